@@ -1,0 +1,17 @@
+"""The plant: what runs inside the FMU. Imports numpy and pinocchio, and nothing of the package."""
+
+from .plant import ParameterError, Plant, check_value
+from .robot import UNBOUNDED, Robot, RobotError, load_robot
+from .variables import Variable, variable_table
+
+__all__ = [
+    "UNBOUNDED",
+    "ParameterError",
+    "Plant",
+    "Robot",
+    "RobotError",
+    "Variable",
+    "check_value",
+    "load_robot",
+    "variable_table",
+]

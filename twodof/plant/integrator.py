@@ -1,0 +1,265 @@
+"""Dormand–Prince 5(4) over one communication step, with located joint-limit stops.
+
+The method is that of SciPy's ``RK45``: its coefficients, error norm, step-size control and
+dense output (Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986;
+Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every communication step begins afresh with
+the step min(max_step, h), so that no integrator state outlives it.
+
+A joint limit is a plastic stop: a joint that reaches it is set onto it with v = 0 and held there
+while its acceleration points into it. It takes that joint's velocity and exerts no reaction on
+the others, whose accelerations stay those of the equations of motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import isfinite, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Acceleration = Callable[[Array, Array], Sequence[float]]
+"""q̈ of the equations of motion at (q, v), n values, joint limits left out."""
+Limits = Sequence[tuple[float, float]]
+"""Per joint (q_min, q_max)."""
+
+A = np.array(
+    [
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+"""Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution."""
+E = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
+P = np.array(
+    [
+        [1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
+        [0, 0, 0, 0],
+        [0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
+        [0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
+        [0, 127303824393 / 49829197408, -318862633887 / 49829197408, 701980252875 / 199316789632],
+        [0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
+        [0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
+    ]
+)
+SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
+STEP_FLOOR = 2.0**-10
+"""Smallest step, as a part of the first one. Across a singularity of the Jacobian the right-hand
+side jumps and no step satisfies the error test; a step of this size is taken as it is."""
+TIME_RESOLUTION = 2.0**-52
+
+
+def advance(
+    acceleration: Acceleration,
+    q: Sequence[float],
+    v: Sequence[float],
+    h: float,
+    limits: Limits,
+    rtol: float,
+    atol: float,
+    max_step: float,
+) -> tuple[list[float], list[float]]:
+    """State one communication step later.
+
+    Args:
+        acceleration: q̈(q, v); autonomous, as inputs are held over the step.
+        q, v: state at the beginning, n each; q within the limits.
+        h: communication step, s, > 0.
+        limits: per joint (q_min, q_max).
+        rtol, atol: tolerances of the error test on the state (q, v).
+        max_step: largest integration step, s.
+
+    Returns:
+        q, v at the end; q within the limits to the last bit.
+
+    Raises:
+        FloatingPointError: the equations gave a value that is not finite.
+    """
+    y = np.array([*q, *v])
+    t = 0.0
+    while t < h:
+        t, y = _until_event(acceleration, y, t, h, limits, rtol, atol, max_step)
+    state = y.tolist()
+    return state[: len(q)], state[len(q) :]
+
+
+def _until_event(
+    acceleration: Acceleration,
+    y: Array,
+    t: float,
+    end: float,
+    limits: Limits,
+    rtol: float,
+    atol: float,
+    max_step: float,
+) -> tuple[float, Array]:
+    """Integrate from t until a joint reaches or leaves a limit, or until the end: (t, y) there."""
+    n = len(limits)
+    first = min(max_step, end - t)
+    floor = STEP_FLOOR * first
+    held, y, f = _hold(acceleration, y, limits)
+    K = np.empty((7, 2 * n))
+    K[0, :n] = y[n:]
+    K[0, n:] = f
+    step, growth = first, MAX_FACTOR
+    while True:
+        last = t + step * (1 + 1e-9) >= end
+        if last:
+            step = end - t
+        y_new, error = _dormand_prince(acceleration, y, step, held, K)
+        ratio = error / (atol + rtol * np.maximum(np.abs(y), np.abs(y_new)))
+        norm = sqrt(ratio.dot(ratio) / (2 * n))
+        if norm < 1.0 or (step <= floor and isfinite(norm)):
+            event = _first_event(acceleration, y, y_new, step, held, K, limits)
+            if event is not None:
+                passed, y = event
+                return (end if last and passed == step else t + passed), y
+            if last:
+                return end, y_new
+            t, y = t + step, y_new
+            K[0] = K[6]
+            factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
+            step = max(floor, min(max_step, step * max(MIN_FACTOR, min(growth, factor))))
+            growth = MAX_FACTOR
+        elif step <= floor:
+            raise FloatingPointError("the equations of motion gave a value that is not finite")
+        else:
+            factor = SAFETY * norm**-0.2 if isfinite(norm) else MIN_FACTOR
+            step = max(floor, step * max(MIN_FACTOR, factor))
+            growth = 1.0  # SciPy's rule: no growth right after a rejection
+
+
+def _dormand_prince(
+    acceleration: Acceleration, y: Array, step: float, held: list[int], K: Array
+) -> tuple[Array, Array]:
+    """One step from y, whose derivative is K[0]: (y_new, error); fills K[1:]."""
+    n = len(y) // 2
+    weights = step * A
+    for stage in range(1, 7):
+        y_new = y + weights[stage - 1, :stage].dot(K[:stage])
+        v = y_new[n:]
+        K[stage, :n] = v
+        K[stage, n:] = acceleration(y_new[:n], v)
+        for i in held:
+            K[stage, n + i] = 0.0
+    return y_new, step * E.dot(K)
+
+
+def _hold(
+    acceleration: Acceleration, y: Array, limits: Limits
+) -> tuple[list[int], Array, list[float]]:
+    """Joints held at a limit; y with their velocity taken; the accelerations left."""
+    n = len(limits)
+    stopped = y.copy()
+    for i, (low, high) in enumerate(limits):
+        if (y[i] >= high and y[n + i] > 0.0) or (y[i] <= low and y[n + i] < 0.0):
+            stopped[n + i] = 0.0
+    a = list(acceleration(stopped[:n], stopped[n:]))
+    held = []
+    for i, (low, high) in enumerate(limits):
+        into = (y[i] >= high and a[i] >= 0.0) or (y[i] <= low and a[i] <= 0.0)
+        if into and stopped[n + i] == 0.0:
+            held.append(i)
+            a[i] = 0.0
+    return held, stopped, a
+
+
+def _first_event(
+    acceleration: Acceleration,
+    y: Array,
+    y_new: Array,
+    step: float,
+    held: list[int],
+    K: Array,
+    limits: Limits,
+) -> tuple[float, Array] | None:
+    """First time in (0, step] at which a limit is reached or left, and the state from there on."""
+    n = len(limits)
+    latest = step
+    if not _events(acceleration, y_new, held, limits):
+        peak = _excursion(y.tolist(), y_new.tolist(), step, K, limits)
+        if peak is None:
+            return None
+        latest = peak
+    Q = K.T.dot(P)
+
+    def state(passed: float) -> Array:
+        return y_new if passed == step else _dense_output(y, Q, passed / step, step)
+
+    def happened(passed: float) -> bool:
+        return bool(_events(acceleration, state(passed), held, limits))
+
+    latest = _bisect(happened, latest, step)
+    reached = state(latest).copy()
+    for i in _events(acceleration, reached, held, limits):
+        if i not in held:
+            reached[i] = min(max(reached[i], limits[i][0]), limits[i][1])
+            reached[n + i] = 0.0
+    return latest, reached
+
+
+def _events(
+    acceleration: Acceleration, y: Array, held: list[int], limits: Limits
+) -> list[int]:
+    """Free joints that are past a limit and held joints that would leave theirs, at y."""
+    n = len(limits)
+    values = y.tolist()
+    found = []
+    for i, (low, high) in enumerate(limits):
+        q, v = values[i], values[n + i]
+        if (q >= high and (q > high or v > 0.0)) or (q <= low and (q < low or v < 0.0)):
+            found.append(i)
+    if held:
+        a = acceleration(y[:n], y[n:])
+        for i in held:
+            low, high = limits[i]
+            if low < high and ((values[i] >= high and a[i] < 0.0) or (values[i] <= low and a[i] > 0.0)):
+                found.append(i)
+    return found
+
+
+def _excursion(
+    y: list[float], y_new: list[float], step: float, K: Array, limits: Limits
+) -> float | None:
+    """Time of the earliest excursion past a limit and back within one step, at its peak."""
+    n = len(limits)
+    peaks = []
+    for i, (low, high) in enumerate(limits):
+        v, v_new = y[n + i], y_new[n + i]
+        if v * v_new >= 0.0:
+            continue
+        limit = high if v > 0.0 else low
+        if abs(v) * step < abs(limit - y[i]):
+            continue
+        Q = K.T.dot(P)
+        start = np.array(y)
+
+        def turned(passed: float, i: int = i, v: float = v) -> bool:
+            return bool(v * _dense_output(start, Q, passed / step, step)[n + i] <= 0.0)
+
+        peak = _bisect(turned, step, step)
+        if (_dense_output(start, Q, peak / step, step)[i] - limit) * v > 0.0:
+            peaks.append(peak)
+    return min(peaks, default=None)
+
+
+def _dense_output(y: Array, Q: Array, x: float, step: float) -> Array:
+    """State at the part x of a step, by the fourth-order interpolant."""
+    return y + step * x * Q.dot((1.0, x, x * x, x * x * x))
+
+
+def _bisect(happened: Callable[[float], bool], latest: float, step: float) -> float:
+    """First time in (0, latest] at which it has happened, to the last bits of the step."""
+    before = 0.0
+    while latest - before > TIME_RESOLUTION * step:
+        middle = 0.5 * (before + latest)
+        if happened(middle):
+            latest = middle
+        else:
+            before = middle
+    return latest
