@@ -1,6 +1,6 @@
 """The plant: what runs inside the FMU. Imports numpy and pinocchio, and nothing of the package."""
 
-from .plant import ParameterError, Plant, check_value
+from .plant import ParameterError, Plant
 from .robot import UNBOUNDED, Robot, RobotError, load_robot
 from .variables import Variable, variable_table
 
@@ -11,7 +11,6 @@ __all__ = [
     "Robot",
     "RobotError",
     "Variable",
-    "check_value",
     "load_robot",
     "variable_table",
 ]

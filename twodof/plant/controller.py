@@ -24,9 +24,7 @@ MAX_SWEEPS = 12
 PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 
 
-def apply_pseudo_inverse(
-    rows: list[list[float]], b: list[float], rcond: float
-) -> list[float]:
+def apply_pseudo_inverse(rows: list[list[float]], b: list[float], rcond: float) -> list[float]:
     """J⁺b, singular values σ ≤ rcond·σ_max dropped (the rule of ``numpy.linalg.pinv``).
 
     Args:

@@ -180,21 +180,20 @@ def _first_event(
 ) -> tuple[float, Array] | None:
     """First time in (0, step] at which a limit is reached or left, and the state from there on."""
     n = len(limits)
-    latest = step
-    if not _events(acceleration, y_new, held, limits):
-        peak = _excursion(y.tolist(), y_new.tolist(), step, K, limits)
-        if peak is None:
-            return None
-        latest = peak
     Q = K.T.dot(P)
 
     def state(passed: float) -> Array:
         return y_new if passed == step else _dense_output(y, Q, passed / step, step)
 
-    def happened(passed: float) -> bool:
-        return bool(_events(acceleration, state(passed), held, limits))
-
-    latest = _bisect(happened, latest, step)
+    latest = step
+    if not _events(acceleration, y_new, held, limits):
+        excursion = _excursion(y, y_new, state, step, limits)
+        if excursion is None:
+            return None
+        latest = excursion
+    latest = _bisect(
+        lambda passed: bool(_events(acceleration, state(passed), held, limits)), latest, step
+    )
     reached = state(latest).copy()
     for i in _events(acceleration, reached, held, limits):
         if i not in held:
@@ -203,9 +202,7 @@ def _first_event(
     return latest, reached
 
 
-def _events(
-    acceleration: Acceleration, y: Array, held: list[int], limits: Limits
-) -> list[int]:
+def _events(acceleration: Acceleration, y: Array, held: list[int], limits: Limits) -> list[int]:
     """Free joints that are past a limit and held joints that would leave theirs, at y."""
     n = len(limits)
     values = y.tolist()
@@ -218,39 +215,37 @@ def _events(
         a = acceleration(y[:n], y[n:])
         for i in held:
             low, high = limits[i]
-            if low < high and ((values[i] >= high and a[i] < 0.0) or (values[i] <= low and a[i] > 0.0)):
+            leaves = a[i] < 0.0 if values[i] >= high else a[i] > 0.0
+            if leaves and low < high:
                 found.append(i)
     return found
 
 
 def _excursion(
-    y: list[float], y_new: list[float], step: float, K: Array, limits: Limits
+    y: Array, y_new: Array, state: Callable[[float], Array], step: float, limits: Limits
 ) -> float | None:
-    """Time of the earliest excursion past a limit and back within one step, at its peak."""
+    """When a joint is furthest past a limit, where it is so within one step and back at its end."""
     n = len(limits)
-    peaks = []
+    before, after = y.tolist(), y_new.tolist()
+    times = []
     for i, (low, high) in enumerate(limits):
-        v, v_new = y[n + i], y_new[n + i]
-        if v * v_new >= 0.0:
-            continue
+        q, v = before[i], before[n + i]
         limit = high if v > 0.0 else low
-        if abs(v) * step < abs(limit - y[i]):
-            continue
-        Q = K.T.dot(P)
-        start = np.array(y)
+        if v * after[n + i] < 0.0 and abs(v) * step > abs(limit - q):
+            turn = _turn(state, n + i, v, step)
+            if (float(state(turn)[i]) - limit) * v > 0.0:
+                times.append(turn)
+    return min(times, default=None)
 
-        def turned(passed: float, i: int = i, v: float = v) -> bool:
-            return bool(v * _dense_output(start, Q, passed / step, step)[n + i] <= 0.0)
 
-        peak = _bisect(turned, step, step)
-        if (_dense_output(start, Q, peak / step, step)[i] - limit) * v > 0.0:
-            peaks.append(peak)
-    return min(peaks, default=None)
+def _turn(state: Callable[[float], Array], component: int, v: float, step: float) -> float:
+    return _bisect(lambda passed: float(state(passed)[component]) * v <= 0.0, step, step)
 
 
 def _dense_output(y: Array, Q: Array, x: float, step: float) -> Array:
     """State at the part x of a step, by the fourth-order interpolant."""
-    return y + step * x * Q.dot((1.0, x, x * x, x * x * x))
+    state: Array = y + step * x * Q.dot((1.0, x, x * x, x * x * x))
+    return state
 
 
 def _bisect(happened: Callable[[float], bool], latest: float, step: float) -> float:

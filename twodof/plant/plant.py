@@ -9,7 +9,6 @@ Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isfinite
 from operator import mul
 
 import numpy as np
@@ -83,7 +82,7 @@ class Plant:
             ParameterError: naming the parameter and what it must be.
         """
         self._check_parameters()
-        self._model.gravity.linear = np.array(self.gravity)
+        self.prepare()
         warnings = []
         self.q = []
         self.v = []
@@ -99,6 +98,10 @@ class Plant:
             self.q.append(inside)
             self.v.append(0.0 if into else v)
         return warnings
+
+    def prepare(self) -> None:
+        """Take over parameters that were set directly, as after restoring a state."""
+        self._model.gravity.linear = np.array(self.gravity)
 
     def step(self, h: float) -> None:
         """Advance the state by one communication step of h seconds, inputs held.
@@ -118,18 +121,18 @@ class Plant:
         """Position of the task frame along the task axes, m, root frame."""
         q = np.array(self.q)
         pin.framesForwardKinematics(self._model, self._data, q)
-        return [self._placement.translation.tolist()[k] for k in self._axes]
+        position: list[float] = self._placement.translation.tolist()
+        return [position[axis] for axis in self._axes]
 
     @property
     def tau(self) -> list[float]:
         """Control effort applied at the current state and inputs, N·m or N."""
         self._hold_inputs()
-        return self._control_effort(np.array(self.q), np.array(self.v)).tolist()
+        tau: list[float] = self._control_effort(np.array(self.q), np.array(self.v)).tolist()
+        return tau
 
     def _hold_inputs(self) -> None:
-        self._task = list(
-            zip(self._axes, self.x_des, self.xd_des, self.xdd_des, self.Kp, self.Kd)
-        )
+        self._task = list(zip(self._axes, self.x_des, self.xd_des, self.xdd_des, self.Kp, self.Kd))
 
     def _commanded_acceleration(self, q: Array, v: Array) -> list[float]:
         """q̈_cmd of the controller at a state, n values."""
@@ -154,7 +157,7 @@ class Plant:
 
     def _control_effort(self, q: Array, v: Array) -> Array:
         command = np.array(self._commanded_acceleration(q, v))
-        tau = pin.rnea(self._model, self._data, q, v, command)
+        tau: Array = pin.rnea(self._model, self._data, q, v, command)
         if self.limit_effort:
             tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
         return tau
@@ -167,7 +170,8 @@ class Plant:
 
         def acceleration(q: Array, v: Array) -> Sequence[float]:
             effort = self._control_effort(q, v) + external - damping * v
-            return pin.aba(self._model, self._data, q, v, effort)
+            a: list[float] = pin.aba(self._model, self._data, q, v, effort).tolist()
+            return a
 
         return acceleration
 
@@ -183,13 +187,3 @@ class Plant:
                     f"q_min[{i + 1}] = {low:g} > q_max[{i + 1}] = {high:g}"
                     f" (joint '{self.robot.joints[i]}')"
                 )
-
-
-def check_value(variable: Variable, value: float) -> None:
-    """Refuse a value that no variable may take.
-
-    Raises:
-        ParameterError: NaN or infinite.
-    """
-    if not isfinite(value):
-        raise ParameterError(f"{variable.name} = {value} is not finite")

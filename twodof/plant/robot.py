@@ -128,9 +128,9 @@ def _check(tree: ET.Element) -> tuple[str, list[str]]:
     joints = _by_name(tree, "joint")
     if len(links) > MAX_JOINTS:
         raise RobotError(f"the URDF has {len(links)} links; at most {MAX_JOINTS} are supported")
-    for kind, elements in (("link", links), ("joint", joints)):
+    for tag, elements in (("link", links), ("joint", joints)):
         for name, element in elements.items():
-            _check_numbers(element, f"{kind} '{name}'")
+            _check_numbers(element, f"{tag} '{name}'")
     root = _check_tree(links, joints)
     warnings = []
     for name, joint in joints.items():
@@ -150,8 +150,8 @@ def _check(tree: ET.Element) -> tuple[str, list[str]]:
             lower, upper = (_attribute(joint, "limit", key, 0.0) for key in ("lower", "upper"))
             if lower > upper:
                 raise RobotError(f"joint '{name}': lower limit {lower:g} > upper limit {upper:g}")
-        for element, key in (("limit", "effort"), ("dynamics", "damping")):
-            if _attribute(joint, element, key, 0.0) < 0:
+        for tag, key in (("limit", "effort"), ("dynamics", "damping")):
+            if _attribute(joint, tag, key, 0.0) < 0:
                 raise RobotError(f"joint '{name}': negative {key}")
         if _attribute(joint, "dynamics", "friction", 0.0):
             warnings.append(f"joint '{name}': friction is not modelled and is ignored")
@@ -195,16 +195,15 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
 def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> str:
     parent: dict[str, str] = {}
     for name, joint in joints.items():
-        ends = []
         for side in ("parent", "child"):
-            element = joint.find(side)
-            link = None if element is None else element.get("link")
-            if link not in links:
-                raise RobotError(f"joint '{name}': its {side} link '{link}' does not exist")
-            ends.append(link)
-        if ends[1] in parent:
-            raise RobotError(f"link '{ends[1]}' has two parents: closed loops are not supported")
-        parent[ends[1]] = ends[0]
+            if _link(joint, side) not in links:
+                raise RobotError(
+                    f"joint '{name}': its {side} link '{_link(joint, side)}' does not exist"
+                )
+        child = _link(joint, "child")
+        if child in parent:
+            raise RobotError(f"link '{child}' has two parents: closed loops are not supported")
+        parent[child] = _link(joint, "parent")
     roots = [link for link in links if link not in parent]
     reached = set(roots)
     for link in links:
@@ -223,12 +222,11 @@ def _check_body(
     joint: ET.Element, links: dict[str, ET.Element], joints: dict[str, ET.Element]
 ) -> None:
     """A moving body, that is a link with all that is fixed to it, needs physical inertia."""
-    first = joint.find("child").get("link")  # type: ignore[union-attr]
+    first = _link(joint, "child")
     children: dict[str, list[str]] = {}
     for other in joints.values():
         if other.get("type") == "fixed":
-            ends = [other.find(side).get("link") for side in ("parent", "child")]  # type: ignore[union-attr]
-            children.setdefault(ends[0], []).append(ends[1])
+            children.setdefault(_link(other, "parent"), []).append(_link(other, "child"))
     body = [first]
     for name in body:
         body.extend(children.get(name, ()))
@@ -291,6 +289,11 @@ def _check_mass_matrix(model: pin.Model, joints: tuple[str, ...]) -> None:
                 f"joint '{joint}': the links behind it have no inertia about its axis,"
                 " so its acceleration is not defined"
             )
+
+
+def _link(joint: ET.Element, side: str) -> str:
+    element = joint.find(side)
+    return "" if element is None else element.get("link", "")
 
 
 def _attribute(element: ET.Element, tag: str, key: str, default: float) -> float:

@@ -105,7 +105,8 @@ def variable_table(robot: Robot, starts: Mapping[str, Value | tuple[float, ...]]
     vector("v_start", "parameter", velocity, "velocity at the start", joint)
     vector("q_min", "parameter", position, "lower limit", joint)
     vector("q_max", "parameter", position, "upper limit", joint)
-    vector("gravity", "parameter", ["m/s2"] * 3, "gravity", [f"axis {a} of the root" for a in "xyz"])
+    root = [f"axis {letter} of {robot.root}" for letter in "xyz"]
+    vector("gravity", "parameter", ["m/s2"] * 3, "gravity", root)
     scalar("rcond", "parameter", "", "singular values up to rcond times the largest are dropped")
     scalar("rtol", "parameter", "", "relative tolerance of the integrator")
     scalar("atol", "parameter", "", "absolute tolerance of the integrator")

@@ -1,0 +1,273 @@
+"""The Python flavour's slave: adapts the plant to FMI 2.0 co-simulation through pythonfmu.
+
+It lives in the FMU as ``slave_<digest>.py`` beside the package ``twodof_<digest>``: names of its
+own, as the wrapper imports by name into ``sys.modules`` and several FMUs share one process.
+
+The wrapper turns an exception into fmi2Fatal, after which no call is allowed. So nothing here
+raises once the instance exists: what is refused is logged, leaves everything as it was and makes
+the next doStep a discard. The FMI state machine is the table ``ALLOWED``.
+"""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+PACKAGE = __name__.replace("slave_", "twodof_")
+fmi = importlib.import_module(f"{PACKAGE}.pythonfmu.fmi2slave")
+Status = importlib.import_module(f"{PACKAGE}.pythonfmu.enums").Fmi2Status
+
+INSTANTIATED, INITIALIZATION, STEP, TERMINATED, ERROR = (
+    "instantiated", "initialization mode", "step mode", "terminated", "error",
+)  # fmt: skip
+ALLOWED = {
+    "fmi2SetupExperiment": {INSTANTIATED},
+    "fmi2EnterInitializationMode": {INSTANTIATED},
+    "fmi2ExitInitializationMode": {INITIALIZATION},
+    "fmi2DoStep": {STEP},
+    "fmi2Terminate": {STEP, ERROR},
+    "fmi2Get": {INITIALIZATION, STEP, TERMINATED, ERROR},
+    "fmi2Set of a parameter": {INSTANTIATED, INITIALIZATION},
+    "fmi2Set of an input": {INSTANTIATED, INITIALIZATION, STEP},
+}
+TIME_TOLERANCE = 1e-9
+
+
+def import_plant(site_packages: list[str]):
+    """The plant package of this FMU; says what to install where a package is missing."""
+    try:
+        return importlib.import_module(f"{PACKAGE}.plant")
+    except ModuleNotFoundError as missing:
+        for folder in site_packages:
+            if folder not in sys.path:
+                sys.path.append(folder)
+        try:
+            return importlib.import_module(f"{PACKAGE}.plant")
+        except ModuleNotFoundError:
+            version = ".".join(map(str, sys.version_info[:3]))
+            raise ImportError(
+                f"the Python of this process ({version}, {sys.prefix}) has no package"
+                f" '{missing.name}': install resources/requirements.txt of this FMU into it, or"
+                " set PYTHONPATH to a site-packages folder that has them, or rebuild the FMU with"
+                " --link-environment, or use the native FMU, which needs no Python"
+            ) from None
+
+
+class TwoDofSlave(fmi.Fmi2Slave):
+    """One instance of the FMU. All files are found through ``self.resources``."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        resources = Path(self.resources)
+        config = json.loads((resources / "plant.json").read_text("utf-8"))
+        self._plant_module = import_plant(config["site_packages"])
+        urdf = (resources / "robot.urdf").read_text("utf-8")
+        robot = self._plant_module.load_robot(urdf, config["frame"], config["axes"])
+        starts = {k: tuple(v) if isinstance(v, list) else v for k, v in config["starts"].items()}
+        self._table = self._plant_module.variable_table(robot, starts)
+        self._plant = self._plant_module.Plant(robot, self._table)
+        self._identity = config["identity"]
+        self._phase = INSTANTIATED
+        self._time = 0.0
+        self._refused = ""
+        self._outputs: dict[str, list[float]] = {}
+
+    # --- life cycle ---
+
+    def setup_experiment(self, start_time, stop_time=None, tolerance=None):
+        if not self._allowed("fmi2SetupExperiment"):
+            return
+        if not self._finite(start_time):
+            self._refuse(f"fmi2SetupExperiment: start time {start_time} is not finite")
+            return
+        if tolerance is not None:
+            self.log("the tolerance of the experiment is ignored: rtol and atol are parameters")
+        self._time = start_time
+
+    def enter_initialization_mode(self):
+        if self._allowed("fmi2EnterInitializationMode"):
+            self._phase = INITIALIZATION
+
+    def exit_initialization_mode(self):
+        if self._allowed("fmi2ExitInitializationMode"):
+            warnings = self._initialise()
+            self._phase = ERROR if warnings is None else STEP
+            for line in warnings or ():
+                self._log(line, Status.warning)
+
+    def do_step(self, current_time, step_size):
+        if self._refused:
+            self._log(f"step discarded: {self._refused}", Status.discard)
+            self._refused = ""
+            return False
+        if not self._allowed("fmi2DoStep"):
+            self._refused = ""  # this discard is its answer
+            return False
+        if not abs(current_time - self._time) <= TIME_TOLERANCE * max(1.0, abs(current_time)):
+            return self._discard(
+                f"fmi2DoStep: the communication point {current_time!r} s is not"
+                f" the time of the FMU, {self._time!r} s"
+            )
+        if not (step_size > 0.0 and self._finite(step_size)):
+            return self._discard(f"fmi2DoStep: the step {step_size!r} s must be > 0")
+        try:
+            self._plant.step(step_size)
+        except FloatingPointError as error:
+            return self._discard(f"fmi2DoStep at {current_time!r} s: {error}")
+        except KeyboardInterrupt:  # SIGINT of the process; raised on, it would be fatal
+            return self._discard(f"fmi2DoStep at {current_time!r} s: interrupted")
+        self._time = current_time + step_size
+        self._outputs.clear()
+        return True
+
+    def terminate(self):
+        if self._allowed("fmi2Terminate"):
+            self._phase = TERMINATED
+
+    # --- variables ---
+
+    def get_real(self, vrs):
+        return self._get(vrs, "Real", float("nan"))
+
+    def get_boolean(self, vrs):
+        return self._get(vrs, "Boolean", False)
+
+    def get_integer(self, vrs):
+        return self._get(vrs, "Integer", 0)
+
+    def get_string(self, vrs):
+        return self._get(vrs, "String", "")
+
+    def set_real(self, vrs, values):
+        self._set(vrs, values, "Real")
+
+    def set_boolean(self, vrs, values):
+        self._set(vrs, values, "Boolean")
+
+    def set_integer(self, vrs, values):
+        self._set(vrs, values, "Integer")
+
+    def set_string(self, vrs, values):
+        self._set(vrs, values, "String")
+
+    def _get(self, vrs, kind, nothing):
+        if self._phase not in ALLOWED["fmi2Get"]:
+            # some importers read start values too early: answered by a log line alone
+            self._log(f"fmi2Get{kind} is not allowed in the state '{self._phase}'", Status.error)
+            return [nothing] * len(vrs)
+        if self._phase == INITIALIZATION and not self._outputs and self._initialise() is None:
+            return [nothing] * len(vrs)
+        values = []
+        for vr in vrs:
+            variable = self._variable(vr, kind, f"fmi2Get{kind}")
+            if variable is None:
+                values.append(nothing)
+            elif variable.causality == "output":
+                values.append(self._output(variable.group)[variable.index])
+            else:
+                value = getattr(self._plant, variable.group)
+                values.append(value if variable.index is None else value[variable.index])
+        return values
+
+    def _output(self, group):
+        if group not in self._outputs:
+            self._outputs[group] = getattr(self._plant, group)
+        return self._outputs[group]
+
+    def _set(self, vrs, values, kind):
+        for vr, value in zip(vrs, values):
+            variable = self._variable(vr, kind, f"fmi2Set{kind}")
+            if variable is None:
+                continue
+            if variable.causality == "output":
+                self._refuse(f"fmi2Set{kind}: {variable.name} is an output and cannot be set")
+                continue
+            article = "a" if variable.causality == "parameter" else "an"
+            if not self._allowed(f"fmi2Set of {article} {variable.causality}", variable.name):
+                continue
+            if kind == "Real" and not self._finite(value):
+                self._refuse(f"{variable.name} = {value} is not finite")
+                continue
+            if variable.index is None:
+                setattr(self._plant, variable.group, value)
+            else:
+                getattr(self._plant, variable.group)[variable.index] = value
+            if self._phase == INITIALIZATION:
+                self._outputs.clear()
+            else:
+                self._outputs.pop("tau", None)
+
+    def _variable(self, vr, kind, call):
+        if not 0 <= vr < len(self._table):
+            self._refuse(f"{call}: there is no variable with value reference {vr}")
+            return None
+        variable = self._table[vr]
+        if variable.type != kind:
+            self._refuse(f"{call}: {variable.name} is of type {variable.type}")
+            return None
+        return variable
+
+    # --- state ---
+
+    def _get_fmu_state(self):
+        state = {"identity": self._identity, "phase": self._phase, "time": self._time}
+        state["refused"] = self._refused
+        groups = {variable.group for variable in self._table if variable.causality != "output"}
+        for group in sorted(groups | {"q", "v"}):
+            value = getattr(self._plant, group)
+            state[group] = list(value) if isinstance(value, list) else value
+        return state
+
+    def _set_fmu_state(self, state):
+        if state.get("identity") != self._identity:
+            self._refuse("fmi2SetFMUstate: the state is not one of this FMU")
+            return
+        for key, value in state.items():
+            if key in ("phase", "time", "refused"):
+                setattr(self, f"_{key}", value)
+            elif key != "identity":
+                setattr(self._plant, key, list(value) if isinstance(value, list) else value)
+        self._plant.prepare()
+        self._outputs.clear()
+
+    @staticmethod
+    def _fmu_state_from_bytes(state):
+        try:
+            return dict(json.loads(state))
+        except (ValueError, TypeError):
+            return {}  # of no FMU: refused when it is set
+
+    # --- refusals ---
+
+    def _initialise(self):
+        """Warnings of the plant's initialisation, None where its parameters are refused."""
+        try:
+            warnings = self._plant.initialise()
+        except self._plant_module.ParameterError as error:
+            self._refuse(str(error))
+            return None
+        self._outputs.clear()
+        return warnings
+
+    def _allowed(self, call, culprit=""):
+        if self._phase in ALLOWED[call]:
+            return True
+        what = f" ({culprit})" if culprit else ""
+        self._refuse(f"{call}{what} is not allowed in the state '{self._phase}'")
+        return False
+
+    def _refuse(self, message):
+        self._log(message, Status.error)
+        self._refused = message
+
+    def _discard(self, message):
+        self._log(message, Status.discard)
+        return False
+
+    def _log(self, message, status):
+        # FMI messages are printf formats
+        self.log(message.replace("%", "%%"), status)
+
+    @staticmethod
+    def _finite(value):
+        return abs(value) < float("inf")

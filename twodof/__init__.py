@@ -1,0 +1,53 @@
+"""From a URDF to an FMU that every FMI tool loads, from a co-simulation to a ROS 2 bag."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from .bag import Bag, Run, read_bag
+    from .build import FmuOptions, build_fmu
+    from .errors import TwoDofError
+    from .fmu import Fmu, load_fmu
+    from .master import Sample, Summary, experiment, samples, simulate
+
+# imported on first use: FMPy, rosbags and Pinocchio take a second together
+_HOME = {
+    "Bag": "bag",
+    "Run": "bag",
+    "read_bag": "bag",
+    "FmuOptions": "build",
+    "build_fmu": "build",
+    "TwoDofError": "errors",
+    "Fmu": "fmu",
+    "load_fmu": "fmu",
+    "Sample": "master",
+    "Summary": "master",
+    "experiment": "master",
+    "samples": "master",
+    "simulate": "master",
+}
+__all__ = [
+    "Bag",
+    "Fmu",
+    "FmuOptions",
+    "Run",
+    "Sample",
+    "Summary",
+    "TwoDofError",
+    "build_fmu",
+    "experiment",
+    "load_fmu",
+    "read_bag",
+    "samples",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

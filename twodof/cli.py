@@ -1,0 +1,362 @@
+"""The command line: parses, calls the function behind each verb, prints.
+
+Imports are inside the verbs, so that ``twodof --help`` is instant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import __version__
+from .errors import InputError, TwoDofError
+
+if TYPE_CHECKING:
+    from .bag import Run
+    from .fmu import Fmu
+    from .master import Experiment, RealTime, Summary
+
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    # the FMU's errors come back with the exception that they cause
+    logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
+    try:
+        status: int = options.verb(options)
+        sys.stdout.flush()
+        return status
+    except TwoDofError as error:
+        print(f"twodof: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("twodof: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output has left: nothing more to say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="twodof",
+        description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
+        epilog="'twodof run' alone builds the default arm's FMU, runs it for 5 s and leaves a bag.",
+    )
+    parser.add_argument("--version", action="version", version=f"twodof {__version__}")
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    build = verbs.add_parser("build", help="build an FMU from a URDF")
+    build.set_defaults(verb=_build)
+    build.add_argument("-o", dest="output", metavar="FILE.fmu", help="default: <name>.fmu")
+    build.add_argument("--urdf", type=Path, help="default: the shipped planar 2-DoF arm")
+    build.add_argument(
+        "--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes"
+    )
+    build.add_argument("--frame", default="EndEffector", help="controlled link (%(default)s)")
+    build.add_argument("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
+    build.add_argument(
+        "--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"),
+        help="m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)",
+    )  # fmt: skip
+    build.add_argument(
+        "--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m"
+    )
+    build.add_argument("--name", default="TwoDof", help="name of the model (%(default)s)")
+    build.add_argument(
+        "--link-environment", action="store_true",
+        help="remember in the FMU where this Python's packages are",
+    )  # fmt: skip
+
+    run = verbs.add_parser(
+        "run", help="simulate an FMU and write a bag",
+        description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
+    )  # fmt: skip
+    run.set_defaults(verb=_run)
+    run.add_argument("fmu", nargs="?", metavar="FMU", help="default: TwoDof.fmu, built if need be")
+    run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
+    run.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
+    run.add_argument(
+        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
+    )
+    run.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
+        help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
+    )  # fmt: skip
+    run.add_argument(
+        "--input", metavar="CSV", help="inputs over time: a column 'time' and one for each input"
+    )
+    run.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
+    run.add_argument(
+        "--scene", action="store_true", help="add robot description, tf, target and end effector"
+    )
+    run.add_argument("--effort", action="store_true", help="put the control effort into the bag")
+    run.add_argument(
+        "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
+    )
+    run.add_argument("--overwrite", action="store_true", help="replace an existing bag")
+    run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
+
+    info = verbs.add_parser("info", help="show what is in an FMU or a bag")
+    info.set_defaults(verb=_info)
+    info.add_argument("path", metavar="FMU|BAG", type=Path)
+    return parser
+
+
+def _build(options: argparse.Namespace) -> int:
+    from .build import FmuOptions, build_fmu
+
+    gravity = None if options.gravity is None else tuple(options.gravity)
+    chosen = FmuOptions(
+        urdf=options.urdf,
+        mesh_dir=options.mesh_dir,
+        frame=options.frame,
+        axes=options.axes,
+        gravity=gravity,
+        q_start=None if options.q_start is None else tuple(options.q_start),
+        name=options.name,
+        link_environment=options.link_environment,
+    )
+    path = build_fmu(options.output, chosen)
+    from .fmu import load_fmu
+
+    fmu = load_fmu(path)
+    _print_table(
+        ("FMU", f"{path} ({path.stat().st_size / 1024:.0f} KB, {', '.join(fmu.platforms)})"),
+        ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
+        ("controlled", _controlled(fmu)),
+    )
+    _print_next(f"twodof run {_quote(path)}", f"twodof info {_quote(path)}")
+    return 0
+
+
+def _run(options: argparse.Namespace) -> int:
+    from .bag import Bag
+    from .build import build_fmu
+    from .inputs import parse_settings
+    from .master import RealTime, experiment, simulate
+
+    settings = parse_settings(options.settings)
+    path = Path(options.fmu) if options.fmu else build_fmu()
+    run = experiment(
+        path,
+        stop_time=options.stop_time,
+        step=options.step,
+        settings=settings,
+        input_file=options.input,
+    )
+    bag = Bag(
+        options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"),
+        run,
+        storage=options.storage,
+        scene=options.scene,
+        effort=options.effort,
+        stamp_start=options.stamp_start,
+        overwrite=options.overwrite,
+        command_line=shlex.join(["twodof", *sys.argv[1:]]),
+    )
+    pace = RealTime() if options.realtime else None
+    with _asked_to_stop() as asked:
+        summary = simulate(run, [bag, _Progress(run)], pace=pace, stop=asked)
+    _print_summary(run, bag.path, options.storage, summary, pace)
+    return INTERRUPTED if summary.stopped else 0
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Whether SIGINT or SIGTERM came; the run reads it between steps, so that a step is never cut.
+
+    A second Ctrl-C interrupts at once.
+    """
+    asked = False
+
+    def ask(number: int, _frame: object) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(number, before[signal.Signals(number)])
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Progress:
+    """A sink that shows a bar on a terminal and nothing in a pipe."""
+
+    def __init__(self, run: Experiment) -> None:
+        self._run = run
+
+    def __enter__(self) -> _Progress:
+        from tqdm import tqdm
+
+        seconds = self._run.steps * self._run.step
+        self._bar = tqdm(
+            total=seconds, unit="s", disable=None, leave=False, desc="simulating",
+            bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left",
+        )  # fmt: skip
+        return self
+
+    def write(self, sample: object) -> None:
+        self._bar.update(self._run.step if sample.k else 0.0)  # type: ignore[attr-defined]
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.close()
+
+
+def _print_summary(
+    run: Experiment, bag: Path, storage: str, summary: Summary, pace: RealTime | None
+) -> None:
+    last = summary.last
+    simulated = last.k * run.step
+    rows = [
+        ("FMU", f"{run.fmu.path}"),
+        ("bag", f"{bag} ({last.k + 1} messages on /joint_states, {storage})"),
+    ]
+    if summary.error is not None:
+        target = ", ".join(f"{last.inputs[f'x_des[{k + 1}]']:g}" for k in range(len(last.x)))
+        rows.append(("end effector", f"{_length(summary.error)} from its target ({target}) m"))
+    speed = simulated / summary.wall_time if summary.wall_time else 0.0
+    rows.append(
+        ("time", f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time")
+    )
+    if pace is not None:
+        rows.append(
+            ("deadlines", f"{pace.missed} of {last.k + 1} missed, worst {pace.worst * 1e3:.1f} ms")
+        )
+    if summary.stopped:
+        rows.append(("stopped", f"on request at {last.t:g} s; the bag is complete up to there"))
+    _print_table(*rows)
+    file = bag / f"{bag.name}.{'mcap' if storage == 'mcap' else 'db3'}"
+    viewer = "Foxglove: open" if storage == "mcap" else "RViz: play"
+    _print_next(
+        f"twodof info {_quote(bag)}", f"ros2 bag play {_quote(bag)}", f"{viewer} {_quote(file)}"
+    )
+
+
+def _length(metres: float) -> str:
+    for factor, unit in ((1.0, "m"), (1e3, "mm"), (1e6, "µm")):
+        if metres * factor >= 1.0:
+            return f"{metres * factor:.3g} {unit}"
+    return f"{metres * 1e9:.3g} nm"
+
+
+def _info(options: argparse.Namespace) -> int:
+    path = options.path
+    if path.is_dir():
+        from .bag import read_bag
+
+        _print_bag(read_bag(path))
+    elif path.suffix in (".mcap", ".db3") and path.is_file():
+        raise InputError(f"'{path}' is a bag's file; give the bag's folder, '{path.parent}'")
+    else:
+        from .fmu import load_fmu
+
+        _print_fmu(load_fmu(path))
+    return 0
+
+
+def _print_fmu(fmu: Fmu) -> None:
+    simulation = fmu.description.coSimulation
+    capabilities = [
+        name
+        for name in (
+            "needsExecutionTool",
+            "canHandleVariableCommunicationStepSize",
+            "canGetAndSetFMUstate",
+            "canSerializeFMUstate",
+            "providesDirectionalDerivative",
+        )
+        if getattr(simulation, name)
+    ]
+    _print_table(
+        ("FMU", f"{fmu.path} ({fmu.name}, {fmu.description.generationTool})"),
+        ("digest", fmu.guid),
+        ("platforms", ", ".join(fmu.platforms) or "none"),
+        ("capabilities", ", ".join(capabilities)),
+        ("robot", fmu.robot or "unknown"),
+        ("joints", ", ".join(fmu.joints)),
+        ("controlled", _controlled(fmu)),
+    )
+    rows = [("variable", "unit", "start", "")]
+    for causality in ("input", "output", "parameter"):
+        for group, names in fmu.groups(causality).items():
+            variables = [fmu.variables[name] for name in names]
+            size = "" if names == [group] else f"[{len(names)}]"
+            starts = ", ".join(_start(v.start) for v in variables if v.start is not None)
+            units = ", ".join(dict.fromkeys(variable.unit or "" for variable in variables))
+            rows.append((f"{group}{size}", units, starts, causality))
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    print()
+    for row in rows:
+        print("  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[3]]).rstrip())
+
+
+def _controlled(fmu: Fmu) -> str:
+    return f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}" if fmu.frame else "unknown"
+
+
+def _start(text: str) -> str:
+    try:
+        value = float(text)
+    except ValueError:
+        return text
+    return "none" if abs(value) > 1e300 else f"{value:g}"
+
+
+def _print_bag(run: Run) -> None:
+    duration = float(run.t[-1])
+    rate = (len(run.t) - 1) / duration if duration else 0.0
+    rows = [
+        ("bag", str(run.path)),
+        ("joints", ", ".join(run.joints)),
+        ("duration", f"{duration:g} s, {len(run.t)} joint states, {rate:g} Hz"),
+        ("first stamp", f"{run.stamps[0] / 1e9:.9f} s"),
+        ("first state", _state(run, 0)),
+        ("last state", _state(run, -1)),
+    ]
+    if run.provenance:
+        fmu = run.provenance["fmu"]
+        rows.append(("FMU", f"{fmu['file']} ({fmu['name']}, {fmu['guid']})"))
+        rows.append(("made by", run.provenance["command_line"] or "the Python API"))
+    _print_table(*rows)
+    print()
+    width = max(len(topic.name) for topic in run.topics)
+    for topic in run.topics:
+        print(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}")
+
+
+def _state(run: Run, k: int) -> str:
+    q = ", ".join(f"{value:.6g}" for value in run.q[k])
+    v = ", ".join(f"{value:.6g}" for value in run.v[k])
+    return f"q = ({q}), v = ({v})"
+
+
+def _quote(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def _print_table(*rows: tuple[str, str]) -> None:
+    width = max(len(label) for label, _ in rows)
+    for label, text in rows:
+        print(f"{label.ljust(width)}  {text}")
+
+
+def _print_next(*commands: str) -> None:
+    print("\nnext")
+    for command in commands:
+        print(f"  {command}")

@@ -1,0 +1,31 @@
+"""The exceptions of the package: one root, named leaves; each message is one clear line."""
+
+from __future__ import annotations
+
+
+class TwoDofError(Exception):
+    """Root of all errors that a user's input or machine can cause."""
+
+
+class BuildError(TwoDofError):
+    """The FMU cannot be built: the URDF, its meshes or an option is at fault."""
+
+
+class FmuError(TwoDofError):
+    """The file is not an FMU that this master can run."""
+
+
+class InputError(TwoDofError):
+    """A ``--set``, an input file or a time of the run is at fault."""
+
+
+class SimulationError(TwoDofError):
+    """The FMU refused or failed a call; ``k`` is the number of steps that were done."""
+
+    def __init__(self, message: str, k: int = 0) -> None:
+        super().__init__(message)
+        self.k = k
+
+
+class BagError(TwoDofError):
+    """A bag cannot be written or read."""

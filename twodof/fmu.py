@@ -1,0 +1,301 @@
+"""An FMU: its file, checked and described, and an instance of it. All of FMPy is here."""
+
+from __future__ import annotations
+
+import logging
+import re
+import stat
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from ctypes import byref, c_double, c_uint
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import fmpy
+from fmpy import fmi2
+from fmpy.fmi1 import FMICallException
+from fmpy.logging import addLoggerProxy
+from fmpy.model_description import ModelDescription, ScalarVariable
+
+from .errors import FmuError, SimulationError
+
+logger = logging.getLogger("twodof.fmu")
+LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
+"""Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
+
+MAX_UNZIPPED = 2 * 1024**3
+MAX_DESCRIPTION = 64 * 1024**2
+
+
+@dataclass(frozen=True)
+class Fmu:
+    """An FMI 2.0 co-simulation FMU with outputs q[i] and v[i].
+
+    Attributes:
+        path: the file.
+        description: FMPy's model description.
+        variables: by name, in the order of the description.
+        platforms: FMI names of the platforms that it has binaries for, e.g. "linux64".
+        robot: name of the robot; "" where the FMU does not say.
+        joints: joint names, one for each q[i]; "joint1", … where the FMU does not say.
+        frame, root, axes: the controlled frame, the frame its position is expressed in and the
+            task axes; "" where the FMU does not say.
+    """
+
+    path: Path
+    description: ModelDescription
+    variables: dict[str, ScalarVariable]
+    platforms: tuple[str, ...]
+    robot: str
+    joints: tuple[str, ...]
+    frame: str
+    root: str
+    axes: str
+
+    @property
+    def name(self) -> str:
+        """The model's name."""
+        return str(self.description.modelName)
+
+    @property
+    def guid(self) -> str:
+        """The FMU's GUID; for FMUs of this package the digest of all that matters."""
+        return str(self.description.guid)
+
+    @property
+    def runs_here(self) -> bool:
+        """Whether it has a binary for this machine's platform."""
+        return fmpy.platform in self.platforms
+
+    def vector(self, group: str) -> list[str]:
+        """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
+        if group in self.variables:
+            return [group]
+        names: list[str] = []
+        while (name := f"{group}[{len(names) + 1}]") in self.variables:
+            names.append(name)
+        return names
+
+    def groups(self, causality: str) -> dict[str, list[str]]:
+        """Vectors and scalars of one causality by group name."""
+        found: dict[str, list[str]] = {}
+        for name, variable in self.variables.items():
+            if variable.causality == causality:
+                found.setdefault(name.partition("[")[0], []).append(name)
+        return found
+
+
+def load_fmu(path: str | Path) -> Fmu:
+    """Read and check an FMU's description; nothing of it is run or unzipped.
+
+    Raises:
+        FmuError: the file is missing, no zip, not FMI 2.0 co-simulation, unsafe to unzip, or
+            has no outputs q[i] and v[i].
+    """
+    path = Path(path)
+    xml, members = _read(path)
+    try:
+        description = fmpy.read_model_description(str(path), validate=True)
+        root = ET.fromstring(xml)
+    except Exception as error:  # FMPy raises bare exceptions of several libraries
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
+        raise FmuError(f"'{path}': modelDescription.xml is not valid: {reason}") from error
+    if description.fmiVersion != "2.0" or description.coSimulation is None:
+        kind = "co-simulation" if description.coSimulation is not None else "model exchange"
+        raise FmuError(
+            f"'{path}' is FMI {description.fmiVersion} {kind}; FMI 2.0 co-simulation is needed"
+        )
+    fmu = Fmu(
+        path=path,
+        description=description,
+        variables={variable.name: variable for variable in description.modelVariables},
+        platforms=_platforms(members, description.coSimulation.modelIdentifier),
+        **_vendor_annotation(root, description),
+    )
+    n = len(fmu.vector("q"))
+    if n == 0 or len(fmu.vector("v")) != n:
+        raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
+    if len(fmu.joints) != n:
+        raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
+    return fmu
+
+
+class Instance:
+    """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
+
+    FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
+    SimulationError with the FMU's own words.
+    """
+
+    def __init__(self, fmu: Fmu, folder: Path) -> None:
+        self._fmu = fmu
+        self._said = ""
+        self._fatal = False
+        self._callbacks = fmi2.fmi2CallbackFunctions(
+            logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
+            allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc),
+            freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free),
+        )
+        addLoggerProxy(byref(self._callbacks))
+        identifier = fmu.description.coSimulation.modelIdentifier
+        try:
+            self._slave = fmi2.FMU2Slave(
+                guid=fmu.guid,
+                unzipDirectory=str(folder),
+                modelIdentifier=identifier,
+                instanceName=identifier,
+            )
+            self._slave.instantiate(callbacks=self._callbacks, loggingOn=True)
+        except Exception as error:  # FMPy raises bare exceptions
+            raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
+
+    def initialise(
+        self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
+    ) -> None:
+        """Set start values and go through initialisation mode."""
+        self.set(values)
+        self._call(self._slave.setupExperiment, startTime=start_time, stopTime=stop_time)
+        self._call(self._slave.enterInitializationMode)
+        self._call(self._slave.exitInitializationMode)
+
+    def set(self, values: Mapping[str, float | bool]) -> None:
+        """Set variables by name."""
+        for kind, setter in (("Real", self._slave.setReal), ("Boolean", self._slave.setBoolean)):
+            chosen = [self._fmu.variables[name] for name in values]
+            chosen = [variable for variable in chosen if variable.type == kind]
+            if chosen:
+                references = [variable.valueReference for variable in chosen]
+                self._call(setter, references, [values[variable.name] for variable in chosen])
+
+    def step(self, t: float, h: float) -> None:
+        """One communication step from t to t + h."""
+        self._call(self._slave.doStep, t, h)
+
+    def reader(self, names: Sequence[str]) -> Callable[[], tuple[float, ...]]:
+        """A function that reads these Real variables."""
+        n = len(names)
+        references = (c_uint * n)(*(self._fmu.variables[name].valueReference for name in names))
+        values = (c_double * n)()
+        get = self._slave.fmi2GetReal
+
+        def read() -> tuple[float, ...]:
+            self._call(get, self._slave.component, references, n, values)
+            return tuple(values)
+
+        return read
+
+    def free(self) -> None:
+        """End the instance; after a fatal failure the standard allows no further call."""
+        if self._fatal:
+            return
+        with suppress(FMICallException):  # it may have failed already, and is freed all the same
+            self._slave.terminate()
+        self._slave.freeInstance()
+
+    def _call(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
+        self._said = ""
+        try:
+            function(*arguments, **named)
+        except FMICallException as error:
+            self._fatal = error.status == fmi2.fmi2Fatal
+            raise SimulationError(self._said or str(error)) from error
+
+    def _log(
+        self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
+    ) -> None:
+        message = text.decode("utf-8", "replace").strip()
+        if status > fmi2.fmi2Warning:
+            self._said = message
+        logger.log(LEVELS.get(status, logging.CRITICAL), message)
+
+
+@contextmanager
+def instantiate(fmu: Fmu) -> Iterator[Instance]:
+    """An instance of the FMU, unzipped into a temporary folder; freed at the end.
+
+    Raises:
+        FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
+    """
+    if not fmu.runs_here:
+        raise FmuError(
+            f"'{fmu.path}' has no binary for this platform ({fmpy.platform}),"
+            f" only for: {', '.join(fmu.platforms) or 'none'}"
+        )
+    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+        try:
+            with zipfile.ZipFile(fmu.path) as archive:
+                archive.extractall(folder)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
+        instance = Instance(fmu, Path(folder))
+        try:
+            yield instance
+        finally:
+            instance.free()
+
+
+def read_resource(fmu: Fmu, name: str) -> bytes | None:
+    """A file of the FMU's resources/ folder, None where it has no such file."""
+    with zipfile.ZipFile(fmu.path) as archive:
+        try:
+            return archive.read(f"resources/{name}")
+        except KeyError:
+            return None
+
+
+def _read(path: Path) -> tuple[bytes, list[str]]:
+    """modelDescription.xml and the members' names, after the checks that make unzipping safe."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            for member in members:
+                name = PurePosixPath(member.filename)
+                link = stat.S_ISLNK(member.external_attr >> 16)
+                if link or name.is_absolute() or ".." in name.parts or "\\" in member.filename:
+                    raise FmuError(f"'{path}' is unsafe: its member '{name}' leaves its folder")
+            if sum(member.file_size for member in members) > MAX_UNZIPPED:
+                raise FmuError(f"'{path}' is unsafe: unzipped it exceeds {MAX_UNZIPPED} bytes")
+            description = archive.getinfo("modelDescription.xml")
+            if description.file_size > MAX_DESCRIPTION:
+                raise FmuError(f"'{path}': modelDescription.xml is too large")
+            xml = archive.read(description)
+    except FileNotFoundError as error:
+        raise FmuError(f"there is no FMU '{path}'; build one with 'twodof build'") from error
+    except OSError as error:
+        raise FmuError(f"cannot read '{path}': {error.strerror}") from error
+    except KeyError as error:
+        raise FmuError(f"'{path}' is no FMU: it has no modelDescription.xml") from error
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        raise FmuError(f"'{path}' is no FMU: it is not a zip archive ({error})") from error
+    if re.search(rb"<!\s*(DOCTYPE|ENTITY)", xml) or b"\0" in xml[:4]:
+        raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
+    return xml, [member.filename for member in members]
+
+
+def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
+    suffixes = {"linux": ".so", "win": ".dll", "darwin": ".dylib"}
+    found = set()
+    for member in members:
+        parts = PurePosixPath(member).parts
+        if len(parts) == 3 and parts[0] == "binaries":
+            suffix = suffixes.get(parts[1].rstrip("0123456789"), "")
+            if parts[2] == identifier + suffix:
+                found.add(parts[1])
+    return tuple(sorted(found))
+
+
+def _vendor_annotation(root: ET.Element, description: ModelDescription) -> dict[str, Any]:
+    robot = root.find("VendorAnnotations/Tool[@name='twodof']/Robot")
+    if robot is None:
+        n = sum(re.fullmatch(r"q\[\d+\]", v.name) is not None for v in description.modelVariables)
+        joints = tuple(f"joint{i + 1}" for i in range(n))
+        return {"robot": "", "joints": joints, "frame": "", "root": "", "axes": ""}
+    return {
+        "robot": robot.get("name", ""),
+        "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),
+        **{key: robot.get(key, "") for key in ("frame", "root", "axes")},
+    }

@@ -1,0 +1,135 @@
+"""What a user sets: names and values of FMU variables, at the start and over time."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from .errors import InputError
+from .fmu import Fmu
+
+Value = float | bool
+Setting = Value | Sequence[float]
+Changes = list[tuple[float, dict[str, Value]]]
+"""Times in s, ascending, and the inputs that take new values there."""
+
+
+def parse_settings(texts: Iterable[str]) -> dict[str, Setting]:
+    """NAME=VALUE texts of a command line: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
+    settings: dict[str, Setting] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise InputError(f"--set {text}: expected NAME=VALUE")
+        if name in settings:
+            raise InputError(f"--set {name} is given twice")
+        settings[name] = _parse_value(name, value.strip())
+    return settings
+
+
+def _parse_value(name: str, text: str) -> Setting:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--set {name}={text}: '{text}' is not a number") from None
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
+    """Values by variable name; a group's name sets all of its elements.
+
+    Raises:
+        InputError: an unknown name (with the nearest that exists), an output, a wrong count or
+            kind of value, or a value that is not finite.
+    """
+    values: dict[str, Value] = {}
+    for name, setting in settings.items():
+        elements = [name] if name in fmu.variables else fmu.vector(name)
+        if not elements:
+            raise InputError(f"there is no variable '{name}'{_suggestion(fmu, name)}")
+        if isinstance(setting, Sequence):
+            given: Sequence[Value] = setting
+            if len(given) != len(elements):
+                raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
+        else:
+            given = [setting] * len(elements)
+        for element, value in zip(elements, given, strict=True):
+            values[element] = _checked(fmu, element, value)
+    return values
+
+
+def _checked(fmu: Fmu, name: str, value: Value) -> Value:
+    variable = fmu.variables[name]
+    if variable.causality not in ("input", "parameter"):
+        raise InputError(f"{name} is of causality '{variable.causality}' and cannot be set")
+    if (variable.type == "Boolean") != isinstance(value, bool):
+        kind = "true or false" if variable.type == "Boolean" else "a number"
+        raise InputError(f"{name} = {value}: expected {kind}")
+    if not isinstance(value, bool):
+        value = float(value)
+        if not math.isfinite(value):
+            raise InputError(f"{name} = {value} is not finite")
+    return value
+
+
+def _suggestion(fmu: Fmu, name: str) -> str:
+    settable = {*fmu.groups("input"), *fmu.groups("parameter"), *fmu.variables}
+    near = difflib.get_close_matches(name, sorted(settable), n=1, cutoff=0.4)
+    return f"; did you mean '{near[0]}'?" if near else f"; there are: {', '.join(sorted(settable))}"
+
+
+def read_changes(fmu: Fmu, path: str | Path) -> Changes:
+    """Inputs over time from a CSV in FMPy's form: a column ``time`` and one for each input.
+
+    A row's values hold from its time until the next row's; before the first row the start
+    values hold.
+
+    Raises:
+        InputError: naming the file, and the row or column at fault.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise InputError(f"cannot read '{path}': {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"'{path}' is not a CSV file: {error}") from error
+    if not rows:
+        raise InputError(f"'{path}' is empty")
+    header = [cell.strip() for cell in rows[0]]
+    if "time" not in header:
+        raise InputError(f"'{path}' has no column 'time'")
+    for i, name in enumerate(header):
+        if name in header[:i]:
+            raise InputError(f"'{path}' has two columns '{name}'")
+        if name == "time":
+            continue
+        if name not in fmu.variables:
+            raise InputError(f"'{path}': there is no variable '{name}'{_suggestion(fmu, name)}")
+        if fmu.variables[name].causality != "input":
+            raise InputError(f"'{path}': {name} is not an input")
+    changes: Changes = []
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(header):
+            raise InputError(f"'{path}' row {number}: {len(row)} cells, expected {len(header)}")
+        values: dict[str, Value] = {}
+        for name, cell in zip(header, row, strict=True):
+            try:
+                values[name] = float(cell)
+            except ValueError:
+                raise InputError(
+                    f"'{path}' row {number}: {name} = '{cell}' is not a number"
+                ) from None
+            if not math.isfinite(values[name]):
+                raise InputError(f"'{path}' row {number}: {name} = {cell} is not finite")
+        time = values.pop("time")
+        if changes and time < changes[-1][0]:
+            raise InputError(f"'{path}' row {number}: time {time:g} is before the row above")
+        changes.append((time, values))
+    return changes

@@ -1,0 +1,174 @@
+"""modelDescription.xml of either flavour, from the variable table. FMI 2.0.4, section 2.2."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+
+from .plant import Robot, Variable
+
+UNITS: dict[str, dict[str, int]] = {
+    "m": {"m": 1},
+    "m/s": {"m": 1, "s": -1},
+    "m/s2": {"m": 1, "s": -2},
+    "rad": {"rad": 1},
+    "rad/s": {"rad": 1, "s": -1},
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "N.m": {"kg": 1, "m": 2, "s": -2},
+    "s": {"s": 1},
+    "1/s": {"s": -1},
+    "1/s2": {"s": -2},
+}
+"""Exponents of the SI base units; all factors are 1."""
+
+LOG_CATEGORIES = {
+    "logStatusWarning": "Warnings",
+    "logStatusDiscard": "Refused steps",
+    "logStatusError": "Refused calls",
+    "logStatusFatal": "Failures that end the instance",
+    "logAll": "All messages",
+}
+DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
+VENDOR = "twodof"
+
+CONTROL_INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn")
+START = ("q_start", "q_min", "q_max")
+"""What q depends on at the start; v depends on v_start too."""
+
+
+def model_description(
+    robot: Robot,
+    table: Sequence[Variable],
+    *,
+    name: str,
+    guid: str,
+    version: str,
+    flavour: Mapping[str, str],
+    source_files: Sequence[str] = (),
+) -> bytes:
+    """The XML text.
+
+    Args:
+        robot, table: the robot and its variables.
+        name: model name and model identifier.
+        guid: as it shall stand in the file; "" while it is being computed.
+        version: version of this package.
+        flavour: further attributes of <CoSimulation>, needsExecutionTool among them.
+        source_files: names under sources/ that a tool compiles.
+    """
+    root = ET.Element(
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName=name,
+        guid=guid,
+        description=f"Robot '{robot.name}' with {len(robot.joints)} joints under operational-space"
+        f" control of {robot.frame}",
+        version=version,
+        license="BSD-3-Clause",
+        generationTool=f"{VENDOR} {version}",
+        variableNamingConvention="structured",
+    )
+    capabilities = {
+        "modelIdentifier": name,
+        "canHandleVariableCommunicationStepSize": "true",
+        "canGetAndSetFMUstate": "true",
+        "canSerializeFMUstate": "true",
+        **flavour,
+    }
+    simulation = ET.SubElement(root, "CoSimulation", capabilities)
+    if source_files:
+        files = ET.SubElement(simulation, "SourceFiles")
+        for file in source_files:
+            ET.SubElement(files, "File", name=file)
+    _units(root, table)
+    categories = ET.SubElement(root, "LogCategories")
+    for category, description in LOG_CATEGORIES.items():
+        ET.SubElement(categories, "Category", name=category, description=description)
+    ET.SubElement(
+        root,
+        "DefaultExperiment",
+        startTime="0.0",
+        stopTime=repr(DEFAULT_STOP_TIME),
+        stepSize=repr(DEFAULT_STEP),
+    )
+    _vendor_annotation(root, robot)
+    _variables(root, table)
+    _structure(root, robot, table)
+    ET.indent(root)
+    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"
+
+
+def _units(root: ET.Element, table: Sequence[Variable]) -> None:
+    used = {variable.unit for variable in table}
+    definitions = ET.SubElement(root, "UnitDefinitions")
+    for name, exponents in UNITS.items():
+        if name in used:
+            unit = ET.SubElement(definitions, "Unit", name=name)
+            base = {key: str(exponent) for key, exponent in exponents.items()}
+            ET.SubElement(unit, "BaseUnit", {**base, "factor": "1"})
+
+
+def _vendor_annotation(root: ET.Element, robot: Robot) -> None:
+    """What a logger needs to know beyond variable names."""
+    tool = ET.SubElement(ET.SubElement(root, "VendorAnnotations"), "Tool", name=VENDOR)
+    task = ET.SubElement(tool, "Robot", name=robot.name, root=robot.root)
+    task.set("frame", robot.frame)
+    task.set("axes", robot.axes)
+    for joint, prismatic in zip(robot.joints, robot.prismatic, strict=True):
+        ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
+
+
+def _variables(root: ET.Element, table: Sequence[Variable]) -> None:
+    variables = ET.SubElement(root, "ModelVariables")
+    for reference, variable in enumerate(table):
+        attributes = {
+            "name": variable.name,
+            "valueReference": str(reference),
+            "description": variable.description,
+            "causality": variable.causality,
+            "variability": "fixed" if variable.causality == "parameter" else "continuous",
+        }
+        if variable.causality == "output":
+            attributes["initial"] = "calculated"
+        elif variable.causality == "parameter":
+            attributes["initial"] = "exact"
+        scalar = ET.SubElement(variables, "ScalarVariable", attributes)
+        typed = ET.SubElement(scalar, variable.type)
+        if variable.unit:
+            typed.set("unit", variable.unit)
+        if variable.start is not None:
+            boolean = variable.type == "Boolean"
+            typed.set("start", str(variable.start).lower() if boolean else repr(variable.start))
+
+
+def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable]) -> None:
+    moves = robot.moves_frame()
+
+    def known(groups: Sequence[str], joint: int | None = None, of_frame: bool = False) -> str:
+        """1-based indices of variables, for one joint, for those that move the frame, or all."""
+        return " ".join(
+            str(i)
+            for i, variable in enumerate(table, start=1)
+            if variable.group in groups
+            and (joint is None or variable.index == joint)
+            and (not of_frame or (variable.index is not None and moves[variable.index]))
+        )
+
+    def at_the_start(variable: Variable) -> str:
+        if variable.group == "q":
+            return known(START, joint=variable.index)
+        if variable.group == "v":
+            return known((*START, "v_start"), joint=variable.index)
+        if variable.group == "x":
+            return known(START, of_frame=True)
+        return known((*START, "v_start", "gravity", "rcond", "limit_effort", *CONTROL_INPUTS))
+
+    structure = ET.SubElement(root, "ModelStructure")
+    outputs = ET.SubElement(structure, "Outputs")
+    initial = ET.SubElement(structure, "InitialUnknowns")
+    for i, variable in enumerate(table, start=1):
+        if variable.causality == "output":
+            now = known(CONTROL_INPUTS) if variable.group == "tau" else ""
+            ET.SubElement(outputs, "Unknown", index=str(i), dependencies=now)
+            ET.SubElement(initial, "Unknown", index=str(i), dependencies=at_the_start(variable))

@@ -1,0 +1,262 @@
+"""What RViz, Foxglove and rerun need to show a robot: a description and transforms.
+
+Transforms are those of robot_state_publisher: one for each joint, parent link to child link.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+logger = logging.getLogger("twodof.scene")
+
+
+class Transform(NamedTuple):
+    """Pose of a child link in its parent link: m, and a unit quaternion (x, y, z, w)."""
+
+    parent: str
+    child: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+
+
+class _Joint(NamedTuple):
+    parent: str
+    child: str
+    kind: str
+    origin: Array  # 4×4
+    axis: Array  # 3
+    coordinate: int | None  # index into q; None for fixed joints
+
+
+class Scene:
+    """A robot to be shown.
+
+    Args:
+        urdf: XML text whose meshes are named ``package://meshes/…``.
+        joints: names of the moving joints in the order of q.
+        frame: the end effector's link.
+        read: gives the bytes of a mesh by its name ``meshes/…``, None where it is missing.
+
+    Attributes:
+        description: the URDF with each mesh replaced by its best-fitting box or cylinder, which
+            renders where the mesh files are not at hand.
+        fixed: transforms of the fixed joints.
+    """
+
+    def __init__(
+        self,
+        urdf: str,
+        joints: Sequence[str],
+        frame: str,
+        read: Callable[[str], bytes | None],
+    ) -> None:
+        tree = ET.fromstring(urdf)
+        self._joints = {}
+        for element in tree.findall("joint"):
+            joint = _read_joint(element, joints)
+            self._joints[joint.child] = joint
+        self._frame = frame
+        self.fixed = [
+            _transform(joint, 0.0) for joint in self._joints.values() if joint.coordinate is None
+        ]
+        _replace_meshes(tree, read)
+        self.description = ET.tostring(tree, encoding="unicode")
+
+    def moving(self, q: Sequence[float]) -> list[Transform]:
+        """Transforms of the moving joints at positions q (rad or m)."""
+        return [
+            _transform(j, q[j.coordinate])
+            for j in self._joints.values()
+            if j.coordinate is not None
+        ]
+
+    def end_effector(self, q: Sequence[float]) -> tuple[float, float, float]:
+        """Position of the end effector in the root frame, m."""
+        point = np.array([0.0, 0.0, 0.0, 1.0])
+        link = self._frame
+        while link in self._joints:
+            joint = self._joints[link]
+            point = _pose(joint, 0.0 if joint.coordinate is None else q[joint.coordinate]) @ point
+            link = joint.parent
+        x, y, z = point[:3].tolist()
+        return x, y, z
+
+
+def _read_joint(element: ET.Element, joints: Sequence[str]) -> _Joint:
+    name = element.get("name", "")
+    axis = _floats(element.find("axis"), "xyz", "1 0 0")
+    return _Joint(
+        parent=element.find("parent").get("link", ""),  # type: ignore[union-attr]
+        child=element.find("child").get("link", ""),  # type: ignore[union-attr]
+        kind=element.get("type", ""),
+        origin=_origin(element.find("origin")),
+        axis=axis / np.linalg.norm(axis),
+        coordinate=joints.index(name) if name in joints else None,
+    )
+
+
+def _floats(element: ET.Element | None, key: str, default: str) -> Array:
+    text = default if element is None else element.get(key, default)
+    return np.array([float(word) for word in text.split()])
+
+
+def _origin(element: ET.Element | None) -> Array:
+    """URDF's xyz and rpy (fixed axes x, y, z) as a homogeneous matrix."""
+    pose = np.eye(4)
+    pose[:3, 3] = _floats(element, "xyz", "0 0 0")
+    roll, pitch, yaw = _floats(element, "rpy", "0 0 0")
+    pose[:3, :3] = (
+        _rotation(np.array([0.0, 0.0, 1.0]), yaw)
+        @ _rotation(np.array([0.0, 1.0, 0.0]), pitch)
+        @ _rotation(np.array([1.0, 0.0, 0.0]), roll)
+    )
+    return pose
+
+
+def _rotation(axis: Array, angle: float) -> Array:
+    """Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Array = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    return rotation
+
+
+def _pose(joint: _Joint, q: float) -> Array:
+    motion = np.eye(4)
+    if joint.kind == "prismatic":
+        motion[:3, 3] = q * joint.axis
+    elif joint.kind != "fixed":
+        motion[:3, :3] = _rotation(joint.axis, q)
+    return joint.origin @ motion
+
+
+def _transform(joint: _Joint, q: float) -> Transform:
+    pose = _pose(joint, q)
+    x, y, z = pose[:3, 3].tolist()
+    return Transform(joint.parent, joint.child, (x, y, z), _quaternion(pose[:3, :3]))
+
+
+def _quaternion(r: Array) -> tuple[float, float, float, float]:
+    """Unit quaternion of a rotation matrix, from its largest component (Shepperd, 1978)."""
+    squares = np.array(
+        [
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+        ]
+    )
+    products = np.array(
+        [
+            [squares[0], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+            [r[1, 0] + r[0, 1], squares[1], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
+            [r[0, 2] + r[2, 0], r[2, 1] + r[1, 2], squares[2], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
+        ]
+    )
+    quaternion = products[int(np.argmax(squares))]
+    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
+    return x, y, z, w
+
+
+def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> None:
+    fitted: dict[tuple[str, str], tuple[ET.Element, Array] | None] = {}
+    for link in tree.findall("link"):
+        for part in [*link.findall("visual"), *link.findall("collision")]:
+            geometry = part.find("geometry")
+            mesh = None if geometry is None else geometry.find("mesh")
+            if geometry is None or mesh is None:
+                continue
+            key = (mesh.get("filename", ""), mesh.get("scale", "1 1 1"))
+            if key not in fitted:
+                fitted[key] = _fit(key[0], _floats(mesh, "scale", "1 1 1"), read)
+            found = fitted[key]
+            if found is None:
+                link.remove(part)
+                continue
+            shape, placement = found
+            geometry.remove(mesh)
+            geometry.append(shape)
+            _place(part, _origin(part.find("origin")) @ placement)
+
+
+def _fit(
+    uri: str, scale: Array, read: Callable[[str], bytes | None]
+) -> tuple[ET.Element, Array] | None:
+    """Smallest box or cylinder along the mesh's principal axes or its own, and its pose."""
+    vertices = _vertices(uri, scale, read)
+    if vertices is None:
+        return None
+    candidates = []
+    for rotation in (np.eye(3), _principal_axes(vertices)):
+        local = vertices @ rotation
+        low, high = local.min(axis=0), local.max(axis=0)
+        size, centre = high - low, (low + high) / 2
+        candidates.append((float(np.prod(size)), "box", size, rotation, centre))
+        for k in range(3):
+            turned = rotation[:, [(k + 1) % 3, (k + 2) % 3, k]]  # the cylinder's axis is z
+            local_turned = vertices @ turned
+            middle = (local_turned.min(axis=0) + local_turned.max(axis=0)) / 2
+            r = float(np.linalg.norm(local_turned[:, :2] - middle[:2], axis=1).max())
+            height = float(np.ptp(local_turned[:, 2]))
+            round_size = np.array([r, height])
+            candidates.append((math.pi * r * r * height, "cylinder", round_size, turned, middle))
+    _, kind, size, rotation, centre = min(candidates, key=lambda candidate: candidate[0])
+    placement = np.eye(4)
+    placement[:3, :3] = rotation
+    placement[:3, 3] = rotation @ centre
+    if kind == "box":
+        return ET.Element("box", size=_text(size)), placement
+    radius, length = (repr(float(value)) for value in size)
+    return ET.Element("cylinder", radius=radius, length=length), placement
+
+
+def _principal_axes(vertices: Array) -> Array:
+    _, axes = np.linalg.eigh(np.cov(vertices.T))
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])  # right-handed
+    return np.asarray(axes, dtype=np.float64)
+
+
+def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Array | None:
+    content = read(uri.removeprefix("package://"))
+    if content is not None:
+        with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+            file = Path(folder, Path(uri).name)
+            file.write_bytes(content)
+            try:
+                mesh = coal.MeshLoader().load(str(file), scale)
+                return np.asarray(mesh.vertices(), dtype=np.float64)
+            except ValueError as error:
+                logger.warning("mesh '%s' is left out of the scene: %s", uri, error)
+                return None
+    logger.warning("mesh '%s' is left out of the scene: the FMU does not carry it", uri)
+    return None
+
+
+def _place(part: ET.Element, pose: Array) -> None:
+    origin = part.find("origin")
+    if origin is None:
+        origin = ET.SubElement(part, "origin")
+    r = pose[:3, :3]
+    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    if abs(math.cos(pitch)) > 1e-9:
+        roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
+    else:  # roll and yaw turn about the same axis: all of it is yaw
+        roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
+    origin.set("xyz", _text(pose[:3, 3]))
+    origin.set("rpy", _text((roll, pitch, yaw)))
+
+
+def _text(values: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
