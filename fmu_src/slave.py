@@ -10,6 +10,7 @@ the next doStep a discard. The FMI state machine is the table ``ALLOWED``.
 
 import importlib
 import json
+import site
 import sys
 from pathlib import Path
 
@@ -39,8 +40,7 @@ def import_plant(site_packages: list[str]):
         return importlib.import_module(f"{PACKAGE}.plant")
     except ModuleNotFoundError as missing:
         for folder in site_packages:
-            if folder not in sys.path:
-                sys.path.append(folder)
+            site.addsitedir(folder)  # with its .pth files: pin keeps its modules behind one
         try:
             return importlib.import_module(f"{PACKAGE}.plant")
         except ModuleNotFoundError:
@@ -175,27 +175,34 @@ class TwoDofSlave(fmi.Fmi2Slave):
         return self._outputs[group]
 
     def _set(self, vrs, values, kind):
-        for vr, value in zip(vrs, values):
-            variable = self._variable(vr, kind, f"fmi2Set{kind}")
-            if variable is None:
-                continue
-            if variable.causality == "output":
-                self._refuse(f"fmi2Set{kind}: {variable.name} is an output and cannot be set")
-                continue
-            article = "a" if variable.causality == "parameter" else "an"
-            if not self._allowed(f"fmi2Set of {article} {variable.causality}", variable.name):
-                continue
-            if kind == "Real" and not self._finite(value):
-                self._refuse(f"{variable.name} = {value} is not finite")
-                continue
+        """All of the values, or none where one of them is refused."""
+        variables = [self._settable(vr, value, kind) for vr, value in zip(vrs, values)]
+        if None in variables:
+            return
+        for variable, value in zip(variables, values):
             if variable.index is None:
                 setattr(self._plant, variable.group, value)
             else:
                 getattr(self._plant, variable.group)[variable.index] = value
-            if self._phase == INITIALIZATION:
-                self._outputs.clear()
-            else:
-                self._outputs.pop("tau", None)
+        if self._phase == INITIALIZATION:
+            self._outputs.clear()
+        else:
+            self._outputs.pop("tau", None)
+
+    def _settable(self, vr, value, kind):
+        variable = self._variable(vr, kind, f"fmi2Set{kind}")
+        if variable is None:
+            return None
+        if variable.causality == "output":
+            self._refuse(f"fmi2Set{kind}: {variable.name} is an output and cannot be set")
+            return None
+        article = "a" if variable.causality == "parameter" else "an"
+        if not self._allowed(f"fmi2Set of {article} {variable.causality}", variable.name):
+            return None
+        if kind == "Real" and not self._finite(value):
+            self._refuse(f"{variable.name} = {value} is not finite")
+            return None
+        return variable
 
     def _variable(self, vr, kind, call):
         if not 0 <= vr < len(self._table):

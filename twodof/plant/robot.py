@@ -141,7 +141,10 @@ def _check(tree: ET.Element) -> tuple[str, list[str]]:
                 f" supported are fixed, {', '.join(MOVING_TYPES)}"
             )
         if joint.find("mimic") is not None:
-            raise RobotError(f"joint '{name}' mimics another joint, which is not supported")
+            raise RobotError(
+                f"joint '{name}' mimics another joint, which is not supported;"
+                " make it fixed, or leave out its <mimic> to move it on its own"
+            )
         if kind == "fixed":
             continue
         if kind != "continuous":
@@ -204,6 +207,8 @@ def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> 
         if child in parent:
             raise RobotError(f"link '{child}' has two parents: closed loops are not supported")
         parent[child] = _link(joint, "parent")
+    if not links:
+        raise RobotError("the URDF has no links")
     roots = [link for link in links if link not in parent]
     reached = set(roots)
     for link in links:
@@ -251,7 +256,7 @@ def _check_inertia(link: str, inertial: ET.Element) -> None:
     entries = [_attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS]
     xx, xy, xz, yy, yz, zz = entries
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    slack = 1e-6 * float(np.abs(moments).sum())  # URDFs are written with few digits
+    slack = 1e-6 * float(np.abs(moments).sum()) + 1e-15  # URDFs are written with few digits
     if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
         text = ", ".join(f"{moment:.3g}" for moment in moments)
         raise RobotError(

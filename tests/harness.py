@@ -1,0 +1,110 @@
+"""An FMU driven call by call through FMPy, and tests that run in a process of their own."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import multiprocessing
+import shutil
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from ctypes import byref
+
+import fmpy
+from fmpy import fmi2
+from fmpy.fmi1 import FMICallException
+from fmpy.logging import addLoggerProxy
+
+
+def in_child_process(test):
+    """Run a test in a fresh process: a crash there is a failure here, and nothing is shared."""
+
+    @functools.wraps(test)
+    def run(*arguments, **named):
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            pool.submit(_call, test.__module__, test.__name__, arguments, named).result(timeout=120)
+
+    return run
+
+
+def _call(module, name, arguments, named):
+    getattr(importlib.import_module(module), name).__wrapped__(*arguments, **named)
+
+
+class Driver:
+    """One instance; ``log`` collects (status, message), ``status`` is that of the last call."""
+
+    def __init__(self, fmu, folder=None, guid=None):
+        self.folder = folder or tempfile.mkdtemp(prefix="fmu ")
+        fmpy.extract(fmu, self.folder)
+        self.description = fmpy.read_model_description(str(fmu))
+        self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
+        self.log = []
+        self.status = 0
+        self.callbacks = fmi2.fmi2CallbackFunctions(
+            logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
+            allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc),
+            freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free),
+        )
+        addLoggerProxy(byref(self.callbacks))
+        self.slave = fmi2.FMU2Slave(
+            guid=guid or self.description.guid,
+            unzipDirectory=str(self.folder),
+            modelIdentifier=self.description.coSimulation.modelIdentifier,
+            instanceName="instance",
+        )
+        self.slave.instantiate(callbacks=self.callbacks, loggingOn=True)
+
+    def _log(self, environment, name, status, category, message):
+        self.log.append((status, message.decode()))
+
+    def call(self, name, *arguments, **named):
+        """Call a method of FMPy's slave; what it returns, with ``status`` set."""
+        self.status = 0
+        try:
+            return getattr(self.slave, name)(*arguments, **named)
+        except FMICallException as error:
+            self.status = error.status
+            return None
+
+    def set(self, **values):
+        """``x_des=(0.1, 0.2)`` sets a vector, ``Kn=1.0`` a scalar."""
+        for group, value in values.items():
+            setter = "setBoolean" if isinstance(value, bool) else "setReal"
+            elements = value if isinstance(value, tuple | list) else [value]
+            self.call(setter, self.references(group), list(elements))
+
+    def references(self, group):
+        if group in self.vr:
+            return [self.vr[group]]
+        return [vr for name, vr in self.vr.items() if name.startswith(f"{group}[")]
+
+    def get(self, *groups):
+        return [x for group in groups for x in self.call("getReal", self.references(group))]
+
+    def outputs(self):
+        return self.get("q", "v", "x", "tau")
+
+    def initialise(self, **values):
+        self.call("setupExperiment", startTime=0.0)
+        self.set(**values)
+        self.call("enterInitializationMode")
+        self.call("exitInitializationMode")
+        return self
+
+    def step(self, t, h=0.01):
+        self.call("doStep", t, h)
+        return self.status
+
+    def run(self, count, start=0, h=0.01):
+        """Outputs after each of ``count`` steps from step ``start`` on."""
+        rows = []
+        for k in range(start, start + count):
+            assert self.step(k * h, h) == 0, self.log
+            rows.append(self.outputs())
+        return rows
+
+    def free(self):
+        self.slave.freeInstance()
+        shutil.rmtree(self.folder, ignore_errors=True)

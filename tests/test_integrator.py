@@ -1,0 +1,134 @@
+"""The integrator against SciPy's RK45 and against motions with known stops."""
+
+import numpy as np
+import pytest
+from scipy.integrate import RK45
+
+from twodof.plant import integrator
+from twodof.plant.integrator import advance
+
+FREE = [(-np.inf, np.inf)]
+
+
+def test_coefficients_are_those_of_scipy():
+    assert np.array_equal(integrator.A[:5, :5], RK45.A[1:6])
+    assert np.array_equal(integrator.A[5], RK45.B)
+    assert np.array_equal(integrator.E, RK45.E)
+    assert np.array_equal(integrator.P, RK45.P)
+
+
+@pytest.mark.parametrize("rtol, atol", [(1e-3, 1e-6), (1e-8, 1e-10)])
+def test_steps_and_states_are_those_of_scipy(rtol, atol):
+    """A pendulum with a stiff spring: steps are rejected and grow again."""
+
+    def acceleration(q, v):
+        return -400.0 * np.sin(q) - 0.3 * v + 50.0 * np.cos(3.0 * q)
+
+    calls = 0
+
+    def counted(q, v):
+        nonlocal calls
+        calls += 1
+        return acceleration(q, v)
+
+    h, max_step = 0.7, 0.2
+    q, v = advance(counted, [1.2], [0.0], h, FREE, rtol, atol, max_step)
+    scipy = RK45(
+        lambda t, y: np.concatenate((y[1:], acceleration(y[:1], y[1:]))),
+        0.0, [1.2, 0.0], h, max_step=max_step, rtol=rtol, atol=atol, first_step=max_step,
+    )  # fmt: skip
+    while scipy.status == "running":
+        scipy.step()
+    assert calls == scipy.nfev
+    assert [*q, *v] == pytest.approx(scipy.y, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("h", [1e-3, 1e-2, 0.7])
+def test_constant_acceleration_stops_at_the_instant_of_contact(h):
+    """Into a wall, then held while pushed into it: polynomials, which the method has exactly."""
+
+    def acceleration(q, v):
+        return [3.0]
+
+    q, v, t = [0.0], [1.0], 0.0
+    contact = (-1.0 + np.sqrt(1.0 + 2 * 3.0 * 0.05)) / 3.0  # q(t) = t + 1.5 t² = 0.05
+    while t < 0.7 - 1e-9:
+        q, v = advance(acceleration, q, v, h, [(-1.0, 0.05)], 1e-3, 1e-6, 1e-3)
+        t += h
+        if t < contact:
+            assert q[0] == pytest.approx(t + 1.5 * t**2, abs=1e-13)
+        else:
+            assert q == [0.05]
+            assert v == [0.0]
+
+
+def test_a_stop_leaves_the_other_joint_alone():
+    def acceleration(q, v):
+        return [5.0, -2.0]
+
+    q, v = advance(
+        acceleration, [0.0, 0.0], [1.0, 1.0], 0.5, [(-1, 0.2), (-9, 9)], 1e-3, 1e-6, 1e-3
+    )
+    assert q[0] == 0.2
+    assert v[0] == 0.0
+    assert q[1] == pytest.approx(0.5 - 0.25, abs=1e-12)
+    assert v[1] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("h", [0.25, 1.0])
+def test_a_held_joint_is_released_where_its_acceleration_turns(side, h):
+    """Joint 2 is a clock of constant speed; joint 1 is pushed into its limit until t = 0.3."""
+
+    def acceleration(q, v):
+        return [side * (0.3 - q[1]), 0.0]
+
+    limits = [(-0.1, 0.1), (-9.0, 9.0)]
+    q, v = [side * 0.1, 0.0], [0.0, 1.0]
+    for _ in range(round(1.0 / h)):
+        q, v = advance(acceleration, q, v, h, limits, 1e-3, 1e-6, 1e-2)
+    # released at 0.3 with v = 0: v = −(t − 0.3)²/2, q = 0.1 − (t − 0.3)³/6
+    assert v[0] == pytest.approx(-side * 0.7**2 / 2, abs=1e-10)
+    assert q[0] == pytest.approx(side * (0.1 - 0.7**3 / 6), abs=1e-10)
+
+
+def test_an_excursion_within_one_step_is_found():
+    """Thrown up to 1.25 mm past the limit and back within one 10 ms step."""
+
+    def acceleration(q, v):
+        return [-200.0]
+
+    top = 1.0 / (2 * 200.0)
+    q, v = advance(acceleration, [0.0], [1.0], 0.01, [(-1.0, top / 2)], 1e-3, 1e-6, 0.01)
+    contact = (1.0 - np.sqrt(1.0 - 2 * 200.0 * top / 2)) / 200.0
+    assert v[0] == pytest.approx(-200.0 * (0.01 - contact), abs=1e-12)
+    assert q[0] == pytest.approx(top / 2 - 100.0 * (0.01 - contact) ** 2, abs=1e-12)
+
+
+def test_two_joints_may_reach_their_limits_in_one_step():
+    def acceleration(q, v):
+        return [1.0, 1.0]
+
+    q, v = advance(acceleration, [0.0, 0.0], [1.0, 1.0], 0.1, [(-1, 0.02), (-1, 0.04)], 1, 1, 0.1)
+    assert (q, v) == ([0.02, 0.04], [0.0, 0.0])
+
+
+def test_a_joint_without_room_stays():
+    q, v = advance(lambda q, v: [-7.0], [0.5], [0.0], 0.1, [(0.5, 0.5)], 1e-3, 1e-6, 1e-3)
+    assert (q, v) == ([0.5], [0.0])
+
+
+def test_a_jump_of_the_acceleration_neither_hangs_nor_fails():
+    """Sliding along the jump: no step satisfies the error test there."""
+
+    def acceleration(q, v):
+        return [-1e4 if q[0] + 0.01 * v[0] > 0.0 else 1e4]
+
+    q, v = advance(acceleration, [1e-3], [0.0], 0.02, FREE, 1e-6, 1e-9, 1e-3)
+    assert abs(q[0]) < 1e-3
+    assert abs(v[0]) < 0.2
+
+
+def test_a_value_that_is_not_finite_is_an_error():
+    with pytest.raises(FloatingPointError, match="not finite"):
+        advance(lambda q, v: [float("nan")], [0.0], [0.0], 0.01, FREE, 1e-3, 1e-6, 1e-3)

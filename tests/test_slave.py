@@ -1,0 +1,475 @@
+"""The Python flavour through FMPy: each test loads it in a process of its own."""
+
+import importlib
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import lxml.etree  # noqa: F401  FMPy imports it late, one test hides it
+import numpy as np
+import pytest
+from harness import Driver, in_child_process
+from oracles import REST, position, task_error
+
+from twodof import FmuOptions, build_fmu
+from twodof.build import DEFAULT_ARM, data_file
+from twodof.plant import Plant, load_robot, variable_table
+
+OK, DISCARD, ERROR = 0, 2, 3
+LIMITS = {"q_min": (-0.2, 0.8), "q_max": (0.8, 1.9), "q_start": (0.3, 1.3), "Kp": (400.0, 400.0)}
+INTO_A_LIMIT = {**LIMITS, "x_des": (0.14, -0.03)}
+
+
+@pytest.fixture(scope="module")
+def ur5_fmu(robots, tmp_path_factory):
+    urdf = robots / "ur_description/urdf/ur5_robot.urdf"
+    options = FmuOptions(urdf=urdf, frame="ee_link", name="UR5", q_start=(0.1, -1.2, 1.4, 0, -1, 0))
+    return build_fmu(tmp_path_factory.mktemp("ur5") / "UR5.fmu", options)
+
+
+# --- the equations, through the FMU ---
+
+
+@in_child_process
+def test_outputs_are_right_after_initialisation_and_follow_the_plant_bit_for_bit(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    robot = load_robot(data_file("urdf", "2dof.urdf").read_text(), "EndEffector", "xy")
+    plant = Plant(robot, variable_table(robot, DEFAULT_ARM))
+    plant.initialise()
+    assert driver.outputs() == [*plant.q, *plant.v, *plant.x, *plant.tau]
+    assert driver.get("x") == pytest.approx(position(np.array([0.5, 0.35])), abs=1e-15)
+    for row in driver.run(50):
+        plant.step(0.01)
+        assert row == [*plant.q, *plant.v, *plant.x, *plant.tau]
+
+
+@in_child_process
+def test_end_effector_follows_the_closed_form(fmu_path):
+    rows = np.array(Driver(fmu_path).initialise().run(500))
+    e0 = np.array([0.2, 0.05]) - position(np.array([0.5, 0.35]))
+    expected = np.array([0.2, 0.05]) - task_error(e0, 50.0, 40.0, 0.01 * np.arange(1, 501))
+    assert np.abs(rows[:, 4:6] - expected).max() <= 1e-9
+    assert np.abs(position(rows[:, :2]) - expected).max() <= 1e-9
+
+
+@pytest.mark.parametrize("name, frame", [("ur5", "ee_link"), ("panda", "panda_hand_tcp")])
+@in_child_process
+def test_other_robots_follow_the_closed_form(name, frame, request_urdf, tmp_path):
+    fmu = build_fmu(
+        tmp_path / "Arm.fmu",
+        FmuOptions(urdf=request_urdf, frame=frame, name="Arm", q_start=REST[name]),
+    )
+    driver = Driver(fmu).initialise()
+    x0 = np.array(driver.get("x"))
+    target = x0 + np.array([0.05, -0.1, 0.08])
+    driver.set(x_des=tuple(target))
+    n = len(REST[name])
+    x = np.array([row[2 * n : 2 * n + 3] for row in driver.run(200)])
+    expected = target - task_error(target - x0, 50.0, 40.0, 0.01 * np.arange(1, 201))
+    assert np.abs(x - expected).max() <= 1e-9
+
+
+@pytest.fixture
+def request_urdf(name, request, robots, tmp_path):
+    """The robot's URDF as a file beside its meshes' packages."""
+    if name == "ur5":
+        return robots / "ur_description/urdf/ur5_robot.urdf"
+    path = tmp_path / "panda.urdf"
+    path.write_text(
+        re.sub(r"<mesh [^>]*>", "<sphere radius='0.01'/>", request.getfixturevalue(name))
+    )
+    return path
+
+
+@in_child_process
+def test_tau_follows_inputs_set_since_the_last_step_and_the_state_does_not(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    driver.run(3)
+    before = driver.outputs()
+    driver.set(x_des=(0.1, 0.1))
+    after = driver.outputs()
+    assert after[:6] == before[:6]
+    assert after[6:] != before[6:]
+
+
+@in_child_process
+def test_steps_of_different_sizes_meet(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    t = 0.0
+    for h in (0.01, 0.003, 0.027, 0.1, 0.0001, 0.8599):
+        assert driver.step(t, h) == OK
+        t += h
+    other = Driver(fmu_path).initialise()
+    other.run(100)
+    assert driver.get("q", "v") == pytest.approx(other.get("q", "v"), abs=1e-11)
+
+
+# --- one process, several FMUs ---
+
+
+@in_child_process
+def test_different_fmus_run_one_after_the_other_and_interleaved(fmu_path, ur5_fmu):
+    alone = []
+    for fmu in (fmu_path, ur5_fmu):
+        driver = Driver(fmu).initialise()
+        alone.append(driver.run(20))
+        driver.free()
+    drivers = [Driver(fmu).initialise() for fmu in (fmu_path, ur5_fmu, fmu_path)]
+    rows = [[], [], []]
+    for k in range(20):
+        for driver, seen in zip(drivers, rows):
+            seen += driver.run(1, start=k)
+    assert rows == [alone[0], alone[1], alone[0]]
+
+
+@in_child_process
+def test_an_fmu_runs_the_code_inside_its_own_zip(fmu_path, tmp_path):
+    """Beside a patched checkout, and beside another FMU whose code differs."""
+    sys.modules["twodof.plant.plant"].Plant.step = None
+    other = tmp_path / "Other.fmu"
+    with zipfile.ZipFile(fmu_path) as old, zipfile.ZipFile(other, "w") as new:
+        (tag,) = {m[1] for n in old.namelist() if (m := re.search(r"slave_(\w+)\.py", n))}
+        for name in old.namelist():
+            content = old.read(name)
+            if name.endswith("plant/plant.py"):
+                content = content.replace(b"return [position[axis]", b"return [42.0")
+            if name.endswith("slavemodule.txt"):
+                content = content.replace(tag.encode(), b"0123")
+            new.writestr(name.replace(tag, "0123"), content)
+    driver, changed = Driver(fmu_path).initialise(), Driver(other).initialise()
+    driver.run(2)
+    assert driver.get("x") == pytest.approx(position(np.array(driver.get("q"))), abs=1e-15)
+    assert changed.get("x") == [42.0, 42.0]
+
+
+@in_child_process
+def test_the_unzip_folder_and_the_working_directory_may_go(fmu_path, tmp_path):
+    (tmp_path / "gone").mkdir()
+    os.chdir(tmp_path / "gone")
+    first = Driver(fmu_path).initialise()
+    shutil.rmtree(first.folder)
+    shutil.rmtree(tmp_path / "gone")
+    expected = first.run(10)
+    first.slave.freeInstance()
+    os.chdir(tmp_path)
+    assert Driver(fmu_path).initialise().run(10) == expected
+
+
+@in_child_process
+def test_importing_the_slave_is_cheap_and_free_of_effects(fmu_path, tmp_path):
+    with zipfile.ZipFile(fmu_path) as archive:
+        archive.extractall(tmp_path)
+    resources = tmp_path / "resources"
+    module = (resources / "slavemodule.txt").read_text().strip()
+    for name in [name for name in sys.modules if name.split(".")[0] in ("pinocchio", "numpy")]:
+        del sys.modules[name]
+    sys.path.insert(0, str(resources))
+    before = sorted(path.name for path in resources.iterdir())
+    namespace = vars(importlib.import_module(module))
+    exec(compile((resources / f"{module}.py").read_text(), module, "exec"), namespace, {})
+    assert "pinocchio" not in sys.modules
+    assert "numpy" not in sys.modules
+    assert sorted(path.name for path in resources.iterdir() if path.suffix != "") == [
+        name for name in before if "." in name
+    ]
+
+
+# --- state ---
+
+
+@pytest.mark.parametrize("settings", [{}, INTO_A_LIMIT], ids=["free", "at a limit"])
+@in_child_process
+def test_save_step_restore_step_is_bit_identical(fmu_path, settings):
+    driver = Driver(fmu_path).initialise(**settings)
+    driver.run(30)
+    assert ("q_max" in settings) == (driver.get("q")[0] == -0.2)
+    saved = driver.call("getFMUstate")
+    held = driver.outputs()
+    expected = driver.run(10, start=30)
+    data = driver.call("serializeFMUstate", saved)
+    driver.set(x_des=(0.1, 0.1), Kp=(7.0, 7.0), tau_ext=(0.1, 0.2), Kn=3.0)
+    driver.run(5, start=40)
+
+    driver.call("setFMUstate", saved)
+    assert driver.outputs() == held
+    assert driver.run(10, start=30) == expected
+
+    other = Driver(fmu_path)  # not even initialised: the state carries all of it
+    other.call("setFMUstate", other.call("deSerializeFMUstate", data))
+    assert other.outputs() == held
+    assert other.run(10, start=30) == expected
+
+
+@in_child_process
+def test_a_saved_state_is_not_changed_by_what_follows(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    saved = driver.call("getFMUstate")
+    before = driver.call("serializeFMUstate", saved)
+    driver.set(x_des=(0.1, 0.1))
+    driver.run(3)
+    assert driver.call("serializeFMUstate", saved) == before
+    driver.call("setFMUstate", saved)
+    driver.set(x_des=(0.15, 0.1))
+    driver.run(3)
+    assert driver.call("serializeFMUstate", saved) == before
+
+
+@pytest.mark.parametrize("data", [b"not a state", b"[1, 2]", b"{}", b'{"identity": "x"}'])
+@in_child_process
+def test_a_foreign_state_is_refused(fmu_path, data):
+    driver = Driver(fmu_path).initialise()
+    driver.run(3)
+    before = driver.outputs()
+    driver.call("setFMUstate", driver.call("deSerializeFMUstate", data))
+    assert (ERROR, "fmi2SetFMUstate: the state is not one of this FMU") in driver.log
+    assert driver.step(0.03) == DISCARD
+    assert driver.outputs() == before
+    assert driver.step(0.03) == OK
+
+
+@in_child_process
+def test_reset_repeats_the_first_run_bit_for_bit(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    expected = driver.run(10)
+    driver.set(x_des=(0.1, 0.1))
+    driver.run(5, start=10)
+    driver.call("reset")
+    assert driver.initialise().run(10) == expected
+
+
+# --- refusals ---
+
+
+def refuse_nan_input(driver):
+    driver.set(x_des=(float("nan"), 0.1))
+
+
+def refuse_infinite_input(driver):
+    driver.set(Kn=float("inf"))
+
+
+def refuse_output(driver):
+    driver.call("setReal", driver.references("q")[:1], [0.1])
+
+
+def refuse_parameter(driver):
+    driver.set(rtol=1e-6)
+
+
+def refuse_unknown_reference(driver):
+    driver.call("setReal", [999], [0.1])
+
+
+def refuse_huge_reference(driver):
+    driver.call("setReal", [2**32 - 1], [0.1])
+
+
+def refuse_wrong_type(driver):
+    driver.call("setReal", driver.references("limit_effort"), [1.0])
+
+
+def refuse_integer(driver):
+    driver.call("setInteger", driver.references("Kn"), [1])
+
+
+def refuse_reading_an_unknown_reference(driver):
+    assert np.isnan(driver.call("getReal", [999])).all()
+
+
+def refuse_second_initialisation(driver):
+    driver.call("enterInitializationMode")
+
+
+REFUSALS = {
+    refuse_nan_input: "x_des[1] = nan is not finite",
+    refuse_infinite_input: "Kn = inf is not finite",
+    refuse_output: "fmi2SetReal: q[1] is an output and cannot be set",
+    refuse_parameter: "fmi2Set of a parameter (rtol) is not allowed in the state 'step mode'",
+    refuse_unknown_reference: "fmi2SetReal: there is no variable with value reference 999",
+    refuse_huge_reference: "fmi2SetReal: there is no variable with value reference -1",
+    refuse_wrong_type: "fmi2SetReal: limit_effort is of type Boolean",
+    refuse_integer: "fmi2SetInteger: Kn is of type Real",
+    refuse_reading_an_unknown_reference: (
+        "fmi2GetReal: there is no variable with value reference 999"
+    ),
+    refuse_second_initialisation: (
+        "fmi2EnterInitializationMode is not allowed in the state 'step mode'"
+    ),
+}
+
+
+@in_child_process
+def test_what_is_refused_is_logged_keeps_the_state_and_discards_the_next_step(fmu_path):
+    expected = Driver(fmu_path).initialise().run(20)
+    driver = Driver(fmu_path).initialise()
+    for k, (refuse, message) in enumerate(REFUSALS.items()):
+        before = driver.outputs()
+        refuse(driver)
+        assert (ERROR, message) in driver.log, refuse.__name__
+        assert driver.step(k * 0.01) == DISCARD, refuse.__name__
+        assert (DISCARD, f"step discarded: {message}") in driver.log
+        assert driver.outputs() == before
+        assert driver.run(1, start=k) == expected[k : k + 1]
+
+
+@pytest.mark.parametrize(
+    "t, h, message",
+    [
+        (
+            0.05,
+            0.01,
+            "fmi2DoStep: the communication point 0.05 s is not the time of the FMU, 0.03 s",
+        ),
+        (0.03 + 1e-8, 0.01, "is not the time of the FMU"),
+        (float("nan"), 0.01, "is not the time of the FMU"),
+        (0.03, 0.0, "fmi2DoStep: the step 0.0 s must be > 0"),
+        (0.03, -0.01, "must be > 0"),
+        (0.03, float("nan"), "must be > 0"),
+        (0.03, float("inf"), "must be > 0"),
+    ],
+)
+@in_child_process
+def test_a_wrong_step_is_discarded(fmu_path, t, h, message):
+    driver = Driver(fmu_path).initialise()
+    driver.run(3)
+    before = driver.outputs()
+    assert driver.step(t, h) == DISCARD
+    assert message in driver.log[-1][1]
+    assert driver.outputs() == before
+    assert driver.step(0.03 + 1e-10) == OK  # rounding of the master's time is no mistake
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"q_min": (4.0, 0.0)}, "q_min[1] = 4 > q_max[1] = 3.14159 (joint 'joint1')"),
+        ({"rtol": 0.0}, "rtol = 0 must be > 0"),
+        ({"max_step": -1.0}, "max_step = -1 must be > 0"),
+        ({"rcond": 2.0}, "rcond = 2 must be in [0, 1)"),
+    ],
+)
+@in_child_process
+def test_bad_parameters_are_refused_at_the_end_of_initialisation(fmu_path, settings, message):
+    driver = Driver(fmu_path).initialise(**settings)
+    assert (ERROR, message) in driver.log
+    assert driver.step(0.0) == DISCARD
+    assert driver.step(0.0) == DISCARD
+    driver.call("reset")
+    assert driver.initialise().step(0.0) == OK
+
+
+@in_child_process
+def test_calls_before_their_time_are_refused(fmu_path):
+    driver = Driver(fmu_path)
+    assert driver.step(0.0) == DISCARD
+    assert driver.log[-1][1] == "fmi2DoStep is not allowed in the state 'instantiated'"
+    assert np.isnan(driver.get("q")).all()
+    assert driver.log[-1][1] == "fmi2GetReal is not allowed in the state 'instantiated'"
+    driver.call("exitInitializationMode")
+    assert (
+        driver.log[-1][1] == "fmi2ExitInitializationMode is not allowed in the state 'instantiated'"
+    )
+    driver.call("reset")
+    driver.initialise()
+    driver.call("terminate")
+    assert driver.step(0.0) == DISCARD
+    assert driver.log[-1][1] == "fmi2DoStep is not allowed in the state 'terminated'"
+    assert driver.get("q") == [0.5, 0.35]  # reading stays allowed
+
+
+@in_child_process
+def test_start_outside_the_limits_warns_and_a_tolerance_is_ignored_with_a_line(fmu_path):
+    driver = Driver(fmu_path)
+    driver.call("setupExperiment", startTime=0.0, tolerance=1e-9)
+    driver.set(q_start=(4.0, 0.35))
+    driver.call("enterInitializationMode")
+    driver.call("exitInitializationMode")
+    assert driver.get("q") == [np.pi, 0.35]
+    (warning,) = [message for status, message in driver.log if status == 1]
+    assert "q_start[1] = 4 of joint 'joint1' is outside its limits" in warning
+    assert any("tolerance of the experiment is ignored" in message for _, message in driver.log)
+
+
+@in_child_process
+def test_refusals_and_resets_in_any_number_do_not_end_the_process(fmu_path):
+    """Three exceptions and a reset end a pythonfmu process; so there are none."""
+    driver = Driver(fmu_path).initialise()
+    for _ in range(5):
+        for refuse in REFUSALS:
+            refuse(driver)
+        assert driver.step(0.0) == DISCARD
+        driver.call("reset")
+        driver.initialise()
+    assert driver.step(0.0) == OK
+
+
+@in_child_process
+def test_sigint_during_a_step_is_a_discard_and_not_fatal(fmu_path):
+    driver = Driver(fmu_path).initialise(max_step=1e-6)  # a step of seconds
+    threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    begin = time.monotonic()
+    assert driver.step(0.0, 0.2) == DISCARD
+    assert time.monotonic() - begin < 5.0
+    assert "interrupted" in driver.log[-1][1]
+    assert driver.get("q") == [0.5, 0.35]
+    assert driver.step(0.0, 1e-4) == OK
+
+
+@in_child_process
+def test_log_messages_are_no_printf_formats(tmp_path):
+    urdf = tmp_path / "percent.urdf"
+    text = data_file("urdf", "2dof.urdf").read_text().replace('"joint1"', '"100%s%n"')
+    urdf.write_text(re.sub(r"<mesh [^>]*>", "<sphere radius='0.01'/>", text))
+    fmu = build_fmu(tmp_path / "P.fmu", FmuOptions(urdf=urdf, axes="xy", name="P"))
+    driver = Driver(fmu).initialise(q_start=(4.0, 0.0))
+    assert "joint '100%s%n' is outside its limits" in driver.log[-1][1]
+
+
+# --- packages ---
+
+
+@in_child_process
+def test_a_missing_package_is_named_with_the_remedy(fmu_path):
+    sys.modules["pinocchio"] = None  # as if it were not installed
+    messages = []
+    Driver._log = lambda self, env, name, status, category, text: messages.append(text.decode())
+    with pytest.raises(Exception, match="Failed to instantiate"):
+        Driver(fmu_path)
+    (message,) = messages
+    assert "has no package 'pinocchio'" in message
+    assert "resources/requirements.txt" in message
+    assert "--link-environment" in message
+
+
+@in_child_process
+def test_a_linked_environment_is_found_without_any_variable(tmp_path):
+    fmu = build_fmu(tmp_path / "L.fmu", FmuOptions(link_environment=True, name="L"))
+    # a host of the same Python that does not know this environment's packages
+    folders = [path for path in sys.path if "site-packages" in path]
+    assert folders
+    for name in [name for name in sys.modules if name.split(".")[0] in ("pinocchio", "cmeel_pth")]:
+        del sys.modules[name]
+    sys.path[:] = [path for path in sys.path if path not in folders]
+    with pytest.raises(ImportError):
+        importlib.import_module("pinocchio")
+    assert Driver(fmu).initialise().step(0.0) == OK
+
+
+def test_requirements_name_what_the_plant_imports(fmu_path):
+    with zipfile.ZipFile(fmu_path) as archive:
+        requirements = archive.read("resources/requirements.txt").decode().split()
+        config = json.loads(archive.read("resources/plant.json"))
+    assert [re.split("[<>=]", line)[0] for line in requirements] == ["numpy", "pin"]
+    assert config["site_packages"] == []
+    imported = set()
+    for path in Path(data_file("plant")).glob("*.py"):
+        imported |= set(re.findall(r"^(?:import|from) ([a-z]\w*)", path.read_text(), re.M))
+    third_party = imported - set(sys.stdlib_module_names)
+    assert third_party == {"numpy", "pinocchio"}
