@@ -89,7 +89,10 @@ REFUSED = {
     "two links of one name": (arm(link("tip")), "two links named 'tip'"),
     "two joints of one name": (arm(link("x"), joint("elbow", "tip", "x")), "two joints .*'elbow'"),
     "no links": (robot(), "no links"),
-    "no moving joint": (robot(link("base"), link("a"), joint("f", "base", "a", kind="fixed")), "mov"),
+    "no moving joint": (
+        robot(link("base"), link("a"), joint("weld", "base", "a", kind="fixed")),
+        "no moving joint",
+    ),
     "one link only": (robot(link("base")), "no moving joint"),
     "missing parent": (arm(elbow=joint("elbow", "ghost", "tip")), "'elbow'.* parent .*'ghost'"),
     "missing child": (arm(joint("wrist", "tip", "ghost")), "'wrist'.* child .*'ghost'"),
@@ -102,8 +105,8 @@ REFUSED = {
     "mimic": (arm(elbow=elbow(LIMIT + '<mimic joint="shoulder"/>')), "'elbow' mimics"),
     "no limit": (arm(elbow=elbow("")), "'elbow' has no <limit>"),
     "no limit, prismatic": (arm(elbow=elbow("", kind="prismatic")), "'elbow' has no <limit>"),
-    "inverted limits": (arm(elbow=elbow('<limit lower="1" upper="-1"/>')), "'elbow': lower limit 1"),
-    "limit below the default 0": (arm(elbow=elbow('<limit upper="-1"/>')), "'elbow': lower limit 0"),
+    "inverted limits": (arm(elbow=elbow('<limit lower="1" upper="-1"/>')), "'elbow': lower limit"),
+    "upper below default 0": (arm(elbow=elbow('<limit upper="-1"/>')), "'elbow': lower limit 0"),
     "negative effort": (arm(elbow=elbow('<limit effort="-1"/>')), "'elbow': negative effort"),
     "negative damping": (arm(elbow=elbow(LIMIT + '<dynamics damping="-1"/>')), "'elbow'.* damping"),
     "zero axis": (arm(elbow=elbow(axis="0 0 0")), "'elbow': its axis is zero"),
@@ -129,7 +132,7 @@ REFUSED = {
     "no <inertia>": (arm(tip=link("tip", '<inertial><mass value="1"/></inertial>')), "link 'tip'"),
     "no ixy": (arm(tip=link("tip", inertial().replace('ixy="0"', ""))), "link 'tip'"),
     "singular mass matrix": (
-        arm(tip=link("tip", '<inertial><mass value="1"/>' + inertial(1, 0, 0, 0)[58:])),
+        arm(tip=link("tip", inertial(1, 0, 0, 0).replace("0.1 0.02 0.03", "0 0 0.03"))),
         "'elbow'.* no inertia about its axis",
     ),
     "broken inertial in a body that has mass": (
@@ -156,7 +159,7 @@ def test_unsupported_joint_type_is_refused(kind: str) -> None:
 
 
 def test_unknown_frame_is_refused_with_those_there_are() -> None:
-    with pytest.raises(RobotError, match="no frame 'hand'.*there are: base, upper, tip"):
+    with pytest.raises(RobotError, match=r"no frame 'hand'.*there are: base, upper, tip"):
         load_robot(arm(), "hand", "xyz")
 
 
@@ -308,7 +311,7 @@ def test_friction_is_ignored_with_a_warning() -> None:
 
 EXTRAS = {
     "transmission": '<transmission name="t"><joint name="elbow"><x/></joint></transmission>',
-    "gazebo": '<gazebo reference="tip"><joint name="elbow" type="ball"/><link name="tip"/></gazebo>',
+    "gazebo": '<gazebo><joint name="elbow" type="ball"/><link name="tip"/></gazebo>',
     "ros2_control": '<ros2_control name="c" type="system"><joint name="shoulder"/></ros2_control>',
     "material": '<material name="red"><color rgba="1 0 0 1"/></material>',
 }
@@ -323,7 +326,6 @@ def test_what_is_not_the_mechanism_is_ignored(extra: str) -> None:
 
 UNUSED = {
     "safety controller": "<safety_controller/>",
-    "calibration": '<calibration rising="up"/>',
     "unknown": "<note>x</note>",
 }
 
@@ -333,9 +335,7 @@ def test_what_a_joint_has_beside_the_mechanism_is_ignored(unused: str) -> None:
     assert load_robot(arm(elbow=elbow(LIMIT + unused)), "tip", "xyz").joints[1] == "elbow"
 
 
-@pytest.mark.parametrize(
-    "shape", ["<geometry/>", '<geometry><mesh/></geometry>', "", '<geometry><box size="a"/></geometry>']
-)  # fmt: skip
+@pytest.mark.parametrize("shape", ["", "<geometry/>", "<geometry><mesh/></geometry>"])
 def test_shapes_have_no_effect_on_the_mechanism(
     shape: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -414,5 +414,5 @@ def test_example_robot_is_the_one_that_pinocchio_loads(
 
 def test_panda_as_published_is_refused_for_its_mimic_joint(robots: Path) -> None:
     urdf = (robots / "panda_description/urdf/panda.urdf").read_text("utf-8")
-    with pytest.raises(RobotError, match="'panda_finger_joint2' mimics .* make it fixed"):
+    with pytest.raises(RobotError, match=r"'panda_finger_joint2' mimics .* make it fixed"):
         load_robot(urdf, "panda_hand_tcp", "xyz")

@@ -1,0 +1,315 @@
+"""The FMU's files: description, digest, reproducibility, and what depends on what."""
+
+import hashlib
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy import read_model_description
+from fmpy.validation import validate_fmu
+from harness import Driver, in_child_process
+from lxml import etree
+
+from twodof import FmuOptions, TwoDofError, build_fmu
+from twodof.build import data_file
+
+SHAPES = re.compile(r"<mesh [^>]*>")
+
+
+@pytest.fixture(scope="module")
+def description(fmu_path):
+    with zipfile.ZipFile(fmu_path) as archive:
+        return etree.fromstring(archive.read("modelDescription.xml"))
+
+
+def test_fmpy_finds_no_problem(fmu_path):
+    assert validate_fmu(str(fmu_path)) == []
+
+
+def test_every_name_unit_and_start_is_as_designed(fmu_path):
+    variables = {v.name: v for v in read_model_description(str(fmu_path)).modelVariables}
+    assert [v.valueReference for v in variables.values()] == list(range(len(variables)))
+    pi = repr(np.pi)
+    expected = {
+        ("input", "m"): {"x_des[1]": "0.2", "x_des[2]": "0.05"},
+        ("input", "m/s"): {"xd_des[1]": "0.0", "xd_des[2]": "0.0"},
+        ("input", "m/s2"): {"xdd_des[1]": "0.0", "xdd_des[2]": "0.0"},
+        ("input", "1/s2"): {"Kp[1]": "50.0", "Kp[2]": "50.0"},
+        ("input", "1/s"): {"Kd[1]": "40.0", "Kd[2]": "40.0", "Kn": "0.0"},
+        ("input", "N.m"): {"tau_ext[1]": "0.0", "tau_ext[2]": "0.0"},
+        ("output", "rad"): {"q[1]": None, "q[2]": None},
+        ("output", "rad/s"): {"v[1]": None, "v[2]": None},
+        ("output", "m"): {"x[1]": None, "x[2]": None},
+        ("output", "N.m"): {"tau[1]": None, "tau[2]": None},
+        ("parameter", "rad"): {
+            "q_start[1]": "0.5", "q_start[2]": "0.35",
+            "q_min[1]": f"-{pi}", "q_min[2]": f"-{pi}", "q_max[1]": pi, "q_max[2]": pi,
+        },
+        ("parameter", "rad/s"): {"v_start[1]": "0.0", "v_start[2]": "0.0"},
+        ("parameter", "m/s2"): {"gravity[1]": "0.0", "gravity[2]": "-9.81", "gravity[3]": "0.0"},
+        ("parameter", "s"): {"max_step": "0.001"},
+        ("parameter", None): {
+            "rcond": "0.01", "rtol": "0.001", "atol": "1e-06", "limit_effort": "false",
+        },
+    }  # fmt: skip
+    found: dict = {}
+    for v in variables.values():
+        found.setdefault((v.causality, v.unit), {})[v.name] = v.start
+        assert v.description
+        assert v.variability == ("fixed" if v.causality == "parameter" else "continuous")
+    assert found == expected
+
+
+def test_units_are_given_in_si_base_units(description):
+    dimensions = {
+        unit.get("name"): {key: int(x) for key, x in unit[0].attrib.items() if key != "factor"}
+        for unit in description.iter("Unit")
+    }
+    assert dimensions == {
+        "m": {"m": 1}, "m/s": {"m": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad": {"rad": 1},
+        "rad/s": {"rad": 1, "s": -1}, "N.m": {"kg": 1, "m": 2, "s": -2}, "s": {"s": 1},
+        "1/s": {"s": -1}, "1/s2": {"s": -2},
+    }  # fmt: skip
+    assert {base.get("factor") for base in description.iter("BaseUnit")} == {"1"}
+
+
+def test_attributes_that_tools_rely_on(description):
+    simulation = description.find("CoSimulation")
+    for capability in (
+        "canHandleVariableCommunicationStepSize", "canGetAndSetFMUstate", "canSerializeFMUstate",
+        "needsExecutionTool",
+    ):  # fmt: skip
+        assert simulation.get(capability) == "true"
+    assert description.get("generationDateAndTime") is None
+    assert description.get("variableNamingConvention") == "structured"
+    assert dict(description.find("DefaultExperiment").attrib) == {
+        "startTime": "0.0", "stopTime": "5.0", "stepSize": "0.01",
+    }  # fmt: skip
+    names = [j.get("name") for j in description.iterfind("VendorAnnotations/Tool/Robot/Joint")]
+    assert names == ["joint1", "joint2"]
+
+
+def test_guid_is_the_digest_of_description_sources_and_resources(fmu_path):
+    with zipfile.ZipFile(fmu_path) as archive:
+        xml = archive.read("modelDescription.xml")
+        guid = etree.fromstring(xml).get("guid")
+        digest = hashlib.sha256(xml.replace(f'guid="{guid}"'.encode(), b'guid=""'))
+        for name in sorted(archive.namelist()):
+            if name.startswith(("resources/", "sources/")):
+                digest.update(name.encode() + b"\0" + archive.read(name))
+    assert guid == digest.hexdigest()
+
+
+def test_the_zip_holds_what_tools_and_people_look_for(fmu_path):
+    with zipfile.ZipFile(fmu_path) as archive:
+        names = archive.namelist()
+        urdf = archive.read("resources/robot.urdf").decode()
+        page = archive.read("documentation/index.html").decode()
+        assert archive.read("model.png").startswith(b"\x89PNG")
+        for info in archive.infolist():
+            assert info.date_time == (1980, 1, 1, 0, 0, 0)
+    assert names == sorted(names)
+    assert {
+        "binaries/linux64/TwoDof.so", "documentation/externalDependencies.txt",
+        "documentation/licenses/license.txt", "documentation/licenses/pythonfmu.txt",
+        "resources/requirements.txt",
+    } < set(names)  # fmt: skip
+    meshes = set(re.findall(r"package://([^\"]+)", urdf))
+    assert len(meshes) == 4
+    assert {f"resources/{name}" for name in meshes} < set(names)
+    assert "x_des[1]" in page
+    assert not re.search(r"\$\w", page)
+
+
+def test_the_same_inputs_give_the_same_bytes(fmu_path, tmp_path):
+    """In another process, folder, time zone, locale and hash seed."""
+    code = "import sys, twodof; twodof.build_fmu(sys.argv[1])"
+    environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "LC_ALL": "C"}
+    package = str(Path(data_file("plant")).parents[1])
+    environment["PYTHONPATH"] = os.pathsep.join([package, environment.get("PYTHONPATH", "")])
+    other = tmp_path / "Other.fmu"
+    subprocess.run([sys.executable, "-c", code, other], cwd=tmp_path, env=environment, check=True)
+    assert other.read_bytes() == fmu_path.read_bytes()
+
+
+def test_an_fmu_that_is_up_to_date_is_left_alone(fmu_path, tmp_path):
+    path = tmp_path / "A.fmu"
+    path.write_bytes(fmu_path.read_bytes())
+    os.utime(path, (1e9, 1e9))
+    build_fmu(path)
+    assert path.stat().st_mtime == 1e9
+    build_fmu(path, FmuOptions(gravity=(0.0, 0.0, 0.0)))
+    assert path.stat().st_mtime > 1e9
+
+
+def test_a_link_into_the_environment_changes_the_digest(fmu_path, tmp_path):
+    linked = build_fmu(tmp_path / "L.fmu", FmuOptions(link_environment=True))
+    guids = {read_model_description(str(path)).guid for path in (fmu_path, linked)}
+    assert len(guids) == 2
+
+
+def test_a_urdf_of_ones_own_gets_the_documented_defaults(panda, tmp_path):
+    urdf = tmp_path / "panda.urdf"
+    urdf.write_text(SHAPES.sub("<sphere radius='0.01'/>", panda))
+    fmu = build_fmu(tmp_path / "P.fmu", FmuOptions(urdf=urdf, frame="panda_hand_tcp", name="P"))
+    start = {v.name: v.start for v in read_model_description(str(fmu)).modelVariables}
+    assert [float(start[f"gravity[{i}]"]) for i in (1, 2, 3)] == [0.0, 0.0, -9.81]
+    middle = (-3.0718 - 0.0698) / 2  # joint 4's limits leave 0 out
+    q = [float(start[f"q_start[{i}]"]) for i in range(1, 8)]
+    assert q == pytest.approx([0, 0, 0, middle, 0, 0, 0])
+    assert float(start["Kn"]) == 10.0
+    # the hand's position by the arm's published lengths, for this pose of the elbow
+    assert [float(start[f"x_des[{k}]"]) for k in (1, 2, 3)] == pytest.approx(
+        _panda_hand(middle), abs=1e-9
+    )
+
+
+def _panda_hand(elbow):
+    """Planar chain in x-z: shoulder 0.333, upper arm 0.316, elbow offset 0.0825, forearm 0.384,
+    wrist offset 0.088, flange 0.107 and hand 0.1034; m. Joint 4 turns about −y."""
+    x, z = 0.0825, 0.333 + 0.316
+    c, s = np.cos(-elbow), np.sin(-elbow)
+    # in the forearm's frame: back by the offset, out by the forearm, then the wrist hangs down
+    forward, up = -0.0825 + 0.088, 0.384 - 0.107 - 0.1034
+    return [x + c * forward + s * up, 0.0, z - s * forward + c * up]
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"axes": "xyz"}, "the shipped arm moves in the x-y plane"),
+        ({"name": "Two Dof"}, "name 'Two Dof' must be an identifier"),
+        ({"frame": "hand"}, "no frame 'hand' in the URDF; there are: .*EndEffector"),
+        ({"q_start": (1.0,)}, "q_start has 1 values, the robot has 2 joints: joint1, joint2"),
+        ({"gravity": (0.0, float("nan"), 0.0)}, "gravity .* must be finite"),
+        ({"mesh_dir": Path("nowhere")}, "the mesh folder 'nowhere' does not exist"),
+        ({"urdf": Path("nowhere.urdf")}, "cannot read the URDF 'nowhere.urdf'"),
+    ],
+)
+def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):
+    with pytest.raises(TwoDofError, match=message):
+        build_fmu(tmp_path / "A.fmu", FmuOptions(**options))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(TwoDofError, match=r"cannot write '.*nowhere/A\.fmu'"):
+        build_fmu(tmp_path / "nowhere" / "A.fmu")
+
+
+# --- dependencies, by moving one variable at a time ---
+
+PERTURBATION = {
+    "q_start": 0.05, "v_start": 0.3, "x_des": 0.01, "xd_des": 0.1, "xdd_des": 0.5, "Kp": 5.0,
+    "Kd": 5.0, "tau_ext": 0.3, "Kn": 1.0, "gravity": 1.0, "rtol": 1e-4, "atol": 1e-7,
+    "max_step": 1e-4,
+}  # fmt: skip
+
+
+def declared(description, element):
+    """Names of the variables that each unknown depends on, by its name."""
+    names = [v.get("name") for v in description.find("ModelVariables")]
+    return {
+        names[int(unknown.get("index")) - 1]: {
+            names[int(i) - 1] for i in unknown.get("dependencies").split()
+        }
+        for unknown in description.find(f"ModelStructure/{element}")
+    }
+
+
+def moved(before, after):
+    return {name for name in before if before[name] != after[name]}
+
+
+def outputs(driver):
+    names = [n for n in driver.vr if re.match(r"(q|v|x|tau)\[", n)]
+    return dict(zip(names, driver.call("getReal", [driver.vr[n] for n in names])))
+
+
+def start_values(driver):
+    return {
+        v.name: v.start == "true" if v.type == "Boolean" else float(v.start)
+        for v in driver.description.modelVariables
+        if v.start is not None
+    }
+
+
+def put(driver, name, value):
+    driver.call("setBoolean" if isinstance(value, bool) else "setReal", [driver.vr[name]], [value])
+
+
+@in_child_process
+def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
+    """Amid its range and at limits, moving to and fro, saturated and not."""
+    with zipfile.ZipFile(fmu_path) as archive:
+        description = etree.fromstring(archive.read("modelDescription.xml"))
+    found: dict = {name: set() for name in declared(description, "InitialUnknowns")}
+    generic = {"v_start[1]": 0.7, "v_start[2]": -0.4, "xd_des[1]": 0.1, "xd_des[2]": 0.2}
+    back = {**generic, "v_start[1]": -0.7, "v_start[2]": 0.4}
+    limits = {"q_max[1]": 0.5, "q_min[2]": 0.35}
+    for base in (generic, back, {**generic, **limits}, {**back, **limits}):
+        for saturated in (False, True):
+            driver = Driver(fmu_path)
+            start = {**start_values(driver), **base, "limit_effort": saturated, "Kp[1]": 60.0}
+            if saturated:
+                start["xdd_des[1]"] = 40000.0
+            for name, value in start.items():
+                put(driver, name, value)
+            driver.call("setupExperiment", startTime=0.0)
+            driver.call("enterInitializationMode")
+            before = outputs(driver)
+            for name, value in start.items():
+                for changed in candidates(name, start):
+                    put(driver, name, changed)
+                    for output in moved(before, outputs(driver)):
+                        found[output].add(name)
+                put(driver, name, value)
+            assert outputs(driver) == before
+            driver.free()
+    expected = declared(description, "InitialUnknowns")
+    # of no effect on this arm, but on others: gravity along the joints' axes, and null-space
+    # damping where there is no null space
+    idle = {"gravity[3]", "Kn"}
+    for output, names in found.items():
+        assert names | idle == expected[output] | idle, (output, names ^ expected[output])
+        assert not names & {"rtol", "atol", "max_step"}
+
+
+def candidates(name, start):
+    """Other values of a variable that the plant accepts."""
+    group, _, index = name.partition("[")
+    value = start[name]
+    if isinstance(value, bool):
+        return [not value]
+    if group in ("q_min", "q_max"):  # on either side of the start
+        near = [start[f"q_start[{index}"] + step for step in (-0.02, 0.02)]
+        low, high = start[f"q_min[{index}"], start[f"q_max[{index}"]
+        return [x for x in near if (x <= high if group == "q_min" else x >= low)]
+    if group == "rcond":
+        return [0.9]
+    return [value + PERTURBATION[group], value - PERTURBATION[group]]
+
+
+@in_child_process
+def test_outputs_depend_on_exactly_what_is_declared(fmu_path):
+    with zipfile.ZipFile(fmu_path) as archive:
+        description = etree.fromstring(archive.read("modelDescription.xml"))
+    expected = declared(description, "Outputs")
+    driver = Driver(fmu_path).initialise(v_start=(0.7, -0.4), rcond=0.5)  # one direction dropped
+    driver.run(5)
+    before = outputs(driver)
+    found: dict = {name: set() for name in expected}
+    inputs = [v.name for v in driver.description.modelVariables if v.causality == "input"]
+    start = start_values(driver)
+    for name in inputs:
+        put(driver, name, start[name] + PERTURBATION[name.partition("[")[0]])
+        for output in moved(before, outputs(driver)):
+            found[output].add(name)
+        put(driver, name, start[name])
+    assert outputs(driver) == before
+    assert found == expected

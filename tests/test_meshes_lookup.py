@@ -1,0 +1,209 @@
+"""Meshes of a URDF: where they are looked for, how they are named, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from twodof.errors import BuildError
+from twodof.meshes import collect_meshes
+
+FILES = {
+    "ws/arm_description/urdf/arm.urdf": b"",
+    "ws/arm_description/meshes/base.stl": b"base",
+    "ws/arm_description/meshes/visual/link.stl": b"visual",
+    "ws/arm_description/meshes/collision/link.stl": b"collision",
+    "ws/arm_description/urdf/beside.stl": b"beside",
+    "ws/tool_description/meshes/tool.stl": b"tool",
+    "ws/arm_description/meshes/with space & more.stl": b"space",
+    "secret.stl": b"secret",
+}
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Path:
+    for name, content in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return tmp_path
+
+
+def urdf(*uris: str) -> str:
+    meshes = "".join(f'<mesh filename="{uri}" scale="1 1 1"/>' for uri in uris)
+    return f'<robot name="arm"><link name="base">{meshes}</link></robot>'
+
+
+def names(text: str) -> list[str]:
+    return re.findall(r'filename="package://(.*?)"', text)
+
+
+def collect(disk: Path, uri: str, mesh_dir: str | None) -> bytes:
+    """The one mesh that a URDF with this name takes along."""
+    folder = disk / "ws/arm_description/urdf"
+    text, files = collect_meshes(urdf(uri), folder, None if mesh_dir is None else disk / mesh_dir)
+    assert names(text) == list(files)
+    (name,) = files
+    assert name.startswith("meshes/")
+    return files[name]
+
+
+PACKAGE = "package://arm_description/meshes/base.stl"
+FOUND = {
+    "mesh_dir holds the package": (PACKAGE, "ws", b"base"),
+    "mesh_dir is the package": (PACKAGE, "ws/arm_description", b"base"),
+    "mesh_dir is the mesh folder": (PACKAGE, "ws/arm_description/meshes", b"base"),
+    "mesh_dir above a subfolder": (
+        "package://arm_description/meshes/visual/link.stl", "ws/arm_description/meshes", b"visual",
+    ),
+    "model://": ("model://arm_description/meshes/base.stl", "ws", b"base"),
+    "folders around the URDF": (PACKAGE, None, b"base"),
+    "another package around the URDF": (
+        "package://tool_description/meshes/tool.stl", None, b"tool",
+    ),
+    "relative to the URDF": ("beside.stl", None, b"beside"),
+    "relative to the URDF with ./": ("./beside.stl", None, b"beside"),
+    "relative to the URDF though mesh_dir is given": ("beside.stl", "ws", b"beside"),
+    "relative to mesh_dir": ("visual/link.stl", "ws/arm_description/meshes", b"visual"),
+    "relative, out of the URDF's folder but inside mesh_dir": (
+        "../meshes/base.stl", "ws/arm_description", b"base",
+    ),
+    "percent and entity": (
+        "package://arm_description/meshes/with%20space%20&amp;%20more.stl", "ws", b"space",
+    ),
+    "entity in a relative name": (
+        "with space &amp; more.stl", "ws/arm_description/meshes", b"space",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("uri", "mesh_dir", "content"), FOUND.values(), ids=FOUND)
+def test_mesh_is_found(disk: Path, uri: str, mesh_dir: str | None, content: bytes) -> None:
+    assert collect(disk, uri, mesh_dir) == content
+
+
+@pytest.mark.parametrize("scheme", ["file://", ""])
+def test_absolute_name_is_found(disk: Path, scheme: str) -> None:
+    assert collect(disk, f"{scheme}{disk}/secret.stl", None) == b"secret"
+
+
+def test_package_in_mesh_dir_goes_before_a_shorter_match(disk: Path) -> None:
+    (disk / "ws/meshes").mkdir()
+    (disk / "ws/meshes/base.stl").write_bytes(b"other")
+    assert collect(disk, PACKAGE, "ws") == b"base"
+
+
+REFUSED = {
+    "not there": ("package://arm_description/meshes/none.stl", "ws", "not found in .*ws"),
+    "not there, no mesh_dir": ("package://nowhere/none.stl", None, "not found; give .*--mesh-dir"),
+    "a folder": ("package://arm_description/meshes", "ws", "not found"),
+    "no path": ("package://", "ws", "not found"),
+    "no name": ("", "ws", "not found"),
+    "absolute, not there": ("/nowhere/none.stl", None, "not found"),
+    "another scheme": ("http://example.com/a.stl", "ws", "not found"),
+    "not a URI": ("package://[arm/a.stl", "ws", "not found"),
+    "too long a name": ("package://arm/" + "a" * 5000, "ws", "not found|too long"),
+    "out of mesh_dir": ("package://../secret.stl", "ws", "leaves its folder"),
+    "out of the package": ("package://arm_description/../../secret.stl", "ws", "leaves its folder"),
+    "out of the folders around": (
+        "package://arm_description/../../secret.stl", None, "leaves its folder",
+    ),
+    "percent": ("package://%2e%2e/secret.stl", "ws", "leaves its folder"),
+    "relative, out of the URDF's folder": ("../../../secret.stl", None, "leaves its folder"),
+    "relative, out of mesh_dir": ("../secret.stl", "ws", "leaves its folder"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("uri", "mesh_dir", "reason"), REFUSED.values(), ids=REFUSED)
+def test_refusal_names_the_mesh(disk: Path, uri: str, mesh_dir: str | None, reason: str) -> None:
+    with pytest.raises(BuildError, match=reason) as refusal:
+        collect(disk, uri, mesh_dir)
+    assert f"mesh '{uri[:50]}" in str(refusal.value)
+
+
+def test_symbolic_link_out_of_the_folder_is_refused(disk: Path) -> None:
+    (disk / "ws/arm_description/meshes/link.stl").symlink_to(disk / "secret.stl")
+    with pytest.raises(BuildError, match="leaves its folder"):
+        collect(disk, "package://arm_description/meshes/link.stl", "ws")
+
+
+def test_mesh_that_cannot_be_read_is_refused(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", fail)
+    with pytest.raises(BuildError, match=r"base\.stl.*Permission denied"):
+        collect(disk, PACKAGE, "ws")
+
+
+def test_meshes_of_one_basename_get_different_names(disk: Path) -> None:
+    uris = [f"package://arm_description/meshes/{kind}/link.stl" for kind in ("visual", "collision")]
+    text, files = collect_meshes(urdf(*uris), disk, disk / "ws")
+    assert len(set(names(text))) == 2
+    assert [files[name] for name in names(text)] == [b"visual", b"collision"]
+
+
+def test_a_mesh_used_twice_is_taken_along_once(disk: Path) -> None:
+    text, files = collect_meshes(urdf(PACKAGE, PACKAGE), disk, disk / "ws")
+    assert names(text) == ["meshes/base.stl"] * 2
+    assert files == {"meshes/base.stl": b"base"}
+
+
+def test_nothing_but_the_names_of_meshes_changes(disk: Path) -> None:
+    before = urdf(PACKAGE).replace("<robot", "<!-- a 'comment' -->\n<robot\n  ")
+    after, _ = collect_meshes(before, disk, disk / "ws")
+    assert after == before.replace(PACKAGE, "package://meshes/base.stl")
+
+
+@pytest.mark.parametrize(
+    "form", ["<mesh\n scale='1 1 1'\n filename = '{}'/>", '<mesh filename="{}">']
+)
+def test_mesh_is_found_however_it_is_written(disk: Path, form: str) -> None:
+    _, files = collect_meshes(form.format(PACKAGE), disk, disk / "ws")
+    assert list(files.values()) == [b"base"]
+
+
+def test_mesh_in_a_comment_is_not_looked_for(disk: Path) -> None:
+    text = f'<robot><!-- <mesh filename="package://old/gone.stl"/> -->{urdf(PACKAGE)}</robot>'
+    assert collect_meshes(text, disk, disk / "ws")[1] == {"meshes/base.stl": b"base"}
+
+
+def test_characters_that_trouble_file_systems_are_replaced(disk: Path) -> None:
+    _, files = collect_meshes(
+        urdf("package://arm_description/meshes/with%20space%20%26%20more.stl"), disk, disk / "ws"
+    )
+    assert list(files) == ["meshes/with_space___more.stl"]
+
+
+def test_collected_robot_collects_again_from_what_was_collected(disk: Path, tmp_path: Path) -> None:
+    uris = [f"package://arm_description/meshes/{kind}/link.stl" for kind in ("visual", "collision")]
+    text, files = collect_meshes(urdf(PACKAGE, *uris), disk, disk / "ws")
+    for name, content in files.items():
+        (tmp_path / "fmu" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "fmu" / name).write_bytes(content)
+    _, again = collect_meshes(text, tmp_path / "fmu", None)
+    assert sorted(again.values()) == sorted(files.values())
+
+
+EXAMPLES = {
+    "ur_description/urdf/ur5_robot.urdf": 14,
+    "panda_description/urdf/panda.urdf": 19,
+    "kinova_description/robots/kinova.urdf": 11,
+    "talos_data/robots/talos_left_arm.urdf": 20,
+    "tiago_description/robots/tiago.urdf": 35,
+    "double_pendulum_description/urdf/double_pendulum.urdf": 3,
+    "so_arm_description/urdf/so100.urdf": 13,
+    "z1_description/urdf/z1.urdf": 11,
+}
+
+
+@pytest.mark.parametrize(("name", "count"), EXAMPLES.items(), ids=[Path(e).stem for e in EXAMPLES])
+def test_example_robot_needs_no_mesh_dir(robots: Path, name: str, count: int) -> None:
+    path = robots / name
+    text, files = collect_meshes(path.read_text("utf-8"), path.parent, None)
+    assert len(files) == count
+    assert {
+        name.removeprefix("package://") for name in re.findall(r'"(package://.*?)"', text)
+    } == set(files)
