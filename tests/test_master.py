@@ -1,0 +1,281 @@
+"""The master: times, order, ends, and FMUs that misbehave."""
+
+import logging
+import re
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from harness import in_child_process
+from oracles import position, task_error
+from pythonfmu import FmuBuilder
+
+import twodof
+from twodof.errors import FmuError, InputError, SimulationError
+from twodof.master import RealTime
+
+
+class Recorder:
+    """A sink that keeps what it is given."""
+
+    def __init__(self):
+        self.samples = []
+        self.left = None
+
+    def __enter__(self):
+        return self
+
+    def write(self, sample):
+        self.samples.append(sample)
+
+    def __exit__(self, *exception):
+        self.left = exception[0]
+
+
+def test_n_steps_give_n_plus_one_samples_at_times_that_are_not_accumulated(fmu_path):
+    recorder = Recorder()
+    summary = twodof.simulate(fmu_path, [recorder], stop_time=0.7, step=0.1)
+    assert [s.k for s in recorder.samples] == list(range(8))
+    assert [s.t for s in recorder.samples] == [k * 0.1 for k in range(8)]
+    assert summary.last == recorder.samples[-1]
+    assert not summary.stopped
+    assert recorder.left is None
+    first = recorder.samples[0]
+    assert first.q == (0.5, 0.35)
+    assert first.v == (0.0, 0.0)
+    assert first.x == pytest.approx(position(np.array(first.q)), abs=1e-15)
+    target = np.array([0.2, 0.05])
+    assert summary.error == pytest.approx(np.linalg.norm(target - summary.last.x), rel=1e-12)
+
+
+@pytest.mark.parametrize("kp, kd", [(50.0, 40.0), (100.0, 20.0), (200.0, 10.0)])
+def test_gains_act_as_in_the_closed_form(fmu_path, kp, kd):
+    """Over-, critically and underdamped."""
+    recorder = Recorder()
+    settings = {"Kp": kp, "Kd": kd, "x_des": (0.15, 0.12)}
+    twodof.simulate(fmu_path, [recorder], stop_time=1.0, settings=settings)
+    x = np.array([s.x for s in recorder.samples])
+    t = np.array([s.t for s in recorder.samples])
+    expected = np.array([0.15, 0.12]) - task_error([0.15, 0.12] - x[0], kp, kd, t)
+    assert np.abs(x - expected).max() <= 1e-9
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"step": 0.0}, "step 0 s must be > 0"),
+        ({"step": -0.01}, "step -0.01 s must be > 0"),
+        ({"step": float("nan")}, "step nan s must be > 0"),
+        ({"stop_time": 0.0}, "stop time 0 s must be after the start time 0 s"),
+        ({"stop_time": float("inf")}, "stop time inf s"),
+        ({"stop_time": 1.005}, r"the run of 1\.005 s is no whole number of steps of 0\.01 s"),
+        ({"stop_time": 0.001}, "no whole number of steps"),
+    ],
+)
+def test_times_without_sense_are_refused(fmu_path, options, message):
+    with pytest.raises(InputError, match=message):
+        twodof.experiment(fmu_path, **options)
+
+
+def test_an_odd_number_of_steps_survives_rounding(fmu_path):
+    # 0.3 / 0.1 is 2.9999999999999996
+    assert twodof.experiment(fmu_path, stop_time=0.3, step=0.1).steps == 3
+    assert twodof.experiment(fmu_path, stop_time=86400.0, step=0.01).steps == 8_640_000
+
+
+def test_a_run_may_start_at_another_time(fmu_path):
+    samples = list(twodof.samples(fmu_path, start_time=100.0, stop_time=100.05))
+    assert [s.t for s in samples] == [100.0 + k * 0.01 for k in range(6)]
+
+
+def test_inputs_sent_hold_from_the_sample_on(fmu_path):
+    run = twodof.samples(fmu_path, stop_time=1.0, settings={"x_des": (0.2, 0.05)})
+    first = next(run)
+    second = run.send({"x_des": (0.1, 0.2)})
+    rest = [second, *run]
+    assert first.inputs["x_des[1]"] == 0.2
+    assert {s.inputs["x_des[1]"] for s in rest} == {0.1}
+    other = list(twodof.samples(fmu_path, stop_time=1.0, settings={"x_des": (0.1, 0.2)}))
+    assert [s.q for s in rest] == [s.q for s in other[1:]]
+
+
+def test_a_sink_is_left_with_the_error_that_ends_the_run(fmu_path):
+    class Failing(Recorder):
+        def write(self, sample):
+            if sample.k == 3:
+                raise RuntimeError("mine")
+            super().write(sample)
+
+    before, failing = Recorder(), Failing()
+    with pytest.raises(RuntimeError, match="mine"):
+        twodof.simulate(fmu_path, [before, failing], stop_time=0.1)
+    assert before.left is RuntimeError
+    assert len(before.samples) == 4
+    assert len(failing.samples) == 3
+
+
+def test_a_run_that_is_asked_to_stop_ends_between_steps(fmu_path):
+    recorder = Recorder()
+    summary = twodof.simulate(
+        fmu_path, [recorder], stop_time=1.0, stop=lambda: len(recorder.samples) > 5
+    )
+    assert summary.stopped
+    assert summary.last.k == len(recorder.samples) - 1 < 10
+
+
+def test_an_abandoned_generator_removes_its_unzipped_fmu(fmu_path, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    run = twodof.samples(fmu_path, stop_time=1.0)
+    next(run)
+    assert len(list(tmp_path.iterdir())) == 1
+    run.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_temporary_folder_with_a_space_works(fmu_path, tmp_path, monkeypatch):
+    (tmp_path / "a b").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "a b"))
+    assert len(list(twodof.samples(fmu_path, stop_time=0.05))) == 6
+
+
+def test_realtime_paces_to_the_wall_clock_and_counts_missed_deadlines(fmu_path):
+    pace = RealTime()
+    begin = time.monotonic()
+    twodof.simulate(fmu_path, pace=pace, stop_time=0.5, step=0.05)
+    assert time.monotonic() - begin >= 0.5
+    slow = RealTime()
+
+    class Slow(Recorder):
+        def write(self, sample):
+            if sample.k == 2:
+                time.sleep(0.12)
+
+    twodof.simulate(fmu_path, [Slow()], pace=slow, stop_time=0.5, step=0.05)
+    assert slow.missed >= 2
+    assert slow.worst >= 0.05
+
+
+def test_messages_of_the_fmu_go_to_logging(fmu_path, caplog):
+    with caplog.at_level(logging.INFO, "twodof.fmu"):
+        twodof.simulate(fmu_path, stop_time=0.01, settings={"q_start": (4.0, 0.35)})
+    (record,) = [r for r in caplog.records if r.name == "twodof.fmu"]
+    assert record.levelno == logging.WARNING
+    assert "q_start[1] = 4 of joint 'joint1' is outside its limits" in record.getMessage()
+
+
+def test_a_refusal_of_the_fmu_comes_with_its_own_words(fmu_path):
+    with pytest.raises(
+        SimulationError, match=r"step 1 at t = 0 s: .*rtol = -1 must be > 0"
+    ) as error:
+        twodof.simulate(fmu_path, stop_time=1.0, settings={"rtol": -1.0})
+    assert error.value.k == 0
+
+
+def changed_plant(fmu_path, folder, old, new):
+    """The default FMU with other code inside, under another digest."""
+    other = folder / "Changed.fmu"
+    with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
+        (tag,) = {m[1] for n in archive.namelist() if (m := re.search(r"slave_(\w+)\.py", n))}
+        own = format(abs(hash((old, new))), "x")
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name.endswith("plant/plant.py"):
+                assert old in content
+                content = content.replace(old, new)
+            if name.endswith("slavemodule.txt"):
+                content = content.replace(tag.encode(), own.encode())
+            changed.writestr(name.replace(tag, own), content)
+    return other
+
+
+@in_child_process
+def test_an_fmu_that_returns_nan_ends_the_run_with_what_was_good(fmu_path, tmp_path):
+    changed = changed_plant(
+        fmu_path, tmp_path, b"        self._hold_inputs()\n        limits",
+        b"        self.v = [float('nan')] * 2; return\n        limits",
+    )  # fmt: skip
+    recorder = Recorder()
+    with pytest.raises(SimulationError, match=r"not finite at t = 0\.01 s"):
+        twodof.simulate(changed, [recorder], stop_time=1.0)
+    assert len(recorder.samples) == 1
+    assert recorder.left is SimulationError
+
+
+@in_child_process
+def test_an_fmu_that_fails_fatally_ends_the_run(fmu_path, tmp_path):
+    changed = changed_plant(
+        fmu_path, tmp_path, b"        self._hold_inputs()\n        limits",
+        b"        raise RuntimeError('broken inside')\n        limits",
+    )  # fmt: skip
+    recorder = Recorder()
+    with pytest.raises(SimulationError, match="broken inside"):
+        twodof.simulate(changed, [recorder], stop_time=1.0)
+    assert len(recorder.samples) == 1
+
+
+OTHER_MAKER = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+
+class Clock(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.angle, self.speed, self.rate = 0.0, 0.0, 2.0
+        output, settable = Fmi2Causality.output, Fmi2Causality.input
+        get = lambda name: (lambda: getattr(self, name))
+        self.register_variable(Real("q[1]", causality=output, getter=get("angle")), nested=False)
+        self.register_variable(Real("v[1]", causality=output, getter=get("speed")), nested=False)
+        self.register_variable(Real("rate", causality=settable))
+
+    def do_step(self, current_time, step_size):
+        self.speed = self.rate
+        self.angle += self.rate * step_size
+        return True
+"""
+
+
+@pytest.fixture(scope="module")
+def other_maker(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clock")
+    (folder / "clock_slave.py").write_text(OTHER_MAKER)
+    return Path(FmuBuilder.build_FMU(folder / "clock_slave.py", folder))
+
+
+@in_child_process
+def test_an_fmu_of_another_maker_runs_where_its_variables_match(other_maker, tmp_path):
+    run = twodof.experiment(other_maker, stop_time=0.05, settings={"rate": 3.0})
+    recorder = Recorder()
+    twodof.simulate(run, [recorder, twodof.Bag(tmp_path / "bag", run)])
+    assert recorder.samples[-1].q == pytest.approx((0.15,))
+    assert recorder.samples[-1].x == recorder.samples[-1].tau == ()
+    assert twodof.read_bag(tmp_path / "bag").joints == ("joint1",)
+
+
+def test_an_fmu_for_another_platform_says_which(fmu_path, tmp_path):
+    other = tmp_path / "Win.fmu"
+    with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
+        for name in archive.namelist():
+            moved = name.replace("linux64/TwoDof.so", "win64/TwoDof.dll")
+            changed.writestr(moved, archive.read(name))
+    with pytest.raises(FmuError, match=r"no binary for this platform \(linux64\), only for: win64"):
+        next(twodof.samples(other))
+
+
+@in_child_process
+def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
+    """100,000 steps of 1 ms (that each takes seven right-hand sides only) into a bag."""
+
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+    class Memory(Recorder):
+        def write(self, sample):
+            if sample.k == 1000:
+                self.early = resident()
+
+    run = twodof.experiment(fmu_path, stop_time=100.0, step=1e-3)
+    memory = Memory()
+    twodof.simulate(run, [twodof.Bag(tmp_path / "bag", run), memory])
+    assert resident() - memory.early <= 5 * 1024**2
