@@ -38,19 +38,22 @@ def import_plant(site_packages: list[str]):
     """The plant package of this FMU; says what to install where a package is missing."""
     try:
         return importlib.import_module(f"{PACKAGE}.plant")
-    except ModuleNotFoundError as missing:
+    except ModuleNotFoundError:
         for folder in site_packages:
             site.addsitedir(folder)  # with its .pth files: pin keeps its modules behind one
-        try:
-            return importlib.import_module(f"{PACKAGE}.plant")
-        except ModuleNotFoundError:
-            version = ".".join(map(str, sys.version_info[:3]))
-            raise ImportError(
-                f"the Python of this process ({version}, {sys.prefix}) has no package"
-                f" '{missing.name}': install resources/requirements.txt of this FMU into it, or"
-                " set PYTHONPATH to a site-packages folder that has them, or rebuild the FMU with"
-                " --link-environment, or use the native FMU, which needs no Python"
-            ) from None
+    try:
+        return importlib.import_module(f"{PACKAGE}.plant")
+    except ModuleNotFoundError as missing:
+        version = ".".join(map(str, sys.version_info[:3]))
+        linked = f" and neither have {', '.join(site_packages)}" if site_packages else ""
+        message = (
+            f"the Python of this process ({version}, {sys.prefix}) has no package"
+            f" '{missing.name}'{linked}: install resources/requirements.txt of this FMU into it,"
+            " or see documentation/externalDependencies.txt, or build the FMU with"
+            " --link-environment, or use the native FMU, which needs no Python"
+        )
+        print(message, file=sys.stderr)  # importers that do not log show nothing else
+        raise ImportError(message) from None
 
 
 class TwoDofSlave(fmi.Fmi2Slave):

@@ -140,6 +140,16 @@ def test_a_temporary_folder_with_a_space_works(fmu_path, tmp_path, monkeypatch):
     assert len(list(twodof.samples(fmu_path, stop_time=0.05))) == 6
 
 
+@pytest.mark.parametrize("name", ["é", "100%41"])
+def test_a_temporary_folder_that_the_wrapper_cannot_read_is_refused(
+    name, fmu_path, tmp_path, monkeypatch
+):
+    (tmp_path / name).mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
+    with pytest.raises(FmuError, match="set TMPDIR to a folder with a plain name"):
+        next(twodof.samples(fmu_path))
+
+
 def test_realtime_paces_to_the_wall_clock_and_counts_missed_deadlines(fmu_path):
     pace = RealTime()
     begin = time.monotonic()
@@ -166,9 +176,7 @@ def test_messages_of_the_fmu_go_to_logging(fmu_path, caplog):
 
 
 def test_a_refusal_of_the_fmu_comes_with_its_own_words(fmu_path):
-    with pytest.raises(
-        SimulationError, match=r"step 1 at t = 0 s: .*rtol = -1 must be > 0"
-    ) as error:
+    with pytest.raises(SimulationError, match="^rtol = -1 must be > 0$") as error:
         twodof.simulate(fmu_path, stop_time=1.0, settings={"rtol": -1.0})
     assert error.value.k == 0
 

@@ -266,6 +266,25 @@ def test_unreachable_targets_and_singularities_never_fail():
         assert np.isfinite(plant.tau).all()
 
 
+def test_a_joint_that_grazes_its_limit_at_the_fold_does_not_chatter():
+    """Folded at both limits: joint 1 is released by −5e-24 rad/s² and back at once, for ever."""
+    plant = default_arm()
+    plant.q, plant.v = [np.pi, -3.1352186957606243], [0.0, -1.4880270052931837]
+    plant.x_des = [-0.11596721002411503, -0.17468495304859388]
+    calls = 0
+    commanded = plant._commanded_acceleration
+
+    def counted(q, v):
+        nonlocal calls
+        calls += 1
+        return commanded(q, v)
+
+    plant._commanded_acceleration = counted
+    plant.step(0.01)
+    assert calls < 10_000
+    assert np.isfinite([*plant.q, *plant.v]).all()
+
+
 def test_target_at_the_reach_and_stretched_start():
     plant = default_arm()
     plant.q_start, plant.x_des = [0.0, 0.0], [2 * LINK, 0.0]

@@ -10,7 +10,9 @@ import shutil
 import sqlite3
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -25,7 +27,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
@@ -41,6 +43,7 @@ JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 PROVENANCE = "run.json"
 PROVENANCE_KEY = "twodof"
+FORMAT = 1
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
@@ -115,62 +118,72 @@ class Bag:
         self._plugin = StoragePlugin[storage.upper()]
         self._overwrite = overwrite
         self._command_line = command_line
-        self._start = time.time_ns() if stamp_start is None else round(stamp_start * NANOSECONDS)
-        if not 0 <= self._start <= LATEST_STAMP:
-            raise BagError(f"the first stamp, {self._start / NANOSECONDS:g} s, is out of range")
-        self._names = list(run.fmu.joints)
+        if stamp_start is not None and not 0 <= stamp_start * NANOSECONDS <= LATEST_STAMP:
+            raise BagError(f"the first stamp, {stamp_start:g} s, is out of range")
+        # a fraction: a double of today's nanoseconds is good to 256 only
+        exact = None if stamp_start is None else Fraction(stamp_start) * NANOSECONDS
+        self._start = time.time_ns() if exact is None else round(exact)
         self._effort = effort
         if effort and not run.fmu.vector("tau"):
             raise BagError(f"'{run.fmu.path}' has no outputs tau[i] for --effort")
         self._scene = _load_scene(run) if scene else None
+        if self._start + run.steps * run.step * NANOSECONDS > LATEST_STAMP:
+            raise BagError(f"the last stamp, {run.steps * run.step:g} s later, is out of range")
         _check_free(self.path, overwrite)
 
     def __enter__(self) -> Bag:
-        if self._overwrite and self.path.exists():
-            shutil.rmtree(self.path)
-        provenance = json.dumps(_provenance(self._run, self._start, self._command_line), indent=1)
-        self._writer = Writer(self.path, version=METADATA_VERSION, storage_plugin=self._plugin)
-        self._writer.set_custom_data(PROVENANCE_KEY, provenance)
+        _check_free(self.path, self._overwrite)
+        provenance = _json(_provenance(self._run, self._start, self._command_line))
+        created = False
         try:
+            if self.path.exists():
+                shutil.rmtree(self.path)
+            self._writer = Writer(self.path, version=METADATA_VERSION, storage_plugin=self._plugin)
+            self._writer.set_custom_data(PROVENANCE_KEY, provenance)
             self._writer.open()
+            created = True
             (self.path / PROVENANCE).write_text(provenance + "\n", "utf-8")
             _write_reserve(self.path / RESERVE)
+            if isinstance(self._writer.storage, Sqlite3Writer):
+                # commits are for a killed process, and need not wait for the disk
+                self._writer.storage.conn.execute("PRAGMA synchronous = OFF")
             self._connections = {JOINT_STATES: self._add(JOINT_STATES, JOINT_STATE, STREAM)}
             if self._scene is not None:
                 for topic, (kind, qos) in SCENE_TOPICS.items():
                     self._connections[topic] = self._add(topic, kind, qos)
+            self._joint_states = self._connections[JOINT_STATES]
+            self._message = _joint_state(self._run.fmu.joints, self._effort)
+            self._flush()
         except (OSError, WriterError, sqlite3.Error) as error:
-            self._writer.abort()
-            shutil.rmtree(self.path, ignore_errors=True)
-            raise BagError(f"cannot write the bag '{self.path}': {error}") from error
-        self._joint_states = self._connections[JOINT_STATES]
-        self._flush()
+            if created:
+                with suppress(OSError, sqlite3.Error):
+                    self._writer.abort()
+                shutil.rmtree(self.path, ignore_errors=True)
+            raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
         return self
 
     def write(self, sample: Sample) -> None:
         """Write one sample: one JointState, and the scene's messages."""
         stamp = self._start + round(sample.k * self._run.step * NANOSECONDS)
-        header = _header(stamp, "")
-        message = Message[JOINT_STATE](
-            header=header,
-            name=self._names,
-            position=np.array(sample.q),
-            velocity=np.array(sample.v),
-            effort=np.array(sample.tau if self._effort else ()),
-        )
+        message = self._message  # one for all samples: making it costs as much as writing it
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+        message.position[:] = sample.q
+        message.velocity[:] = sample.v
+        if self._effort:
+            message.effort[:] = sample.tau
         try:
-            self._write(self._joint_states, stamp, JOINT_STATE, message)
+            self._put(self._joint_states, stamp, message)
             if self._scene is not None:
                 self._write_scene(self._scene, stamp, sample)
-            storage = self._writer.storage
-            full = isinstance(storage, McapWriter) and storage.chunk.bio.tell() > CHUNK_SIZE
-            if full or time.monotonic() - self._flushed > FLUSH_PERIOD:
+            late = time.monotonic() - self._flushed > FLUSH_PERIOD
+            if late or self._pending > CHUNK_SIZE:
                 self._flush()
         except (OSError, sqlite3.Error) as error:
             self._salvage()
+            kept = self._writer.counts[self._joint_states.id]
             raise BagError(
                 f"cannot go on writing the bag '{self.path}': {_reason(error)};"
-                f" it is closed with what was written up to sample {sample.k}"
+                f" it is closed with its first {kept} samples"
             ) from error
 
     def __exit__(self, *exception: object) -> None:
@@ -183,12 +196,14 @@ class Bag:
     def _add(self, topic: str, kind: str, qos: Qos) -> Connection:
         return self._writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=[qos])
 
-    def _write(self, connection: Connection, stamp: int, kind: str, message: object) -> None:
-        self._writer.write(connection, stamp, STORE.serialize_cdr(message, kind))
+    def _put(self, connection: Connection, stamp: int, message: object) -> None:
+        data = STORE.serialize_cdr(message, connection.msgtype)
+        self._writer.write(connection, stamp, data)
+        self._pending += len(data)
 
     def _write_scene(self, scene: Scene, stamp: int, sample: Sample) -> None:
         def put(topic: str, message: object) -> None:
-            self._write(self._connections[topic], stamp, SCENE_TOPICS[topic][0], message)
+            self._put(self._connections[topic], stamp, message)
 
         if sample.k == 0:
             put("/robot_description", Message["std_msgs/msg/String"](data=scene.description))
@@ -212,6 +227,7 @@ class Bag:
         elif isinstance(storage, Sqlite3Writer):
             storage.conn.commit()
         self._flushed = time.monotonic()
+        self._pending = 0
 
     def _salvage(self) -> None:
         """Give up the reserve and bring the storage into a state in which it can be closed."""
@@ -247,12 +263,24 @@ def _reason(error: Exception) -> str:
 
 
 def _check_free(path: Path, overwrite: bool) -> None:
-    if not path.exists():
-        return
+    try:
+        if not path.exists():
+            return
+    except OSError as error:
+        raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
     if not overwrite:
         raise BagError(f"'{path}' exists already; choose another name with -o or use --overwrite")
-    if not (path / "metadata.yaml").exists() and not (path / PROVENANCE).exists():
+    if path.is_symlink() or not _is_bag(path):
         raise BagError(f"'{path}' is not a bag and is not overwritten")
+
+
+def _is_bag(path: Path) -> bool:
+    """A folder with rosbag2's metadata, or with our provenance where the writer died."""
+    try:
+        metadata = (path / "metadata.yaml").read_text("utf-8", "replace")
+        return metadata.startswith("rosbag2_bagfile_information:")
+    except OSError:
+        return bool(_read_provenance(path))
 
 
 def _write_reserve(path: Path) -> None:
@@ -272,13 +300,18 @@ def _load_scene(run: Experiment) -> Scene:
     )
 
 
+def _json(value: object) -> str:
+    """JSON without a single space: writers of YAML fold at spaces, and not all do it right."""
+    return json.dumps(value, separators=(",", ":")).replace(" ", "\\u0020")
+
+
 def _provenance(run: Experiment, stamp_start: int, command_line: str) -> dict[str, Any]:
     """What plots, replay and recovery need to know; readable by anything that reads JSON."""
     fmu = run.fmu
     urdf = read_resource(fmu, "robot.urdf")
     packages = ("numpy", "fmpy", "rosbags", "pin")
     return {
-        "format": 1,
+        "format": FORMAT,
         "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
         "robot": fmu.robot,
         "frame": fmu.frame,
@@ -298,6 +331,18 @@ def _provenance(run: Experiment, stamp_start: int, command_line: str) -> dict[st
         "command_line": command_line,
         "urdf": None if urdf is None else urdf.decode(),
     }
+
+
+def _joint_state(joints: Sequence[str], effort: bool) -> Any:
+    """A JointState to be filled in."""
+    n = len(joints)
+    return Message[JOINT_STATE](
+        header=_header(0, ""),
+        name=list(joints),
+        position=np.zeros(n),
+        velocity=np.zeros(n),
+        effort=np.zeros(n if effort else 0),
+    )
 
 
 def _header(stamp: int, frame: str) -> Any:
@@ -390,13 +435,17 @@ def read_bag(path: str | Path) -> Run:
             for connection, stamp, data in reader.messages(chosen):
                 message: Any = STORE.deserialize_cdr(data, connection.msgtype)
                 names = names or tuple(message.name)
+                if tuple(message.name) != names:
+                    raise BagError(f"'{path}' has joint states of different joints")
                 stamps.append(stamp)
                 rows.append((message.position, message.velocity, message.effort))
-    except (ReaderError, OSError, sqlite3.Error) as error:
+        q, v, effort = (np.array([row[i] for row in rows], dtype=np.float64) for i in range(3))
+    except BagError:
+        raise
+    except Exception as error:  # a damaged bag raises anything inside the reader
         raise BagError(f"cannot read the bag '{path}': {error}") from error
     if not rows:
         raise BagError(f"'{path}' has no joint states")
-    q, v, effort = (np.array([row[i] for row in rows], dtype=np.float64) for i in range(3))
     return Run(
         path=path,
         topics=topics,
@@ -417,4 +466,5 @@ def _read_provenance(path: Path) -> dict[str, Any]:
         found = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise BagError(f"cannot read '{file}': {error}") from error
-    return found if isinstance(found, dict) else {}
+    ours = isinstance(found, dict) and found.get("format") == FORMAT and "fmu" in found
+    return found if ours else {}

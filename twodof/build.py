@@ -18,7 +18,7 @@ import pythonfmu
 
 from . import __version__
 from .documentation import documentation
-from .errors import BuildError
+from .errors import ZIP_ERRORS, BuildError
 from .meshes import collect_meshes
 from .model_description import model_description
 from .plant import Plant, Robot, RobotError, Variable, load_robot, variable_table
@@ -89,8 +89,10 @@ def compose(options: FmuOptions) -> Files:
     """All files of the FMU by their path in it."""
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
-    urdf, meshes = _read_urdf(options)
-    robot, table, starts = _model(options, urdf)
+    path = options.urdf or data_file("urdf", "2dof.urdf")
+    text = _read_urdf(path)
+    robot, table, starts = _model(options, text)
+    urdf, meshes = collect_meshes(text, path.parent, _mesh_dir(options))
     sources = _slave_sources()
     config: dict[str, Any] = {
         "frame": options.frame,
@@ -149,18 +151,19 @@ def data_file(*parts: str) -> Path:
     return installed if installed.exists() else package.parent.joinpath(*parts)
 
 
-def _read_urdf(options: FmuOptions) -> tuple[str, Files]:
-    path = options.urdf or data_file("urdf", "2dof.urdf")
+def _read_urdf(path: Path) -> str:
     try:
-        text = path.read_text("utf-8")
+        return path.read_text("utf-8")
     except OSError as error:
         raise BuildError(f"cannot read the URDF '{path}': {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
+
+
+def _mesh_dir(options: FmuOptions) -> Path | None:
     if options.mesh_dir is not None and not options.mesh_dir.is_dir():
         raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
-    mesh_dir = options.mesh_dir if options.urdf else data_file("meshes")
-    return collect_meshes(text, path.parent, mesh_dir)
+    return options.mesh_dir if options.urdf else data_file("meshes")
 
 
 def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
@@ -231,7 +234,7 @@ def _holds(path: Path, files: Files) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.read("modelDescription.xml") == files["modelDescription.xml"]
-    except (OSError, KeyError, zipfile.BadZipFile):
+    except (*ZIP_ERRORS, KeyError):
         return False
 
 

@@ -30,24 +30,39 @@ INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    options = _parser().parse_args(arguments)
+    options.command_line = shlex.join(["twodof", *arguments])
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     try:
         status: int = options.verb(options)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         return status
-    except TwoDofError as error:
-        print(f"twodof: error: {error}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
-        print("twodof: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return _fail("interrupted", INTERRUPTED)
+    except TwoDofError as error:
+        return _fail(str(error))
     except BrokenPipeError:  # the reader of our output has left: nothing more to say
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence()
         return 1
+    except OSError as error:
+        _silence()
+        culprit = "" if error.filename is None else f"'{error.filename}': "
+        return _fail(f"{culprit}{error.strerror or error}")
+
+
+def _fail(message: str, status: int = 1) -> int:
+    print("twodof: error:", " ".join(message.split()), file=sys.stderr)
+    return status
+
+
+def _silence() -> None:
+    """What is still in the output's buffer cannot be written and must not fail again at exit."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -165,7 +180,7 @@ def _run(options: argparse.Namespace) -> int:
         effort=options.effort,
         stamp_start=options.stamp_start,
         overwrite=options.overwrite,
-        command_line=shlex.join(["twodof", *sys.argv[1:]]),
+        command_line=options.command_line,
     )
     pace = RealTime() if options.realtime else None
     with _asked_to_stop() as asked:

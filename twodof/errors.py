@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
+
+ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
+"""What reading a damaged, encrypted or foreign zip archive raises."""
+
 
 class TwoDofError(Exception):
     """Root of all errors that a user's input or machine can cause."""

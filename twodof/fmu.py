@@ -21,7 +21,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ModelDescription, ScalarVariable
 
-from .errors import FmuError, SimulationError
+from .errors import ZIP_ERRORS, FmuError, SimulationError
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
@@ -102,8 +102,7 @@ def load_fmu(path: str | Path) -> Fmu:
         description = fmpy.read_model_description(str(path), validate=True)
         root = ET.fromstring(xml)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
-        raise FmuError(f"'{path}': modelDescription.xml is not valid: {reason}") from error
+        raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
     if description.fmiVersion != "2.0" or description.coSimulation is None:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
         raise FmuError(
@@ -117,7 +116,9 @@ def load_fmu(path: str | Path) -> Fmu:
         **_vendor_annotation(root, description),
     )
     n = len(fmu.vector("q"))
-    if n == 0 or len(fmu.vector("v")) != n:
+    logged = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
+    real = all(v.causality == "output" and v.type == "Real" for v in logged)
+    if n == 0 or len(logged) != 2 * n or not real:
         raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
     if len(fmu.joints) != n:
         raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
@@ -158,9 +159,9 @@ class Instance:
     ) -> None:
         """Set start values and go through initialisation mode."""
         self.set(values)
-        self._call(self._slave.setupExperiment, startTime=start_time, stopTime=stop_time)
-        self._call(self._slave.enterInitializationMode)
-        self._call(self._slave.exitInitializationMode)
+        self._accept(self._slave.setupExperiment, startTime=start_time, stopTime=stop_time)
+        self._accept(self._slave.enterInitializationMode)
+        self._accept(self._slave.exitInitializationMode)
 
     def set(self, values: Mapping[str, float | bool]) -> None:
         """Set variables by name."""
@@ -169,7 +170,7 @@ class Instance:
             chosen = [variable for variable in chosen if variable.type == kind]
             if chosen:
                 references = [variable.valueReference for variable in chosen]
-                self._call(setter, references, [values[variable.name] for variable in chosen])
+                self._accept(setter, references, [values[variable.name] for variable in chosen])
 
     def step(self, t: float, h: float) -> None:
         """One communication step from t to t + h."""
@@ -204,6 +205,12 @@ class Instance:
             self._fatal = error.status == fmi2.fmi2Fatal
             raise SimulationError(self._said or str(error)) from error
 
+    def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
+        """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
+        self._call(function, *arguments, **named)
+        if self._said:
+            raise SimulationError(self._said)
+
     def _log(
         self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
     ) -> None:
@@ -229,8 +236,9 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
         try:
             with zipfile.ZipFile(fmu.path) as archive:
                 archive.extractall(folder)
-        except (OSError, zipfile.BadZipFile) as error:
+        except ZIP_ERRORS as error:
             raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
+        _check_wrapper_reads(fmu, Path(folder))
         instance = Instance(fmu, Path(folder))
         try:
             yield instance
@@ -238,13 +246,25 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
             instance.free()
 
 
+def _check_wrapper_reads(fmu: Fmu, folder: Path) -> None:
+    """pythonfmu's wrapper decodes no escape but %20, and crashes where it finds no resources."""
+    escapes = folder.as_uri().replace("%20", "")
+    if "%" in escapes and fmu.description.coSimulation.needsExecutionTool:
+        raise FmuError(
+            f"the temporary folder '{folder.parent}' has characters that the FMU's Python wrapper"
+            " cannot read; set TMPDIR to a folder with a plain name"
+        )
+
+
 def read_resource(fmu: Fmu, name: str) -> bytes | None:
     """A file of the FMU's resources/ folder, None where it has no such file."""
-    with zipfile.ZipFile(fmu.path) as archive:
-        try:
+    try:
+        with zipfile.ZipFile(fmu.path) as archive:
             return archive.read(f"resources/{name}")
-        except KeyError:
-            return None
+    except KeyError:
+        return None
+    except ZIP_ERRORS as error:
+        raise FmuError(f"cannot read resources/{name} of '{fmu.path}': {error}") from error
 
 
 def _read(path: Path) -> tuple[bytes, list[str]]:
@@ -269,8 +289,8 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
         raise FmuError(f"cannot read '{path}': {error.strerror}") from error
     except KeyError as error:
         raise FmuError(f"'{path}' is no FMU: it has no modelDescription.xml") from error
-    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        raise FmuError(f"'{path}' is no FMU: it is not a zip archive ({error})") from error
+    except ZIP_ERRORS as error:
+        raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
     if re.search(rb"<!\s*(DOCTYPE|ENTITY)", xml) or b"\0" in xml[:4]:
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, [member.filename for member in members]

@@ -5,14 +5,16 @@ from __future__ import annotations
 import csv
 import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from .errors import InputError
 from .fmu import Fmu
 
 Value = float | bool
-Setting = Value | Sequence[float]
+Setting = Any
+"""A number, a Boolean, or a sequence or array of numbers; checked by ``resolve``."""
 Changes = list[tuple[float, dict[str, Value]]]
 """Times in s, ascending, and the inputs that take new values there."""
 
@@ -52,36 +54,44 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
     for name, setting in settings.items():
         elements = [name] if name in fmu.variables else fmu.vector(name)
         if not elements:
-            raise InputError(f"there is no variable '{name}'{_suggestion(fmu, name)}")
-        if isinstance(setting, Sequence):
-            given: Sequence[Value] = setting
-            if len(given) != len(elements):
-                raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
-        else:
-            given = [setting] * len(elements)
+            settable = {**fmu.groups("input"), **fmu.groups("parameter")}
+            known = [*settable, *(element for group in settable.values() for element in group)]
+            raise InputError(f"there is no variable '{name}'{_suggestion(name, known)}")
+        # arrays give their own kind of numbers
+        plain = setting.tolist() if hasattr(setting, "tolist") else setting
+        given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
+        if len(given) != len(elements):
+            raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
         for element, value in zip(elements, given, strict=True):
             values[element] = _checked(fmu, element, value)
     return values
 
 
-def _checked(fmu: Fmu, name: str, value: Value) -> Value:
+def _checked(fmu: Fmu, name: str, value: object) -> Value:
     variable = fmu.variables[name]
     if variable.causality not in ("input", "parameter"):
         raise InputError(f"{name} is of causality '{variable.causality}' and cannot be set")
-    if (variable.type == "Boolean") != isinstance(value, bool):
-        kind = "true or false" if variable.type == "Boolean" else "a number"
-        raise InputError(f"{name} = {value}: expected {kind}")
-    if not isinstance(value, bool):
-        value = float(value)
-        if not math.isfinite(value):
-            raise InputError(f"{name} = {value} is not finite")
-    return value
+    if variable.type == "Boolean":
+        if not isinstance(value, bool):
+            raise InputError(f"{name} = {value!r}: expected true or false")
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{name} = {value!r}: expected a number")
+    if not math.isfinite(value):
+        raise InputError(f"{name} = {value} is not finite")
+    return float(value)
 
 
-def _suggestion(fmu: Fmu, name: str) -> str:
-    settable = {*fmu.groups("input"), *fmu.groups("parameter"), *fmu.variables}
-    near = difflib.get_close_matches(name, sorted(settable), n=1, cutoff=0.4)
-    return f"; did you mean '{near[0]}'?" if near else f"; there are: {', '.join(sorted(settable))}"
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    known = list(known)
+    near = [f"{name}[1]"] if f"{name}[1]" in known else _nearest(name, known)
+    return f"; did you mean '{near[0]}'?" if near else f"; there are: {', '.join(known)}"
+
+
+def _nearest(name: str, known: list[str]) -> list[str]:
+    by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
+    near = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.4)
+    return [by_lower[match] for match in near]
 
 
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
@@ -95,14 +105,15 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+            lines = enumerate(csv.reader(file), start=1)
+            rows = [(number, row) for number, row in lines if any(map(str.strip, row))]
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"'{path}' is not a CSV file: {error}") from error
-    if not rows:
-        raise InputError(f"'{path}' is empty")
-    header = [cell.strip() for cell in rows[0]]
+    if len(rows) < 2:
+        raise InputError(f"'{path}' {'has no rows' if rows else 'is empty'}")
+    header = [cell.strip() for cell in rows[0][1]]
     if "time" not in header:
         raise InputError(f"'{path}' has no column 'time'")
     for i, name in enumerate(header):
@@ -111,11 +122,12 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
         if name == "time":
             continue
         if name not in fmu.variables:
-            raise InputError(f"'{path}': there is no variable '{name}'{_suggestion(fmu, name)}")
+            known = [element for group in fmu.groups("input").values() for element in group]
+            raise InputError(f"'{path}': there is no variable '{name}'{_suggestion(name, known)}")
         if fmu.variables[name].causality != "input":
             raise InputError(f"'{path}': {name} is not an input")
     changes: Changes = []
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(f"'{path}' row {number}: {len(row)} cells, expected {len(header)}")
         values: dict[str, Value] = {}

@@ -125,6 +125,8 @@ def _steps(start: float, stop: float, h: float) -> int:
         raise InputError(f"step {h:g} s must be > 0")
     if not (isfinite(start) and isfinite(stop) and stop > start):
         raise InputError(f"stop time {stop:g} s must be after the start time {start:g} s")
+    if not isfinite((stop - start) / h):
+        raise InputError(f"step {h!r} s is too small for a run of {stop - start:g} s")
     steps = round((stop - start) / h)
     if abs(steps * h - (stop - start)) > TIME_TOLERANCE * h * max(1, steps):
         raise InputError(f"the run of {stop - start:g} s is no whole number of steps of {h:g} s")

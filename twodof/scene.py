@@ -101,7 +101,7 @@ def _read_joint(element: ET.Element, joints: Sequence[str]) -> _Joint:
         child=element.find("child").get("link", ""),  # type: ignore[union-attr]
         kind=element.get("type", ""),
         origin=_origin(element.find("origin")),
-        axis=axis / np.linalg.norm(axis),
+        axis=axis / (np.linalg.norm(axis) or 1.0),  # fixed joints may have a zero axis
         coordinate=joints.index(name) if name in joints else None,
     )
 

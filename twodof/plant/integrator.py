@@ -13,7 +13,8 @@ the others, whose accelerations stay those of the equations of motion.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isfinite, sqrt
+from dataclasses import dataclass
+from math import inf, isfinite, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +49,23 @@ P = np.array(
     ]
 )
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
-STEP_FLOOR = 2.0**-10
+STEP_FLOOR = 2.0**-8
 """Smallest step, as a part of the first one. Across a singularity of the Jacobian the right-hand
 side jumps and no step satisfies the error test; a step of this size is taken as it is."""
+PATIENCE = 0.25
+"""As a part of the largest step: a joint that is back at its limit sooner than this after leaving
+it is kept there for as long. Where its acceleration only grazes zero, as it may at a singularity,
+it would else leave and return without end."""
 TIME_RESOLUTION = 2.0**-52
+
+
+@dataclass
+class _Stops:
+    """Joints at rest at a limit: all of them, and those that may leave it when they are drawn."""
+
+    limits: Limits
+    held: list[int]
+    watched: list[int]
 
 
 def advance(
@@ -82,8 +96,21 @@ def advance(
     """
     y = np.array([*q, *v])
     t = 0.0
+    patience = PATIENCE * min(max_step, h)
+    left = [-inf] * len(limits)  # when each joint last left its limit
+    kept = [0.0] * len(limits)  # until when each joint is kept at its limit
     while t < h:
-        t, y = _until_event(acceleration, y, t, h, limits, rtol, atol, max_step)
+        end = min((until for until in kept if until > t), default=h)
+        stops, y, f = _hold(acceleration, y, limits, [until > t for until in kept])
+        for i, (low, high) in enumerate(limits):
+            if i not in stops.held and not low < y[i] < high:
+                left[i] = t
+        t, y, stopped = _until_event(
+            acceleration, y, f, t, min(end, h), stops, rtol, atol, max_step
+        )
+        for i in stopped:
+            if t - left[i] < patience:
+                kept[i] = t + patience
     state = y.tolist()
     return state[: len(q)], state[len(q) :]
 
@@ -91,18 +118,21 @@ def advance(
 def _until_event(
     acceleration: Acceleration,
     y: Array,
+    f: list[float],
     t: float,
     end: float,
-    limits: Limits,
+    stops: _Stops,
     rtol: float,
     atol: float,
     max_step: float,
-) -> tuple[float, Array]:
-    """Integrate from t until a joint reaches or leaves a limit, or until the end: (t, y) there."""
-    n = len(limits)
+) -> tuple[float, Array, list[int]]:
+    """Integrate from t until a joint reaches or leaves a limit, or until the end.
+
+    Returns the time, the state there, and the joints that reached a limit. f is q̈ at y.
+    """
+    n = len(f)
     first = min(max_step, end - t)
     floor = STEP_FLOOR * first
-    held, y, f = _hold(acceleration, y, limits)
     K = np.empty((7, 2 * n))
     K[0, :n] = y[n:]
     K[0, n:] = f
@@ -111,16 +141,16 @@ def _until_event(
         last = t + step * (1 + 1e-9) >= end
         if last:
             step = end - t
-        y_new, error = _dormand_prince(acceleration, y, step, held, K)
+        y_new, error = _dormand_prince(acceleration, y, step, stops.held, K)
         ratio = error / (atol + rtol * np.maximum(np.abs(y), np.abs(y_new)))
         norm = sqrt(ratio.dot(ratio) / (2 * n))
         if norm < 1.0 or (step <= floor and isfinite(norm)):
-            event = _first_event(acceleration, y, y_new, step, held, K, limits)
+            event = _first_event(acceleration, y, y_new, step, stops, K)
             if event is not None:
-                passed, y = event
-                return (end if last and passed == step else t + passed), y
+                passed, y, stopped = event
+                return (end if last and passed == step else t + passed), y, stopped
             if last:
-                return end, y_new
+                return end, y_new, []
             t, y = t + step, y_new
             K[0] = K[6]
             factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
@@ -151,70 +181,66 @@ def _dormand_prince(
 
 
 def _hold(
-    acceleration: Acceleration, y: Array, limits: Limits
-) -> tuple[list[int], Array, list[float]]:
-    """Joints held at a limit; y with their velocity taken; the accelerations left."""
+    acceleration: Acceleration, y: Array, limits: Limits, kept: list[bool]
+) -> tuple[_Stops, Array, list[float]]:
+    """Joints that rest at a limit; y with the velocity into it taken; the accelerations left."""
     n = len(limits)
-    stopped = y.copy()
+    y = y.copy()
     for i, (low, high) in enumerate(limits):
         if (y[i] >= high and y[n + i] > 0.0) or (y[i] <= low and y[n + i] < 0.0):
-            stopped[n + i] = 0.0
-    a = list(acceleration(stopped[:n], stopped[n:]))
+            y[n + i] = 0.0
+    a = list(acceleration(y[:n], y[n:]))
     held = []
     for i, (low, high) in enumerate(limits):
         into = (y[i] >= high and a[i] >= 0.0) or (y[i] <= low and a[i] <= 0.0)
-        if into and stopped[n + i] == 0.0:
+        if (into or kept[i]) and y[n + i] == 0.0:
             held.append(i)
             a[i] = 0.0
-    return held, stopped, a
+    return _Stops(limits, held, [i for i in held if not kept[i]]), y, a
 
 
 def _first_event(
-    acceleration: Acceleration,
-    y: Array,
-    y_new: Array,
-    step: float,
-    held: list[int],
-    K: Array,
-    limits: Limits,
-) -> tuple[float, Array] | None:
-    """First time in (0, step] at which a limit is reached or left, and the state from there on."""
-    n = len(limits)
+    acceleration: Acceleration, y: Array, y_new: Array, step: float, stops: _Stops, K: Array
+) -> tuple[float, Array, list[int]] | None:
+    """First time in (0, step] at which a limit is reached or left.
+
+    Returns that time, the state from there on, and the joints that reached a limit.
+    """
+    n = len(stops.limits)
     Q = K.T.dot(P)
 
     def state(passed: float) -> Array:
         return y_new if passed == step else _dense_output(y, Q, passed / step, step)
 
     latest = step
-    if not _events(acceleration, y_new, held, limits):
-        excursion = _excursion(y, y_new, state, step, limits)
+    if not _events(acceleration, y_new, stops):
+        excursion = _excursion(y, y_new, state, step, stops.limits)
         if excursion is None:
             return None
         latest = excursion
-    latest = _bisect(
-        lambda passed: bool(_events(acceleration, state(passed), held, limits)), latest, step
-    )
-    reached = state(latest).copy()
-    for i in _events(acceleration, reached, held, limits):
-        if i not in held:
-            reached[i] = min(max(reached[i], limits[i][0]), limits[i][1])
-            reached[n + i] = 0.0
-    return latest, reached
+    latest = _bisect(lambda passed: bool(_events(acceleration, state(passed), stops)), latest, step)
+    y = state(latest).copy()
+    stopped = [i for i in _events(acceleration, y, stops) if i not in stops.held]
+    for i in stopped:
+        low, high = stops.limits[i]
+        y[i] = min(max(y[i], low), high)
+        y[n + i] = 0.0
+    return latest, y, stopped
 
 
-def _events(acceleration: Acceleration, y: Array, held: list[int], limits: Limits) -> list[int]:
-    """Free joints that are past a limit and held joints that would leave theirs, at y."""
-    n = len(limits)
+def _events(acceleration: Acceleration, y: Array, stops: _Stops) -> list[int]:
+    """Free joints that are past a limit and watched joints that leave theirs, at y."""
+    n = len(stops.limits)
     values = y.tolist()
     found = []
-    for i, (low, high) in enumerate(limits):
+    for i, (low, high) in enumerate(stops.limits):
         q, v = values[i], values[n + i]
         if (q >= high and (q > high or v > 0.0)) or (q <= low and (q < low or v < 0.0)):
             found.append(i)
-    if held:
+    if stops.watched:
         a = acceleration(y[:n], y[n:])
-        for i in held:
-            low, high = limits[i]
+        for i in stops.watched:
+            low, high = stops.limits[i]
             leaves = a[i] < 0.0 if values[i] >= high else a[i] > 0.0
             if leaves and low < high:
                 found.append(i)

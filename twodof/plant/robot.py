@@ -17,7 +17,8 @@ UNBOUNDED = 1.7976931348623157e308
 """Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
-MAX_JOINTS = 1000
+MAX_LINKS = 1000
+MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
 LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
 
 
@@ -68,7 +69,7 @@ def load_robot(urdf: str, frame: str, axes: str) -> Robot:
 
     Args:
         urdf: XML text.
-        frame: link (or joint) name whose origin is the end effector.
+        frame: name of the link whose origin is the end effector.
         axes: one to three different letters of "xyz", the task's axes in the root frame.
 
     Raises:
@@ -78,28 +79,27 @@ def load_robot(urdf: str, frame: str, axes: str) -> Robot:
         raise RobotError(f"axes '{axes}': expected one to three different letters of x, y, z")
     tree = _parse(urdf)
     root, warnings = _check(tree)
-    _one_coordinate_each(tree)
+    links = [str(link.get("name")) for link in tree.findall("link")]
+    if frame not in links:
+        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(links)}")
     try:
-        model = pin.buildModelFromXML(ET.tostring(tree, encoding="unicode"))
+        model = pin.buildModelFromXML(ET.tostring(_mechanism(tree), encoding="unicode"))
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"Pinocchio cannot read the URDF: {error}") from error
-    if not model.existFrame(frame):
-        known = ", ".join(f.name for f in model.frames if f.type == pin.FrameType.BODY)
-        raise RobotError(f"no frame '{frame}' in the URDF; there are: {known}")
-    xml = {j.get("name"): j for j in tree.iter("joint") if j.get("type") != "fixed"}
+    xml = {str(joint.get("name")): joint for joint in tree.findall("joint")}
     joints = tuple(model.names)[1:]
     _check_mass_matrix(model, joints)
     return Robot(
-        name=model.name,
+        name=tree.get("name", ""),
         model=model,
         joints=joints,
         prismatic=tuple(xml[j].get("type") == "prismatic" for j in joints),
-        q_min=tuple(_attribute(xml[j], "limit", "lower", 0.0) for j in joints),
-        q_max=tuple(_attribute(xml[j], "limit", "upper", 0.0) for j in joints),
+        q_min=tuple(_limits(xml[j])[0] for j in joints),
+        q_max=tuple(_limits(xml[j])[1] for j in joints),
         effort=tuple(_attribute(xml[j], "limit", "effort", 0.0) or math.inf for j in joints),
         damping=tuple(_attribute(xml[j], "dynamics", "damping", 0.0) for j in joints),
         frame=frame,
-        frame_id=model.getFrameId(frame),
+        frame_id=model.getFrameId(frame, pin.FrameType.BODY),
         axes=axes,
         root=root,
         warnings=tuple(warnings),
@@ -115,10 +115,6 @@ def _parse(urdf: str) -> ET.Element:
         raise RobotError(f"the URDF is not XML: {error}") from error
     if tree.tag != "robot":
         raise RobotError(f"the URDF's root element is <{tree.tag}>, expected <robot>")
-    # only what describes the mechanism: <transmission> and <gazebo> have joints of their own
-    for child in list(tree):
-        if child.tag not in ("link", "joint"):
-            tree.remove(child)
     return tree
 
 
@@ -126,8 +122,10 @@ def _check(tree: ET.Element) -> tuple[str, list[str]]:
     """Refuse what is not supported; the root link's name and the warnings."""
     links = _by_name(tree, "link")
     joints = _by_name(tree, "joint")
-    if len(links) > MAX_JOINTS:
-        raise RobotError(f"the URDF has {len(links)} links; at most {MAX_JOINTS} are supported")
+    moving = [name for name, joint in joints.items() if joint.get("type") != "fixed"]
+    for what, names, most in (("links", links, MAX_LINKS), ("moving joints", moving, MAX_JOINTS)):
+        if len(names) > most:
+            raise RobotError(f"the URDF has {len(names)} {what}; at most {most} are supported")
     for tag, elements in (("link", links), ("joint", joints)):
         for name, element in elements.items():
             _check_numbers(element, f"{tag} '{name}'")
@@ -150,7 +148,7 @@ def _check(tree: ET.Element) -> tuple[str, list[str]]:
         if kind != "continuous":
             if joint.find("limit") is None:
                 raise RobotError(f"joint '{name}' has no <limit>, which type '{kind}' needs")
-            lower, upper = (_attribute(joint, "limit", key, 0.0) for key in ("lower", "upper"))
+            lower, upper = _limits(joint)
             if lower > upper:
                 raise RobotError(f"joint '{name}': lower limit {lower:g} > upper limit {upper:g}")
         for tag, key in (("limit", "effort"), ("dynamics", "damping")):
@@ -161,7 +159,7 @@ def _check(tree: ET.Element) -> tuple[str, list[str]]:
         if not any(_vector(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))):
             raise RobotError(f"joint '{name}': its axis is zero")
         _check_body(joint, links, joints)
-    if all(joint.get("type") == "fixed" for joint in joints.values()):
+    if not moving:
         raise RobotError("the URDF has no moving joint")
     return root, warnings
 
@@ -238,13 +236,8 @@ def _check_body(
     mass = 0.0
     for name in body:
         inertial = links[name].find("inertial")
-        if inertial is None:
-            continue
-        value = _attribute(inertial, "mass", "value", 0.0)
-        if value < 0:
-            raise RobotError(f"link '{name}': negative mass {value:g} kg")
-        mass += value
-        _check_inertia(name, inertial)
+        if inertial is not None:
+            mass += _check_inertia(name, inertial)
     if mass == 0.0:
         raise RobotError(
             f"link '{first}' moves (joint '{joint.get('name')}') but has no mass;"
@@ -252,9 +245,17 @@ def _check_body(
         )
 
 
-def _check_inertia(link: str, inertial: ET.Element) -> None:
-    entries = [_attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS]
-    xx, xy, xz, yy, yz, zz = entries
+def _check_inertia(link: str, inertial: ET.Element) -> float:
+    """The link's mass, after the checks."""
+    for tag, keys in (("mass", ("value",)), ("inertia", _INERTIA_KEYS)):
+        element = inertial.find(tag)
+        missing = [key for key in keys if element is None or element.get(key) is None]
+        if missing:
+            raise RobotError(f"link '{link}': its <inertial> has no <{tag} {' '.join(missing)}>")
+    mass = _attribute(inertial, "mass", "value", 0.0)
+    if mass < 0.0:
+        raise RobotError(f"link '{link}': negative mass {mass:g} kg")
+    xx, xy, xz, yy, yz, zz = (_attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS)
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     slack = 1e-6 * float(np.abs(moments).sum()) + 1e-15  # URDFs are written with few digits
     if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
@@ -263,35 +264,51 @@ def _check_inertia(link: str, inertial: ET.Element) -> None:
             f"link '{link}': its inertia is not physical, principal moments {text} kg·m2"
             " must be positive and none larger than the sum of the other two"
         )
+    return mass
 
 
 _INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-def _one_coordinate_each(tree: ET.Element) -> None:
-    """Make continuous joints revolute without limits, so that Pinocchio's state is the angle."""
+def _mechanism(tree: ET.Element) -> ET.Element:
+    """The URDF of the bare mechanism: inertias, joints, limits, and nothing else.
+
+    urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here.
+    Continuous joints become revolute without limits, so that Pinocchio's state is the angle.
+    """
+    bare = ET.Element("robot", name=tree.get("name") or "robot")
+    for link in tree.findall("link"):
+        copy = ET.SubElement(bare, "link", name=str(link.get("name")))
+        copy.extend(link.findall("inertial"))
     for joint in tree.findall("joint"):
-        if joint.get("type") == "fixed":
+        kind = str(joint.get("type"))
+        copy = ET.SubElement(bare, "joint", name=str(joint.get("name")), type=kind)
+        copy.extend(e for e in joint if e.tag in ("parent", "child", "origin"))
+        if kind == "fixed":
             continue
-        limit = joint.find("limit")
-        if limit is None:
-            limit = ET.SubElement(joint, "limit")
-        for key in ("effort", "velocity"):  # urdfdom insists on both
-            limit.set(key, limit.get(key, "0"))
-        if joint.get("type") == "continuous":
-            joint.set("type", "revolute")
-            limit.set("lower", repr(-UNBOUNDED))
-            limit.set("upper", repr(UNBOUNDED))
+        copy.extend(joint.findall("axis"))
+        low, high = _limits(joint)
+        ET.SubElement(copy, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
+        if kind == "continuous":
+            copy.set("type", "revolute")
+    return bare
+
+
+def _limits(joint: ET.Element) -> tuple[float, float]:
+    if joint.get("type") == "continuous":
+        return -UNBOUNDED, UNBOUNDED
+    return _attribute(joint, "limit", "lower", 0.0), _attribute(joint, "limit", "upper", 0.0)
 
 
 def _check_mass_matrix(model: pin.Model, joints: tuple[str, ...]) -> None:
+    """Every joint, the outermost first, must have something to move."""
     mass_matrix = pin.crba(model, model.createData(), np.zeros(model.nq))
     mass_matrix = np.triu(mass_matrix) + np.triu(mass_matrix, 1).T
-    for i, joint in enumerate(joints):
+    for i in reversed(range(len(joints))):
         block = mass_matrix[i:, i:]
-        if not np.linalg.eigvalsh(block)[0] > 1e-12 * max(1e-12, np.trace(block)):
+        if not np.linalg.eigvalsh(block)[0] > 1e-12 * np.trace(block):
             raise RobotError(
-                f"joint '{joint}': the links behind it have no inertia about its axis,"
+                f"joint '{joints[i]}': the links behind it have no inertia about its axis,"
                 " so its acceleration is not defined"
             )
 

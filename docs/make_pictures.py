@@ -1,0 +1,239 @@
+"""Makes docs/arm.png, the README's picture, and fmu_src/model.png, the icon in FMI tools.
+
+    python docs/make_pictures.py
+
+The picture shows the default run, from the samples of the FMU itself, with the arm drawn from its
+meshes as seen from above. The icon suits the FMU of any robot. Needs matplotlib.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import twodof  # noqa: E402
+
+LINK = 0.15  # m
+LINK_COLOURS = {"link1": (0.33, 0.40, 0.49), "link2": (0.96, 0.55, 0.14)}
+INK, GREY, BLUE, ORANGE = "#1f2933", "#8a94a0", "#0060a8", "#f58c24"
+WINDOW = (-0.110, 0.470, -0.148, 0.236)  # m: left, right, bottom, top
+WIDTH = 1200  # pixels
+OVERSAMPLING = 3
+LIGHT = np.array([-0.45, 0.60, 0.66])
+STEP_IN_DEPTH = 0.0012  # m: an edge is drawn where the depth jumps by more
+
+
+def main() -> None:
+    """Make both pictures."""
+    plt.rcParams.update({"font.family": "DejaVu Sans", "text.color": INK})
+    with tempfile.TemporaryDirectory() as folder:
+        fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
+        samples = list(twodof.samples(fmu))
+    draw_arm(samples, ROOT / "docs" / "arm.png")
+    draw_icon(ROOT / "fmu_src" / "model.png")
+
+
+# --- the arm ---
+
+
+def draw_arm(samples: list[twodof.Sample], path: Path) -> None:
+    """The arm at the start and at the end, with what its end effector did between."""
+    left, right, bottom, top = WINDOW
+    height = round(WIDTH * (top - bottom) / (right - left))
+    figure = plt.figure(figsize=(WIDTH / 150, height / 150), dpi=150)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    axes.axis("off")
+    first, last = samples[0], samples[-1]
+    draw_scale(axes)
+    for sample, opacity in ((first, 0.30), (last, 1.0)):
+        image = render(triangles(sample.q), height)
+        image[..., 3] *= opacity
+        axes.imshow(image, extent=WINDOW, interpolation="none", zorder=2 + opacity)
+    draw_path(axes, samples)
+    figure.savefig(path, pil_kwargs={"optimize": True}, metadata={"Software": None})
+    plt.close(figure)
+
+
+def draw_scale(axes: plt.Axes) -> None:
+    """Scales in metres with the base at 0, and the circle of the arm's reach."""
+    reach = 2 * LINK
+    axes.add_patch(Arc((0, 0), 2 * reach, 2 * reach, color=GREY, lw=1.4, ls=(0, (6, 4)), zorder=1))
+    left, _, bottom, _ = WINDOW
+    x, y = left + 0.040, bottom + 0.025
+    axes.plot([0, 0.3], [y, y], color=INK, lw=1.2)
+    axes.plot([x, x], [-0.1, 0.2], color=INK, lw=1.2)
+    text = {"fontsize": 11}
+    for tick in (0.0, 0.1, 0.2, 0.3):
+        axes.plot([tick, tick], [y - 0.003, y + 0.003], color=INK, lw=1.2)
+        axes.text(tick, y - 0.007, f"{tick:g}", ha="center", va="top", **text)
+    for tick in (-0.1, 0.0, 0.1, 0.2):
+        axes.plot([x - 0.003, x + 0.003], [tick, tick], color=INK, lw=1.2)
+        label = f"{tick:g}".replace("-", "\N{MINUS SIGN}")
+        axes.text(x - 0.006, tick, label, ha="right", va="center", **text)
+    axes.text(0.309, y, "x in m", va="center", **text)
+    axes.text(x, 0.209, "y in m", ha="center", va="bottom", **text)
+
+
+def draw_path(axes: plt.Axes, samples: list[twodof.Sample]) -> None:
+    """The path of the end effector with a dot every half second, its target, and the notes."""
+    x = np.array([sample.x for sample in samples])
+    target = np.array([samples[0].inputs[f"x_des[{k}]"] for k in (1, 2)])
+    axes.plot(*x.T, color="white", lw=5.5, zorder=4, solid_capstyle="round")
+    axes.plot(*x.T, color=BLUE, lw=2.6, zorder=5, solid_capstyle="round")
+    axes.plot(*x[::50].T, "o", color=BLUE, ms=6.5, mec="white", mew=1.2, zorder=6)
+    axes.plot(*target, "+", color="white", ms=25, mew=5.0, zorder=7)
+    axes.plot(*target, "+", color=INK, ms=22, mew=2.2, zorder=8)
+    reach = 2 * LINK * np.array([np.cos(-0.22), np.sin(-0.22)])
+    end = f"end, at the target\n({target[0]:g}, {target[1]:g})"
+    for point, gap, text, colour in (
+        (x[0], 0.016, "start", BLUE),
+        (0.5 * (x[0] + x[50]), 0.006, "path of the end effector,\na dot every 0.5 s", BLUE),
+        (target, 0.018, end, INK),
+        (reach, 0.004, "reach of the arm", "#5b6570"),
+    ):
+        axes.plot([point[0] + gap, 0.309], [point[1]] * 2, color=colour, lw=0.8, zorder=3.5)
+        axes.text(0.314, point[1], text, color=colour, fontsize=12, va="center")
+
+
+def triangles(q: tuple[float, ...]) -> list[tuple[np.ndarray, tuple[float, float, float]]]:
+    """Each link's triangles, n × 3 × 3 in m, where angles q put them, and its colour."""
+    elbow = (LINK * np.cos(q[0]), LINK * np.sin(q[0]), 0.0)
+    poses = {"link1": (q[0], (0.0, 0.0, 0.0)), "link2": (q[0] + q[1], elbow)}
+    placed = []
+    for link, (angle, origin) in poses.items():
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        placed.append((read_stl(ROOT / "meshes" / f"{link}.stl") @ turn.T + origin, link))
+    return [(corners, LINK_COLOURS[link]) for corners, link in placed]
+
+
+def read_stl(path: Path) -> np.ndarray:
+    """Triangles of a binary STL, n × 3 × 3."""
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
+    return np.frombuffer(path.read_bytes(), record, offset=84)["corners"].astype(float)
+
+
+def render(parts: list[tuple[np.ndarray, tuple[float, float, float]]], height: int) -> np.ndarray:
+    """RGBA image of triangles seen from above: a depth buffer, shading and drawn edges."""
+    rows, columns = height * OVERSAMPLING, WIDTH * OVERSAMPLING
+    left, right, _, top = WINDOW
+    scale = columns / (right - left)
+    depth = np.full((rows, columns), -1.0)
+    image = np.zeros((rows, columns, 4))
+    for corners, colour in parts:
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
+        pixels = np.stack(
+            [(corners[..., 0] - left) * scale, (top - corners[..., 1]) * scale], axis=-1
+        )
+        for (a, b, c), z, normal in zip(pixels, corners[..., 2], normals, strict=True):
+            if normal[2] > 1e-6:
+                fill(depth, image, (a, b, c), z, shade(colour, normal))
+    edges = np.zeros((rows, columns), dtype=bool)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(depth, axis=axis)) > STEP_IN_DEPTH
+        pair = (jump[:-1], jump[1:]) if axis == 0 else (jump[:, :-1], jump[:, 1:])
+        inner = (slice(1, -1), slice(None)) if axis == 0 else (slice(None), slice(1, -1))
+        edges[inner] |= pair[0] | pair[1]
+    image[edges] = (0.10, 0.13, 0.17, 1.0)
+    image[..., :3] *= image[..., 3:]
+    blocks = image.reshape(height, OVERSAMPLING, WIDTH, OVERSAMPLING, 4).mean(axis=(1, 3))
+    blocks[..., :3] /= np.maximum(blocks[..., 3:], 1e-9)
+    return blocks
+
+
+def shade(colour: tuple[float, float, float], normal: np.ndarray) -> np.ndarray:
+    """Diffuse light from the upper left and a soft highlight."""
+    light = LIGHT / np.linalg.norm(LIGHT)
+    diffuse = max(0.0, float(normal @ light))
+    half = light + np.array([0.0, 0.0, 1.0])
+    highlight = max(0.0, float(normal @ half / np.linalg.norm(half))) ** 30
+    return np.clip(np.array(colour) * (0.45 + 0.75 * diffuse) + 0.10 * highlight, 0.0, 1.0)
+
+
+def fill(
+    depth: np.ndarray,
+    image: np.ndarray,
+    corners: tuple[np.ndarray, np.ndarray, np.ndarray],
+    z: np.ndarray,
+    colour: np.ndarray,
+) -> None:
+    """Draw one triangle, corners in pixels, where it is nearer than what is there."""
+    a, b, c = corners
+    low = np.maximum(np.floor(np.min(corners, axis=0)).astype(int), 0)
+    high = np.minimum(np.ceil(np.max(corners, axis=0)).astype(int) + 1, depth.shape[::-1])
+    area = (b[1] - c[1]) * (a[0] - c[0]) + (c[0] - b[0]) * (a[1] - c[1])
+    if area == 0.0 or (high <= low).any():
+        return
+    x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
+    u = ((b[1] - c[1]) * (x - c[0]) + (c[0] - b[0]) * (y - c[1])) / area
+    v = ((c[1] - a[1]) * (x - c[0]) + (a[0] - c[0]) * (y - c[1])) / area
+    w = 1.0 - u - v
+    window = (slice(low[1], high[1]), slice(low[0], high[0]))
+    new = u * z[0] + v * z[1] + w * z[2]
+    seen = (u >= -1e-9) & (v >= -1e-9) & (w >= -1e-9) & (new > depth[window])
+    depth[window][seen] = new[seen]
+    image[window][seen] = (*colour, 1.0)
+
+
+# --- the icon ---
+
+
+def draw_icon(path: Path) -> None:
+    """A robot arm in a block, with inputs that come in and outputs that go out."""
+    figure = plt.figure(figsize=(3.0, 2.0), dpi=100)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0, 300), ylim=(0, 200))
+    axes.axis("off")
+    axes.add_patch(
+        FancyBboxPatch(
+            (74, 8), 152, 184, boxstyle="round,pad=0,rounding_size=10",
+            facecolor="#f4f6f8", edgecolor=INK, lw=1.6,
+        )
+    )  # fmt: skip
+    arm = np.array([[116, 42], [116, 88], [158, 138], [198, 110]], dtype=float)
+    axes.plot([94, 138], [30, 30], color=INK, lw=5, solid_capstyle="round")
+    looks = ((INK, 15), ("#54657c", 12), (ORANGE, 9))
+    for link, (colour, width) in zip(pairwise(arm), looks, strict=True):
+        axes.plot(*np.transpose(link), color=colour, lw=width, solid_capstyle="round")
+    for joint, radius in zip(arm[1:3], (6.0, 5.0), strict=True):
+        axes.add_patch(Circle(joint, radius, facecolor="white", edgecolor=INK, lw=1.2, zorder=5))
+    axes.add_patch(Circle(arm[3], 3.4, facecolor="white", edgecolor=INK, lw=1.2, zorder=5))
+    labels = {"fontsize": 12, "va": "center"}
+    for text, y in (("$x_{des}$", 150), ("$K_p$", 100), ("$K_d$", 50)):
+        axes.text(8, y, text, ha="left", **labels)
+        arrow(axes, 48, 74, y)
+    for text, y in (("$q$", 130), ("$v$", 70)):
+        arrow(axes, 226, 258, y)
+        axes.text(270, y, text, ha="left", **labels)
+    figure.savefig(
+        path, transparent=True, pil_kwargs={"optimize": True}, metadata={"Software": None}
+    )
+    plt.close(figure)
+
+
+def arrow(axes: plt.Axes, start: float, end: float, y: float) -> None:
+    """A signal from left to right."""
+    axes.add_patch(
+        FancyArrowPatch(
+            (start, y), (end, y), arrowstyle="-|>", mutation_scale=13, color=BLUE, lw=1.8,
+            shrinkA=0, shrinkB=0,
+        )
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

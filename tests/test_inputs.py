@@ -1,0 +1,343 @@
+"""What a user sets: constants, inputs over time, and what a run makes of them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import twodof
+from twodof.errors import InputError
+from twodof.fmu import Fmu
+from twodof.inputs import Setting, parse_settings, read_changes, resolve
+from twodof.master import Sample
+
+
+@pytest.fixture(scope="module")
+def fmu(fmu_path: Path) -> Fmu:
+    return twodof.load_fmu(fmu_path)
+
+
+# --- constants ---
+
+PARSED = {
+    "a number": (["Kp=80"], {"Kp": 80.0}),
+    "an exponent": (["Kp=1e2"], {"Kp": 100.0}),
+    "a negative number": (["x_des=-0.1"], {"x_des": -0.1}),
+    "a vector": (["x_des=0.25,0.1"], {"x_des": [0.25, 0.1]}),
+    "an element": (["x_des[1]=0.25"], {"x_des[1]": 0.25}),
+    "true": (["limit_effort=true"], {"limit_effort": True}),
+    "False": (["limit_effort=False"], {"limit_effort": False}),
+    "spaces": ([" Kp = 80 ", "x_des = 0.25, 0.1"], {"Kp": 80.0, "x_des": [0.25, 0.1]}),
+    "several": (["Kp=80", "Kd=20"], {"Kp": 80.0, "Kd": 20.0}),
+    "none": ([], {}),
+}
+
+
+@pytest.mark.parametrize(("texts", "settings"), PARSED.values(), ids=PARSED)
+def test_setting_is_parsed(texts: list[str], settings: dict[str, Setting]) -> None:
+    parsed = parse_settings(texts)
+    assert parsed == settings
+    assert [type(value) for value in parsed.values()] == [type(v) for v in settings.values()]
+
+
+UNPARSED = {
+    "no equals sign": (["Kp"], "Kp: expected NAME=VALUE"),
+    "no name": (["=5"], "=5: expected NAME=VALUE"),
+    "no value": (["Kp="], "Kp=: '' is not a number"),
+    "a word": (["Kp=high"], "Kp=high: 'high' is not a number"),
+    "a word in a vector": (["x_des=0.1,y"], "x_des=0.1,y"),
+    "an empty element": (["x_des=0.1,"], "x_des=0.1,"),
+    "two equals signs": (["Kp=5=6"], "Kp=5=6"),
+    "twice": (["Kp=80", "Kp=90"], "Kp is given twice"),
+}
+
+
+@pytest.mark.parametrize(("texts", "culprit"), UNPARSED.values(), ids=UNPARSED)
+def test_setting_that_cannot_be_parsed_is_refused(texts: list[str], culprit: str) -> None:
+    with pytest.raises(InputError, match=f"--set {culprit}"):
+        parse_settings(texts)
+
+
+RESOLVED = {
+    "all elements": ({"Kp": 80}, {"Kp[1]": 80.0, "Kp[2]": 80.0}),
+    "a vector": ({"x_des": (0.25, 0.1)}, {"x_des[1]": 0.25, "x_des[2]": 0.1}),
+    "a list": ({"q_start": [0.1, 0.2]}, {"q_start[1]": 0.1, "q_start[2]": 0.2}),
+    "one element": ({"x_des[2]": 0.1}, {"x_des[2]": 0.1}),
+    "a scalar": ({"Kn": 5}, {"Kn": 5.0}),
+    "a scalar as a vector of one": ({"Kn": [5]}, {"Kn": 5.0}),
+    "a vector of three": ({"gravity": [0, 0, -9.81]}, {f"gravity[{i}]": g for i, g in
+                          ((1, 0.0), (2, 0.0), (3, -9.81))}),
+    "a Boolean": ({"limit_effort": True}, {"limit_effort": True}),
+    "an element after its vector": ({"Kp": 80, "Kp[2]": 90}, {"Kp[1]": 80.0, "Kp[2]": 90.0}),
+    "an array": ({"x_des": np.array([0.25, 0.1])}, {"x_des[1]": 0.25, "x_des[2]": 0.1}),
+    "a number of numpy": ({"Kn": np.float64(5)}, {"Kn": 5.0}),
+    "a Boolean of numpy": ({"limit_effort": np.bool_(True)}, {"limit_effort": True}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("settings", "values"), RESOLVED.values(), ids=RESOLVED)
+def test_setting_gives_values_of_variables(
+    fmu: Fmu, settings: dict[str, Setting], values: dict[str, float | bool]
+) -> None:
+    resolved = resolve(fmu, settings)
+    assert resolved == values
+    assert {type(value) for value in resolved.values()} <= {float, bool}
+
+
+UNRESOLVED = {
+    "unknown, a near name": ({"Kpp": 1}, "no variable 'Kpp'; did you mean 'Kp'"),
+    "unknown, other case": ({"KP": 1}, "no variable 'KP'; did you mean 'Kp'"),
+    "unknown, a near vector": ({"xdes": 1}, "no variable 'xdes'; did you mean 'x_des'"),
+    "unknown, a near parameter": ({"qstart": 1}, "'qstart'; did you mean 'q_start'"),
+    "unknown, nothing near": ({"#####": 1}, "no variable '#####'; there are: .*Kd"),
+    "no such element": ({"x_des[3]": 1}, r"no variable 'x_des\[3\]'"),
+    "index 0": ({"x_des[0]": 1}, r"no variable 'x_des\[0\]'"),
+    "an output": ({"q": 1}, r"q\[1\] is of causality 'output'"),
+    "an output's element": ({"tau[2]": 1}, r"tau\[2\] is of causality 'output'"),
+    "too few": ({"x_des": [1]}, "x_des has 2 elements, 1 were given"),
+    "too many": ({"x_des": [1, 2, 3]}, "x_des has 2 elements, 3 were given"),
+    "several for an element": ({"x_des[1]": [1, 2]}, r"x_des\[1\] has 1 elements, 2 were given"),
+    "none": ({"x_des": []}, "x_des has 2 elements, 0 were given"),
+    "NaN": ({"Kp": float("nan")}, r"Kp\[1\] = nan is not finite"),
+    "infinite": ({"x_des": [0.1, float("-inf")]}, r"x_des\[2\] = -inf is not finite"),
+    "a Boolean for a number": ({"Kp": True}, r"Kp\[1\] = True: expected a number"),
+    "a number for a Boolean": ({"limit_effort": 1.0}, "limit_effort = 1.0: expected true or false"),
+    "a text": ({"Kn": "5"}, "Kn"),
+    "a text as long as the vector": ({"Kp": "80"}, "Kp"),
+    "nothing": ({"Kn": None}, "Kn"),
+    "a matrix": ({"x_des": [[1, 2], [3, 4]]}, "x_des"),
+}
+
+
+@pytest.mark.parametrize(("settings", "culprit"), UNRESOLVED.values(), ids=UNRESOLVED)
+def test_setting_that_does_not_fit_the_fmu_is_refused(
+    fmu: Fmu, settings: dict[str, Setting], culprit: str
+) -> None:
+    with pytest.raises(InputError, match=culprit):
+        resolve(fmu, settings)
+
+
+@pytest.mark.parametrize("unknown", ["tau[3]", "q1", "v[9]"])
+def test_what_is_suggested_can_be_set(fmu: Fmu, unknown: str) -> None:
+    with pytest.raises(InputError, match=r"did you mean|there are") as refusal:
+        resolve(fmu, {unknown: 1.0})
+    _, _, suggested = str(refusal.value).partition("did you mean '")
+    if suggested:
+        resolve(fmu, {suggested.partition("'")[0]: 0.1})
+
+
+# --- inputs over time ---
+
+TABLES = {
+    "one column": ("time,Kn\n0,1\n0.5,2\n", [(0.0, {"Kn": 1.0}), (0.5, {"Kn": 2.0})]),
+    "time not first": ("Kn,time\n1,0.5\n", [(0.5, {"Kn": 1.0})]),
+    "spaces": (" time , Kn \n 0 , 1 \n", [(0.0, {"Kn": 1.0})]),
+    "a byte order mark": ("\ufefftime,Kn\n0,1\n", [(0.0, {"Kn": 1.0})]),
+    "quotes": ('"time","x_des[1]"\n0,1\n', [(0.0, {"x_des[1]": 1.0})]),
+    "line ends of Windows": ("time,Kn\r\n0,1\r\n", [(0.0, {"Kn": 1.0})]),
+    "empty lines": ("time,Kn\n\n0,1\n\n", [(0.0, {"Kn": 1.0})]),
+    "no line end": ("time,Kn\n0,1", [(0.0, {"Kn": 1.0})]),
+    "before the start": ("time,Kn\n-1,1\n", [(-1.0, {"Kn": 1.0})]),
+    "two rows of one time": ("time,Kn\n1,1\n1,2\n", [(1.0, {"Kn": 1.0}), (1.0, {"Kn": 2.0})]),
+}
+
+
+@pytest.mark.parametrize(("text", "changes"), TABLES.values(), ids=TABLES)
+def test_table_is_read(
+    fmu: Fmu, tmp_path: Path, text: str, changes: list[tuple[float, dict[str, float]]]
+) -> None:
+    (tmp_path / "inputs.csv").write_text(text, "utf-8", newline="")
+    assert read_changes(fmu, tmp_path / "inputs.csv") == changes
+
+
+BAD_TABLES = {
+    "empty": ("", "is empty"),
+    "empty lines only": ("\n\n", "is empty"),
+    "no time": ("t,Kn\n0,1\n", "has no column 'time'"),
+    "no header": ("0,1\n1,2\n", "has no column 'time'"),
+    "unsorted": ("time,Kn\n0,1\n2,1\n1,1\n", "row 4: time 1 is before"),
+    "row too short": ("time,Kn\n0,1\n1\n", "row 3: 1 cells, expected 2"),
+    "row too long": ("time,Kn\n0,1,2\n", "row 2: 3 cells, expected 2"),
+    "NaN": ("time,Kn\n0,nan\n", "row 2: Kn = nan is not finite"),
+    "infinite": ("time,Kn\n0,1\n1,inf\n", "row 3: Kn = inf is not finite"),
+    "NaN time": ("time,Kn\nnan,1\n", "row 2: time = nan is not finite"),
+    "unknown column": ("time,Kq\n0,1\n", "no variable 'Kq'; did you mean 'K"),
+    "column without a name": ("time,\n0,1\n", "no variable ''"),
+    "vector": ("time,x_des\n0,1\n", r"no variable 'x_des'; did you mean 'x_des\[1\]'"),
+    "no number": ("time,Kn\n0,high\n", "row 2: Kn = 'high' is not a number"),
+    "empty cell": ("time,Kn\n0,\n", "row 2: Kn = '' is not a number"),
+    "semicolons": ("time;Kn\n0;1\n", "has no column 'time'"),
+    "two columns of one name": ("time,Kn,Kn\n0,1,1\n", "two columns 'Kn'"),
+    "two times": ("time,time\n0,1\n", "two columns 'time'"),
+    "parameter": ("time,rtol\n0,1\n", "rtol is not an input"),
+    "output": ("time,q[1]\n0,1\n", r"q\[1\] is not an input"),
+    "no rows": ("time,Kn\n", "has no rows|is empty"),
+    "row below an empty line": ("time,Kn\n\n0,high\n", "row 3"),
+}
+
+
+@pytest.mark.parametrize(("text", "culprit"), BAD_TABLES.values(), ids=BAD_TABLES)
+def test_refused_table_is_named_with_its_culprit(
+    fmu: Fmu, tmp_path: Path, text: str, culprit: str
+) -> None:
+    path = tmp_path / "inputs.csv"
+    path.write_text(text, "utf-8")
+    with pytest.raises(InputError, match=culprit) as refusal:
+        read_changes(fmu, path)
+    assert f"'{path}'" in str(refusal.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"PK\x03\x04\xc0\x00\x80"])
+def test_table_that_is_not_text_is_refused(fmu: Fmu, tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "inputs.csv").write_bytes(content)
+    with pytest.raises(InputError, match=r"inputs\.csv' is not a CSV file"):
+        read_changes(fmu, tmp_path / "inputs.csv")
+
+
+@pytest.mark.parametrize(("name", "reason"), [("none.csv", "No such file"), ("", "Is a directory")])
+def test_table_that_is_no_file_is_refused(fmu: Fmu, tmp_path: Path, name: str, reason: str) -> None:
+    with pytest.raises(InputError, match=f"{tmp_path / name}.*{reason}"):
+        read_changes(fmu, tmp_path / name)
+
+
+@pytest.mark.parametrize("settings", [{"x_des": 0.2}, {"x_des[1]": 0.2}])
+def test_variable_that_is_both_set_and_in_the_table_is_refused(
+    fmu: Fmu, tmp_path: Path, settings: dict[str, Setting]
+) -> None:
+    (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0,0.1\n")
+    with pytest.raises(InputError, match=r"x_des\[1\] is both set and in '.*inputs\.csv'"):
+        twodof.experiment(fmu, settings=settings, input_file=tmp_path / "inputs.csv")
+
+
+# --- a run ---
+
+STEP = 0.01
+ROWS = [
+    (0.0, {"x_des[1]": 0.21, "Kp[2]": 50.0}),
+    (0.03, {"x_des[1]": 0.24, "Kp[2]": 70.0}),  # on a communication point, up to rounding
+    (0.045, {"x_des[1]": 0.18, "Kp[2]": 60.0}),  # between two: from the next one on
+    (0.061, {"x_des[1]": 9.99, "Kp[2]": 99.0}),  # two within one step: the latter
+    (0.069, {"x_des[1]": 0.22, "Kp[2]": 80.0}),
+    (0.5, {"x_des[1]": 0.0, "Kp[2]": 0.0}),  # after the end: never
+]
+SET_AT = {0: 0, 3: 1, 5: 2, 7: 4}
+"""Which of the rows a user would set by hand at which communication point."""
+N = 12
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    lines = [f"{t},{row['x_des[1]']},{row['Kp[2]']}" for t, row in ROWS]
+    path = tmp_path / "inputs.csv"
+    path.write_text("\n".join(["time,x_des[1],Kp[2]", *lines]))
+    return path
+
+
+def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: object) -> list[Sample]:
+    """A run whose inputs are sent at communication points; those of point 0 are set before."""
+    run = twodof.samples(fmu, stop_time=N * STEP, settings=rows.get(0), **options)
+    found = [next(run)]
+    while found[-1].k < N:
+        found.append(run.send(rows.get(found[-1].k) if found[-1].k else None))
+    return found
+
+
+def test_run_with_a_table_is_the_run_with_its_rows_set_by_hand(fmu: Fmu, table: Path) -> None:
+    from_table = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table))
+    assert from_table == by_hand(fmu, {k: ROWS[row][1] for k, row in SET_AT.items()})
+    assert len({sample.q for sample in from_table}) == N + 1
+
+
+def test_value_holds_from_its_row_to_the_next(fmu: Fmu, table: Path) -> None:
+    found = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table))
+    # a sample's inputs are those of the step that led to it
+    row = [max(at for at in SET_AT if at <= max(k - 1, 0)) for k in range(N + 1)]
+    for sample, at in zip(found, row):
+        given = ROWS[SET_AT[at]][1]
+        assert {name: sample.inputs[name] for name in given} == given
+        assert sample.inputs["x_des[2]"] == 0.05
+
+
+def test_inputs_of_earlier_samples_do_not_change_later(fmu: Fmu, table: Path) -> None:
+    run = twodof.samples(fmu, stop_time=N * STEP, input_file=table)
+    seen = [(sample, dict(sample.inputs)) for sample in run]
+    assert all(sample.inputs == inputs for sample, inputs in seen)
+
+
+def test_start_values_hold_before_the_first_row(fmu: Fmu, tmp_path: Path) -> None:
+    (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0.05,0.1\n")
+    run = twodof.samples(fmu, stop_time=N * STEP, input_file=tmp_path / "inputs.csv")
+    assert [sample.inputs["x_des[1]"] for sample in run] == [0.2] * 6 + [0.1] * (N - 5)
+
+
+def test_rows_before_the_start_hold_at_the_start(fmu: Fmu, tmp_path: Path) -> None:
+    (tmp_path / "inputs.csv").write_text("time,x_des[1]\n-2,0.3\n-1,0.1\n")
+    run = twodof.samples(fmu, stop_time=STEP, input_file=tmp_path / "inputs.csv")
+    plain = twodof.samples(fmu, stop_time=STEP, settings={"x_des[1]": 0.1})
+    assert list(run) == list(plain)
+
+
+def test_changed_inputs_change_the_trajectory_only_afterwards(fmu: Fmu) -> None:
+    changed = by_hand(fmu, {4: {"x_des[1]": 0.1}})
+    plain = by_hand(fmu, {})
+    same = [a.q == b.q for a, b in zip(changed, plain)]
+    assert same == [True] * 5 + [False] * (N - 4)
+
+
+def test_what_is_sent_may_be_a_vector(fmu: Fmu) -> None:
+    vector = by_hand(fmu, {2: {"x_des": (0.1, 0.07)}})
+    assert vector == by_hand(fmu, {2: {"x_des[1]": 0.1, "x_des[2]": 0.07}})
+
+
+def test_a_parameter_cannot_be_sent(fmu: Fmu) -> None:
+    with pytest.raises(twodof.TwoDofError, match="rtol"):
+        by_hand(fmu, {2: {"rtol": 1e-4}})
+
+
+def test_a_setting_holds_throughout(fmu: Fmu) -> None:
+    run = twodof.samples(fmu, stop_time=N * STEP, settings={"Kp": 80, "q_start": (0.4, 0.6)})
+    found = list(run)
+    assert found[0].q == (0.4, 0.6)
+    assert {(sample.inputs["Kp[1]"], sample.inputs["Kp[2]"]) for sample in found} == {(80.0, 80.0)}
+
+
+def test_samples_lie_on_multiples_of_the_step(fmu: Fmu) -> None:
+    found = by_hand(fmu, {})
+    assert [(sample.k, sample.t) for sample in found] == [(k, k * STEP) for k in range(N + 1)]
+    assert all(a.q != b.q for a, b in pairwise(found))
+
+
+TIMES = {
+    "step 0": ({"step": 0.0}, "step 0 s must be > 0"),
+    "step negative": ({"step": -0.01}, "step -0.01 s must be > 0"),
+    "step NaN": ({"step": float("nan")}, "step nan s"),
+    "step infinite": ({"step": float("inf")}, "step inf s"),
+    "step of nothing": ({"step": 1e-320}, "step 1.*e-320"),
+    "stop no multiple": ({"stop_time": 1.0, "step": 0.3}, "1 s is no whole number of steps of 0.3"),
+    "step beyond the stop": ({"stop_time": 0.1, "step": 1.0}, "no whole number of steps"),
+    "stop 0": ({"stop_time": 0.0}, "stop time 0 s must be after the start time 0 s"),
+    "stop before start": ({"stop_time": 1.0, "start_time": 2.0}, "stop time 1 s must be after"),
+    "stop NaN": ({"stop_time": float("nan")}, "stop time nan"),
+    "start infinite": ({"start_time": float("-inf")}, "start time -inf"),
+}
+
+
+@pytest.mark.parametrize(("times", "culprit"), TIMES.values(), ids=TIMES)
+def test_times_that_make_no_run_are_refused(
+    fmu: Fmu, times: dict[str, float], culprit: str
+) -> None:
+    with pytest.raises(InputError, match=culprit):
+        twodof.experiment(fmu, **times)
+
+
+@pytest.mark.parametrize(
+    ("stop", "step", "n"), [(5.0, 0.01, 500), (0.3, 0.1, 3), (1e4, 1e-3, 10**7)]
+)
+def test_number_of_steps_is_right_though_the_step_has_no_binary_form(
+    fmu: Fmu, stop: float, step: float, n: int
+) -> None:
+    run = twodof.experiment(fmu, stop_time=stop, step=step)
+    assert (run.steps, run.time(n)) == (n, n * step)

@@ -1,0 +1,451 @@
+"""The scene: transforms against Pinocchio's kinematics, fitted shapes against the meshes.
+
+Quaternions and rpy angles are turned into matrices by SciPy, meshes are read by trimesh or, where
+they are COLLADA files, by Pinocchio.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import xml.etree.ElementTree as ET
+import zipfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import oracles
+import pinocchio as pin
+import pytest
+import trimesh
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
+
+import twodof
+from twodof.master import Sample
+from twodof.scene import Scene, Transform
+
+START = 1_700_000_000  # s since the epoch
+SECOND = 1_000_000_000  # ns
+LATCHED = ["/robot_description", "/tf_static"]
+ROBOTS = {
+    "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "panda, two prismatic joints": "panda_description/urdf/panda.urdf",
+    "kinova, three continuous joints": "kinova_description/robots/kinova.urdf",
+    "tiago, a tree with all of them": "tiago_description/robots/tiago_no_hand.urdf",
+}
+
+Messages = dict[str, list[tuple[int, Any]]]
+Placements = dict[str, np.ndarray]
+
+
+# --- poses ---
+
+
+def pose(translation: Iterable[float], rotation: Rotation) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.as_matrix()
+    matrix[:3, 3] = list(translation)
+    return matrix
+
+
+def chained(transforms: Iterable[Transform]) -> Placements:
+    """Poses of all child links in the root, as tf2 computes them."""
+    local: dict[str, tuple[str, np.ndarray]] = {}
+    for parent, child, translation, rotation in transforms:
+        assert child not in local
+        local[child] = (parent, pose(translation, Rotation.from_quat(rotation)))
+
+    def placement(link: str) -> np.ndarray:
+        if link not in local:
+            return np.eye(4)
+        parent, matrix = local[link]
+        return placement(parent) @ matrix
+
+    return {child: placement(child) for child in local}
+
+
+def placements(urdf: str, joints: list[str], q: np.ndarray) -> Placements:
+    """The same by Pinocchio, which has two coordinates for a continuous joint."""
+    model = pin.buildModelFromXML(urdf)
+    data = model.createData()
+    configuration = pin.neutral(model)
+    for name, angle in zip(joints, q, strict=True):
+        joint = model.joints[model.getJointId(name)]
+        values = [angle] if joint.nq == 1 else [math.cos(angle), math.sin(angle)]
+        configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+    pin.framesForwardKinematics(model, data, configuration)
+    bodies = {f.name: i for i, f in enumerate(model.frames) if f.type == pin.FrameType.BODY}
+    return {name: data.oMf[i].homogeneous for name, i in bodies.items()}
+
+
+def moving_joints(urdf: str) -> list[str]:
+    return list(pin.buildModelFromXML(urdf).names)[1:]
+
+
+def assert_same_poses(found: Placements, expected: Placements, urdf: str) -> None:
+    children = [joint.find("child").get("link") for joint in ET.fromstring(urdf).findall("joint")]
+    assert sorted(found) == sorted(child for child in children if child is not None)
+    for link, matrix in found.items():
+        np.testing.assert_allclose(matrix, expected[link], rtol=0.0, atol=1e-12, err_msg=link)
+
+
+def nothing(_: str) -> None:
+    return None
+
+
+@pytest.fixture
+def robot(request: pytest.FixtureRequest, robots: Path) -> str:
+    return (robots / ROBOTS[request.param]).read_text()
+
+
+@pytest.mark.parametrize("robot", list(ROBOTS), indirect=True)
+def test_transforms_are_the_placements_of_pinocchio(robot: str) -> None:
+    joints = moving_joints(robot)[::-1]  # not in the order of the file
+    scene = Scene(robot, joints, "", nothing)
+    random = np.random.default_rng(0)
+    for _ in range(10):
+        q = random.uniform(-4.0, 4.0, len(joints))
+        transforms = [*scene.fixed, *scene.moving(q.tolist())]
+        for transform in transforms:
+            assert np.linalg.norm(transform.rotation) == pytest.approx(1.0, abs=1e-14)
+        assert_same_poses(chained(transforms), placements(robot, joints, q), robot)
+
+
+@pytest.mark.filterwarnings("error")
+def test_fixed_joint_may_have_a_zero_axis() -> None:
+    urdf = (
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="fixed">'
+        '<parent link="a"/><child link="b"/><origin xyz="1 2 3"/><axis xyz="0 0 0"/>'
+        "</joint></robot>"
+    )
+    expected = [Transform("a", "b", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))]
+    assert Scene(urdf, [], "b", nothing).fixed == expected
+
+
+def test_quaternion_is_x_y_z_w_with_the_sign_of_the_right_hand(fmu_urdf: str) -> None:
+    scene = Scene(fmu_urdf, ["joint1", "joint2"], "EndEffector", nothing)
+    first, second = scene.moving([math.pi / 2, -math.pi / 3])
+    np.testing.assert_allclose(first.rotation, [0.0, 0.0, 0.5**0.5, 0.5**0.5], atol=1e-15)
+    np.testing.assert_allclose(second.rotation, [0.0, 0.0, -0.5, 0.75**0.5], atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", ["1 0 0", "0 1 0", "0 0 1", "1 1 0", "-3 2 1"])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 3.0, math.pi, 3.3, -math.pi, 7.0])
+def test_quaternion_is_right_near_half_turns(axis: str, angle: float) -> None:
+    urdf = (
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
+        f'<parent link="a"/><child link="b"/><axis xyz="{axis}"/></joint></robot>'
+    )
+    (found,) = Scene(urdf, ["j"], "b", nothing).moving([angle])
+    direction = np.array(axis.split(), dtype=float)
+    expected = Rotation.from_rotvec(angle * direction / np.linalg.norm(direction))
+    np.testing.assert_allclose(
+        Rotation.from_quat(found.rotation).as_matrix(), expected.as_matrix(), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("robot", list(ROBOTS), indirect=True)
+def test_end_effector_is_where_pinocchio_has_it(robot: str) -> None:
+    joints = moving_joints(robot)
+    last = ET.fromstring(robot).findall("link")[-1].get("name", "")
+    scene = Scene(robot, joints, last, nothing)
+    random = np.random.default_rng(1)
+    for _ in range(10):
+        q = random.uniform(-4.0, 4.0, len(joints))
+        expected = placements(robot, joints, q)[last][:3, 3]
+        np.testing.assert_allclose(scene.end_effector(q.tolist()), expected, rtol=0.0, atol=1e-12)
+
+
+# --- topics of a bag ---
+
+
+def read(bag: Path) -> Messages:
+    messages: Messages = {}
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            messages.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return messages
+
+
+def nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec * SECOND + stamp.nanosec)
+
+
+def transforms(message: Any) -> list[Transform]:
+    found = []
+    for stamped in message.transforms:
+        p, r = stamped.transform.translation, stamped.transform.rotation
+        parent, child = stamped.header.frame_id, stamped.child_frame_id
+        found.append(Transform(parent, child, (p.x, p.y, p.z), (r.x, r.y, r.z, r.w)))
+    return found
+
+
+def xyz(message: Any) -> list[float]:
+    return [message.point.x, message.point.y, message.point.z]
+
+
+@pytest.fixture(scope="module")
+def fmu_urdf(fmu_path: Path) -> str:
+    with zipfile.ZipFile(fmu_path) as fmu:
+        return fmu.read("resources/robot.urdf").decode()
+
+
+@pytest.fixture(scope="module")
+def messages(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Messages:
+    """Of a run of the default arm whose target jumps after 0.5 s."""
+    folder = tmp_path_factory.mktemp("scene")
+    inputs = folder / "inputs.csv"
+    inputs.write_text("time,x_des[1],x_des[2]\n0,0.2,0.05\n0.5,0.1,0.2\n")
+    run = twodof.experiment(fmu_path, stop_time=1.0, input_file=inputs)
+    twodof.simulate(run, [twodof.Bag(folder / "bag", run, scene=True, stamp_start=START)])
+    return read(folder / "bag")
+
+
+def test_scene_has_one_message_a_sample_and_one_on_latched_topics(messages: Messages) -> None:
+    streams = ["/joint_states", "/tf", "/target", "/end_effector"]
+    assert set(messages) == {*streams, *LATCHED}
+    for topic in streams:
+        stamps = [log_time for log_time, _ in messages[topic]]
+        assert stamps == [START * SECOND + k * SECOND // 100 for k in range(101)]
+    for topic in LATCHED:
+        assert [log_time for log_time, _ in messages[topic]] == [START * SECOND]
+
+
+def test_stamps_are_the_log_times(messages: Messages) -> None:
+    for topic in ("/joint_states", "/target", "/end_effector"):
+        for log_time, message in messages[topic]:
+            assert nanoseconds(message.header.stamp) == log_time
+    for topic in ("/tf", "/tf_static"):
+        for log_time, message in messages[topic]:
+            assert {nanoseconds(t.header.stamp) for t in message.transforms} == {log_time}
+
+
+def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(
+    messages: Messages, fmu_urdf: str
+) -> None:
+    ((_, static),) = messages["/tf_static"]
+    for (_, state), (_, tf) in zip(messages["/joint_states"], messages["/tf"], strict=True):
+        expected = placements(fmu_urdf, list(state.name), np.array(state.position))
+        found = chained([*transforms(static), *transforms(tf)])
+        assert_same_poses(found, expected, fmu_urdf)
+
+
+def test_end_effector_topic_is_the_closed_form_in_the_root_frame(messages: Messages) -> None:
+    states, points = messages["/joint_states"], messages["/end_effector"]
+    for (_, state), (_, point) in zip(states, points, strict=True):
+        assert point.header.frame_id == "world"
+        expected = [*oracles.position(np.array(state.position)), 0.0]
+        np.testing.assert_allclose(xyz(point), expected, rtol=0.0, atol=1e-15)
+
+
+def test_target_topic_is_the_input_in_the_root_frame(messages: Messages) -> None:
+    points = [message for _, message in messages["/target"]]
+    assert {point.header.frame_id for point in points} == {"world"}
+    found = [xyz(point) for point in points]
+    assert found[:50] == [[0.2, 0.05, 0.0]] * 50
+    assert found[51:] == [[0.1, 0.2, 0.0]] * 50  # the change and sample 50 are at the same time
+
+
+def test_target_follows_the_end_effector_along_axes_that_are_not_controlled(
+    robots: Path, ur5: str, tmp_path: Path
+) -> None:
+    options = twodof.FmuOptions(
+        urdf=robots / ROBOTS["ur5"], mesh_dir=robots.parents[1], frame="tool0", axes="zx"
+    )
+    fmu = twodof.build_fmu(tmp_path / "ur5.fmu", options)
+    run = twodof.experiment(fmu)
+    q = (0.1, -0.9, 1.2, 0.4, 0.5, 0.6)
+    inputs = {"x_des[1]": 0.7, "x_des[2]": -0.3}
+    with twodof.Bag(tmp_path / "bag", run, scene=True) as bag:
+        bag.write(Sample(0, 0.0, q, q, (0.0, 0.0), q, inputs))
+    found = read(tmp_path / "bag")
+    ((_, end_effector),) = found["/end_effector"]
+    ((_, target),) = found["/target"]
+    assert end_effector.header.frame_id == target.header.frame_id == "world"
+    x = placements(ur5, moving_joints(ur5), np.array(q))["tool0"][:3, 3]
+    np.testing.assert_allclose(xyz(end_effector), x, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(xyz(target), [-0.3, x[1], 0.7], rtol=0.0, atol=1e-12)
+
+
+# --- robot description ---
+
+
+def geometries(urdf: str) -> list[tuple[ET.Element, np.ndarray]]:
+    """Shapes of all visuals and collisions in the order of the file, and their poses."""
+    found = []
+    for link in ET.fromstring(urdf).findall("link"):
+        for part in (*link.findall("visual"), *link.findall("collision")):
+            origin = part.find("origin")
+            attributes = {} if origin is None else origin.attrib
+            position, angles = (
+                [float(word) for word in attributes.get(key, "0 0 0").split()]
+                for key in ("xyz", "rpy")
+            )
+            shape = part.find("geometry")[0]
+            found.append((shape, pose(position, Rotation.from_euler("xyz", angles))))
+    return found
+
+
+def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def outside(shape: ET.Element, points: np.ndarray) -> float:
+    """How far points reach out of a box or cylinder in the middle of their frame, m."""
+    if shape.tag == "box":
+        half = np.array([float(word) for word in shape.get("size", "").split()]) / 2
+        return float((np.abs(points) - half).max())
+    assert shape.tag == "cylinder"
+    radial = np.hypot(points[:, 0], points[:, 1]) - float(shape.get("radius", ""))
+    axial = np.abs(points[:, 2]) - float(shape.get("length", "")) / 2
+    return float(max(radial.max(), axial.max()))
+
+
+def volume(shape: ET.Element) -> float:
+    if shape.tag == "box":
+        return math.prod(float(word) for word in shape.get("size", "").split())
+    return math.pi * float(shape.get("radius", "")) ** 2 * float(shape.get("length", ""))
+
+
+def assert_shapes_hold_the_meshes(
+    description: str, urdf: str, vertices: Callable[[str], np.ndarray]
+) -> None:
+    assert "<mesh" not in description
+    before, after = geometries(urdf), geometries(description)
+    meshes = 0
+    for (mesh, placed), (shape, fitted) in zip(before, after, strict=True):
+        if mesh.tag != "mesh":
+            assert (shape.tag, shape.attrib) == (mesh.tag, mesh.attrib)
+            np.testing.assert_array_equal(fitted, placed)
+            continue
+        meshes += 1
+        own = vertices(mesh.get("filename", ""))
+        own = own * np.array([float(word) for word in mesh.get("scale", "1 1 1").split()])
+        local = moved(moved(own, placed), np.linalg.inv(fitted))
+        assert outside(shape, local) <= 1e-9
+        assert volume(shape) <= np.prod(np.ptp(own, axis=0)) * (1.0 + 1e-9)
+    assert meshes > 0
+
+
+def assert_same_robot(description: str, urdf: str) -> None:
+    """As read by urdfdom, with all but the geometry."""
+    found, expected = pin.buildModelFromXML(description), pin.buildModelFromXML(urdf)
+    assert found == expected
+
+
+def test_description_of_the_default_arm_holds_its_meshes(
+    messages: Messages, fmu_path: Path, fmu_urdf: str
+) -> None:
+    ((_, message),) = messages["/robot_description"]
+    assert_same_robot(message.data, fmu_urdf)
+    model = pin.buildModelFromXML(message.data)
+    for kind in (pin.VISUAL, pin.COLLISION):
+        shapes = pin.buildGeomFromUrdfString(model, message.data, kind)
+        assert len(shapes.geometryObjects) == 2
+    with zipfile.ZipFile(fmu_path) as fmu:
+
+        def vertices(uri: str) -> np.ndarray:
+            name = uri.removeprefix("package://")
+            file = io.BytesIO(fmu.read(f"resources/{name}"))
+            return np.array(trimesh.load_mesh(file, file_type="stl").vertices)
+
+        assert_shapes_hold_the_meshes(message.data, fmu_urdf, vertices)
+
+
+def test_description_of_the_ur5_holds_its_meshes(robots: Path, ur5: str) -> None:
+    folder = robots.parents[1]
+    joints = moving_joints(ur5)
+    description = Scene(ur5, joints, "tool0", lambda name: (folder / name).read_bytes()).description
+    assert_same_robot(description, ur5)
+    model = pin.buildModelFromXML(ur5)
+    visuals = pin.buildGeomFromUrdfString(model, ur5, pin.VISUAL, None, [str(folder)])
+    collada = {thing.meshPath: thing.geometry.vertices() for thing in visuals.geometryObjects}
+
+    def vertices(uri: str) -> np.ndarray:
+        path = folder / uri.removeprefix("package://")
+        if path.suffix == ".stl":
+            return np.array(trimesh.load_mesh(path).vertices)
+        return np.array(collada[str(path)])
+
+    assert_shapes_hold_the_meshes(description, ur5, vertices)
+
+
+def with_mesh(attributes: str = "", origin: str = "") -> str:
+    return (
+        '<robot name="thing"><link name="base"/><link name="thing"><visual>'
+        f'{origin}<geometry><mesh filename="package://meshes/thing.stl"{attributes}/></geometry>'
+        "</visual></link><joint name='fixed' type='fixed'><parent link='base'/>"
+        "<child link='thing'/></joint></robot>"
+    )
+
+
+def placed(seed: int) -> np.ndarray:
+    """Somewhere, turned in some way; the first is where it was made."""
+    if seed == 0:
+        return np.eye(4)
+    turn = Rotation.from_rotvec(np.random.default_rng(seed).normal(size=3))
+    return pose([0.3, -0.2, 0.1], turn)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("extents", [(0.3, 0.1, 0.05), (0.02, 0.2, 0.1), (1.0, 0.9, 0.8)])
+def test_fit_recovers_a_box(seed: int, extents: tuple[float, float, float]) -> None:
+    mesh = trimesh.creation.box(extents=extents, transform=placed(seed))
+    content = mesh.export(file_type="stl")
+    description = Scene(with_mesh(), [], "thing", lambda _: content).description
+    assert_shapes_hold_the_meshes(description, with_mesh(), lambda _: single(mesh.vertices))
+    ((shape, _),) = geometries(description)
+    assert shape.tag == "box"
+    size = sorted(float(word) for word in shape.get("size", "").split())
+    assert size == pytest.approx(sorted(extents), rel=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("radius", "length"), [(0.04, 0.3), (0.2, 0.02), (0.1, 0.25)])
+def test_fit_recovers_a_cylinder(seed: int, radius: float, length: float) -> None:
+    mesh = trimesh.creation.cylinder(radius, length, sections=64, transform=placed(seed))
+    content = mesh.export(file_type="stl")
+    description = Scene(with_mesh(), [], "thing", lambda _: content).description
+    assert_shapes_hold_the_meshes(description, with_mesh(), lambda _: single(mesh.vertices))
+    ((shape, _),) = geometries(description)
+    assert shape.tag == "cylinder"
+    found = [float(shape.get(key, "")) for key in ("radius", "length")]
+    assert found == pytest.approx([radius, length], rel=1e-2)
+
+
+def single(vertices: np.ndarray) -> np.ndarray:
+    """With the precision that an STL file has."""
+    return np.asarray(vertices, dtype=np.float32).astype(float)
+
+
+@pytest.mark.parametrize(
+    "angles", ["0 0 0", "0.3 -0.4 2.5", "0 1.5707963267948966 0", "1 -1.5707963267948966 2"]
+)
+def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles: str) -> None:
+    mesh = trimesh.creation.box(extents=(300.0, 100.0, 50.0))
+    mesh.apply_translation([10.0, 20.0, 30.0])
+    content = mesh.export(file_type="stl")
+    origin = f'<origin xyz="1 2 3" rpy="{angles}"/>'
+    urdf = with_mesh(' scale="0.001 0.002 0.003"', origin)
+    description = Scene(urdf, [], "thing", lambda _: content).description
+    assert_shapes_hold_the_meshes(description, urdf, lambda _: single(mesh.vertices))
+    ((shape, _),) = geometries(description)
+    size = sorted(float(word) for word in shape.get("size", "").split())
+    assert size == pytest.approx([0.15, 0.2, 0.3], rel=1e-6)
+
+
+@pytest.mark.parametrize("content", [None, b"this is no mesh"], ids=["missing", "unreadable"])
+def test_mesh_that_cannot_be_read_is_left_out_and_named(
+    content: bytes | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        description = Scene(with_mesh(), [], "thing", lambda _: content).description
+    assert "thing.stl" in caplog.text
+    assert "<mesh" not in description
+    assert geometries(description) == []
+    assert_same_robot(description, with_mesh())
