@@ -38,14 +38,15 @@ static const double P[STAGES][4] = {
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 /* Smallest step, as a part of the first one, 2⁻¹⁰. Across a singularity of the Jacobian the
    right-hand side jumps and no step satisfies the error test; a step of this size is taken as it
-   is. */
+   is. Nor does an event end a step sooner: where a joint chatters at its limit, events would else
+   follow each other without the time moving on. */
 static const double STEP_FLOOR = 1.0 / 1024.0;
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
 /* One integration step, from y to y_new. */
 typedef struct {
     const Plant *plant;
-    double size;                /* s */
+    double size, floor;         /* s; the smallest step of this communication step */
     double y[N_STATES], y_new[N_STATES];
     double K[STAGES][N_STATES]; /* derivatives at the stages */
     double Q[N_STATES][4];      /* coefficients of the dense output */
@@ -192,8 +193,8 @@ static double excursion(const Step *step)
     return earliest;
 }
 
-/* First time in (0, size] at which a limit is reached or left, and y_new the state from there on;
-   0 where there is none. */
+/* First time in (0, size], but not before the floor, at which a limit is reached or left, and y_new
+   the state from there on; 0 where there is none. */
 static double first_event(Step *step)
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
@@ -213,7 +214,7 @@ static double first_event(Step *step)
     double latest = at_the_end ? step->size : excursion(step);
     if (latest == 0.0)
         return 0.0;
-    latest = bisect(step, event_happened, 0, latest);
+    latest = fmax(bisect(step, event_happened, 0, latest), fmin(step->floor, step->size));
     double reached[N_STATES];
     dense_output(step, latest, reached);
     events(step, reached, found);
@@ -231,15 +232,14 @@ static double first_event(Step *step)
 static double until_event(Step *step, double t, double end)
 {
     const double max_step = step->plant->value[MAX_STEP];
-    const double first = fmin(max_step, end - t), floor = STEP_FLOOR * first;
-    double next = first, growth = MAX_FACTOR;
+    double next = fmin(max_step, end - t), growth = MAX_FACTOR;
     hold(step);
     for (;;) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
         const double norm = dormand_prince(step);
         double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
-        if (norm < 1.0 || (step->size <= floor && isfinite(norm))) {
+        if (norm < 1.0 || (step->size <= step->floor && isfinite(norm))) {
             const double passed = first_event(step);
             memcpy(step->y, step->y_new, sizeof step->y);
             if (last && (passed == 0.0 || passed == step->size))
@@ -249,13 +249,13 @@ static double until_event(Step *step, double t, double end)
             t += step->size;
             memcpy(step->K[0], step->K[STAGES - 1], sizeof step->K[0]);
             factor = fmax(MIN_FACTOR, fmin(growth, factor));
-            next = fmax(floor, fmin(max_step, step->size * factor));
+            next = fmax(step->floor, fmin(max_step, step->size * factor));
             growth = MAX_FACTOR;
-        } else if (step->size <= floor) {
+        } else if (step->size <= step->floor) {
             return NAN;
         } else {
             factor = isfinite(norm) ? factor : MIN_FACTOR;
-            next = fmax(floor, step->size * fmax(MIN_FACTOR, factor));
+            next = fmax(step->floor, step->size * fmax(MIN_FACTOR, factor));
             growth = 1.0; /* no growth right after a rejection */
         }
     }
@@ -266,6 +266,7 @@ int advance(Plant *plant, double h)
     Step step;
     double t = 0.0;
     step.plant = plant;
+    step.floor = STEP_FLOOR * fmin(plant->value[MAX_STEP], h);
     memcpy(step.y, &plant->value[Q], N_JOINTS * sizeof *step.y);
     memcpy(step.y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *step.y);
     while (t < h)
