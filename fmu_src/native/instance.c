@@ -1,0 +1,136 @@
+/* The state machine of FMI 2.0 co-simulation, messages, and initialisation. */
+#include "instance.h"
+
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <string.h>
+
+static const char *const PHASE_NAME[N_PHASES] = {
+    "instantiated", "initialization mode", "step mode", "step failed", "terminated"};
+
+enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
+       T = 1 << TERMINATED, ANY = N | I | S | F | T };
+
+/* FMI 2.0.4, section 4.2.4: each call and the phases in which it is allowed. A refused call
+   changes nothing, so there is no error phase. */
+static const struct {
+    const char *name;
+    int phases;
+} CALLS[N_CALLS] = {
+    [SET_DEBUG_LOGGING] = {"fmi2SetDebugLogging", ANY},
+    [SETUP_EXPERIMENT] = {"fmi2SetupExperiment", N},
+    [ENTER_INITIALIZATION] = {"fmi2EnterInitializationMode", N},
+    [EXIT_INITIALIZATION] = {"fmi2ExitInitializationMode", I},
+    [TERMINATE] = {"fmi2Terminate", S | F},
+    [RESET] = {"fmi2Reset", ANY},
+    [DO_STEP] = {"fmi2DoStep", S},
+    [CANCEL_STEP] = {"fmi2CancelStep", 0}, /* no step is ever pending */
+    [GET_STATUS] = {"fmi2GetStatus", S | F | T},
+    [GET_REAL] = {"fmi2GetReal", I | S | F | T},
+    [GET_INTEGER] = {"fmi2GetInteger", I | S | F | T},
+    [GET_BOOLEAN] = {"fmi2GetBoolean", I | S | F | T},
+    [GET_STRING] = {"fmi2GetString", I | S | F | T},
+    [SET_REAL] = {"fmi2SetReal", N | I | S},
+    [SET_INTEGER] = {"fmi2SetInteger", N | I | S},
+    [SET_BOOLEAN] = {"fmi2SetBoolean", N | I | S},
+    [SET_STRING] = {"fmi2SetString", N | I | S},
+    [SET_INPUT] = {"fmi2Set of an input", N | I | S},
+    [SET_PARAMETER] = {"fmi2Set of a parameter", N | I},
+    [GET_STATE] = {"fmi2GetFMUstate", ANY},
+    [SET_STATE] = {"fmi2SetFMUstate", ANY},
+    [FREE_STATE] = {"fmi2FreeFMUstate", ANY},
+    [SIZE_OF_STATE] = {"fmi2SerializedFMUstateSize", ANY},
+    [SERIALIZE] = {"fmi2SerializeFMUstate", ANY},
+    [DESERIALIZE] = {"fmi2DeSerializeFMUstate", ANY},
+};
+
+const char *call_name(Call call)
+{
+    return CALLS[call].name;
+}
+
+int allowed(Instance *instance, Call call, const char *culprit)
+{
+    const int phase = instance->state.phase;
+    if (CALLS[call].phases >> phase & 1)
+        return 1;
+    report(instance, fmi2Error, "%s%s%s%s is not allowed in the state '%s'", CALLS[call].name,
+           culprit ? " (" : "", culprit ? culprit : "", culprit ? ")" : "", PHASE_NAME[phase]);
+    return 0;
+}
+
+Instance *enter(fmi2Component component, Call call)
+{
+    return component && allowed(component, call, NULL) ? component : NULL;
+}
+
+fmi2Status report(Instance *instance, fmi2Status status, const char *format, ...)
+{
+    static const char *const CATEGORY[] = {
+        "logAll", "logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"};
+    char text[512], escaped[2 * sizeof text], *end = escaped;
+    va_list arguments;
+    if (!instance->log || (status == fmi2OK && !instance->verbose))
+        return status;
+    va_start(arguments, format);
+    vsnprintf(text, sizeof text, format, arguments);
+    va_end(arguments);
+    for (const char *c = text; *c; c++) { /* FMI messages are printf formats */
+        if (*c == '%')
+            *end++ = '%';
+        *end++ = *c;
+    }
+    *end = '\0';
+    instance->log(instance->environment, instance->name, status, CATEGORY[status], escaped);
+    return status;
+}
+
+void reset_state(State *state)
+{
+    memset(state, 0, sizeof *state);
+    memcpy(state->guid, MODEL_GUID, sizeof MODEL_GUID);
+    memcpy(state->plant.value, START, sizeof START);
+    state->stop_time = HUGE_VAL;
+    state->phase = INSTANTIATED;
+}
+
+static fmi2Status check_parameters(Instance *instance)
+{
+    const double *value = instance->state.plant.value;
+    const int positive[] = {RTOL, ATOL, MAX_STEP};
+    for (int i = 0; i < 3; i++)
+        if (!(value[positive[i]] > 0.0))
+            return report(instance, fmi2Error, "%s = %g must be > 0", VARIABLE_NAME[positive[i]],
+                          value[positive[i]]);
+    if (!(value[RCOND] >= 0.0 && value[RCOND] < 1.0))
+        return report(instance, fmi2Error, "rcond = %g must be in [0, 1)", value[RCOND]);
+    for (int i = 0; i < N_JOINTS; i++)
+        if (value[Q_MIN + i] > value[Q_MAX + i])
+            return report(instance, fmi2Error, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
+                          i + 1, value[Q_MIN + i], i + 1, value[Q_MAX + i], JOINT_NAME[i]);
+    return fmi2OK;
+}
+
+fmi2Status initialise(Instance *instance, int warn)
+{
+    State *state = &instance->state;
+    double *value = state->plant.value;
+    if (check_parameters(instance) != fmi2OK)
+        return fmi2Error;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double start = value[Q_START + i], v = value[V_START + i];
+        const double low = value[Q_MIN + i], high = value[Q_MAX + i];
+        const double q = start < low ? low : start > high ? high : start;
+        const int into = (q >= high && v > 0.0) || (q <= low && v < 0.0);
+        if (warn && q != start)
+            report(instance, fmi2Warning,
+                   "q_start[%d] = %g of joint '%s' is outside its limits [%g, %g] and was clamped"
+                   " to %g", i + 1, start, JOINT_NAME[i], low, high, q);
+        value[Q + i] = q;
+        value[V + i] = into ? 0.0 : v;
+    }
+    state->initialised = 1;
+    state->has_x = state->has_tau = 0;
+    return fmi2OK;
+}

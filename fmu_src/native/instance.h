@@ -1,0 +1,59 @@
+/* One instance of the FMU, and what every FMI function does first. */
+#ifndef INSTANCE_H
+#define INSTANCE_H
+
+#include "fmi2Functions.h"
+#include "plant.h"
+
+typedef enum { INSTANTIATED, INITIALIZATION, STEP, STEP_FAILED, TERMINATED, N_PHASES } Phase;
+
+/* All that getFMUstate saves. Plain data without pointers. */
+typedef struct {
+    char guid[sizeof MODEL_GUID + 8 - sizeof MODEL_GUID % 8]; /* of the model that it belongs to */
+    Plant plant;
+    double time;      /* s */
+    double stop_time; /* s, HUGE_VAL where there is none */
+    int phase;
+    int initialised;  /* the outputs q and v are those of the parameters and the state */
+    int has_x;        /* the output x is computed */
+    int has_tau;      /* the output tau is computed */
+} State;
+
+typedef struct {
+    State state;
+    fmi2CallbackLogger log;
+    fmi2CallbackAllocateMemory allocate;
+    fmi2CallbackFreeMemory release;
+    fmi2ComponentEnvironment environment;
+    const char *name;
+    int verbose;
+} Instance;
+
+/* The calls of the state machine; setting variables has two rows, by causality. */
+typedef enum {
+    SET_DEBUG_LOGGING, SETUP_EXPERIMENT, ENTER_INITIALIZATION, EXIT_INITIALIZATION, TERMINATE,
+    RESET, DO_STEP, CANCEL_STEP, GET_STATUS, GET_REAL, GET_INTEGER, GET_BOOLEAN, GET_STRING,
+    SET_REAL, SET_INTEGER, SET_BOOLEAN, SET_STRING, SET_INPUT, SET_PARAMETER, GET_STATE,
+    SET_STATE, FREE_STATE, SIZE_OF_STATE, SERIALIZE, DESERIALIZE, N_CALLS
+} Call;
+
+/* Name of a call, as messages say it. */
+const char *call_name(Call call);
+
+/* Whether a call is allowed in the instance's phase; where not, logs it. */
+int allowed(Instance *instance, Call call, const char *culprit);
+
+/* The instance of a component where the call is allowed, else NULL; a refusal is logged. */
+Instance *enter(fmi2Component component, Call call);
+
+/* Log a printf message; what is below a warning only where logging is on. Returns the status. */
+fmi2Status report(Instance *instance, fmi2Status status, const char *format, ...);
+
+/* Set the state to that of a new instance. */
+void reset_state(State *state);
+
+/* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
+   clamped is logged too. */
+fmi2Status initialise(Instance *instance, int warn);
+
+#endif

@@ -1,0 +1,279 @@
+/* Dormand–Prince 5(4) over one communication step, with located joint-limit stops. The rules are
+   those of plant/integrator.py, which are SciPy's RK45 with stops.
+
+   Every communication step begins afresh with the step min(max_step, h). A joint limit is a
+   plastic stop: a joint that reaches it is set onto it with v = 0 and held there while its
+   acceleration points into it.
+
+   Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986;
+   Hairer, Nørsett & Wanner, "Solving ODEs I", II.4. */
+#include "integrator.h"
+
+#include <math.h>
+#include <string.h>
+
+enum { STAGES = 7, N_STATES = 2 * N_JOINTS }; /* y = (q, v) */
+
+/* Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution. */
+static const double A[STAGES - 1][STAGES - 1] = {
+    {1.0 / 5, 0, 0, 0, 0, 0},
+    {3.0 / 40, 9.0 / 40, 0, 0, 0, 0},
+    {44.0 / 45, -56.0 / 15, 32.0 / 9, 0, 0, 0},
+    {19372.0 / 6561, -25360.0 / 2187, 64448.0 / 6561, -212.0 / 729, 0, 0},
+    {9017.0 / 3168, -355.0 / 33, 46732.0 / 5247, 49.0 / 176, -5103.0 / 18656, 0},
+    {35.0 / 384, 0, 500.0 / 1113, 125.0 / 192, -2187.0 / 6784, 11.0 / 84},
+};
+static const double E[STAGES] = {
+    -71.0 / 57600, 0, 71.0 / 16695, -71.0 / 1920, 17253.0 / 339200, -22.0 / 525, 1.0 / 40};
+static const double P[STAGES][4] = {
+    {1, -8048581381.0 / 2820520608, 8663915743.0 / 2820520608, -12715105075.0 / 11282082432},
+    {0, 0, 0, 0},
+    {0, 131558114200.0 / 32700410799, -68118460800.0 / 10900136933, 87487479700.0 / 32700410799},
+    {0, -1754552775.0 / 470086768, 14199869525.0 / 1410260304, -10690763975.0 / 1880347072},
+    {0, 127303824393.0 / 49829197408, -318862633887.0 / 49829197408,
+     701980252875.0 / 199316789632},
+    {0, -282668133.0 / 205662961, 2019193451.0 / 616988883, -1453857185.0 / 822651844},
+    {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
+};
+static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
+/* Smallest step, as a part of the first one, 2⁻¹⁰. Across a singularity of the Jacobian the
+   right-hand side jumps and no step satisfies the error test; a step of this size is taken as it
+   is. Nor does an event end a step sooner: where a joint chatters at its limit, events would else
+   follow each other without the time moving on. */
+static const double STEP_FLOOR = 1.0 / 1024.0;
+static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
+
+/* One integration step, from y to y_new. */
+typedef struct {
+    const Plant *plant;
+    double size, floor;         /* s; the smallest step of this communication step */
+    double y[N_STATES], y_new[N_STATES];
+    double K[STAGES][N_STATES]; /* derivatives at the stages */
+    double Q[N_STATES][4];      /* coefficients of the dense output */
+    int held[N_JOINTS];         /* joints held at a limit */
+    int any_held;
+} Step;
+
+/* Set out at y: take the velocity that points into a limit, find the joints held there. */
+static void hold(Step *step)
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    double *q = step->y, *v = step->y + N_JOINTS, *a = step->K[0] + N_JOINTS;
+    for (int i = 0; i < N_JOINTS; i++)
+        if ((q[i] >= high[i] && v[i] > 0.0) || (q[i] <= low[i] && v[i] < 0.0))
+            v[i] = 0.0;
+    acceleration(step->plant, q, v, a);
+    step->any_held = 0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const int into = (q[i] >= high[i] && a[i] >= 0.0) || (q[i] <= low[i] && a[i] <= 0.0);
+        step->held[i] = into && v[i] == 0.0;
+        if (step->held[i]) {
+            step->any_held = 1;
+            a[i] = 0.0;
+        }
+        step->K[0][i] = v[i];
+    }
+}
+
+/* Fill y_new and K[1…6] from y and K[0]; the norm of the error, which passes where below 1. */
+static double dormand_prince(Step *step)
+{
+    const double rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
+    double *y_new = step->y_new, sum = 0.0;
+    for (int stage = 1; stage < STAGES; stage++) {
+        double weight[STAGES - 1], *a = step->K[stage] + N_JOINTS;
+        for (int s = 0; s < stage; s++)
+            weight[s] = step->size * A[stage - 1][s];
+        for (int i = 0; i < N_STATES; i++) {
+            double change = 0.0;
+            for (int s = 0; s < stage; s++)
+                change += weight[s] * step->K[s][i];
+            y_new[i] = step->y[i] + change;
+        }
+        memcpy(step->K[stage], y_new + N_JOINTS, N_JOINTS * sizeof *y_new);
+        acceleration(step->plant, y_new, y_new + N_JOINTS, a);
+        for (int i = 0; i < N_JOINTS; i++)
+            if (step->held[i])
+                a[i] = 0.0;
+    }
+    for (int i = 0; i < N_STATES; i++) {
+        double error = 0.0;
+        for (int s = 0; s < STAGES; s++)
+            error += E[s] * step->K[s][i];
+        const double size = fabs(step->y[i]), size_new = fabs(y_new[i]);
+        const double ratio =
+            step->size * error / (atol + rtol * (size > size_new ? size : size_new));
+        sum += ratio * ratio;
+    }
+    return sqrt(sum / N_STATES);
+}
+
+/* State at a time within the step, by the fourth-order interpolant. */
+static void dense_output(const Step *step, double passed, double y[N_STATES])
+{
+    const double x = passed / step->size;
+    for (int i = 0; i < N_STATES; i++) {
+        const double *c = step->Q[i];
+        const double slope = c[0] + c[1] * x + c[2] * (x * x) + c[3] * (x * x * x);
+        y[i] = passed == step->size ? step->y_new[i] : step->y[i] + step->size * x * slope;
+    }
+}
+
+/* Mark the free joints that are past a limit and the held joints that would leave theirs, at y;
+   whether there are any. */
+static int events(const Step *step, const double y[N_STATES], int found[N_JOINTS])
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    const double *q = y, *v = y + N_JOINTS;
+    double a[N_JOINTS];
+    int any = 0;
+    if (step->any_held)
+        acceleration(step->plant, q, v, a);
+    for (int i = 0; i < N_JOINTS; i++) {
+        found[i] = (q[i] >= high[i] && (q[i] > high[i] || v[i] > 0.0))
+                   || (q[i] <= low[i] && (q[i] < low[i] || v[i] < 0.0));
+        if (step->held[i] && low[i] < high[i])
+            found[i] |= q[i] >= high[i] ? a[i] < 0.0 : a[i] > 0.0;
+        any |= found[i];
+    }
+    return any;
+}
+
+/* What may happen within a step: an event, or a joint's turning back. */
+typedef int Happened(const Step *step, double passed, int joint);
+
+static int event_happened(const Step *step, double passed, int joint)
+{
+    double y[N_STATES];
+    int found[N_JOINTS];
+    (void)joint;
+    dense_output(step, passed, y);
+    return events(step, y, found);
+}
+
+static int joint_turned(const Step *step, double passed, int joint)
+{
+    double y[N_STATES];
+    dense_output(step, passed, y);
+    return y[N_JOINTS + joint] * step->y[N_JOINTS + joint] <= 0.0;
+}
+
+/* First time in (0, latest] at which it has happened, to the last bits of the step. */
+static double bisect(const Step *step, Happened *happened, int joint, double latest)
+{
+    double before = 0.0;
+    while (latest - before > TIME_RESOLUTION * step->size) {
+        const double middle = 0.5 * (before + latest);
+        if (!(before < middle && middle < latest))
+            break;
+        if (happened(step, middle, joint))
+            latest = middle;
+        else
+            before = middle;
+    }
+    return latest;
+}
+
+/* When a joint is furthest past a limit, where it is so within the step and back at its end; the
+   earliest such time, 0 where there is none. */
+static double excursion(const Step *step)
+{
+    double earliest = 0.0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double q = step->y[i], v = step->y[N_JOINTS + i];
+        const double limit = step->plant->value[(v > 0.0 ? Q_MAX : Q_MIN) + i];
+        if (!(v * step->y_new[N_JOINTS + i] < 0.0 && fabs(v) * step->size > fabs(limit - q)))
+            continue;
+        double y[N_STATES];
+        const double turn = bisect(step, joint_turned, i, step->size);
+        dense_output(step, turn, y);
+        if ((y[i] - limit) * v > 0.0 && (earliest == 0.0 || turn < earliest))
+            earliest = turn;
+    }
+    return earliest;
+}
+
+/* First time in (0, size], but not before the floor, at which a limit is reached or left, and y_new
+   the state from there on; 0 where there is none. */
+static double first_event(Step *step)
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    int found[N_JOINTS];
+    const int at_the_end = events(step, step->y_new, found);
+    int turned = 0;
+    for (int i = 0; i < N_JOINTS; i++)
+        turned |= step->y[N_JOINTS + i] * step->y_new[N_JOINTS + i] < 0.0;
+    if (!at_the_end && !turned)
+        return 0.0;
+    for (int i = 0; i < N_STATES; i++)
+        for (int k = 0; k < 4; k++) {
+            step->Q[i][k] = 0.0;
+            for (int s = 0; s < STAGES; s++)
+                step->Q[i][k] += step->K[s][i] * P[s][k];
+        }
+    double latest = at_the_end ? step->size : excursion(step);
+    if (latest == 0.0)
+        return 0.0;
+    latest = fmax(bisect(step, event_happened, 0, latest), fmin(step->floor, step->size));
+    double reached[N_STATES];
+    dense_output(step, latest, reached);
+    events(step, reached, found);
+    for (int i = 0; i < N_JOINTS; i++)
+        if (found[i] && !step->held[i]) {
+            reached[i] = fmin(fmax(reached[i], low[i]), high[i]);
+            reached[N_JOINTS + i] = 0.0;
+        }
+    memcpy(step->y_new, reached, sizeof reached);
+    return latest;
+}
+
+/* Integrate from the time t, at y, until a joint reaches or leaves a limit, or until the end: the
+   time reached, y being the state there; NaN where a value is not finite. */
+static double until_event(Step *step, double t, double end)
+{
+    const double max_step = step->plant->value[MAX_STEP];
+    double next = fmin(max_step, end - t), growth = MAX_FACTOR;
+    hold(step);
+    for (;;) {
+        const int last = t + next * (1.0 + 1e-9) >= end;
+        step->size = last ? end - t : next;
+        const double norm = dormand_prince(step);
+        double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
+        if (norm < 1.0 || (step->size <= step->floor && isfinite(norm))) {
+            const double passed = first_event(step);
+            memcpy(step->y, step->y_new, sizeof step->y);
+            if (last && (passed == 0.0 || passed == step->size))
+                return end;
+            if (passed > 0.0)
+                return t + passed;
+            t += step->size;
+            memcpy(step->K[0], step->K[STAGES - 1], sizeof step->K[0]);
+            factor = fmax(MIN_FACTOR, fmin(growth, factor));
+            next = fmax(step->floor, fmin(max_step, step->size * factor));
+            growth = MAX_FACTOR;
+        } else if (step->size <= step->floor) {
+            return NAN;
+        } else {
+            factor = isfinite(norm) ? factor : MIN_FACTOR;
+            next = fmax(step->floor, step->size * fmax(MIN_FACTOR, factor));
+            growth = 1.0; /* no growth right after a rejection */
+        }
+    }
+}
+
+int advance(Plant *plant, double h)
+{
+    Step step;
+    double t = 0.0;
+    step.plant = plant;
+    step.floor = STEP_FLOOR * fmin(plant->value[MAX_STEP], h);
+    memcpy(step.y, &plant->value[Q], N_JOINTS * sizeof *step.y);
+    memcpy(step.y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *step.y);
+    while (t < h)
+        t = until_event(&step, t, h);
+    if (isnan(t))
+        return 0;
+    memcpy(&plant->value[Q], step.y, N_JOINTS * sizeof *step.y);
+    memcpy(&plant->value[V], step.y + N_JOINTS, N_JOINTS * sizeof *step.y);
+    return 1;
+}

@@ -1,0 +1,101 @@
+/* J⁺ b for one to three rows; the rules and thresholds are those of plant/controller.py. */
+#include "pseudo_inverse.h"
+
+#include <math.h>
+#include <string.h>
+
+/* Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12. */
+static const double WELL_CONDITIONED = 1e-3;
+/* Rows count as orthogonal where the cosine of their angle is below this, 2⁻⁵⁰. */
+static const double ORTHOGONAL = 1.0 / 1125899906842624.0;
+enum { MAX_SWEEPS = 12 };
+
+static double dot(const double a[N_JOINTS], const double b[N_JOINTS])
+{
+    double total = 0.0;
+    for (int i = 0; i < N_JOINTS; i++)
+        total += a[i] * b[i];
+    return total;
+}
+
+/* y = (J Jᵀ)⁻¹ b by cofactors; false where a singular value may have to be dropped. */
+static int solve_normal_equations(double J[N_AXES][N_JOINTS], const double b[N_AXES],
+                                  double smallest, double y[N_AXES])
+{
+#if N_AXES == 2
+    const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g11 = dot(J[1], J[1]);
+    const double determinant = g00 * g11 - g01 * g01;
+    const double trace = g00 + g11;
+    if (!(determinant > smallest * trace * trace)) /* ≤ σ_min²/σ_max² */
+        return 0;
+    y[0] = (g11 * b[0] - g01 * b[1]) / determinant;
+    y[1] = (g00 * b[1] - g01 * b[0]) / determinant;
+    return 1;
+#elif N_AXES == 3
+    const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g02 = dot(J[0], J[2]);
+    const double g11 = dot(J[1], J[1]), g12 = dot(J[1], J[2]), g22 = dot(J[2], J[2]);
+    const double c00 = g11 * g22 - g12 * g12, c01 = g02 * g12 - g01 * g22;
+    const double c02 = g01 * g12 - g02 * g11, c11 = g00 * g22 - g02 * g02;
+    const double c12 = g01 * g02 - g00 * g12, c22 = g00 * g11 - g01 * g01;
+    const double determinant = g00 * c00 + g01 * c01 + g02 * c02;
+    const double trace = g00 + g11 + g22;
+    if (!(4.0 * determinant > smallest * trace * trace * trace)) /* as λ₁λ₂ ≤ (λ₁ + λ₂)²/4 */
+        return 0;
+    y[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant;
+    y[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant;
+    y[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / determinant;
+    return 1;
+#else
+    (void)J, (void)b, (void)smallest, (void)y;
+    return 0;
+#endif
+}
+
+/* One-sided Jacobi: rotations from the left make the rows orthogonal, row k becomes σ_k v_kᵀ and
+   b_k becomes u_kᵀ b. Source: Hestenes, J. SIAM 6(1), 1958. */
+static void orthogonalise(double J[N_AXES][N_JOINTS], double b[N_AXES])
+{
+    int rotated = 1;
+    for (int sweep = 0; sweep < MAX_SWEEPS && rotated; sweep++) {
+        rotated = 0;
+        for (int i = 0; i < N_AXES; i++)
+            for (int j = i + 1; j < N_AXES; j++) {
+                const double ii = dot(J[i], J[i]), ij = dot(J[i], J[j]), jj = dot(J[j], J[j]);
+                if (!(fabs(ij) > ORTHOGONAL * sqrt(ii * jj)))
+                    continue;
+                rotated = 1;
+                const double zeta = (jj - ii) / (2.0 * ij);
+                const double t = 1.0 / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
+                const double c = 1.0 / sqrt(1.0 + t * t);
+                const double s = zeta >= 0.0 ? c * t : -c * t;
+                for (int k = 0; k < N_JOINTS; k++) {
+                    const double x = J[i][k], y = J[j][k];
+                    J[i][k] = c * x - s * y;
+                    J[j][k] = s * x + c * y;
+                }
+                const double bi = b[i], bj = b[j];
+                b[i] = c * bi - s * bj;
+                b[j] = s * bi + c * bj;
+            }
+    }
+}
+
+void apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
+                          double result[N_JOINTS])
+{
+    double y[N_AXES]; /* J⁺ b = Jᵀ y */
+    if (!solve_normal_equations(J, b, fmax(rcond * rcond, WELL_CONDITIONED), y)) {
+        double square[N_AXES], largest = 0.0;
+        orthogonalise(J, b);
+        for (int k = 0; k < N_AXES; k++) {
+            square[k] = dot(J[k], J[k]);
+            largest = fmax(largest, square[k]);
+        }
+        for (int k = 0; k < N_AXES; k++)
+            y[k] = square[k] > rcond * rcond * largest ? b[k] / square[k] : 0.0;
+    }
+    memset(result, 0, N_JOINTS * sizeof *result);
+    for (int k = 0; k < N_AXES; k++)
+        for (int i = 0; i < N_JOINTS; i++)
+            result[i] += y[k] * J[k][i];
+}

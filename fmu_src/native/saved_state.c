@@ -1,0 +1,120 @@
+/* FMI 2.0: saving, restoring and serialising the state, which is one plain struct. */
+#include <stdint.h>
+#include <string.h>
+
+#include "instance.h"
+
+static fmi2Status refuse(Instance *instance, Call call, const char *reason)
+{
+    return report(instance, fmi2Error, "%s: %s", call_name(call), reason);
+}
+
+static const char NULL_POINTER[] = "null pointer";
+static const char FOREIGN[] = "the state is not one of this FMU";
+
+static int is_own(const State *state)
+{
+    return memcmp(state->guid, MODEL_GUID, sizeof MODEL_GUID) == 0;
+}
+
+/* Serialised, a checksum follows the state: bytes that were changed are refused. FNV-1a, 64 bits;
+   source: Fowler, Noll & Vo, RFC 9923. */
+static uint64_t checksum(const void *bytes)
+{
+    const unsigned char *byte = bytes;
+    uint64_t sum = UINT64_C(0xcbf29ce484222325);
+    for (size_t i = 0; i < sizeof(State); i++)
+        sum = (sum ^ byte[i]) * UINT64_C(0x100000001b3);
+    return sum;
+}
+
+enum { SERIALIZED_SIZE = sizeof(State) + sizeof(uint64_t) };
+
+fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)
+{
+    Instance *instance = enter(component, GET_STATE);
+    if (!instance)
+        return fmi2Error;
+    if (!saved)
+        return refuse(instance, GET_STATE, NULL_POINTER);
+    if (!*saved)
+        *saved = instance->allocate(1, sizeof(State));
+    if (!*saved)
+        return refuse(instance, GET_STATE, "no memory");
+    memcpy(*saved, &instance->state, sizeof(State));
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate saved)
+{
+    Instance *instance = enter(component, SET_STATE);
+    if (!instance)
+        return fmi2Error;
+    if (!saved)
+        return refuse(instance, SET_STATE, NULL_POINTER);
+    if (!is_own(saved))
+        return refuse(instance, SET_STATE, FOREIGN);
+    memcpy(&instance->state, saved, sizeof(State));
+    return fmi2OK;
+}
+
+fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *saved)
+{
+    Instance *instance = enter(component, FREE_STATE);
+    if (!instance)
+        return fmi2Error;
+    if (saved && *saved) {
+        instance->release(*saved);
+        *saved = NULL;
+    }
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component component, fmi2FMUstate saved, size_t *size)
+{
+    Instance *instance = enter(component, SIZE_OF_STATE);
+    if (!instance)
+        return fmi2Error;
+    if (!saved || !size)
+        return refuse(instance, SIZE_OF_STATE, NULL_POINTER);
+    *size = SERIALIZED_SIZE;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializeFMUstate(fmi2Component component, fmi2FMUstate saved, fmi2Byte bytes[],
+                                 size_t size)
+{
+    Instance *instance = enter(component, SERIALIZE);
+    if (!instance)
+        return fmi2Error;
+    if (!saved || !bytes)
+        return refuse(instance, SERIALIZE, NULL_POINTER);
+    if (size < SERIALIZED_SIZE)
+        return refuse(instance, SERIALIZE, "the buffer is too small");
+    const uint64_t sum = checksum(saved);
+    memcpy(bytes, saved, sizeof(State));
+    memcpy(bytes + sizeof(State), &sum, sizeof sum);
+    return fmi2OK;
+}
+
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes[], size_t size,
+                                   fmi2FMUstate *saved)
+{
+    Instance *instance = enter(component, DESERIALIZE);
+    uint64_t sum;
+    if (!instance)
+        return fmi2Error;
+    if (!bytes || !saved)
+        return refuse(instance, DESERIALIZE, NULL_POINTER);
+    if (size != SERIALIZED_SIZE)
+        return refuse(instance, DESERIALIZE, FOREIGN);
+    memcpy(&sum, bytes + sizeof(State), sizeof sum);
+    if (sum != checksum(bytes) || memcmp(bytes, MODEL_GUID, sizeof MODEL_GUID) != 0)
+        return refuse(instance, DESERIALIZE, FOREIGN);
+    if (!*saved)
+        *saved = instance->allocate(1, sizeof(State));
+    if (!*saved)
+        return refuse(instance, DESERIALIZE, "no memory");
+    memcpy(*saved, bytes, sizeof(State));
+    return fmi2OK;
+}

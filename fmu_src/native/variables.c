@@ -1,0 +1,164 @@
+/* FMI 2.0: getting and setting variables. A refused call changes no variable. */
+#include <math.h>
+#include <stddef.h>
+
+#include "instance.h"
+
+/* Types of variables; there are no integers and no strings. */
+typedef enum { REAL, BOOLEAN, NONE } Type;
+static const char *const TYPE_NAME[] = {"Real", "Boolean"};
+
+/* Whether the value references are of variables of a type. */
+static int known(Instance *instance, Call call, Type type, const fmi2ValueReference vr[],
+                 size_t count, const void *values)
+{
+    if (count > 0 && (!vr || !values)) {
+        report(instance, fmi2Error, "%s: null pointer", call_name(call));
+        return 0;
+    }
+    for (size_t i = 0; i < count; i++) {
+        if (vr[i] >= N_VARIABLES) {
+            report(instance, fmi2Error, "%s: there is no variable with value reference %u",
+                   call_name(call), vr[i]);
+            return 0;
+        }
+        const Type actual = vr[i] == LIMIT_EFFORT ? BOOLEAN : REAL;
+        if (actual != type) {
+            report(instance, fmi2Error, "%s: %s is of type %s", call_name(call),
+                   VARIABLE_NAME[vr[i]], TYPE_NAME[actual]);
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Whether a variable may be set now. */
+static int settable(Instance *instance, Call call, fmi2ValueReference vr)
+{
+    if (vr >= FIRST_OUTPUT && vr < FIRST_PARAMETER) {
+        report(instance, fmi2Error, "%s: %s is an output and cannot be set", call_name(call),
+               VARIABLE_NAME[vr]);
+        return 0;
+    }
+    return allowed(instance, vr < FIRST_OUTPUT ? SET_INPUT : SET_PARAMETER, VARIABLE_NAME[vr]);
+}
+
+/* Take over a value; outputs that follow from it are computed anew when they are read. */
+static void set(State *state, fmi2ValueReference vr, double value)
+{
+    state->plant.value[vr] = value;
+    state->has_tau = 0;
+    if (vr >= FIRST_PARAMETER)
+        state->initialised = 0;
+}
+
+/* Make an output right for the present state, inputs and parameters. */
+static fmi2Status update(Instance *instance, fmi2ValueReference vr)
+{
+    State *state = &instance->state;
+    if (!state->initialised && initialise(instance, 0) != fmi2OK)
+        return fmi2Error;
+    if (vr >= X && vr < TAU && !state->has_x) {
+        compute_position(&state->plant);
+        state->has_x = 1;
+    }
+    if (vr >= TAU && !state->has_tau) {
+        compute_effort(&state->plant);
+        state->has_tau = 1;
+    }
+    if (!isfinite(state->plant.value[vr]))
+        return report(instance, fmi2Discard, "fmi2GetReal: %s is not finite", VARIABLE_NAME[vr]);
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                       fmi2Real value[])
+{
+    Instance *instance = enter(component, GET_REAL);
+    if (!instance || !known(instance, GET_REAL, REAL, vr, count, value))
+        return fmi2Error;
+    for (size_t i = 0; i < count; i++)
+        if (vr[i] >= FIRST_OUTPUT && vr[i] < FIRST_PARAMETER) {
+            const fmi2Status status = update(instance, vr[i]);
+            if (status != fmi2OK)
+                return status;
+        }
+    for (size_t i = 0; i < count; i++)
+        value[i] = instance->state.plant.value[vr[i]];
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                       const fmi2Real value[])
+{
+    Instance *instance = enter(component, SET_REAL);
+    if (!instance || !known(instance, SET_REAL, REAL, vr, count, value))
+        return fmi2Error;
+    for (size_t i = 0; i < count; i++) {
+        if (!settable(instance, SET_REAL, vr[i]))
+            return fmi2Error;
+        if (!isfinite(value[i]))
+            return report(instance, fmi2Error, "%s = %s is not finite", VARIABLE_NAME[vr[i]],
+                          isnan(value[i]) ? "nan" : value[i] > 0.0 ? "inf" : "-inf");
+    }
+    for (size_t i = 0; i < count; i++)
+        set(&instance->state, vr[i], value[i]);
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetBoolean(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                          fmi2Boolean value[])
+{
+    Instance *instance = enter(component, GET_BOOLEAN);
+    if (!instance || !known(instance, GET_BOOLEAN, BOOLEAN, vr, count, value))
+        return fmi2Error;
+    for (size_t i = 0; i < count; i++)
+        value[i] = instance->state.plant.value[vr[i]] != 0.0 ? fmi2True : fmi2False;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetBoolean(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                          const fmi2Boolean value[])
+{
+    Instance *instance = enter(component, SET_BOOLEAN);
+    if (!instance || !known(instance, SET_BOOLEAN, BOOLEAN, vr, count, value))
+        return fmi2Error;
+    for (size_t i = 0; i < count; i++)
+        if (!settable(instance, SET_BOOLEAN, vr[i]))
+            return fmi2Error;
+    for (size_t i = 0; i < count; i++)
+        set(&instance->state, vr[i], value[i] ? 1.0 : 0.0);
+    return fmi2OK;
+}
+
+/* Integers and strings: any reference is refused, none is fine. */
+static fmi2Status none(fmi2Component component, Call call, const fmi2ValueReference vr[],
+                       size_t count, const void *values)
+{
+    Instance *instance = enter(component, call);
+    return instance && known(instance, call, NONE, vr, count, values) ? fmi2OK : fmi2Error;
+}
+
+fmi2Status fmi2GetInteger(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                          fmi2Integer value[])
+{
+    return none(component, GET_INTEGER, vr, count, value);
+}
+
+fmi2Status fmi2SetInteger(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                          const fmi2Integer value[])
+{
+    return none(component, SET_INTEGER, vr, count, value);
+}
+
+fmi2Status fmi2GetString(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                         fmi2String value[])
+{
+    return none(component, GET_STRING, vr, count, value);
+}
+
+fmi2Status fmi2SetString(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                         const fmi2String value[])
+{
+    return none(component, SET_STRING, vr, count, value);
+}

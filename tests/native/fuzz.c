@@ -1,0 +1,260 @@
+/* Random legal and illegal FMI calls, with NaN, infinities, wrong value references and foreign
+   states. Compiled with AddressSanitizer and UndefinedBehaviorSanitizer, which end the program at
+   the first fault. It knows in which phase each instance is and checks that every call that is
+   illegal there is refused and leaves the instance's state as it was.
+
+       fuzz SEQUENCES SEED */
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "fmi2Functions.h"
+#include "instance.h"
+
+#define CHECK(condition)                                                                     \
+    do {                                                                                     \
+        if (!(condition)) {                                                                  \
+            fprintf(stderr, "line %d: not %s\n", __LINE__, #condition);                      \
+            exit(1);                                                                         \
+        }                                                                                    \
+    } while (0)
+
+enum { LONGEST = 40, MANY = 6 };
+static uint64_t seed;
+static long logged, refused, done;
+
+static unsigned pick(unsigned below) /* xorshift64* */
+{
+    seed ^= seed >> 12, seed ^= seed << 25, seed ^= seed >> 27;
+    return (unsigned)((seed * UINT64_C(2685821657736338717)) >> 33) % below;
+}
+
+static double number(void)
+{
+    static const double odd[] = {0.0, -0.0, 1e-320, -1.0, 1e6, -1e6, 1e300, -1e300, 1.7e308};
+    switch (pick(8)) {
+    case 0: return pick(2) ? NAN : pick(2) ? INFINITY : -INFINITY;
+    case 1: return odd[pick(9)];
+    default: return (pick(2001) - 1000.0) * 1e-3;
+    }
+}
+
+static void log_message(fmi2ComponentEnvironment environment, fmi2String name, fmi2Status status,
+                        fmi2String category, fmi2String message, ...)
+{
+    (void)environment;
+    CHECK(name && category && message && status <= fmi2Error && strlen(message) < 1000);
+    logged++;
+}
+
+static const fmi2CallbackFunctions CALLBACKS = {log_message, calloc, free, NULL, NULL};
+
+static Instance *instantiate(void)
+{
+    return fmi2Instantiate("fuzz", fmi2CoSimulation, MODEL_GUID, "", &CALLBACKS, 0, (int)pick(2));
+}
+
+static fmi2Status variables(Instance *c)
+{
+    fmi2ValueReference vr[MANY];
+    double real[MANY];
+    int whole[MANY];
+    fmi2String text[MANY] = {"", "", "", "", "", ""};
+    const size_t count = pick(MANY + 1);
+    const unsigned range = pick(10) ? N_VARIABLES : 0xffffffffu;
+    for (size_t i = 0; i < MANY; i++) {
+        vr[i] = pick(range);
+        real[i] = number();
+        whole[i] = (int)pick(3) - 1;
+        /* the master's choice alone: how long a step takes */
+        if (vr[i] == MAX_STEP && real[i] > 0.0 && real[i] < 1e-3)
+            real[i] = 1e-3;
+    }
+    const fmi2ValueReference *place = pick(30) ? vr : NULL;
+    switch (pick(9)) {
+    case 0: return fmi2GetBoolean(c, place, count, whole);
+    case 1: return fmi2SetBoolean(c, place, count, whole);
+    case 2: return pick(2) ? fmi2GetInteger(c, place, count, whole)
+                           : fmi2SetInteger(c, place, count, whole);
+    case 3: return pick(2) ? fmi2GetString(c, place, count, text)
+                           : fmi2SetString(c, place, count, text);
+    case 4:
+    case 5: return fmi2GetReal(c, place, count, pick(30) ? real : NULL);
+    default: return fmi2SetReal(c, place, count, pick(30) ? real : NULL);
+    }
+}
+
+static fmi2Status saved_states(Instance *c, fmi2FMUstate *saved)
+{
+    fmi2Byte bytes[sizeof(State) + 64];
+    size_t size = 0;
+    fmi2FMUstate other = NULL;
+    fmi2Status status = fmi2OK;
+    switch (pick(4)) {
+    case 0: return fmi2GetFMUstate(c, pick(20) ? saved : NULL);
+    case 1: return fmi2SetFMUstate(c, *saved);
+    case 2: return fmi2FreeFMUstate(c, pick(20) ? saved : NULL);
+    default:
+        if (!*saved)
+            return fmi2SerializedFMUstateSize(c, NULL, &size);
+        CHECK(fmi2SerializedFMUstateSize(c, *saved, &size) == fmi2OK && size <= sizeof bytes);
+        CHECK(fmi2SerializeFMUstate(c, *saved, bytes, size - 1) == fmi2Error);
+        CHECK(fmi2SerializeFMUstate(c, *saved, bytes, size) == fmi2OK);
+        if (pick(2)) {
+            bytes[pick((unsigned)size)] ^= (fmi2Byte)(1 << pick(7));
+            CHECK(fmi2DeSerializeFMUstate(c, bytes, size, &other) == fmi2Error && !other);
+            return fmi2Error;
+        }
+        CHECK(fmi2DeSerializeFMUstate(c, bytes, size - pick(2), pick(2) ? &other : saved)
+              <= fmi2Error);
+        if (other)
+            status = fmi2SetFMUstate(c, other);
+        fmi2FreeFMUstate(c, &other);
+        return status;
+    }
+}
+
+static fmi2Status step(Instance *c)
+{
+    const double h = pick(10) ? 1e-3 * (1 + pick(20)) : number();
+    const double t = pick(10) ? c->state.time : number();
+    const int is_time = fabs(t - c->state.time) <= 1e-9 * fmax(1.0, fabs(t));
+    const int legal = c->state.phase == STEP && is_time && h > 0.0 && isfinite(h);
+    if (legal && h > 0.02)
+        return fmi2OK; /* the master's choice alone: how long a step takes */
+    const fmi2Status status = fmi2DoStep(c, t, h, (int)pick(2));
+    CHECK(legal || status == fmi2Error);
+    if (status == fmi2OK)
+        for (int i = Q; i < X; i++)
+            CHECK(isfinite(c->state.plant.value[i]));
+    return status;
+}
+
+static fmi2Status ask(Instance *c)
+{
+    const fmi2StatusKind kind = (fmi2StatusKind)pick(4);
+    const fmi2String names[2] = {pick(2) ? "logAll" : "logStatusError", pick(3) ? "logAll" : "?"};
+    double real;
+    int whole;
+    fmi2Status status;
+    fmi2String text;
+    switch (pick(7)) {
+    case 0: return fmi2GetStatus(c, kind, pick(9) ? &status : NULL);
+    case 1: return fmi2GetRealStatus(c, kind, pick(9) ? &real : NULL);
+    case 2: return fmi2GetIntegerStatus(c, kind, &whole);
+    case 3: return fmi2GetBooleanStatus(c, kind, pick(9) ? &whole : NULL);
+    case 4: return fmi2GetStringStatus(c, kind, &text);
+    case 5: return fmi2CancelStep(c);
+    default: return fmi2SetDebugLogging(c, (int)pick(2), pick(3), pick(9) ? names : NULL);
+    }
+}
+
+static fmi2Status unsupported(Instance *c)
+{
+    switch (pick(13)) {
+    case 0: return fmi2GetDirectionalDerivative(c, NULL, 0, NULL, 0, NULL, NULL);
+    case 1: return fmi2SetRealInputDerivatives(c, NULL, 0, NULL, NULL);
+    case 2: return fmi2GetRealOutputDerivatives(c, NULL, 0, NULL, NULL);
+    case 3: return fmi2EnterEventMode(c);
+    case 4: return fmi2NewDiscreteStates(c, NULL);
+    case 5: return fmi2EnterContinuousTimeMode(c);
+    case 6: return fmi2CompletedIntegratorStep(c, 0, NULL, NULL);
+    case 7: return fmi2SetTime(c, number());
+    case 8: return fmi2SetContinuousStates(c, NULL, 0);
+    case 9: return fmi2GetDerivatives(c, NULL, 0);
+    case 10: return fmi2GetEventIndicators(c, NULL, 0);
+    case 11: return fmi2GetContinuousStates(c, NULL, 0);
+    default: return fmi2GetNominalsOfContinuousStates(c, NULL, 0);
+    }
+}
+
+/* A call that only the phase makes legal, and the phase after it. */
+static fmi2Status move(Instance *c)
+{
+    const int phase = c->state.phase;
+    const int tolerance = (int)pick(2), stop = pick(4) == 0;
+    const double start = pick(5) ? 0.0 : number(), end = pick(5) ? 1.0 : number();
+    fmi2Status status = fmi2Error;
+    switch (pick(6)) {
+    case 0:
+        status = fmi2SetupExperiment(c, tolerance, number(), start, stop, end);
+        CHECK(status == (phase == INSTANTIATED && isfinite(start) && (!stop || end >= start)
+                             ? fmi2OK : fmi2Error));
+        return status;
+    case 1:
+        status = fmi2EnterInitializationMode(c);
+        CHECK((status == fmi2OK) == (phase == INSTANTIATED));
+        CHECK(c->state.phase == (status == fmi2OK ? INITIALIZATION : phase));
+        return status;
+    case 2:
+    case 3:
+        status = fmi2ExitInitializationMode(c);
+        CHECK(status == fmi2Error || phase == INITIALIZATION);
+        CHECK(c->state.phase == (status == fmi2OK ? STEP : phase));
+        return status;
+    case 4:
+        if (pick(4))
+            return fmi2OK;
+        status = fmi2Terminate(c);
+        CHECK((status == fmi2OK) == (phase == STEP || phase == STEP_FAILED));
+        return status;
+    default:
+        if (pick(4))
+            return fmi2OK;
+        return fmi2Reset(c);
+    }
+}
+
+static void sequence(void)
+{
+    fmi2FMUstate saved = NULL;
+    Instance *c = instantiate();
+    CHECK(c);
+    for (unsigned i = 0, length = 1 + pick(LONGEST); i < length; i++) {
+        const State before = c->state;
+        fmi2Status status;
+        switch (pick(10)) {
+        case 0: status = ask(c); break;
+        case 1: status = saved_states(c, &saved); break;
+        case 2: status = unsupported(c); CHECK(status == fmi2Error); break;
+        case 3:
+        case 4: status = variables(c); break;
+        case 5:
+        case 6: status = step(c); break;
+        default: status = move(c); break;
+        }
+        CHECK(status == fmi2OK || status == fmi2Discard || status == fmi2Error);
+        if (status == fmi2Error) {
+            refused++;
+            CHECK(c->state.phase == before.phase && c->state.time == before.time);
+            for (int k = 0; k < N_VARIABLES; k++)
+                if (before.initialised || k < FIRST_OUTPUT || k >= FIRST_PARAMETER)
+                    CHECK(c->state.plant.value[k] == before.plant.value[k]
+                          || (k >= X && k < FIRST_PARAMETER));
+        } else {
+            done++;
+        }
+    }
+    fmi2FreeFMUstate(c, &saved);
+    fmi2FreeInstance(c);
+}
+
+int main(int count, char *argument[])
+{
+    const long sequences = count > 1 ? atol(argument[1]) : 1000;
+    seed = count > 2 ? strtoull(argument[2], NULL, 10) * UINT64_C(0x9e3779b97f4a7c15) + 1 : 1;
+    CHECK(!fmi2Instantiate("x", fmi2CoSimulation, "wrong", "", &CALLBACKS, 0, 0));
+    CHECK(!fmi2Instantiate("x", fmi2CoSimulation, NULL, NULL, &CALLBACKS, 0, 0));
+    CHECK(!fmi2Instantiate("x", fmi2ModelExchange, MODEL_GUID, "", &CALLBACKS, 0, 0));
+    CHECK(!fmi2Instantiate("", fmi2CoSimulation, MODEL_GUID, "", &CALLBACKS, 0, 0));
+    CHECK(!fmi2Instantiate("x", fmi2CoSimulation, MODEL_GUID, "", NULL, 0, 0));
+    CHECK(fmi2DoStep(NULL, 0.0, 0.01, 0) == fmi2Error);
+    fmi2FreeInstance(NULL);
+    for (long i = 0; i < sequences; i++)
+        sequence();
+    printf("%ld sequences, %ld calls done, %ld refused, %ld messages\n", sequences, done, refused,
+           logged);
+    return 0;
+}

@@ -1,0 +1,178 @@
+"""Robots for the native tests, and their engines compiled and loaded once a session."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import re
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pinocchio as pin
+
+from twodof.native import compile_library, host_platform, model_header
+from twodof.plant import Plant, Robot, Variable, load_robot, variable_table
+
+ROOT = Path(__file__).parents[1]
+SOURCES = ROOT / "fmu_src" / "native"
+HERE = Path(__file__).parent / "native"
+GUID = "0123456789abcdef"
+SCRATCH = Path(tempfile.mkdtemp(prefix="twodof-tests-"))
+
+
+def robots_folder() -> Path:
+    """Where the package example-robot-data keeps its URDFs."""
+    for parent in Path(pin.__file__).parents:
+        folder = parent / "share" / "example-robot-data" / "robots"
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError("the package example-robot-data is not installed")
+
+
+# URDF below robots_folder(), frame, axes
+ROBOTS = {
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0", "xyz"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp", "xyz"),
+    "z1": ("z1_description/urdf/z1.urdf", "gripperMover", "zx"),
+    "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", "link2", "y"),
+    "anymal_c": ("anymal_c_simple_description/urdf/anymal.urdf", "LF_FOOT", "xyz"),
+    "tiago": ("tiago_description/robots/tiago_no_hand.urdf", "wrist_ft_tool_link", "xyz"),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "left_gripper", "xyz"),
+    "finger": ("finger_edu_description/robots/finger_edu.urdf", "finger_tip_link", "x"),
+}
+
+
+@dataclass(frozen=True)
+class Model:
+    """A robot, its variables and the sources of its native FMU."""
+
+    robot: Robot
+    table: list[Variable]
+    starts: dict
+
+    def plant(self) -> Plant:
+        plant = Plant(self.robot, self.table)
+        plant.initialise()
+        return plant
+
+    def reference(self, name: str) -> int:
+        return next(i for i, variable in enumerate(self.table) if name in (variable.name, variable.group))
+
+    def sources(self, *more: Path) -> dict[str, bytes]:
+        headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
+        files = {p.name: p.read_bytes() for p in (*sorted(SOURCES.iterdir()), *headers, *more)}
+        files["model.h"] = model_header(self.robot, self.table, name="Arm", guid=GUID).encode()
+        return files
+
+
+@functools.cache
+def model(name: str) -> Model:
+    """The shipped arm, or a robot of ROBOTS at the middle of its limits."""
+    if name == "twodof":
+        robot = load_robot((ROOT / "urdf" / "2dof.urdf").read_text(), "EndEffector", "xy")
+        starts = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
+        return Model(robot, variable_table(robot, starts), starts)
+    path, frame, axes = ROBOTS[name]
+    text = (robots_folder() / path).read_text()
+    return from_urdf(without_mimic(text), frame, axes)
+
+
+def without_mimic(urdf: str) -> str:
+    """Mimic joints as joints of their own: the plant refuses them, the dynamics have them all."""
+    return re.sub(r"<mimic[^>]*/>", "", urdf)
+
+
+def from_urdf(urdf: str, frame: str, axes: str) -> Model:
+    robot = load_robot(urdf, frame, axes)
+    rest = tuple(
+        0.2 if low < 0.2 < high else 0.5 * (low + high)
+        for low, high in zip(robot.q_min, robot.q_max)
+    )
+    starts = {"q_start": rest, "x_des": (0.0,) * len(axes)}
+    plant = Plant(robot, variable_table(robot, starts))
+    plant.initialise()
+    starts["x_des"] = tuple(plant.x)
+    return Model(robot, variable_table(robot, starts), starts)
+
+
+@functools.cache
+def library(name: str) -> Path:
+    """The shared library of a model's FMU, as it is shipped."""
+    path = SCRATCH / name / "Arm.so"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(compile_library(model(name).sources(), host_platform(), "Arm"))
+    return path
+
+
+class Engine:
+    """A model's engine with its inner functions, compiled by the machine's own compiler."""
+
+    def __init__(self, of: Model, flags: tuple[str, ...] = ()) -> None:
+        self.model = of
+        path = executable(of, HERE / "probe.c", flags=("-shared", "-fPIC", *flags))
+        self.lib = ctypes.CDLL(str(path))
+        self.n, self.m = len(of.robot.joints), len(of.robot.axes)
+
+    def call(self, name: str, *arguments: object) -> int:
+        return getattr(self.lib, f"probe_{name}")(*(
+            ctypes.c_double(a) if isinstance(a, float) else a.ctypes.data_as(ctypes.c_void_p)
+            for a in arguments
+        ))
+
+    def task(self, q, v):
+        x, J, drift = np.empty(self.m), np.empty((self.m, self.n)), np.empty(self.m)
+        self.call("task", q, v, x, J, drift)
+        return x, J, drift
+
+    def inverse_dynamics(self, q, v, a, gravity):
+        tau = np.empty(self.n)
+        self.call("inverse_dynamics", q, v, a, gravity, tau)
+        return tau
+
+    def acceleration_of_effort(self, q, tau):
+        a = np.empty(self.n)
+        self.call("acceleration_of_effort", q, tau, a)
+        return a
+
+    def values(self, plant: Plant) -> np.ndarray:
+        """All variables of a Python plant by value reference; x and tau are 0."""
+        row = []
+        for variable in self.model.table:
+            if variable.group in ("x", "tau"):
+                row.append(0.0)
+                continue
+            value = getattr(plant, variable.group)
+            row.append(float(value if variable.index is None else value[variable.index]))
+        return np.array(row)
+
+    def group(self, values: np.ndarray, name: str) -> np.ndarray:
+        return values[[i for i, v in enumerate(self.model.table) if v.group == name]]
+
+
+@functools.cache
+def engine(name: str) -> Engine:
+    return Engine(model(name))
+
+
+def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
+    """Engine, FMI layer and C files of the tests, compiled by the machine's own compiler."""
+    files = of.sources(*more)
+    digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
+    folder = SCRATCH / digest
+    output = folder / "program"
+    if not output.exists():
+        folder.mkdir()
+        for file, content in files.items():
+            (folder / file).write_bytes(content)
+        subprocess.run(
+            ["gcc", "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
+             "-Werror", "-fno-math-errno", "-fvisibility=hidden", *flags, "-o", output, *sorted(f for f in files if f.endswith(".c")), "-lm"],
+            cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
+        )  # fmt: skip
+    return output

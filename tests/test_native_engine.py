@@ -1,0 +1,263 @@
+"""The C engine against Pinocchio, NumPy and the Python plant."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from native_models import ROBOTS, Engine, engine, from_urdf, model
+
+# trees, prismatic joints, axes along x, y, z and none of them; mimic joints count as joints
+EVERY_ROBOT = ("twodof", *ROBOTS)
+STATES = 1000
+
+
+def deviation(a, b):
+    return np.abs(a - b).max() / max(1.0, np.abs(b).max())
+
+
+def random_states(rng, n):
+    for _ in range(STATES):
+        yield rng.uniform(-np.pi, np.pi, n), rng.normal(0.0, 2.0, n), rng.normal(0.0, 5.0, n)
+
+
+def test_robots_cover_trees_prismatic_joints_and_every_axis():
+    robots = [model(name).robot for name in EVERY_ROBOT]
+    assert any(any(robot.prismatic) for robot in robots)
+    assert sum(len(set(robot.model.parents[1:])) < len(robot.joints) for robot in robots) >= 2
+    kinds = {joint.shortname()[10:] for robot in robots for joint in list(robot.model.joints)[1:]}
+    assert kinds >= {"RX", "RY", "RZ", "PZ", "RevoluteUnaligned"}
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_kinematics_equal_pinocchio(name):
+    native, robot = engine(name), model(name).robot
+    data = robot.model.createData()
+    axes = ["xyz".index(axis) for axis in robot.axes]
+    for q, v, _ in random_states(np.random.default_rng(1), native.n):
+        pin.forwardKinematics(robot.model, data, q, v, np.zeros(native.n))
+        J = pin.computeFrameJacobian(
+            robot.model, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
+        )[axes]
+        drift = pin.getFrameClassicalAcceleration(
+            robot.model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
+        ).linear[axes]
+        x = data.oMf[robot.frame_id].translation[axes]
+        for ours, theirs in zip(native.task(q, v), (x, J, drift)):
+            assert deviation(ours, theirs) <= 1e-11
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_dynamics_equal_pinocchio(name):
+    native, robot = engine(name), model(name).robot
+    n, reference = native.n, robot.model.copy()
+    data = reference.createData()
+    gravity, still = np.array([0.3, -2.0, -9.81]), np.zeros(native.n)
+    reference.gravity.linear = gravity
+    for q, v, a in random_states(np.random.default_rng(2), n):
+        M = pin.crba(reference, data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        columns = [native.inverse_dynamics(q, still, e, np.zeros(3)) for e in np.eye(n)]
+        assert deviation(np.array(columns).T, M) <= 1e-11
+        h = pin.nonLinearEffects(reference, data, q, v)
+        assert deviation(native.inverse_dynamics(q, v, still, gravity), h) <= 1e-11
+        tau = pin.rnea(reference, data, q, v, a)
+        assert deviation(native.inverse_dynamics(q, v, a, gravity), tau) <= 1e-11
+        assert deviation(M @ native.acceleration_of_effort(q, a), a) <= 1e-11
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_controller_equals_pinocchio(name):
+    """τ of the controller with NumPy's pseudo-inverse, where σ_min/σ_max ≥ 0.05."""
+    native, robot = engine(name), model(name).robot
+    reference, plant = robot.model.copy(), model(name).plant()
+    data = reference.createData()
+    rng = np.random.default_rng(3)
+    compared = 0
+    for q, v, _ in random_states(rng, native.n):
+        x, J, drift = native.task(q, v)
+        sigma = np.linalg.svd(J, compute_uv=False)
+        if sigma[-1] < 0.05 * sigma[0]:
+            continue
+        plant.q, plant.v = list(q), list(v)
+        plant.x_des, plant.xd_des, plant.xdd_des = (list(rng.normal(size=native.m)) for _ in "123")
+        plant.Kn = 3.0
+        values = native.values(plant)
+        native.call("outputs", values)
+        command = np.array(plant.xdd_des) + 40.0 * (plant.xd_des - J @ v)
+        command += 50.0 * (plant.x_des - x) - drift
+        inverse = np.linalg.pinv(J, rcond=plant.rcond)
+        a = inverse @ command - 3.0 * (v - inverse @ (J @ v))
+        reference.gravity.linear = np.array(plant.gravity)
+        tau = pin.rnea(reference, data, q, v, a)
+        assert deviation(native.group(values, "tau"), tau) <= 1e-11
+        assert deviation(native.group(values, "x"), x) == 0.0
+        compared += 1
+    assert compared >= 100
+
+
+@pytest.mark.parametrize("name", ["finger", "twodof", "ur5"])
+@pytest.mark.parametrize("singular", [1e-16, 1e-6, 0.005, 0.02, 0.5])
+def test_pseudo_inverse_equals_numpy(name, singular):
+    """With one, two and three rows, smallest singular value below and above rcond = 0.01."""
+    native = engine(name)
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        J = rng.normal(size=(native.m, native.n))
+        U, sigma, Vt = np.linalg.svd(J, full_matrices=False)
+        sigma[-1] = singular * sigma[0] if native.m > 1 else sigma[0]
+        J = np.ascontiguousarray(U * sigma @ Vt)
+        b, result = rng.normal(size=native.m), np.empty(native.n)
+        expected = np.linalg.pinv(J, rcond=0.01) @ b
+        native.call("pseudo_inverse", J.copy(), b.copy(), 0.01, result)
+        assert deviation(result, expected) <= 1e-11
+
+
+def test_pseudo_inverse_of_zero_is_zero():
+    native, result = engine("ur5"), np.full(6, np.nan)
+    native.call("pseudo_inverse", np.zeros((3, 6)), np.ones(3), 0.01, result)
+    assert not result.any()
+
+
+# --- trajectories against the Python plant ---
+
+
+def follow(name, changes=None, targets=(), seconds=3.0, h=0.01, of=None):
+    """Largest deviation of q, v, x, tau; limits that were touched; smallest σ_min/σ_max."""
+    native = of or engine(name)
+    plant = native.model.plant()
+    for group, value in (changes or {}).items():
+        setattr(plant, group, value)
+    plant.initialise()
+    values = native.values(plant)
+    steps = round(seconds / h)
+    worst, touched, conditioning = 0.0, set(), 1.0
+    x_des = [i for i, v in enumerate(native.model.table) if v.group == "x_des"]
+    for k in range(steps):
+        if targets:
+            target = targets[k * len(targets) // steps]
+            plant.x_des = list(map(float, target))
+            values[x_des] = plant.x_des
+        plant.step(h)
+        assert native.call("advance", values, float(h)) == 1
+        native.call("outputs", values)
+        for group in ("q", "v", "x", "tau"):
+            expected = np.array(getattr(plant, group))
+            worst = max(worst, np.abs(native.group(values, group) - expected).max())
+        for i, q in enumerate(native.group(values, "q")):
+            touched |= {(i, "min")} if q == plant.q_min[i] else set()
+            touched |= {(i, "max")} if q == plant.q_max[i] else set()
+        J = native.task(np.array(plant.q), np.array(plant.v))[1]
+        sigma = np.linalg.svd(J, compute_uv=False)
+        conditioning = min(conditioning, sigma[-1] / sigma[0])
+    return worst, touched, conditioning
+
+
+NARROW = {"q_min": [-0.2, 0.6], "q_max": [0.6, 1.9], "q_start": [0.2, 1.2]}
+TARGETS = [
+    (0.17, 0.01), (-0.04, -0.09), (0.23, 0.27), (0.16, 0.19), (0.14, 0.27), (0.24, -0.1),
+]  # fmt: skip
+
+
+def test_default_run():
+    worst, _, conditioning = follow("twodof", seconds=5.0)
+    assert worst <= 1e-9 and conditioning >= 0.05
+
+
+@pytest.mark.parametrize("h", [0.001, 0.01, 0.05])
+def test_every_stop_and_release(h):
+    worst, touched, conditioning = follow("twodof", NARROW, TARGETS, seconds=6.0, h=h)
+    assert touched == {(0, "min"), (0, "max"), (1, "min"), (1, "max")}
+    assert worst <= 1e-9 and conditioning >= 0.05
+
+
+def test_external_effort_at_limits():
+    changes = {**NARROW, "tau_ext": [0.1, -0.05]}
+    worst, touched, conditioning = follow("twodof", changes, TARGETS, seconds=6.0)
+    assert len(touched) >= 3
+    assert worst <= 1e-9 and conditioning >= 0.05
+
+
+ARMS = {
+    "ur5": [(0.1, 0.0, 0.0), (0.0, 0.1, -0.1), (-0.05, -0.1, 0.05)],
+    "panda": [(0.1, 0.0, 0.0), (0.0, 0.1, -0.1), (-0.05, -0.1, 0.05)],
+}
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("case", ["free", "tau_ext", "limit_effort"])
+def test_arms(name, case):
+    n = engine(name).n
+    changes = {
+        "free": {},
+        "tau_ext": {"tau_ext": [0.5] * n},
+        "limit_effort": {"tau_ext": [0.5] * n, "limit_effort": True},
+    }[case]
+    x = np.array(model(name).starts["x_des"])
+    targets = [x + offset for offset in ARMS[name]]
+    worst, _, conditioning = follow(name, changes, targets, seconds=2.0)
+    assert worst <= 1e-9 and conditioning >= 0.05
+
+
+WEAK = """<robot name="weak"><link name="world"/>
+<link name="l1"><inertial><origin xyz=".1 0 .02"/><mass value="2"/>
+<inertia ixx=".01" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="l2"><inertial><origin xyz=".1 .01 0"/><mass value="1"/>
+<inertia ixx=".01" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j1" type="revolute"><parent link="world"/><child link="l1"/><axis xyz="0 0 1"/>
+<dynamics damping="0.4"/><limit lower="-2" upper="2" effort="4" velocity="9"/></joint>
+<joint name="j2" type="{kind}"><parent link="l1"/><child link="l2"/><origin xyz=".3 0 0"/>
+<axis xyz="{axis}"/><dynamics damping="0.3"/>
+<limit lower="0.5" upper="2" effort="3" velocity="9"/></joint>
+<link name="tool"/><joint name="t" type="fixed"><parent link="l2"/><child link="tool"/>
+<origin xyz=".25 0 0"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("limit_effort", [False, True])
+@pytest.mark.parametrize("kind, axis", [("revolute", "0 0 1"), ("prismatic", "1 0.5 0")])
+def test_damping_and_saturation(kind, axis, limit_effort):
+    """A damped arm that is too weak for its target; τ is seen to saturate."""
+    of = Engine(from_urdf(WEAK.format(kind=kind, axis=axis), "tool", "xy"))
+    x = np.array(of.model.starts["x_des"])
+    changes = {"gravity": [0.0, -9.81, 0.0], "limit_effort": limit_effort}
+    targets = [x + (-0.02, 0.05), x + (0.02, -0.03)]
+    worst, _, conditioning = follow("", changes, targets, seconds=2.0, of=of)
+    assert worst <= 1e-9 and conditioning >= 0.05
+
+
+def test_damping_changes_the_motion():
+    """That D enters at all, against Pinocchio's forward dynamics."""
+    of = Engine(from_urdf(WEAK.format(kind="prismatic", axis="1 0.5 0"), "tool", "xy"))
+    plant = of.model.plant()
+    plant.q, plant.v, plant.tau_ext, plant.limit_effort = [0.3, 0.5], [1.0, -2.0], [1.0, 2.0], True
+    a = np.empty(2)
+    of.call("acceleration", of.values(plant), a)
+    plant._hold_inputs()
+    expected = plant._equations_of_motion()(np.array(plant.q), np.array(plant.v))
+    assert deviation(a, np.array(expected)) <= 1e-11
+
+
+def test_steps_across_singularities_stay_finite_and_inside():
+    """Reachable or not: every step ends, finite, within the limits, and without hanging."""
+    native, plant = engine("twodof"), model("twodof").plant()
+    rng = np.random.default_rng(5)
+    x_des = [i for i, v in enumerate(native.model.table) if v.group == "x_des"]
+    for _ in range(100):
+        plant.q_start = rng.uniform(-np.pi, np.pi, 2).tolist()
+        plant.initialise()
+        values = native.values(plant)
+        values[x_des] = rng.uniform(-0.5, 0.5, 2)
+        for _ in range(100):
+            assert native.call("advance", values, 0.01) == 1
+            assert np.isfinite(values).all() and np.abs(native.group(values, "q")).max() <= np.pi
+
+
+def test_a_value_that_is_not_finite_leaves_the_plant_unchanged():
+    native, plant = engine("twodof"), model("twodof").plant()
+    plant.Kp = [1e308, 1e308]
+    plant.x_des = [1e300, 1.0]
+    values = native.values(plant)
+    before = values.copy()
+    assert native.call("advance", values, 0.01) == 0
+    assert (values == before).all()

@@ -1,0 +1,474 @@
+"""The native FMU's library through FMPy: the standard's state machine, saved states, instances."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import struct
+import subprocess
+import threading
+
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi2 import (
+    FMU2Slave,
+    fmi2CallbackAllocateMemoryTYPE,
+    fmi2CallbackFreeMemoryTYPE,
+    fmi2CallbackFunctions,
+    fmi2CallbackLoggerTYPE,
+)
+
+from native_models import GUID, HERE, executable, library, model
+from twodof.native import NativeBuildError, compile_library, universal
+
+OK, WARNING, DISCARD, ERROR = range(4)
+
+
+class FMU2Arm(FMU2Slave):
+    """An instance that keeps its messages; calls give their status instead of raising."""
+
+    def __init__(self, name="twodof", guid=GUID, logging=False, start=True):
+        self.of = model(name)
+        super().__init__(
+            guid=guid, modelIdentifier="Arm", unzipDirectory=str(library(name).parent), libraryPath=str(library(name)),
+            instanceName=name,
+        )  # fmt: skip
+        self.messages: list[tuple[int, str]] = []
+        functions = fmi2CallbackFunctions()
+        functions.logger = fmi2CallbackLoggerTYPE(
+            lambda _, name, status, category, text: self.messages.append((status, text.decode()))
+        )
+        functions.allocateMemory = fmi2CallbackAllocateMemoryTYPE()
+        functions.freeMemory = fmi2CallbackFreeMemoryTYPE()
+        self.instantiate(callbacks=functions, loggingOn=logging)
+        self.time = 0.0
+        if start:
+            self.start()
+
+    def status(self, function, *arguments):
+        try:
+            getattr(self, function)(*arguments)
+        except FMICallException as error:
+            return error.status
+        return OK
+
+    def refused(self, message, function, *arguments):
+        """The call is refused with this message alone and changes nothing."""
+        before, self.messages = self.snapshot(), []
+        assert self.status(function, *arguments) == ERROR
+        assert len(self.messages) == 1 and self.messages[0][0] == ERROR
+        assert re.search(message, self.messages[0][1]), self.messages
+        assert self.snapshot() == before
+        return True
+
+    def snapshot(self):
+        state = self.getFMUState()
+        blob = self.serializeFMUState(state)
+        self.freeFMUState(state)
+        return bytes(blob)
+
+    def start(self, **values):
+        for name, value in values.items():
+            self.set(name, value)
+        self.setupExperiment(startTime=0.0)
+        self.enterInitializationMode()
+        self.exitInitializationMode()
+        self.time = 0.0
+
+    def set(self, name, value):
+        first = self.of.reference(name)
+        values = np.atleast_1d(value).tolist()
+        self.setReal(list(range(first, first + len(values))), values)
+
+    def get(self, name):
+        table = self.of.table
+        return self.getReal([i for i, v in enumerate(table) if name in (v.name, v.group)])
+
+    def step(self, h=0.01):
+        self.doStep(self.time, h)
+        self.time += h
+
+    def outputs(self):
+        return [self.get(group) for group in ("q", "v", "x", "tau")]
+
+    def run(self, steps):
+        """A run with changing targets, as numbers to compare bit for bit."""
+        rows = []
+        for k in range(steps):
+            if k % 40 == 0:
+                self.set("x_des", [0.25 - 0.002 * k, 0.05 + 0.001 * k])
+            self.step()
+            rows.append(self.outputs())
+        return rows
+
+
+Arm = FMU2Arm  # FMPy finds the standard's version in the class's name
+
+
+def test_outputs_equal_the_python_plant():
+    arm, plant = Arm(), model("twodof").plant()
+    for _ in range(100):
+        for ours, theirs in zip(arm.outputs(), (plant.q, plant.v, plant.x, plant.tau)):
+            assert np.abs(np.array(ours) - theirs).max() <= 1e-9
+        arm.step()
+        plant.step(0.01)
+
+
+def test_tau_follows_inputs_at_once():
+    arm, plant = Arm(), model("twodof").plant()
+    plant.x_des = [0.25, 0.1]
+    arm.set("x_des", plant.x_des)
+    assert arm.get("tau") == pytest.approx(plant.tau, abs=1e-12)
+    assert arm.get("x") == pytest.approx(plant.x, abs=1e-12)
+
+
+def test_outputs_follow_parameters_in_initialization_mode():
+    arm = Arm(start=False)
+    arm.setupExperiment(startTime=0.0)
+    arm.enterInitializationMode()
+    assert arm.get("q") == [0.5, 0.35]
+    arm.set("q_start", [0.1, 0.2])
+    assert arm.get("q") == [0.1, 0.2]
+    assert arm.get("x") == pytest.approx(
+        [0.15 * (np.cos(0.1) + np.cos(0.3)), 0.15 * (np.sin(0.1) + np.sin(0.3))], abs=1e-12
+    )
+    still = arm.get("tau")
+    arm.set("gravity", [0.0, 0.0, 0.0])
+    assert arm.get("tau") != still
+
+
+def test_limit_effort_is_boolean():
+    arm = Arm(start=False)
+    vr = arm.of.reference("limit_effort")
+    arm.setBoolean([vr], [True])
+    arm.start(x_des=[1e4, 0.0])
+    assert arm.getBoolean([vr]) == [True]
+    assert np.abs(arm.get("tau")).max() == 10.0
+    arm.refused("limit_effort is of type Boolean", "getReal", [vr])
+    arm.refused("rcond is of type Real", "getBoolean", [arm.of.reference("rcond")])
+
+
+# --- the state machine ---
+
+LEGAL = {
+    "instantiated": {"setupExperiment", "enterInitializationMode", "reset", "set input",
+                     "set parameter"},
+    "initialization": {"exitInitializationMode", "reset", "get", "set input", "set parameter"},
+    "step": {"doStep", "terminate", "reset", "get", "set input", "getStatus"},
+    "failed": {"terminate", "reset", "get", "getStatus"},
+    "terminated": {"reset", "get", "getStatus"},
+}  # fmt: skip
+CALLS = {
+    "setupExperiment": ("setupExperiment", None, 0.0),
+    "enterInitializationMode": ("enterInitializationMode",),
+    "exitInitializationMode": ("exitInitializationMode",),
+    "doStep": ("doStep", 0.0, 0.01),
+    "terminate": ("terminate",),
+    "reset": ("reset",),
+    "get": ("getReal", [0]),
+    "set input": ("setReal", [0], [0.1]),
+    "set parameter": ("setReal", [32], [0.02]),
+    "getStatus": ("getRealStatus", 2),
+}
+
+
+def arm_in(phase):
+    arm = Arm(start=False)
+    if phase == "instantiated":
+        return arm
+    if phase == "initialization":
+        arm.setupExperiment(startTime=0.0)
+        arm.enterInitializationMode()
+        return arm
+    arm.start()
+    if phase == "failed":
+        arm.set("Kp", [1e308, 1e308])
+        arm.set("x_des", [1e300, 1.0])
+        assert arm.status("doStep", 0.0, 0.01) == DISCARD
+    if phase == "terminated":
+        arm.terminate()
+    return arm
+
+
+@pytest.mark.parametrize("phase", LEGAL)
+@pytest.mark.parametrize("call", CALLS)
+def test_every_call_in_every_phase(phase, call):
+    arm = arm_in(phase)
+    if call in LEGAL[phase]:
+        assert arm.status(*CALLS[call]) == OK
+    else:
+        arm.refused("is not allowed in the state", *CALLS[call])
+
+
+def test_functions_that_are_not_supported_return_an_error():
+    arm = Arm()
+    for function in (
+        "EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode", "CompletedIntegratorStep",
+        "SetTime", "SetContinuousStates", "GetDerivatives", "GetEventIndicators",
+        "GetContinuousStates", "GetNominalsOfContinuousStates", "GetDirectionalDerivative",
+        "SetRealInputDerivatives", "GetRealOutputDerivatives",
+    ):  # fmt: skip
+        arm.messages.clear()
+        null = ctypes.c_void_p()
+        assert arm.dll[f"fmi2{function}"](ctypes.c_void_p(arm.component), *[null] * 6) == ERROR
+        assert arm.messages == [(ERROR, f"fmi2{function} is not supported by this FMU")]
+
+
+# --- refusals ---
+
+
+@pytest.mark.parametrize("value, text", [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf")])
+def test_values_that_are_not_finite(value, text):
+    arm = Arm()
+    vr = arm.of.reference("Kp[2]")
+    # nothing of a refused call is done, its first value neither
+    arm.refused(rf"^Kp\[2\] = {text} is not finite$", "setReal", [0, vr], [0.3, value])
+
+
+def test_refusals_name_the_culprit():
+    arm = Arm()
+    vr = arm.of.reference
+    arm.refused("no variable with value reference 37", "getReal", [0, 37])
+    arm.refused("no variable with value reference 4294967295", "setReal", [2**32 - 1], [0.0])
+    arm.refused(r"q\[1\] is an output and cannot be set", "setReal", [vr("q[1]")], [0.0])
+    arm.refused(r"parameter \(max_step\) is not allowed", "setReal", [vr("max_step")], [0.1])
+    arm.refused(r"x_des\[1\] is of type Real", "getInteger", [0])
+    arm.refused(r"x_des\[1\] is of type Real", "setString", [0], ["a"])
+    arm.refused("communication point 0.1 s is not the time of the FMU, 0 s", "doStep", 0.1, 0.01)
+    arm.refused("communication point nan s", "doStep", np.nan, 0.01)
+    for h in (0.0, -0.01, np.nan, np.inf):
+        arm.refused("the step .* must be > 0", "doStep", 0.0, h)
+    assert arm.status("doStep", 0.9e-9, 0.01) == OK
+
+
+def test_parameters_are_checked_when_initialization_ends():
+    for name, value, message in (
+        ("rtol", 0.0, "rtol = 0 must be > 0"),
+        ("atol", -1.0, "atol = -1 must be > 0"),
+        ("max_step", 0.0, "max_step = 0 must be > 0"),
+        ("rcond", 1.0, r"rcond = 1 must be in \[0, 1\)"),
+        ("q_min[2]", 4.0, r"q_min\[2\] = 4 > q_max\[2\] = 3.14159 \(joint 'joint2'\)"),
+    ):
+        arm = arm_in("initialization")
+        good = arm.get(name)
+        arm.set(name, value)
+        arm.refused(message, "exitInitializationMode")
+        arm.refused(message, "getReal", [arm.of.reference("q[1]")])
+        arm.set(name, good)
+        arm.exitInitializationMode()
+
+
+def test_start_and_stop_times():
+    arm = Arm(start=False)
+    arm.refused("start time is not finite", "setupExperiment", None, np.nan)
+    arm.refused("stop time 1 < start time 2", "setupExperiment", None, 2.0, 1.0)
+    arm.setupExperiment(startTime=1.0, stopTime=1.02)
+    arm.enterInitializationMode()
+    arm.exitInitializationMode()
+    arm.doStep(1.0, 0.01)
+    arm.refused("ends after the stop time, 1.02 s", "doStep", 1.01, 0.02)
+    arm.doStep(1.01, 0.01)
+
+
+def test_tolerance_is_ignored_with_a_message():
+    arm = Arm(start=False, logging=True)
+    arm.setupExperiment(tolerance=1e-9, startTime=0.0)
+    assert [status for status, _ in arm.messages] == [OK]
+    assert "tolerance 1e-09 of the experiment is ignored" in arm.messages[0][1]
+    quiet = Arm(start=False)
+    quiet.setupExperiment(tolerance=1e-9, startTime=0.0)
+    assert not quiet.messages
+
+
+def test_start_outside_the_limits_is_clamped_with_a_warning():
+    arm = Arm(start=False)
+    arm.start(q_start=[4.0, 0.35], v_start=[1.0, 0.0])
+    text = (
+        "q_start[1] = 4 of joint 'joint1' is outside its limits [-3.14159, 3.14159]"
+        " and was clamped to 3.14159"
+    )
+    assert arm.messages == [(WARNING, text)]
+    assert arm.get("q") == [np.pi, 0.35] and arm.get("v") == [0.0, 0.0]
+
+
+def test_wrong_guid_and_names():
+    with pytest.raises(Exception, match="instantiate"):
+        Arm(guid="another")
+    arm = Arm()
+    assert arm.fmi2GetVersion() == b"2.0" and arm.fmi2GetTypesPlatform() == b"default"
+    arm.refused("there is no category 'x'", "setDebugLogging", True, ["x"])
+
+
+def test_a_failed_step_is_discarded_and_changes_nothing():
+    arm = Arm()
+    arm.step()
+    before = arm.get("q")
+    saved = arm.getFMUState()
+    arm.set("Kp", [1e308, 1e308])
+    arm.set("x_des", [1e300, 1.0])
+    arm.messages.clear()
+    assert arm.status("doStep", 0.01, 0.01) == DISCARD
+    assert arm.messages == [
+        (DISCARD, "fmi2DoStep at 0.01 s: the equations of motion gave a value that is not finite")
+    ]
+    assert arm.get("q") == before and arm.getRealStatus(2) == 0.01
+    arm.setFMUState(saved)
+    arm.doStep(0.01, 0.01)
+    assert arm.get("q") == two_steps()
+
+
+def two_steps():
+    arm = Arm()
+    arm.step()
+    arm.step()
+    return arm.get("q")
+
+
+# --- saved states, reset, instances ---
+
+
+@pytest.mark.parametrize("at_limit", [False, True])
+@pytest.mark.parametrize("serialised", [False, True])
+def test_restored_run_is_the_same_bit_for_bit(at_limit, serialised):
+    arm = Arm(start=False)
+    if at_limit:
+        arm.set("q_max", [0.52, 0.4])
+    arm.start()
+    for _ in range(60):
+        arm.step()
+    assert at_limit == (arm.get("q")[1] == 0.4 or arm.get("q")[0] == 0.52)
+    saved, time = arm.getFMUState(), arm.time
+    if serialised:
+        saved = arm.deSerializeFMUstate(arm.serializeFMUState(saved))
+    first = arm.run(100)
+    arm.setFMUState(saved)
+    arm.time = time
+    assert arm.run(100) == first
+    other = Arm(start=False)  # another instance takes it over
+    other.setFMUState(saved)
+    other.time = time
+    assert other.run(100) == first
+
+
+def test_foreign_and_damaged_states_are_refused():
+    arm, other = Arm(), Arm("ur5")
+    state = other.getFMUState()
+    foreign = other.serializeFMUState(state)
+    own = bytearray(arm.serializeFMUState(arm.getFMUState()))
+    own[100] ^= 1
+    for blob in (foreign, bytes(own), b"", b"nonsense"):
+        arm.refused("not one of this FMU", "deSerializeFMUstate", blob)
+    arm.refused("null pointer", "setFMUState", ctypes.c_void_p())
+
+
+def test_reset_repeats_the_first_run_bit_for_bit():
+    arm = Arm()
+    first = arm.run(100)
+    arm.reset()
+    arm.start()
+    assert arm.run(100) == first
+
+
+def test_hundred_interleaved_instances_equal_one_alone():
+    alone = Arm().run(60)
+    arms = [Arm() for _ in range(100)]
+    others = [Arm("ur5") for _ in range(3)]
+    for k in range(60):
+        for other in others:
+            other.step()
+        for arm in arms:
+            if k % 40 == 0:
+                arm.set("x_des", [0.25 - 0.002 * k, 0.05 + 0.001 * k])
+            arm.step()
+            assert arm.outputs() == alone[k]
+
+
+def test_eight_threads_equal_one_alone():
+    alone, results = Arm().run(200), {}
+    arms = [Arm() for _ in range(8)]
+
+    def work(i):
+        results[i] = arms[i].run(200)
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [results[i] == alone for i in range(8)] == [True] * 8
+
+
+# --- the library ---
+
+
+def test_library_exports_the_standard_needs_libc_alone_and_is_small():
+    path = library("twodof")
+    symbols = subprocess.check_output(["nm", "-D", "--defined-only", path], text=True).split()[2::3]
+    header = "\n".join(
+        content.decode() for file, content in model("twodof").sources().items()
+        if file == "fmi2Functions.h"
+    )  # fmt: skip
+    assert sorted(symbols) == sorted(re.findall(r"FMI2_Export \w+TYPE +(\w+);", header))
+    needed = subprocess.check_output(["readelf", "-d", path], text=True)
+    assert set(re.findall(r"NEEDED.*\[(.*)\]", needed)) <= {"libc.so.6", "libm.so.6"}
+    versions = re.findall(r"GLIBC_2\.(\d+)", subprocess.check_output(["nm", "-D", path], text=True))
+    assert max(map(int, versions)) <= 17
+    assert path.stat().st_size <= 200_000
+
+
+def test_no_memory_is_allocated_and_no_global_is_written():
+    """Outside of instantiation and saved states; no writable data but the linker's own."""
+    wanted = {"fmi2.c": 1, "saved_state.c": 2}  # calls of the allocator
+    for file, content in model("twodof").sources().items():
+        if file.endswith(".c"):
+            assert len(re.findall(r"allocate\(1,", content.decode())) == wanted.get(file, 0), file
+            assert not re.search(r"^static (?!const|inline)[^()]*[;=]", content.decode(), re.M), file
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_random_calls_under_sanitizers(part):
+    """100,000 random sequences of legal and illegal calls, with NaN, infinities and more."""
+    program = executable(
+        model("twodof"), HERE / "fuzz.c",
+        flags=("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
+    )  # fmt: skip
+    done = subprocess.run([program, "25000", str(part)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("25000 sequences")
+
+
+def test_run_under_valgrind():
+    if not shutil.which("valgrind"):
+        pytest.skip("valgrind is not installed")
+    program = executable(model("twodof"), HERE.parents[1] / "benchmarks" / "native_step.c")
+    command = ["valgrind", "-q", "--error-exitcode=9", "--leak-check=full", program]
+    done = subprocess.run([*command, "0.01", "20", "2"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_compiler_errors():
+    sources = model("twodof").sources()
+    with pytest.raises(NativeBuildError, match="there is no platform 'linux32'; there are linux64"):
+        compile_library(sources, "linux32", "Arm")
+    with pytest.raises(NativeBuildError, match=r"(?s)compiler failed.*error"):
+        compile_library({**sources, "plant.c": b"int main(void) { return x; }"}, "linux64", "Arm")
+
+
+def test_equal_sources_give_equal_libraries():
+    first = compile_library(model("twodof").sources(), "linux64", "Arm")
+    assert compile_library(model("twodof").sources(), "linux64", "Arm") == first
+    assert b"/tmp" not in first and b"twodof-native" not in first
+
+
+def test_universal_header():
+    thin = [struct.pack("<III", 0xFEEDFACF, cpu, 3) + b"x" * size
+            for cpu, size in ((0x1000007, 20000), (0x100000C, 5))]  # fmt: skip
+    fat = universal(thin)
+    magic, count = struct.unpack_from(">II", fat)
+    assert (magic, count) == (0xCAFEBABE, 2)
+    for i, library_ in enumerate(thin):
+        cpu, _, offset, size, align = struct.unpack_from(">5I", fat, 8 + 20 * i)
+        assert offset % 2**align == 0 and fat[offset : offset + size] == library_
+        assert cpu == struct.unpack_from("<I", library_, 4)[0]
