@@ -839,7 +839,7 @@ def test_disk_too_small_to_begin_with_is_left_as_it_was(
     run: Experiment, disk: Callable[..., Path], storage: str
 ) -> None:
     refused = 0
-    for size in (512, *range(2048, 2128, 4)):
+    for size in (4, 8, 12, 16, 32, 512, *range(2048, 2128, 4)):
         path = disk(size) / "bag"
         try:
             with twodof.Bag(path, run, storage=storage):

@@ -176,7 +176,7 @@ def test_messages_of_the_fmu_go_to_logging(fmu_path, caplog):
 
 
 def test_a_refusal_of_the_fmu_comes_with_its_own_words(fmu_path):
-    with pytest.raises(SimulationError, match="^rtol = -1 must be > 0$") as error:
+    with pytest.raises(SimulationError, match=r"^rtol = -1 must be > 0$") as error:
         twodof.simulate(fmu_path, stop_time=1.0, settings={"rtol": -1.0})
     assert error.value.k == 0
 

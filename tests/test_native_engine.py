@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-
 from native_models import ROBOTS, Engine, engine, from_urdf, model
 
 # trees, prismatic joints, axes along x, y, z and none of them; mimic joints count as joints

@@ -19,8 +19,8 @@ from fmpy.fmi2 import (
     fmi2CallbackFunctions,
     fmi2CallbackLoggerTYPE,
 )
-
 from native_models import GUID, HERE, executable, library, model
+
 from twodof.native import NativeBuildError, compile_library, universal
 
 OK, WARNING, DISCARD, ERROR = range(4)

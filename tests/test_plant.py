@@ -9,7 +9,8 @@ import pinocchio as pin
 import pytest
 from oracles import LINK, REST, TwoLinkArm, drift, jacobian, position, task_error
 
-from twodof.build import DEFAULT_ARM, data_file
+from twodof.build import DEFAULT_ARM
+from twodof.data import data_file
 from twodof.plant import ParameterError, Plant, load_robot, variable_table
 
 KP, KD = 50.0, 40.0

@@ -439,6 +439,19 @@ def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles: str) -> None:
     assert size == pytest.approx([0.15, 0.2, 0.3], rel=1e-6)
 
 
+@pytest.mark.parametrize("k", range(24))
+def test_fit_is_right_where_the_shape_is_turned_by_right_angles(k: int) -> None:
+    # a third of these have a pitch of a right angle, where roll and yaw turn about one axis
+    turned = placed(1)
+    mesh = trimesh.creation.box(extents=(0.3, 0.1, 0.05), transform=turned)
+    content = mesh.export(file_type="stl")
+    turn = Rotation.create_group("O")[k] * Rotation.from_matrix(turned[:3, :3]).inv()
+    roll, pitch, yaw = turn.as_euler("xyz").tolist()
+    urdf = with_mesh(origin=f'<origin xyz="1 2 3" rpy="{roll!r} {pitch!r} {yaw!r}"/>')
+    description = Scene(urdf, [], "thing", lambda _: content).description
+    assert_shapes_hold_the_meshes(description, urdf, lambda _: single(mesh.vertices))
+
+
 @pytest.mark.parametrize("content", [None, b"this is no mesh"], ids=["missing", "unreadable"])
 def test_mesh_that_cannot_be_read_is_left_out_and_named(
     content: bytes | None, caplog: pytest.LogCaptureFixture

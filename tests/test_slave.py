@@ -20,7 +20,8 @@ from harness import Driver, in_child_process
 from oracles import REST, position, task_error
 
 from twodof import FmuOptions, build_fmu
-from twodof.build import DEFAULT_ARM, data_file
+from twodof.build import DEFAULT_ARM
+from twodof.data import data_file
 from twodof.plant import Plant, load_robot, variable_table
 
 OK, DISCARD, ERROR = 0, 2, 3

@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
-import site
-import sysconfig
 import tempfile
 import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pythonfmu
-
 from . import __version__
+from .data import data_file
 from .documentation import documentation
 from .errors import ZIP_ERRORS, BuildError
+from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
+from .native import host_platform
 from .plant import Plant, Robot, RobotError, Variable, load_robot, variable_table
-
-Files = dict[str, bytes]
-"""Contents of the FMU by path inside the zip."""
 
 DEFAULT_FRAME = "EndEffector"
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-PYTHONFMU_FILES = (
-    "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,7 +43,10 @@ class FmuOptions:
         q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
             else 0 where the limits allow and their middle where not.
         name: model name and identifier.
-        link_environment: remember the folders of this Python's packages in the FMU.
+        link_environment: remember the folders of this Python's packages in the FMU; not for the
+            native flavour, which needs none.
+        native: the plant as compiled C instead of Python code.
+        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64"; empty: this machine's.
     """
 
     urdf: Path | None = None
@@ -61,55 +57,46 @@ class FmuOptions:
     q_start: tuple[float, ...] | None = None
     name: str = "TwoDof"
     link_environment: bool = False
+    native: bool = False
+    platforms: tuple[str, ...] = ()
 
 
 def build_fmu(output: str | Path | None = None, options: FmuOptions | None = None) -> Path:
-    """Build the Python flavour's FMU.
+    """Build an FMU.
 
     Args:
-        output: the file; None: ``<name>.fmu`` in the working directory. Written whole or not
-            at all.
-        options: what to build; None: the shipped planar arm.
+        output: the file; None: ``<name>.fmu``, or ``<name>-native.fmu``, in the working
+            directory. Written whole or not at all.
+        options: what to build; None: the shipped planar arm in the Python flavour.
 
     Returns:
         The path of the FMU. A file that already holds exactly this FMU is left alone.
 
     Raises:
-        BuildError: naming what is wrong with the URDF, a mesh, an option or the output folder.
+        BuildError: naming what is wrong with the URDF, a mesh, an option, the compiler or the
+            output folder.
     """
     options = options or FmuOptions()
-    path = Path(output) if output is not None else Path(f"{options.name}.fmu")
-    files = compose(options)
-    if not _holds(path, files):
-        _write_zip(path, files)
+    default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
+    path = Path(output if output is not None else default)
+    flavour, guid, files = _compose(options)
+    if not _holds(path, files["modelDescription.xml"], flavour.platforms):
+        _write_zip(path, {**files, **flavour.finish(guid)})
     return path
 
 
-def compose(options: FmuOptions) -> Files:
-    """All files of the FMU by their path in it."""
+def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
+    """The flavour, the GUID, and all files of the FMU but those that the flavour finishes."""
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
     path = options.urdf or data_file("urdf", "2dof.urdf")
     text = _read_urdf(path)
     robot, table, starts = _model(options, text)
     urdf, meshes = collect_meshes(text, path.parent, _mesh_dir(options))
-    sources = _slave_sources()
-    config: dict[str, Any] = {
-        "frame": options.frame,
-        "axes": robot.axes,
-        "starts": starts,
-        "site_packages": _site_packages() if options.link_environment else [],
-    }
-    identity = hashlib.sha256(urdf.encode() + json.dumps(config, sort_keys=True).encode())
-    config["identity"] = identity.hexdigest()
-    resources = {
-        **sources,
-        **meshes,
-        "robot.urdf": urdf.encode(),
-        "plant.json": (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
-        "requirements.txt": data_file("fmu_src", "requirements.txt").read_bytes(),
-    }
+    flavour = _flavour(options, robot, table, urdf, starts)
+    resources = {"robot.urdf": urdf.encode(), **meshes}
     files = {f"resources/{name}": content for name, content in resources.items()}
+    files.update(flavour.files)
 
     def describe(guid: str) -> bytes:
         return model_description(
@@ -118,7 +105,8 @@ def compose(options: FmuOptions) -> Files:
             name=options.name,
             guid=guid,
             version=__version__,
-            flavour={"needsExecutionTool": "true", "canNotUseMemoryManagementFunctions": "true"},
+            flavour=flavour.attributes,
+            source_files=flavour.source_files,
         )
 
     digest = hashlib.sha256(describe(""))
@@ -129,26 +117,26 @@ def compose(options: FmuOptions) -> Files:
     files["model.png"] = data_file("fmu_src", "model.png").read_bytes()
     files.update(
         documentation(
-            robot,
-            table,
-            name=options.name,
-            guid=guid,
-            version=__version__,
-            urdf=urdf,
-            templates=data_file("fmu_src"),
-            licence=data_file("LICENSE"),
+            robot, table, flavour, name=options.name, guid=guid, version=__version__, urdf=urdf
         )
     )
-    wrapper = Path(pythonfmu.__file__).parent / "resources/binaries/linux64/libpythonfmu-export.so"
-    files[f"binaries/linux64/{options.name}.so"] = wrapper.read_bytes()
-    return files
+    return flavour, guid, files
 
 
-def data_file(*parts: str) -> Path:
-    """A file that the package ships: inside the package when installed, else in the checkout."""
-    package = Path(__file__).parent
-    installed = package.joinpath(*parts)
-    return installed if installed.exists() else package.parent.joinpath(*parts)
+def _flavour(
+    options: FmuOptions,
+    robot: Robot,
+    table: list[Variable],
+    urdf: str,
+    starts: Mapping[str, Any],
+) -> Flavour:
+    if not options.native:
+        if options.platforms:
+            raise BuildError("platforms can be chosen for the native flavour only (--native)")
+        return python_flavour(robot, urdf, starts, options.name, options.link_environment)
+    if options.link_environment:
+        raise BuildError("a native FMU needs no environment to link (--link-environment)")
+    return native_flavour(robot, table, options.name, options.platforms or (host_platform(),))
 
 
 def _read_urdf(path: Path) -> str:
@@ -204,36 +192,12 @@ def _rest(robot: Robot) -> tuple[float, ...]:
     )
 
 
-def _slave_sources() -> Files:
-    """The Python code of the FMU under names that no other FMU's code has."""
-    here = Path(__file__).parent
-    package = {f"plant/{path.name}": path.read_bytes() for path in (here / "plant").glob("*.py")}
-    wrapper = Path(pythonfmu.__file__).parent
-    package.update({f"pythonfmu/{name}": (wrapper / name).read_bytes() for name in PYTHONFMU_FILES})
-    package["pythonfmu/__init__.py"] = package["__init__.py"] = b""
-    slave = data_file("fmu_src", "slave.py").read_bytes()
-    digest = hashlib.sha256(slave)
-    for name in sorted(package):
-        digest.update(name.encode() + b"\0" + package[name])
-    tag = digest.hexdigest()[:12]
-    files = {f"twodof_{tag}/{name}": content for name, content in package.items()}
-    files[f"slave_{tag}.py"] = slave
-    files["slavemodule.txt"] = f"slave_{tag}\n".encode()
-    return files
-
-
-def _site_packages() -> list[str]:
-    folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
-    if site.ENABLE_USER_SITE:
-        folders.append(site.getusersitepackages())
-    return list(dict.fromkeys(folders))
-
-
-def _holds(path: Path, files: Files) -> bool:
+def _holds(path: Path, description: bytes, platforms: Sequence[str]) -> bool:
     """Whether the file is already this FMU; its guid is a digest of all that matters."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return archive.read("modelDescription.xml") == files["modelDescription.xml"]
+            found = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
+            return archive.read("modelDescription.xml") == description and found == set(platforms)
     except (*ZIP_ERRORS, KeyError):
         return False
 

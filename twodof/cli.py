@@ -94,6 +94,13 @@ def _parser() -> argparse.ArgumentParser:
         "--link-environment", action="store_true",
         help="remember in the FMU where this Python's packages are",
     )  # fmt: skip
+    build.add_argument(
+        "--native", action="store_true", help="compiled C, which needs no Python where it runs"
+    )
+    build.add_argument(
+        "--platform", dest="platforms", action="append", default=[], metavar="P",
+        help="of a native FMU: linux64, win64, darwin64 or all; repeatable (this machine's)",
+    )  # fmt: skip
 
     run = verbs.add_parser(
         "run", help="simulate an FMU and write a bag",
@@ -101,6 +108,9 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     run.set_defaults(verb=_run)
     run.add_argument("fmu", nargs="?", metavar="FMU", help="default: TwoDof.fmu, built if need be")
+    run.add_argument(
+        "--native", action="store_true", help="build and run the native default FMU instead"
+    )
     run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
     run.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
     run.add_argument(
@@ -143,6 +153,8 @@ def _build(options: argparse.Namespace) -> int:
         q_start=None if options.q_start is None else tuple(options.q_start),
         name=options.name,
         link_environment=options.link_environment,
+        native=options.native,
+        platforms=_platforms(options.platforms),
     )
     path = build_fmu(options.output, chosen)
     from .fmu import load_fmu
@@ -157,14 +169,26 @@ def _build(options: argparse.Namespace) -> int:
     return 0
 
 
+def _platforms(chosen: Sequence[str]) -> tuple[str, ...]:
+    from .native import TARGETS
+
+    return tuple(TARGETS) if "all" in chosen else tuple(dict.fromkeys(chosen))
+
+
 def _run(options: argparse.Namespace) -> int:
     from .bag import Bag
-    from .build import build_fmu
+    from .build import FmuOptions, build_fmu
     from .inputs import parse_settings
     from .master import RealTime, experiment, simulate
+    from .native import host_platform
 
     settings = parse_settings(options.settings)
-    path = Path(options.fmu) if options.fmu else build_fmu()
+    if options.native and options.fmu:
+        raise InputError("--native builds the default arm's FMU; leave it out beside an FMU")
+    native = options.native or host_platform() != "linux64"
+    if native and not options.native and not options.fmu:
+        print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
+    path = Path(options.fmu) if options.fmu else build_fmu(None, FmuOptions(native=native))
     run = experiment(
         path,
         stop_time=options.stop_time,

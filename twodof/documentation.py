@@ -6,37 +6,37 @@ import hashlib
 import html
 import importlib.metadata
 from collections.abc import Sequence
-from pathlib import Path
 from string import Template
 
+from .data import data_file
+from .flavours import Files, Flavour
 from .plant import Robot, Variable
 
 
 def documentation(
     robot: Robot,
     table: Sequence[Variable],
+    flavour: Flavour,
     *,
     name: str,
     guid: str,
     version: str,
     urdf: str,
-    templates: Path,
-    licence: Path,
-) -> dict[str, bytes]:
+) -> Files:
     """Files of the folder by their path in the FMU.
 
     Args:
         robot, table: the robot and its variables.
+        flavour: says what the FMU depends on and whose code it contains.
         name, guid, version: of the model description.
         urdf: text of resources/robot.urdf.
-        templates: folder of documentation.html and externalDependencies.txt.
-        licence: this package's licence.
     """
     rows = "\n".join(
         "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in _row(variable)) + "</tr>"
         for variable in table
     )
-    page = Template((templates / "documentation.html").read_text("utf-8")).substitute(
+    template = data_file("fmu_src", "documentation.html").read_text("utf-8")
+    page = Template(template).substitute(
         name=name,
         robot=html.escape(robot.name),
         frame=html.escape(robot.frame),
@@ -49,11 +49,12 @@ def documentation(
     )
     return {
         "documentation/index.html": page.encode(),
-        "documentation/externalDependencies.txt": (
-            templates / "externalDependencies.txt"
-        ).read_bytes(),
-        "documentation/licenses/license.txt": licence.read_bytes(),
-        "documentation/licenses/pythonfmu.txt": _licence_of("pythonfmu"),
+        "documentation/externalDependencies.txt": flavour.dependencies,
+        "documentation/licenses/license.txt": data_file("LICENSE").read_bytes(),
+        **{
+            f"documentation/licenses/{distribution}.txt": _licence_of(distribution)
+            for distribution in flavour.licences
+        },
     }
 
 

@@ -8,7 +8,6 @@ so that the engine has one kind of axis. Pinocchio has read the URDF.
 from __future__ import annotations
 
 import importlib.util
-import os
 import platform as host
 import shutil
 import struct

@@ -1,0 +1,139 @@
+"""The two flavours of the FMU: what each adds to the files that both carry."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import site
+import sysconfig
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pythonfmu
+
+from .data import data_file
+from .native import EXTENSIONS, compile_library, model_header
+from .plant import Robot, Variable
+
+Files = dict[str, bytes]
+"""Contents by path inside the FMU."""
+
+PYTHONFMU_FILES = (
+    "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
+)  # fmt: skip
+FMI_HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
+
+
+@dataclass(frozen=True)
+class Flavour:
+    """What one flavour adds.
+
+    Attributes:
+        attributes: of <CoSimulation> in the model description.
+        files: resources and sources; the GUID is a digest of them.
+        source_files: names under sources/ that a tool compiles.
+        platforms: FMI platforms of the binaries.
+        finish: given the GUID, the files that contain it and the binaries.
+        dependencies: text of documentation/externalDependencies.txt.
+        licences: of others' code that the FMU contains, by name of the distribution.
+    """
+
+    attributes: Mapping[str, str]
+    files: Files
+    source_files: Sequence[str]
+    platforms: Sequence[str]
+    finish: Callable[[str], Files]
+    dependencies: bytes
+    licences: Sequence[str]
+
+
+def python_flavour(
+    robot: Robot, urdf: str, starts: Mapping[str, Any], name: str, link_environment: bool
+) -> Flavour:
+    """The plant as Python code behind pythonfmu's wrapper, for linux64."""
+    config: dict[str, Any] = {
+        "frame": robot.frame,
+        "axes": robot.axes,
+        "starts": starts,
+        "site_packages": _site_packages() if link_environment else [],
+    }
+    identity = hashlib.sha256(urdf.encode() + json.dumps(config, sort_keys=True).encode())
+    config["identity"] = identity.hexdigest()
+    resources = {
+        **_slave_sources(),
+        "plant.json": (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
+        "requirements.txt": data_file("fmu_src", "requirements.txt").read_bytes(),
+    }
+    wrapper = _pythonfmu() / "resources/binaries/linux64/libpythonfmu-export.so"
+    return Flavour(
+        attributes={"needsExecutionTool": "true", "canNotUseMemoryManagementFunctions": "true"},
+        files={f"resources/{path}": content for path, content in resources.items()},
+        source_files=(),
+        platforms=("linux64",),
+        finish=lambda guid: {f"binaries/linux64/{name}.so": wrapper.read_bytes()},
+        dependencies=data_file("fmu_src", "externalDependencies.txt").read_bytes(),
+        licences=("pythonfmu",),
+    )
+
+
+def native_flavour(
+    robot: Robot, table: Sequence[Variable], name: str, platforms: Sequence[str]
+) -> Flavour:
+    """The plant as C99 sources, compiled for the platforms."""
+    fmpy = find_spec("fmpy")  # it comes with the headers of the standard
+    assert fmpy is not None and fmpy.origin is not None
+    headers = Path(fmpy.origin).parent / "c-code"
+    sources = {path.name: path.read_bytes() for path in data_file("fmu_src", "native").iterdir()}
+    sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
+
+    def header(guid: str) -> Files:
+        return {"model.h": model_header(robot, table, name=name, guid=guid).encode()}
+
+    def finish(guid: str) -> Files:
+        files = {f"sources/{path}": content for path, content in header(guid).items()}
+        for platform in platforms:
+            library = compile_library({**sources, **header(guid)}, platform, name)
+            files[f"binaries/{platform}/{name}{EXTENSIONS[platform]}"] = library
+        return files
+
+    return Flavour(
+        attributes={"needsExecutionTool": "false", "canNotUseMemoryManagementFunctions": "false"},
+        files={f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
+        source_files=sorted(path for path in sources if path.endswith(".c")),
+        platforms=platforms,
+        finish=finish,
+        dependencies=b"None: the binaries need the C library and its mathematics only.\n",
+        licences=(),
+    )
+
+
+def _slave_sources() -> Files:
+    """The Python code of the FMU under names that no other FMU's code has."""
+    plant = Path(__file__).parent / "plant"
+    package = {f"plant/{path.name}": path.read_bytes() for path in plant.glob("*.py")}
+    for name in PYTHONFMU_FILES:
+        package[f"pythonfmu/{name}"] = (_pythonfmu() / name).read_bytes()
+    package["pythonfmu/__init__.py"] = package["__init__.py"] = b""
+    slave = data_file("fmu_src", "slave.py").read_bytes()
+    digest = hashlib.sha256(slave)
+    for name in sorted(package):
+        digest.update(name.encode() + b"\0" + package[name])
+    tag = digest.hexdigest()[:12]
+    files = {f"twodof_{tag}/{name}": content for name, content in package.items()}
+    files[f"slave_{tag}.py"] = slave
+    files["slavemodule.txt"] = f"slave_{tag}\n".encode()
+    return files
+
+
+def _pythonfmu() -> Path:
+    return Path(pythonfmu.__file__).parent
+
+
+def _site_packages() -> list[str]:
+    folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
+    if site.ENABLE_USER_SITE:
+        folders.append(site.getusersitepackages())
+    return list(dict.fromkeys(folders))
