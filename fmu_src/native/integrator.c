@@ -36,26 +36,31 @@ static const double P[STAGES][4] = {
     {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
 };
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
-/* Smallest step, as a part of the first one, 2⁻¹⁰. Across a singularity of the Jacobian the
+/* Smallest step, as a part of the first one, 2⁻⁸. Across a singularity of the Jacobian the
    right-hand side jumps and no step satisfies the error test; a step of this size is taken as it
-   is. Nor does an event end a step sooner: where a joint chatters at its limit, events would else
-   follow each other without the time moving on. */
-static const double STEP_FLOOR = 1.0 / 1024.0;
+   is. */
+static const double STEP_FLOOR = 1.0 / 256.0;
+/* As a part of the largest step: a joint that is back at its limit sooner than this after leaving
+   it is kept there for as long. Where its acceleration only grazes zero, as it may at a
+   singularity, it would else leave and return without end. */
+static const double PATIENCE = 0.25;
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
 /* One integration step, from y to y_new. */
 typedef struct {
     const Plant *plant;
-    double size, floor;         /* s; the smallest step of this communication step */
+    double size;                /* s */
     double y[N_STATES], y_new[N_STATES];
     double K[STAGES][N_STATES]; /* derivatives at the stages */
     double Q[N_STATES][4];      /* coefficients of the dense output */
-    int held[N_JOINTS];         /* joints held at a limit */
-    int any_held;
+    int held[N_JOINTS];         /* joints that rest at a limit */
+    int watched[N_JOINTS];      /* those of them that may leave it when they are drawn */
+    int any_watched;
+    int stopped[N_JOINTS];      /* joints that reached a limit at the end of the step */
 } Step;
 
-/* Set out at y: take the velocity that points into a limit, find the joints held there. */
-static void hold(Step *step)
+/* Set out at y: take the velocity that points into a limit, find the joints that rest there. */
+static void hold(Step *step, const int kept[N_JOINTS])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
     double *q = step->y, *v = step->y + N_JOINTS, *a = step->K[0] + N_JOINTS;
@@ -63,14 +68,14 @@ static void hold(Step *step)
         if ((q[i] >= high[i] && v[i] > 0.0) || (q[i] <= low[i] && v[i] < 0.0))
             v[i] = 0.0;
     acceleration(step->plant, q, v, a);
-    step->any_held = 0;
+    step->any_watched = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         const int into = (q[i] >= high[i] && a[i] >= 0.0) || (q[i] <= low[i] && a[i] <= 0.0);
-        step->held[i] = into && v[i] == 0.0;
-        if (step->held[i]) {
-            step->any_held = 1;
+        step->held[i] = (into || kept[i]) && v[i] == 0.0;
+        step->watched[i] = step->held[i] && !kept[i];
+        step->any_watched |= step->watched[i];
+        if (step->held[i])
             a[i] = 0.0;
-        }
         step->K[0][i] = v[i];
     }
 }
@@ -119,7 +124,7 @@ static void dense_output(const Step *step, double passed, double y[N_STATES])
     }
 }
 
-/* Mark the free joints that are past a limit and the held joints that would leave theirs, at y;
+/* Mark the free joints that are past a limit and the watched joints that leave theirs, at y;
    whether there are any. */
 static int events(const Step *step, const double y[N_STATES], int found[N_JOINTS])
 {
@@ -127,12 +132,12 @@ static int events(const Step *step, const double y[N_STATES], int found[N_JOINTS
     const double *q = y, *v = y + N_JOINTS;
     double a[N_JOINTS];
     int any = 0;
-    if (step->any_held)
+    if (step->any_watched)
         acceleration(step->plant, q, v, a);
     for (int i = 0; i < N_JOINTS; i++) {
         found[i] = (q[i] >= high[i] && (q[i] > high[i] || v[i] > 0.0))
                    || (q[i] <= low[i] && (q[i] < low[i] || v[i] < 0.0));
-        if (step->held[i] && low[i] < high[i])
+        if (step->watched[i] && low[i] < high[i])
             found[i] |= q[i] >= high[i] ? a[i] < 0.0 : a[i] > 0.0;
         any |= found[i];
     }
@@ -193,8 +198,8 @@ static double excursion(const Step *step)
     return earliest;
 }
 
-/* First time in (0, size], but not before the floor, at which a limit is reached or left, and y_new
-   the state from there on; 0 where there is none. */
+/* First time in (0, size] at which a limit is reached or left, y_new the state from there on; 0
+   where there is none. */
 static double first_event(Step *step)
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
@@ -214,15 +219,17 @@ static double first_event(Step *step)
     double latest = at_the_end ? step->size : excursion(step);
     if (latest == 0.0)
         return 0.0;
-    latest = fmax(bisect(step, event_happened, 0, latest), fmin(step->floor, step->size));
+    latest = bisect(step, event_happened, 0, latest);
     double reached[N_STATES];
     dense_output(step, latest, reached);
     events(step, reached, found);
-    for (int i = 0; i < N_JOINTS; i++)
-        if (found[i] && !step->held[i]) {
+    for (int i = 0; i < N_JOINTS; i++) {
+        step->stopped[i] = found[i] && !step->held[i];
+        if (step->stopped[i]) {
             reached[i] = fmin(fmax(reached[i], low[i]), high[i]);
             reached[N_JOINTS + i] = 0.0;
         }
+    }
     memcpy(step->y_new, reached, sizeof reached);
     return latest;
 }
@@ -233,13 +240,14 @@ static double until_event(Step *step, double t, double end)
 {
     const double max_step = step->plant->value[MAX_STEP];
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
-    hold(step);
+    const double smallest = STEP_FLOOR * next;
+    memset(step->stopped, 0, sizeof step->stopped);
     for (;;) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
         const double norm = dormand_prince(step);
         double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
-        if (norm < 1.0 || (step->size <= step->floor && isfinite(norm))) {
+        if (norm < 1.0 || (step->size <= smallest && isfinite(norm))) {
             const double passed = first_event(step);
             memcpy(step->y, step->y_new, sizeof step->y);
             if (last && (passed == 0.0 || passed == step->size))
@@ -249,13 +257,13 @@ static double until_event(Step *step, double t, double end)
             t += step->size;
             memcpy(step->K[0], step->K[STAGES - 1], sizeof step->K[0]);
             factor = fmax(MIN_FACTOR, fmin(growth, factor));
-            next = fmax(step->floor, fmin(max_step, step->size * factor));
+            next = fmax(smallest, fmin(max_step, step->size * factor));
             growth = MAX_FACTOR;
-        } else if (step->size <= step->floor) {
+        } else if (step->size <= smallest) {
             return NAN;
         } else {
             factor = isfinite(norm) ? factor : MIN_FACTOR;
-            next = fmax(step->floor, step->size * fmax(MIN_FACTOR, factor));
+            next = fmax(smallest, step->size * fmax(MIN_FACTOR, factor));
             growth = 1.0; /* no growth right after a rejection */
         }
     }
@@ -263,14 +271,34 @@ static double until_event(Step *step, double t, double end)
 
 int advance(Plant *plant, double h)
 {
+    const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
+    const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
+    double left[N_JOINTS];       /* when each joint last left its limit */
+    double until[N_JOINTS] = {0}; /* until when each joint is kept at its limit */
     Step step;
     double t = 0.0;
     step.plant = plant;
-    step.floor = STEP_FLOOR * fmin(plant->value[MAX_STEP], h);
     memcpy(step.y, &plant->value[Q], N_JOINTS * sizeof *step.y);
     memcpy(step.y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *step.y);
-    while (t < h)
-        t = until_event(&step, t, h);
+    for (int i = 0; i < N_JOINTS; i++)
+        left[i] = -HUGE_VAL;
+    while (t < h) {
+        double end = h;
+        int kept[N_JOINTS];
+        for (int i = 0; i < N_JOINTS; i++) {
+            kept[i] = until[i] > t;
+            if (kept[i])
+                end = fmin(end, until[i]);
+        }
+        hold(&step, kept);
+        for (int i = 0; i < N_JOINTS; i++)
+            if (!step.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
+                left[i] = t;
+        t = until_event(&step, t, end);
+        for (int i = 0; i < N_JOINTS; i++)
+            if (step.stopped[i] && t - left[i] < patience)
+                until[i] = t + patience;
+    }
     if (isnan(t))
         return 0;
     memcpy(&plant->value[Q], step.y, N_JOINTS * sizeof *step.y);
