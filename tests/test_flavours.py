@@ -1,0 +1,89 @@
+"""The two flavours side by side, through the master and the command line."""
+
+import numpy as np
+import pytest
+from oracles import position, task_error
+
+import twodof
+from twodof import FmuOptions, build_fmu
+from twodof.cli import main
+
+
+@pytest.fixture(scope="module")
+def native_fmu(tmp_path_factory):
+    return build_fmu(tmp_path_factory.mktemp("native") / "N.fmu", FmuOptions(native=True))
+
+
+RUNS = {
+    "default": {},
+    "at limits": {
+        "q_min": (-0.2, 0.8), "q_max": (0.8, 1.9), "q_start": (0.3, 1.3), "Kp": 400.0,
+        "x_des": (0.14, -0.03),
+    },
+    "external torque": {"tau_ext": (0.2, -0.1), "x_des": (0.12, 0.15)},
+    "limited effort": {"limit_effort": True, "x_des": (0.1, 0.2), "Kp": 3000.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("settings", RUNS.values(), ids=RUNS)
+def test_trajectories_of_both_flavours_agree(fmu_path, native_fmu, settings):
+    runs = [
+        list(twodof.samples(fmu, stop_time=2.0, settings=settings))
+        for fmu in (fmu_path, native_fmu)
+    ]
+    for group in ("q", "v", "x", "tau"):
+        python, native = (np.array([getattr(s, group) for s in run]) for run in runs)
+        scale = np.maximum(1.0, np.abs(python))
+        assert (np.abs(native - python) / scale).max() <= 1e-9, group
+    assert [s.inputs for s in runs[0]] == [s.inputs for s in runs[1]]
+
+
+def test_native_end_effector_follows_the_closed_form_into_the_bag(native_fmu, tmp_path):
+    run = twodof.experiment(native_fmu)
+    twodof.simulate(run, [twodof.Bag(tmp_path / "bag", run)])
+    q = twodof.read_bag(tmp_path / "bag").q
+    target = np.array([0.2, 0.05])
+    expected = target - task_error(target - position(q[0]), 50.0, 40.0, 0.01 * np.arange(501))
+    assert np.abs(position(q) - expected).max() <= 1e-9
+
+
+def test_run_native_builds_its_own_fmu_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["run", "--native", "--stop-time", "0.1", "--overwrite", "-o", "bag"]
+    assert main(arguments) == 0
+    built = (tmp_path / "TwoDof-native.fmu").stat().st_mtime_ns
+    assert main(arguments) == 0
+    assert (tmp_path / "TwoDof-native.fmu").stat().st_mtime_ns == built
+    assert "TwoDof-native.fmu" in capsys.readouterr().out
+    assert not (tmp_path / "TwoDof.fmu").exists()
+
+
+def test_run_native_beside_an_fmu_is_refused(native_fmu, capsys):
+    assert main(["run", "--native", str(native_fmu)]) == 1
+    assert "--native builds the default arm's FMU" in capsys.readouterr().err
+
+
+def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("twodof.native.host_platform", lambda: "darwin64")
+    monkeypatch.setattr("twodof.build.host_platform", lambda: "linux64")  # what can run here
+    assert main(["run", "--stop-time", "0.1", "-o", "bag"]) == 0
+    captured = capsys.readouterr()
+    assert "the Python flavour is for Linux x86-64: building the native one" in captured.err
+    assert "TwoDof-native.fmu" in captured.out
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (FmuOptions(platforms=("win64",)), "for the native flavour only"),
+        (FmuOptions(native=True, link_environment=True), "needs no environment to link"),
+        (FmuOptions(native=True, platforms=("amiga",)), "no platform 'amiga'"),
+    ],
+)
+def test_options_that_do_not_fit_a_flavour_are_refused(options, message, tmp_path):
+    with pytest.raises(twodof.TwoDofError, match=message):
+        build_fmu(tmp_path / "A.fmu", options)
+    assert list(tmp_path.iterdir()) == []
