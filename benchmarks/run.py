@@ -1,4 +1,4 @@
-"""Times the guide's listing, the plant, the FMU and the logger in one run, and prints a table.
+"""Times the guide's listing, the plant, the FMUs and the logger in one run, and prints tables.
 
     python benchmarks/run.py
 
@@ -6,6 +6,10 @@ Simulators take turns of ten steps, loggers turns of some thousand messages, so 
 machine hits all alike; times are medians. Steps are timed in processor time: on an idle machine
 it is the wall time, on a busy one a long step is interrupted more often than a short one, which
 would flatter the short ones. Logging is timed in wall time, as it waits for the disk.
+
+The native engine is timed from C too, where Python's calls do not count, beside MuJoCo's own C
+loop, and for arms of 2 to 16 joints. MuJoCo has the arm swing freely with its limits off, which is
+the least that it can be asked for; RK4 at 1 ms is its choice that comes closest in accuracy.
 
 Beside its time each simulator has its distance from the exact solution, so that nobody compares
 the speed of things that compute something else: in the default run both task axes obey
@@ -15,7 +19,9 @@ e'' + 40 e' + 50 e = 0 for the error e, which has a closed form. Needs the packa
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
+import itertools
 import math
 import platform
 import statistics
@@ -23,14 +29,17 @@ import subprocess
 import sys
 import tempfile
 import time
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import fmpy
+import mujoco
 import numpy as np
+import pinocchio as pin
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -41,14 +50,19 @@ sys.path[:0] = [str(HERE), str(ROOT)]
 from listing import PendulumSimulator  # noqa: E402
 
 import twodof  # noqa: E402
-from twodof.plant import Plant, load_robot, variable_table  # noqa: E402
+from twodof.flavours import native_flavour  # noqa: E402
+from twodof.native import compile_library, host_platform  # noqa: E402
+from twodof.plant import Plant, Robot, load_robot, variable_table  # noqa: E402
 
 URDF = ROOT / "urdf" / "2dof.urdf"
 STEP, STEPS = 0.01, 500  # s; the default run of 5 s
+MUJOCO_STEP = 0.001  # s
 Q_START, X_DES, KP, KD, LINK = (0.5, 0.35), (0.2, 0.05), 50.0, 40.0, 0.15
-PASSES, TURN = 4, 10
+STARTS = {"q_start": Q_START, "x_des": X_DES, "gravity": (0.0, -9.81, 0.0)}
+PASSES, TURN = 3, 10
 LOG_ROUNDS, LOG_TURN = 5, 20_000
-FMU_BAR, LOG_BAR, HELP_BAR = 5.0, 1.5, 0.3
+C_ROUNDS = 15
+FMU_BAR, NATIVE_BAR, MUJOCO_BAR, GROWTH_BAR, LOG_BAR, HELP_BAR = 5.0, 300.0, 4.0, 2.0, 1.5, 0.3
 BUSY = 1.1
 
 
@@ -93,11 +107,21 @@ class Listing:
         return self.program.evaluations
 
 
+@dataclass(frozen=True)
+class Arm:
+    """A robot and the start values of its run, by group of variables."""
+
+    robot: Robot
+    starts: dict[str, Any]
+
+
+def shipped_arm() -> Arm:
+    return Arm(load_robot(URDF.read_text("utf-8"), "EndEffector", "xy"), STARTS)
+
+
 class PlantAlone:
-    def __init__(self) -> None:
-        robot = load_robot(URDF.read_text("utf-8"), "EndEffector", "xy")
-        starts = {"q_start": Q_START, "x_des": X_DES, "gravity": (0.0, -9.81, 0.0)}
-        self.plant = Plant(robot, variable_table(robot, starts))
+    def __init__(self, arm: Arm) -> None:
+        self.plant = Plant(arm.robot, variable_table(arm.robot, arm.starts))
 
     def restart(self) -> None:
         self.plant.initialise()
@@ -191,29 +215,171 @@ class Master:
 def table(stack: ExitStack, folder: Path) -> list[Row]:
     """The rows, the listing first; another simulator is another entry."""
     fmu = twodof.build_fmu(folder / "TwoDof.fmu")
+    native = twodof.build_fmu(folder / "Native.fmu", twodof.FmuOptions(native=True))
     bare = FmuInFmpy(fmu, folder / "bare", outputs=False)
     reading = FmuInFmpy(fmu, folder / "reading", outputs=True)
+    native_bare = FmuInFmpy(native, folder / "native_bare", outputs=False)
+    native_reading = FmuInFmpy(native, folder / "native_reading", outputs=True)
     master = Master(fmu)
-    for simulator in (bare, reading, master):
+    for simulator in (bare, reading, native_bare, native_reading, master):
         stack.callback(simulator.free)
-    listing, counted = Listing(), CountedPlant()
+    listing, arm = Listing(), shipped_arm()
     return [
         Row("listing", "the guide's program as written", listing, listing.evaluations),
-        Row("plant", "twodof.plant.Plant.step", PlantAlone(), counted_by(counted)),
+        Row("plant", "twodof.plant.Plant.step", PlantAlone(arm), lambda: right_hand_sides(arm)),
         Row("FMU", "one doStep through FMPy", bare, bar=FMU_BAR),
         Row("FMU, read", "doStep, then getReal of all outputs", reading),
+        Row("native FMU", "one doStep through FMPy", native_bare, bar=NATIVE_BAR),
+        Row("native, read", "doStep, then getReal of all outputs", native_reading, bar=NATIVE_BAR),
         Row("master", "one sample of twodof.samples", master),
     ]
 
 
-def counted_by(counted: CountedPlant) -> Callable[[], int]:
-    """Right-hand sides of the whole default run, from a run of its own."""
+def right_hand_sides(arm: Arm) -> int:
+    """Those of a whole run, from a run of its own."""
+    counted = CountedPlant(arm)
+    counted.restart()
+    for k in range(STEPS):
+        counted.step(k)
+    return counted.evaluations()
 
-    def evaluations() -> int:
-        accuracy(counted)
-        return counted.evaluations()
 
-    return evaluations
+# --- what is timed from C ---
+
+
+@dataclass(frozen=True)
+class RowInC:
+    """One row of the table of steps in C.
+
+    Attributes:
+        cost: processor time of one step of 10 ms, s, the mean of one run.
+        evaluations: right-hand sides of one step.
+        grows: whether the growth with the number of joints is taken from this row.
+    """
+
+    name: str
+    joints: int
+    cost: Callable[[], float]
+    evaluations: float
+    grows: bool = False
+
+
+def table_in_c(folder: Path) -> list[RowInC]:
+    """The rows, MuJoCo first and then the same arm of the native engine."""
+    rows = [RowInC("MuJoCo, RK4 at 1 ms, no controller", 2, mujoco_cost(), 4 * STEP / MUJOCO_STEP)]
+    arms = {"shipped arm": shipped_arm(), "Panda": panda(), "chain": chain(16)}
+    for name, arm in arms.items():
+        n = len(arm.robot.joints)
+        pushed = Arm(arm.robot, {**arm.starts, "tau_ext": (1e-3,) * n})
+        for kind, chosen in (("", arm), (", tau_ext", pushed)):
+            cost, sides = native_cost(chosen, folder), right_hand_sides(chosen) / STEPS
+            rows.append(RowInC(f"native, {name}{kind}", n, cost, sides, grows=not kind))
+    return rows
+
+
+def panda() -> Arm:
+    """The Panda with its fingers fixed and without the damping of its joints."""
+    for parent in Path(pin.__file__).parents:
+        path = parent / "share/example-robot-data/robots/panda_description/urdf/panda.urdf"
+        if path.is_file():
+            break
+    tree = without_shapes(path.read_text("utf-8"))
+    for joint in tree.findall("joint"):
+        for element in joint.findall("dynamics") + joint.findall("mimic"):
+            joint.remove(element)
+        if joint.get("type") == "prismatic":
+            joint.set("type", "fixed")
+    return spatial_arm(tree, "panda_hand_tcp", (0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8))
+
+
+def chain(n: int) -> Arm:
+    """Rods one after the other, their joints about y and z in turns."""
+    tree = ET.Element("robot", name="chain")
+    ET.SubElement(tree, "link", name="l0")
+    for i in range(1, n + 1):
+        link = ET.SubElement(tree, "link", name=f"l{i}")
+        body = ET.SubElement(link, "inertial")
+        ET.SubElement(body, "origin", xyz="0.05 0 0")
+        ET.SubElement(body, "mass", value="0.5")
+        ET.SubElement(
+            body, "inertia", ixx="1e-4", iyy="5e-4", izz="5e-4", ixy="0", ixz="0", iyz="0"
+        )
+        joint = ET.SubElement(tree, "joint", name=f"j{i}", type="revolute")
+        ET.SubElement(joint, "parent", link=f"l{i - 1}")
+        ET.SubElement(joint, "child", link=f"l{i}")
+        ET.SubElement(joint, "origin", xyz="0.1 0 0")
+        ET.SubElement(joint, "axis", xyz="0 1 0" if i % 2 else "0 0 1")
+        ET.SubElement(joint, "limit", lower="-3", upper="3", effort="100", velocity="10")
+    return spatial_arm(tree, f"l{n}", (0.2,) * n)
+
+
+def spatial_arm(tree: ET.Element, frame: str, q_start: tuple[float, ...]) -> Arm:
+    """An arm of three task axes whose target is 0.1 m from its start along each."""
+    robot = load_robot(ET.tostring(tree, encoding="unicode"), frame, "xyz")
+    starts: dict[str, Any] = {"q_start": q_start, "x_des": (0.0, 0.0, 0.0)}
+    plant = Plant(robot, variable_table(robot, starts))
+    plant.initialise()
+    return Arm(robot, {**starts, "x_des": tuple(x - 0.1 for x in plant.x)})
+
+
+def without_shapes(urdf: str) -> ET.Element:
+    tree = ET.fromstring(urdf)
+    for link in tree.findall("link"):
+        for shape in link.findall("visual") + link.findall("collision"):
+            link.remove(shape)
+    return tree
+
+
+def native_cost(arm: Arm, folder: Path) -> Callable[[], float]:
+    """Times a run of the native engine in C, compiled as in its FMU."""
+    name = f"step{len(list(folder.glob('step*')))}"
+    flavour = native_flavour(arm.robot, variable_table(arm.robot, arm.starts), name, ())
+    sources = {Path(path).name: content for path, content in flavour.files.items()}
+    sources["native_step.c"] = (HERE / "native_step.c").read_bytes()
+    path = folder / name
+    path.write_bytes(compile_library(sources, host_platform(), name))
+    step_cost = ctypes.CDLL(str(path)).step_cost
+    step_cost.argtypes, step_cost.restype = (ctypes.c_double, ctypes.c_int), ctypes.c_double
+    return lambda: step_cost(STEP, STEPS)
+
+
+def mujoco_arm() -> mujoco.MjModel:
+    tree = without_shapes(URDF.read_text("utf-8"))
+    model = mujoco.MjModel.from_xml_string(ET.tostring(tree, encoding="unicode"))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.timestep = MUJOCO_STEP
+    model.opt.gravity = STARTS["gravity"]
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # the limits
+    model.dof_damping = 0.0
+    return model
+
+
+def mujoco_cost() -> Callable[[], float]:
+    """Times a run of MuJoCo's own loop: one call from Python for all of it."""
+    model = mujoco_arm()
+    data = mujoco.MjData(model)
+    repeats = round(STEP / MUJOCO_STEP)
+
+    def cost() -> float:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = Q_START
+        begin = time.thread_time_ns()
+        mujoco.mj_step(model, data, nstep=STEPS * repeats)
+        return (time.thread_time_ns() - begin) * 1e-9 / STEPS
+
+    return cost
+
+
+def times_in_c(rows: Sequence[RowInC], rounds: int = C_ROUNDS) -> list[float]:
+    """Median over the rounds, s; in each round every row runs once."""
+    costs = [[row.cost() for row in rows] for _ in range(rounds)]
+    return [statistics.median(taken) for taken in zip(*costs, strict=True)]
+
+
+def growth(joints: Sequence[int], times: Sequence[float]) -> float:
+    """The exponent p of time ~ joints^p, the largest between neighbours."""
+    pairs = itertools.pairwise(zip(joints, times, strict=True))
+    return max(math.log(t1 / t0) / math.log(n1 / n0) for (n0, t0), (n1, t1) in pairs)
 
 
 # --- what is measured ---
@@ -340,7 +506,7 @@ def run_time(folder: Path, fmu: Path) -> float:
 
 
 def main() -> None:
-    packages = ("numpy", "scipy", "pin", "fmpy", "pythonfmu", "rosbags")
+    packages = ("numpy", "scipy", "pin", "fmpy", "pythonfmu", "rosbags", "mujoco")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
     print(f"twodof {twodof.__version__}, Python {platform.python_version()}, {versions}\n")
     begin = time.perf_counter()
@@ -349,6 +515,8 @@ def main() -> None:
         rows = table(stack, folder)
         fmu = folder / "TwoDof.fmu"
         print_steps(rows, *step_times([row.simulator for row in rows]))
+        in_c = table_in_c(folder)
+        print_in_c(in_c, times_in_c(in_c))
         print_logs(log_times(folder, fmu))
         print_once(help_time(), run_time(folder, fmu))
     print(f"\n{time.perf_counter() - begin:.0f} s in all")
@@ -359,7 +527,7 @@ def print_steps(rows: Sequence[Row], times: Sequence[float], busy: float) -> Non
         f"One communication step of 10 ms in the default run of {STEPS * STEP:g} s"
         f" (medians of {PASSES * STEPS} steps)\n"
     )
-    line = "  {:10} {:36} {:>9} {:>8} {:>11} {:>6}   {}"
+    line = "  {:12} {:36} {:>9} {:>8} {:>11} {:>6}   {}"
     print(line.format("", "", "processor", "times", "off exact", "rhs", "").rstrip())
     print(line.format("row", "what it is", "time", "faster", "solution", "/ step", "wanted"))
     for row, seconds in zip(rows, times, strict=True):
@@ -379,10 +547,46 @@ def print_steps(rows: Sequence[Row], times: Sequence[float], busy: float) -> Non
     print(
         "\n  times faster: than the listing. off exact solution: largest distance of the end"
         "\n  effector, at any sample, from the closed form of e'' + 40 e' + 50 e = 0."
-        "\n  rhs / step: evaluations of the right-hand side; the FMU runs those of the plant."
+        "\n  rhs / step: evaluations of the right-hand side; the FMUs run those of the plant."
     )
     if busy > BUSY:
         print(f"  The machine was busy: wall time was {busy:.2f} times the processor time.")
+
+
+def print_in_c(rows: Sequence[RowInC], times: Sequence[float]) -> None:
+    print(
+        "\nThe same step of 10 ms in C, without Python"
+        f" (processor time, medians of {C_ROUNDS} runs of {STEPS * STEP:g} s)\n"
+    )
+    line = "  {:36} {:>6} {:>9} {:>6} {:>9}   {}"
+    print(line.format("", "", "processor", "rhs", "of", "").rstrip())
+    print(line.format("row", "joints", "time", "/ step", "MuJoCo's", "wanted"))
+    for place, (row, seconds) in enumerate(zip(rows, times, strict=True)):
+        faster = times[0] / seconds
+        same_arm = row.joints == rows[0].joints
+        print(
+            line.format(
+                row.name,
+                row.joints,
+                f"{1e6 * seconds:.1f} µs",
+                f"{row.evaluations:.1f}",
+                f"1 / {faster:.1f}" if same_arm else "",
+                f"1 / {MUJOCO_BAR:g}: {verdict(faster >= MUJOCO_BAR)}" if place == 1 else "",
+            ).rstrip()
+        )
+    for label, grows in (("without", True), ("with", False)):
+        chosen = [k for k, row in enumerate(rows) if k and row.grows == grows]
+        power = growth([rows[k].joints for k in chosen], [times[k] for k in chosen])
+        print(
+            f"\n  Growth {label} tau_ext: at most joints^{power:.2f} from row to row;"
+            f" wanted <= {GROWTH_BAR:g}: {verdict(power <= GROWTH_BAR)}",
+            end="",
+        )
+    print(
+        "\n\n  native: controller and all; Panda: fingers fixed, damping removed; chain: generated."
+        "\n  tau_ext: with an external effort, so that M⁻¹ is needed; without, M cancels."
+        "\n  MuJoCo: mj_step with nstep, no controller, limits off."
+    )
 
 
 def print_logs(logs: dict[str, tuple[float, float]]) -> None:

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import mujoco
 import numpy as np
+import pinocchio as pin
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -48,17 +50,44 @@ def test_listing_is_off_by_centimetres_and_needs_65_right_hand_sides(
 
 
 def test_plant_is_exact_and_needs_61_right_hand_sides(benchmark: ModuleType) -> None:
-    counted = benchmark.CountedPlant()
-    assert benchmark.accuracy(counted) <= 1e-12
-    assert counted.evaluations() == 61 * benchmark.STEPS
-    assert benchmark.accuracy(benchmark.PlantAlone()) <= 1e-12
+    arm = benchmark.shipped_arm()
+    assert benchmark.accuracy(benchmark.PlantAlone(arm)) <= 1e-12
+    assert benchmark.right_hand_sides(arm) == 61 * benchmark.STEPS
 
 
 def test_step_times_measure_every_row(benchmark: ModuleType, monkeypatch) -> None:
     monkeypatch.setattr(benchmark, "STEPS", 20)
-    rows = [benchmark.Listing(), benchmark.PlantAlone()]
+    rows = [benchmark.Listing(), benchmark.PlantAlone(benchmark.shipped_arm())]
     times, busy = benchmark.step_times(rows, passes=1)
     assert len(times) == 2 and min(times) > 0.0 and busy > 0.0
+
+
+def test_growth_is_the_largest_exponent(benchmark: ModuleType) -> None:
+    assert benchmark.growth([2, 7, 16], [4.0, 49.0, 256.0]) == pytest.approx(2.0)
+    assert benchmark.growth([1, 2, 4], [1.0, 2.0, 16.0]) == pytest.approx(3.0)
+
+
+def test_arms_have_the_joints_that_the_table_says(benchmark: ModuleType) -> None:
+    for arm, joints in ((benchmark.panda(), 7), (benchmark.chain(16), 16)):
+        assert len(arm.robot.joints) == joints and not any(arm.robot.damping)
+
+
+def test_mujoco_has_the_same_arm(benchmark: ModuleType) -> None:
+    """Free fall from the start: MuJoCo's motion is that of Pinocchio's dynamics."""
+    model, robot = benchmark.mujoco_arm(), benchmark.shipped_arm().robot
+    data, reference = mujoco.MjData(model), robot.model.copy()
+    reference.gravity.linear = np.array(benchmark.STARTS["gravity"])
+    data.qpos[:], data.qvel[:] = benchmark.Q_START, (1.0, -2.0)
+    mujoco.mj_forward(model, data)
+    expected = pin.aba(reference, reference.createData(), data.qpos, data.qvel, np.zeros(2))
+    np.testing.assert_allclose(data.qacc, expected, rtol=1e-9)
+
+
+def test_steps_are_timed_from_c(benchmark: ModuleType, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(benchmark, "STEPS", 100)  # clock() has a resolution of 1 µs
+    native = benchmark.native_cost(benchmark.shipped_arm(), tmp_path)
+    rows = [benchmark.RowInC("", 2, cost, 61.0) for cost in (native, benchmark.mujoco_cost())]
+    assert all(0.0 < cost < 1e-3 for cost in benchmark.times_in_c(rows, rounds=3))
 
 
 def test_targets_repeat_with_their_seed(monkeypatch) -> None:

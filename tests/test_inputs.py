@@ -217,7 +217,7 @@ def test_variable_that_is_both_set_and_in_the_table_is_refused(
 STEP = 0.01
 ROWS = [
     (0.0, {"x_des[1]": 0.21, "Kp[2]": 50.0}),
-    (0.03, {"x_des[1]": 0.24, "Kp[2]": 70.0}),  # on a communication point, up to rounding
+    (0.03 + 1e-12, {"x_des[1]": 0.24, "Kp[2]": 70.0}),  # on a communication point but for rounding
     (0.045, {"x_des[1]": 0.18, "Kp[2]": 60.0}),  # between two: from the next one on
     (0.061, {"x_des[1]": 9.99, "Kp[2]": 99.0}),  # two within one step: the latter
     (0.069, {"x_des[1]": 0.22, "Kp[2]": 80.0}),

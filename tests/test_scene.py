@@ -418,6 +418,18 @@ def test_fit_recovers_a_cylinder(seed: int, radius: float, length: float) -> Non
     assert found == pytest.approx([radius, length], rel=1e-2)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_fit_finds_the_axis_of_a_cylinder(axis: int) -> None:
+    mesh = trimesh.creation.cylinder(0.04, 0.3, sections=64)
+    mesh.vertices = np.roll(mesh.vertices, axis + 1, axis=1)
+    content = mesh.export(file_type="stl")
+    description = Scene(with_mesh(), [], "thing", lambda _: content).description
+    assert_shapes_hold_the_meshes(description, with_mesh(), lambda _: single(mesh.vertices))
+    ((shape, fitted),) = geometries(description)
+    assert float(shape.get("length", "")) == pytest.approx(0.3)
+    np.testing.assert_allclose(np.abs(fitted[:3, 2]), np.eye(3)[axis], atol=1e-6)
+
+
 def single(vertices: np.ndarray) -> np.ndarray:
     """With the precision that an STL file has."""
     return np.asarray(vertices, dtype=np.float32).astype(float)

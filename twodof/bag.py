@@ -44,6 +44,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 PROVENANCE = "run.json"
 PROVENANCE_KEY = "twodof"
 FORMAT = 1
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
@@ -115,7 +116,9 @@ class Bag:
     ) -> None:
         self.path = Path(path)
         self._run = run
-        self._plugin = StoragePlugin[storage.upper()]
+        if storage not in STORAGES:
+            raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
+        self._plugin = STORAGES[storage]
         self._overwrite = overwrite
         self._command_line = command_line
         if stamp_start is not None and not 0 <= stamp_start * NANOSECONDS <= LATEST_STAMP:
@@ -140,8 +143,8 @@ class Bag:
                 shutil.rmtree(self.path)
             self._writer = Writer(self.path, version=METADATA_VERSION, storage_plugin=self._plugin)
             self._writer.set_custom_data(PROVENANCE_KEY, provenance)
-            self._writer.open()
             created = True
+            self._writer.open()
             (self.path / PROVENANCE).write_text(provenance + "\n", "utf-8")
             _write_reserve(self.path / RESERVE)
             if isinstance(self._writer.storage, Sqlite3Writer):
@@ -155,7 +158,7 @@ class Bag:
             self._message = _joint_state(self._run.fmu.joints, self._effort)
             self._flush()
         except (OSError, WriterError, sqlite3.Error) as error:
-            if created:
+            if created and not isinstance(error, WriterError):  # else the folder is not ours
                 with suppress(OSError, sqlite3.Error):
                     self._writer.abort()
                 shutil.rmtree(self.path, ignore_errors=True)
