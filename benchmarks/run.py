@@ -9,7 +9,7 @@ would flatter the short ones. Logging is timed in wall time, as it waits for the
 
 The native engine is timed from C too, where Python's calls do not count, beside MuJoCo's own C
 loop, and for arms of 2 to 16 joints. MuJoCo has the arm swing freely with its limits off, which is
-the least that it can be asked for; RK4 at 1 ms is its choice that comes closest in accuracy.
+the least that it can be asked for.
 
 Beside its time each simulator has its distance from the exact solution, so that nobody compares
 the speed of things that compute something else: in the default run both task axes obey

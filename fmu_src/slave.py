@@ -112,7 +112,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
                 f" the time of the FMU, {self._time!r} s"
             )
         if not (step_size > 0.0 and self._finite(step_size)):
-            return self._discard(f"fmi2DoStep: the step {step_size!r} s must be > 0")
+            return self._discard(f"fmi2DoStep: the step {step_size!r} s must be finite and > 0")
         try:
             self._plant.step(step_size)
         except FloatingPointError as error:

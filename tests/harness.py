@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.util
 import multiprocessing
+import os
 import shutil
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from ctypes import byref
 
 import fmpy
+import pytest
 from fmpy import fmi2
 from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
@@ -108,3 +111,17 @@ class Driver:
     def free(self):
         self.slave.freeInstance()
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def needs(*names):
+    """A program's path, or a module's name, under the first of its names that is installed.
+
+    Where there is none the test is skipped, and in CI it fails.
+    """
+    for name in names:
+        if program := shutil.which(name):
+            return program
+        if "/" not in name and importlib.util.find_spec(name):
+            return name
+    missing = f"{names[0]} is not installed"
+    return pytest.fail(missing) if os.environ.get("CI") == "true" else pytest.skip(missing)

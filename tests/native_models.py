@@ -62,7 +62,7 @@ class Model:
         return plant
 
     def reference(self, name: str) -> int:
-        return next(i for i, variable in enumerate(self.table) if name in (variable.name, variable.group))
+        return next(i for i, v in enumerate(self.table) if name in (v.name, v.group))
 
     def sources(self, *more: Path) -> dict[str, bytes]:
         headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
@@ -120,10 +120,11 @@ class Engine:
         self.n, self.m = len(of.robot.joints), len(of.robot.axes)
 
     def call(self, name: str, *arguments: object) -> int:
-        return getattr(self.lib, f"probe_{name}")(*(
+        values = (
             ctypes.c_double(a) if isinstance(a, float) else a.ctypes.data_as(ctypes.c_void_p)
             for a in arguments
-        ))
+        )
+        return getattr(self.lib, f"probe_{name}")(*values)
 
     def task(self, q, v):
         x, J, drift = np.empty(self.m), np.empty((self.m, self.n)), np.empty(self.m)
@@ -172,7 +173,8 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
             (folder / file).write_bytes(content)
         subprocess.run(
             ["gcc", "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
-             "-Werror", "-fno-math-errno", "-fvisibility=hidden", *flags, "-o", output, *sorted(f for f in files if f.endswith(".c")), "-lm"],
+             "-Werror", "-fno-math-errno", "-fvisibility=hidden", *flags, "-o", output,
+             *sorted(f for f in files if f.endswith(".c")), "-lm"],
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
     return output

@@ -1,5 +1,9 @@
 """The two flavours side by side, through the master and the command line."""
 
+import subprocess
+import zipfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 from oracles import position, task_error
@@ -45,6 +49,19 @@ def test_native_end_effector_follows_the_closed_form_into_the_bag(native_fmu, tm
     target = np.array([0.2, 0.05])
     expected = target - task_error(target - position(q[0]), 50.0, 40.0, 0.01 * np.arange(501))
     assert np.abs(position(q) - expected).max() <= 1e-9
+
+
+def test_sources_compiled_without_any_flag_show_the_standard_functions_alone(native_fmu, tmp_path):
+    """Else libc's own advance(), or another FMU's functions, would be called instead."""
+    with zipfile.ZipFile(native_fmu) as archive:
+        archive.extractall(tmp_path)
+    files = [str(path) for path in sorted(Path(tmp_path, "sources").glob("*.c"))]
+    library = tmp_path / "library.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, *files, "-lm"], check=True)
+    symbols = subprocess.check_output(["nm", "-D", "--defined-only", library], text=True).split()
+    names = [name for name in symbols[2::3] if not name.startswith("_")]
+    assert len(names) == 44
+    assert all(name.startswith("fmi2") for name in names)
 
 
 def test_run_native_builds_its_own_fmu_once(tmp_path, monkeypatch, capsys):

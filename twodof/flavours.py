@@ -69,7 +69,7 @@ def python_flavour(
     }
     wrapper = _pythonfmu() / "resources/binaries/linux64/libpythonfmu-export.so"
     return Flavour(
-        attributes={"needsExecutionTool": "true", "canNotUseMemoryManagementFunctions": "true"},
+        attributes={"needsExecutionTool": "true"},
         files={f"resources/{path}": content for path, content in resources.items()},
         source_files=(),
         platforms=("linux64",),
@@ -100,7 +100,7 @@ def native_flavour(
         return files
 
     return Flavour(
-        attributes={"needsExecutionTool": "false", "canNotUseMemoryManagementFunctions": "false"},
+        attributes={"needsExecutionTool": "false"},
         files={f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
         source_files=sorted(path for path in sources if path.endswith(".c")),
         platforms=platforms,

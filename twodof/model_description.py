@@ -73,6 +73,7 @@ def model_description(
         "canHandleVariableCommunicationStepSize": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
+        "canNotUseMemoryManagementFunctions": "true",
         **flavour,
     }
     simulation = ET.SubElement(root, "CoSimulation", capabilities)

@@ -8,6 +8,7 @@ so that the engine has one kind of axis. Pinocchio has read the URDF.
 from __future__ import annotations
 
 import importlib.util
+import os
 import platform as host
 import shutil
 import struct
@@ -20,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import BuildError
 from .plant import Robot, Variable
 
 Array = NDArray[np.float64]
@@ -49,10 +51,6 @@ FLAGS = (
 """Multiplications are never fused with additions, so that platforms agree."""
 
 
-class NativeBuildError(Exception):
-    """The native library cannot be built; the message says why, a failed compiler's included."""
-
-
 def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: str) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
 
@@ -63,13 +61,11 @@ def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: st
         guid: as the modelDescription has it.
 
     Raises:
-        NativeBuildError: more joints than the engine's working memory has room for.
+        BuildError: more joints than the engine's working memory has room for.
     """
     n, m = len(robot.joints), len(robot.axes)
     if n > MAX_JOINTS:
-        raise NativeBuildError(
-            f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}"
-        )
+        raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
     groups = [variable.group for variable in table]
     assert tuple(dict.fromkeys(groups)) == GROUPS
     model = robot.model
@@ -101,7 +97,9 @@ def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: st
             "double JOINT_R",
             (turned[p].T @ M.rotation @ R for p, M, R in zip(parents, placements, to_z)),
         ),
-        _table("double JOINT_P", (turned[p].T @ M.translation for p, M in zip(parents, placements))),
+        _table(
+            "double JOINT_P", (turned[p].T @ M.translation for p, M in zip(parents, placements))
+        ),
         f"static const double FRAME_P[3] = "
         f"{_literal(turned[frame.parentJoint].T @ frame.placement.translation)};\n",
         "/* Bodies: mass, centre of mass, inertia about it, in the joint's frame. */\n"
@@ -133,13 +131,11 @@ def compile_library(
         flags: further flags for the compiler.
 
     Raises:
-        NativeBuildError: the platform does not exist, there is no compiler for it, or the compiler
+        BuildError: the platform does not exist, there is no compiler for it, or the compiler
             failed.
     """
     if platform not in TARGETS:
-        raise NativeBuildError(
-            f"there is no platform '{platform}'; there are {', '.join(TARGETS)}"
-        )
+        raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")
     with tempfile.TemporaryDirectory(prefix="twodof-native-") as folder:
         for file, content in sources.items():
             Path(folder, file).write_bytes(content)
@@ -186,10 +182,10 @@ def _compilers(platform: str) -> list[list[str]]:
     if platform == host_platform() and own:
         architectures = ["-arch", "x86_64", "-arch", "arm64"] if platform == "darwin64" else []
         return [[own, *architectures]]
-    missing = "this machine has no C compiler" if platform == host_platform() else (
-        f"this machine's own compiler builds for {host_platform() or 'no FMI platform'} only"
-    )
-    raise NativeBuildError(
+    missing = f"this machine's own compiler builds for {host_platform() or 'no FMI platform'} only"
+    if platform == host_platform():
+        missing = "this machine has no C compiler"
+    raise BuildError(
         f"cannot compile for {platform}: {missing}; install the package 'ziglang'"
         " (the extra 'native'), which compiles for every platform"
     )
@@ -208,15 +204,31 @@ def _link_flags(platform: str, output: str) -> list[str]:
 def _run(command: Sequence[str], folder: str) -> None:
     try:
         done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
-        )
+            command, cwd=folder, env=_environment(folder),
+            capture_output=True, text=True, errors="replace", check=False,
+        )  # fmt: skip
     except OSError as error:
-        raise NativeBuildError(f"cannot run the compiler '{command[0]}': {error}") from error
+        raise BuildError(f"cannot run the compiler '{command[0]}': {error}") from error
     if done.returncode != 0:
-        raise NativeBuildError(
+        raise BuildError(
             f"the compiler failed (exit status {done.returncode}): {' '.join(command)}\n"
             f"{done.stderr.strip() or done.stdout.strip()}"
         )
+
+
+def _environment(folder: str) -> dict[str, str]:
+    """This process's environment; zig's cache is in the folder where home has no room for it."""
+    environment = dict(os.environ)
+    if os.name == "posix" and not environment.get("ZIG_GLOBAL_CACHE_DIR"):
+        home = environment.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+        cache = Path(home, "zig")
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            usable = os.access(cache, os.W_OK)
+        except OSError:
+            usable = False
+        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else Path(folder, "zig-cache"))
+    return environment
 
 
 def _axis(joint: object) -> Array:
@@ -229,7 +241,7 @@ def _axis(joint: object) -> Array:
 
 
 def _rotation_to_z(axis: Array) -> Array:
-    """A rotation R with R e_z = axis; a permutation, which is exact, where the axis is x, y or z."""
+    """A rotation R with R e_z = axis; a permutation, so exact, where the axis is x, y or z."""
     k = int(np.argmax(np.abs(axis)))
     x = np.roll(np.eye(3)[0], k + 1)  # the coordinate axis after the largest component
     x -= axis * axis.dot(x)
@@ -242,12 +254,13 @@ def _value_references(groups: Sequence[str]) -> str:
     lines.append(f"    N_VARIABLES = {len(groups)},")
     for constant, group in (("FIRST_OUTPUT", FIRST_OUTPUT), ("FIRST_PARAMETER", FIRST_PARAMETER)):
         lines.append(f"    {constant} = {group.upper()},")
-    return "/* Value references: the first of each vector. */\nenum {\n" + "\n".join(lines) + "\n};\n"
+    body = "\n".join(lines)
+    return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
 
 
 def _table(declaration: str, values: Iterable[object]) -> str:
     rows = list(values)
-    shape = "".join(f"[{size}]" for size in (len(rows), *np.shape(rows[0])))
+    shape = "".join(f"[{size}]" for size in (len(rows), *np.asarray(rows[0]).shape))
     body = "".join(f"\n    {_literal(row)}," for row in rows)
     return f"static const {declaration}{shape} = {{{body}\n}};\n"
 

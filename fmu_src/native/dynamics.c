@@ -87,17 +87,27 @@ static void body_inertia(int i, Inertia *inertia)
 }
 
 /* S = R S Rᵀ */
-static void rotate_matrix(double S[3][3], double R[3][3])
+static inline void rotate_matrix(double S[3][3], double R[3][3])
 {
     double T[3][3];
     for (int r = 0; r < 3; r++)
         for (int k = 0; k < 3; k++)
-            T[r][k] = dot3(S[r], R[k]); /* S Rᵀ */
-    memset(S, 0, sizeof T);
+            T[k][r] = dot3(S[r], R[k]); /* (S Rᵀ)ᵀ */
     for (int r = 0; r < 3; r++)
         for (int k = 0; k < 3; k++)
-            for (int j = 0; j < 3; j++)
-                S[r][k] += R[r][j] * T[j][k];
+            S[r][k] = dot3(R[r], T[k]);
+}
+
+/* The same of a symmetric S. */
+static inline void rotate_symmetric(double S[3][3], double R[3][3])
+{
+    double T[3][3];
+    for (int r = 0; r < 3; r++)
+        for (int k = 0; k < 3; k++)
+            T[k][r] = dot3(S[r], R[k]);
+    for (int r = 0; r < 3; r++)
+        for (int k = 0; k <= r; k++)
+            S[r][k] = S[k][r] = dot3(R[r], T[k]);
 }
 
 /* total += the inertia of a child, whose frame is placed at (R, p). With P = [p]× and rotated
@@ -105,9 +115,9 @@ static void rotate_matrix(double S[3][3], double R[3][3])
 static void add_child(Inertia *total, Inertia *child, Placement *placement)
 {
     const double *p = placement->p;
-    rotate_matrix(child->A, placement->R);
+    rotate_symmetric(child->A, placement->R);
     rotate_matrix(child->B, placement->R);
-    rotate_matrix(child->C, placement->R);
+    rotate_symmetric(child->C, placement->R);
     for (int k = 0; k < 3; k++) {
         double column[3] = {0.0, 0.0, 0.0}; /* of P C; C is symmetric */
         add_cross(column, p, child->C[k]);
@@ -138,7 +148,7 @@ void acceleration_of_effort(Placement joint[N_JOINTS], const double tau[N_JOINTS
 {
     Inertia body[N_JOINTS];
     double bias[N_JOINTS][2][3], U[N_JOINTS][2][3], motion[N_JOINTS][2][3]; /* angular, linear */
-    double D[N_JOINTS], u[N_JOINTS];
+    double D_inverse[N_JOINTS], u[N_JOINTS];
     memset(bias, 0, sizeof bias);
     for (int i = 0; i < N_JOINTS; i++)
         body_inertia(i, &body[i]);
@@ -148,19 +158,20 @@ void acceleration_of_effort(Placement joint[N_JOINTS], const double tau[N_JOINTS
             U[i][0][k] = PRISMATIC[i] ? inertia->B[k][2] : inertia->A[k][2];
             U[i][1][k] = PRISMATIC[i] ? inertia->C[k][2] : inertia->B[2][k];
         }
-        D[i] = U[i][PRISMATIC[i]][2];
+        D_inverse[i] = 1.0 / U[i][PRISMATIC[i]][2];
         u[i] = tau[i] - bias[i][PRISMATIC[i]][2];
         const int parent = PARENT[i];
         if (parent < 0)
             continue;
         for (int k = 0; k < 3; k++) {
+            const double angular = U[i][0][k] * D_inverse[i], linear = U[i][1][k] * D_inverse[i];
             for (int j = 0; j < 3; j++) {
-                inertia->A[k][j] -= U[i][0][k] * U[i][0][j] / D[i];
-                inertia->B[k][j] -= U[i][0][k] * U[i][1][j] / D[i];
-                inertia->C[k][j] -= U[i][1][k] * U[i][1][j] / D[i];
+                inertia->A[k][j] -= angular * U[i][0][j];
+                inertia->B[k][j] -= angular * U[i][1][j];
+                inertia->C[k][j] -= linear * U[i][1][j];
             }
-            bias[i][0][k] += U[i][0][k] * u[i] / D[i];
-            bias[i][1][k] += U[i][1][k] * u[i] / D[i];
+            bias[i][0][k] += angular * u[i];
+            bias[i][1][k] += linear * u[i];
         }
         double force[3] = {0.0, 0.0, 0.0};
         add_rotated(force, joint[i].R, bias[i][1]);
@@ -180,7 +191,7 @@ void acceleration_of_effort(Placement joint[N_JOINTS], const double tau[N_JOINTS
             rotate_back(motion[i][0], joint[i].R, motion[parent][0]);
             rotate_back(motion[i][1], joint[i].R, linear);
         }
-        a[i] = (u[i] - dot3(U[i][0], motion[i][0]) - dot3(U[i][1], motion[i][1])) / D[i];
+        a[i] = (u[i] - dot3(U[i][0], motion[i][0]) - dot3(U[i][1], motion[i][1])) * D_inverse[i];
         motion[i][PRISMATIC[i]][2] += a[i];
     }
 }

@@ -43,8 +43,6 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     if (!functions)
         return NULL;
     Instance draft = {.log = functions->logger,
-                      .allocate = functions->allocateMemory,
-                      .release = functions->freeMemory,
                       .environment = functions->componentEnvironment,
                       .name = name ? name : "",
                       .verbose = logging_on};
@@ -53,11 +51,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
         report(&draft, fmi2Error, "%s", reason);
         return NULL;
     }
-    if (!draft.allocate || !draft.release) {
-        draft.allocate = calloc;
-        draft.release = free;
-    }
-    Instance *instance = draft.allocate(1, sizeof *instance + strlen(name) + 1);
+    Instance *instance = calloc(1, sizeof *instance + strlen(name) + 1);
     if (!instance) {
         report(&draft, fmi2Error, "fmi2Instantiate: no memory");
         return NULL;
@@ -70,9 +64,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
 
 void fmi2FreeInstance(fmi2Component component)
 {
-    Instance *instance = component;
-    if (instance)
-        instance->release(instance);
+    free(component);
 }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component component, fmi2Boolean logging_on, size_t count,
@@ -162,11 +154,12 @@ fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
         return report(instance, fmi2Error, "fmi2DoStep: the communication point %.12g s is not the"
                       " time of the FMU, %.12g s", point, state->time);
     if (!(h > 0.0 && isfinite(h)))
-        return report(instance, fmi2Error, "fmi2DoStep: the step %.12g s must be > 0", h);
+        return report(instance, fmi2Error, "fmi2DoStep: the step %.12g s must be finite and > 0",
+                      h);
     if (point + h > state->stop_time && is_far(point + h, state->stop_time))
         return report(instance, fmi2Error, "fmi2DoStep: the step of %.12g s from %.12g s ends after"
                       " the stop time, %.12g s", h, point, state->stop_time);
-    if (!advance(&state->plant, h)) {
+    if (!advance_plant(&state->plant, h)) {
         state->phase = STEP_FAILED;
         return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: the equations of motion gave"
                       " a value that is not finite", point);

@@ -3,6 +3,7 @@
 #define INSTANCE_H
 
 #include "fmi2Functions.h"
+#include "internal.h"
 #include "plant.h"
 
 typedef enum { INSTANTIATED, INITIALIZATION, STEP, STEP_FAILED, TERMINATED, N_PHASES } Phase;
@@ -22,8 +23,6 @@ typedef struct {
 typedef struct {
     State state;
     fmi2CallbackLogger log;
-    fmi2CallbackAllocateMemory allocate;
-    fmi2CallbackFreeMemory release;
     fmi2ComponentEnvironment environment;
     const char *name;
     int verbose;
@@ -38,22 +37,22 @@ typedef enum {
 } Call;
 
 /* Name of a call, as messages say it. */
-const char *call_name(Call call);
+INTERNAL const char *call_name(Call call);
 
 /* Whether a call is allowed in the instance's phase; where not, logs it. */
-int allowed(Instance *instance, Call call, const char *culprit);
+INTERNAL int allowed(Instance *instance, Call call, const char *culprit);
 
 /* The instance of a component where the call is allowed, else NULL; a refusal is logged. */
-Instance *enter(fmi2Component component, Call call);
+INTERNAL Instance *enter(fmi2Component component, Call call);
 
 /* Log a printf message; what is below a warning only where logging is on. Returns the status. */
-fmi2Status report(Instance *instance, fmi2Status status, const char *format, ...);
+INTERNAL fmi2Status report(Instance *instance, fmi2Status status, const char *format, ...);
 
 /* Set the state to that of a new instance. */
-void reset_state(State *state);
+INTERNAL void reset_state(State *state);
 
 /* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
    clamped is logged too. */
-fmi2Status initialise(Instance *instance, int warn);
+INTERNAL fmi2Status initialise(Instance *instance, int warn);
 
 #endif

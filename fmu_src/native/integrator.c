@@ -269,7 +269,7 @@ static double until_event(Step *step, double t, double end)
     }
 }
 
-int advance(Plant *plant, double h)
+int advance_plant(Plant *plant, double h)
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);

@@ -48,15 +48,20 @@ void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *
     double origin[N_JOINTS][3], axis[N_JOINTS][3];
     for (int k = 0; k <= N_PATH; k++) {
         const int i = k < N_PATH ? PATH[k] : 0;
-        double r[3] = {0.0, 0.0, 0.0};
-        add_rotated(r, R, k < N_PATH ? joint[i].p : FRAME_P);
-        for (int d = 0; d < 3; d++)
-            x[d] += r[d];
-        add_cross(a, alpha, r);
-        add_centripetal(a, omega, r);
-        if (k == N_PATH)
-            break;
-        turn(R, joint[i].R);
+        if (k == 0 && k < N_PATH) { /* its parent is the root, which rests */
+            memcpy(x, joint[i].p, sizeof x);
+            memcpy(R, joint[i].R, sizeof R);
+        } else {
+            double r[3] = {0.0, 0.0, 0.0};
+            add_rotated(r, R, k < N_PATH ? joint[i].p : FRAME_P);
+            for (int d = 0; d < 3; d++)
+                x[d] += r[d];
+            add_cross(a, alpha, r);
+            add_centripetal(a, omega, r);
+            if (k == N_PATH)
+                break;
+            turn(R, joint[i].R);
+        }
         double motion[3], coriolis[3] = {0.0, 0.0, 0.0};
         for (int d = 0; d < 3; d++) {
             origin[k][d] = x[d];

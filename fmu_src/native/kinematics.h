@@ -2,6 +2,7 @@
 #ifndef KINEMATICS_H
 #define KINEMATICS_H
 
+#include "internal.h"
 #include "model.h"
 
 /* Placement of a joint's frame in its parent's: a = R b + p. Each joint turns about, or slides
@@ -19,9 +20,9 @@ typedef struct {
 } TaskFrame;
 
 /* Placements of all joints at the position q. */
-void place_joints(const double q[N_JOINTS], Placement joint[N_JOINTS]);
+INTERNAL void place_joints(const double q[N_JOINTS], Placement joint[N_JOINTS]);
 
 /* The task frame at the velocity v. */
-void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *task);
+INTERNAL void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *task);
 
 #endif

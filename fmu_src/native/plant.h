@@ -2,6 +2,7 @@
 #ifndef PLANT_H
 #define PLANT_H
 
+#include "internal.h"
 #include "model.h"
 
 /* All variables of the FMU by value reference: inputs, outputs (q and v are the state; x and tau
@@ -11,13 +12,13 @@ typedef struct {
 } Plant;
 
 /* q̈ of the equations of motion at a state, joint limits left out. */
-void acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                  double a[N_JOINTS]);
+INTERNAL void acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                           double a[N_JOINTS]);
 
 /* The output x at the plant's state. */
-void compute_position(Plant *plant);
+INTERNAL void compute_position(Plant *plant);
 
 /* The output tau, the control effort applied, at the plant's state and inputs. */
-void compute_effort(Plant *plant);
+INTERNAL void compute_effort(Plant *plant);
 
 #endif

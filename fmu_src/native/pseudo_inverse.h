@@ -2,11 +2,12 @@
 #ifndef PSEUDO_INVERSE_H
 #define PSEUDO_INVERSE_H
 
+#include "internal.h"
 #include "model.h"
 
 /* result = J⁺ b, singular values σ ≤ rcond·σ_max dropped: the least-squares solution of smallest
    norm. J and b are used as working memory. */
-void apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
-                          double result[N_JOINTS]);
+INTERNAL void apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
+                                   double result[N_JOINTS]);
 
 #endif

@@ -1,5 +1,6 @@
 /* FMI 2.0: saving, restoring and serialising the state, which is one plain struct. */
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "instance.h"
@@ -38,7 +39,7 @@ fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)
     if (!saved)
         return refuse(instance, GET_STATE, NULL_POINTER);
     if (!*saved)
-        *saved = instance->allocate(1, sizeof(State));
+        *saved = calloc(1, sizeof(State));
     if (!*saved)
         return refuse(instance, GET_STATE, "no memory");
     memcpy(*saved, &instance->state, sizeof(State));
@@ -64,7 +65,7 @@ fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *saved)
     if (!instance)
         return fmi2Error;
     if (saved && *saved) {
-        instance->release(*saved);
+        free(*saved);
         *saved = NULL;
     }
     return fmi2OK;
@@ -112,7 +113,7 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes
     if (sum != checksum(bytes) || memcmp(bytes, MODEL_GUID, sizeof MODEL_GUID) != 0)
         return refuse(instance, DESERIALIZE, FOREIGN);
     if (!*saved)
-        *saved = instance->allocate(1, sizeof(State));
+        *saved = calloc(1, sizeof(State));
     if (!*saved)
         return refuse(instance, DESERIALIZE, "no memory");
     memcpy(*saved, bytes, sizeof(State));

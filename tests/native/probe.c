@@ -47,7 +47,7 @@ FMI2_Export void probe_acceleration(const double value[], double a[])
 
 FMI2_Export int probe_advance(double value[], double h)
 {
-    return advance((Plant *)value, h);
+    return advance_plant((Plant *)value, h);
 }
 
 FMI2_Export void probe_outputs(double value[])

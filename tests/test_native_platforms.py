@@ -1,0 +1,389 @@
+"""The native libraries for every platform: what they contain, their runs, how they are built."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import stat
+import struct
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+import zipfile
+from pathlib import Path
+
+import fmpy
+import fmpy.build
+import numpy as np
+import pytest
+from harness import in_child_process, needs
+
+from twodof import FmuOptions, build_fmu
+from twodof.cli import main
+from twodof.errors import BuildError
+from twodof.native import TARGETS, host_platform
+
+HOST = Path(__file__).parent / "native" / "host.c"
+PLATFORMS = ("linux64", "win64", "darwin64")
+BINARIES = {
+    "linux64": "binaries/linux64/TwoDof.so",
+    "win64": "binaries/win64/TwoDof.dll",
+    "darwin64": "binaries/darwin64/TwoDof.dylib",
+}
+LIMITED = {
+    "q_max[1]": 0.6, "q_max[2]": 1.2, "x_des[1]": 0.1, "x_des[2]": 0.2,
+    "tau_ext[1]": 0.3, "tau_ext[2]": -0.2,
+}  # fmt: skip
+"""A run in which joints stop at their limits."""
+
+
+def native(path: Path, *platforms: str) -> Path:
+    return build_fmu(path, FmuOptions(native=True, platforms=platforms))
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory):
+    """The default arm's FMU for all platforms."""
+    needs("ziglang")
+    return native(tmp_path_factory.mktemp("all platforms") / "TwoDof.fmu", *PLATFORMS)
+
+
+@pytest.fixture(scope="module")
+def unzipped(shipped):
+    fmpy.extract(shipped, shipped.parent / "unzipped")
+    return shipped.parent / "unzipped"
+
+
+@pytest.fixture
+def without_zig(monkeypatch):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "ziglang" else find_spec(name)
+    )
+
+
+def test_files_and_description(shipped, fmu_path):
+    """The same model description as the Python flavour's, up to what the flavours differ in."""
+    with zipfile.ZipFile(shipped) as archive:
+        binaries = {name for name in archive.namelist() if name.startswith("binaries/")}
+        ours = ET.fromstring(archive.read("modelDescription.xml"))
+        sources = {name[8:] for name in archive.namelist() if name.startswith("sources/")}
+    assert binaries == set(BINARIES.values())
+    with zipfile.ZipFile(fmu_path) as archive:
+        theirs = ET.fromstring(archive.read("modelDescription.xml"))
+    simulation = ours.find("CoSimulation")
+    assert simulation.get("needsExecutionTool") == "false"
+    files = [file.get("name") for file in simulation.iter("File")]
+    assert files == sorted(name for name in sources if name.endswith(".c"))
+    for tree in (ours, theirs):
+        assert tree.attrib.pop("guid") and tree.attrib.pop("generationTool")
+        simulation = tree.find("CoSimulation")
+        del simulation.attrib["needsExecutionTool"]
+        del simulation.attrib["canNotUseMemoryManagementFunctions"]
+        for element in simulation.findall("SourceFiles"):
+            simulation.remove(element)
+    assert canonical(ours) == canonical(theirs)
+
+
+def canonical(tree: ET.Element) -> str:
+    return ET.canonicalize(ET.tostring(tree), strip_text=True)
+
+
+# --- what the libraries contain ---
+
+
+def fmi_functions() -> set[str]:
+    header = (Path(fmpy.__file__).parent / "c-code/fmi2Functions.h").read_text()
+    return set(re.findall(r"FMI2_Export \w+TYPE +(\w+);", header))
+
+
+def text(data: bytes, offset: int) -> str:
+    return data[offset : data.index(b"\0", offset)].decode()
+
+
+def test_linux_library(unzipped):
+    """ELF: the FMI functions only, libc and libm only, of glibc 2.17 at most."""
+    data = (unzipped / BINARIES["linux64"]).read_bytes()
+    assert data[:6] == b"\x7fELF\x02\x01" and struct.unpack_from("<H", data, 18) == (62,)
+    assert len(data) < 200_000
+    (table,) = struct.unpack_from("<Q", data, 40)
+    size, count, names = struct.unpack_from("<HHH", data, 58)
+    headers = [struct.unpack_from("<IIQQQQ", data, table + i * size) for i in range(count)]
+    name_of = {i: text(data, headers[names][4] + header[0]) for i, header in enumerate(headers)}
+    section = {name_of[i]: header[4:] for i, header in enumerate(headers)}
+    strings = section[".dynstr"][0]
+
+    offset, length = section[".dynsym"]
+    symbols = [struct.unpack_from("<IBBH", data, offset + i) for i in range(24, length, 24)]
+    exported = {text(data, strings + s[0]) for s in symbols if s[3] != 0}
+    assert exported == fmi_functions()
+
+    offset, length = section[".dynamic"]
+    dynamic = [struct.unpack_from("<QQ", data, offset + i) for i in range(0, length, 16)]
+    needed = {text(data, strings + value) for tag, value in dynamic if tag == 1}
+    assert needed <= {"libc.so.6", "libm.so.6"}
+    assert [text(data, strings + value) for tag, value in dynamic if tag == 14] == ["TwoDof.so"]
+
+    versions, offset = [], section[".gnu.version_r"][0]
+    while True:
+        _, _, _, auxiliary, following = struct.unpack_from("<HHIII", data, offset)
+        entry = offset + auxiliary
+        while True:
+            name, step = struct.unpack_from("<II", data, entry + 8)
+            versions.append(text(data, strings + name))
+            entry += step
+            if not step:
+                break
+        offset += following
+        if not following:
+            break
+    assert versions
+    assert all(v.startswith("GLIBC_2.") for v in versions)
+    assert max([int(part) for part in v[6:].split(".")] for v in versions) <= [2, 17]
+
+
+def test_windows_library(unzipped):
+    """PE: the FMI functions only; Windows itself and the C runtime that comes with it."""
+    data = (unzipped / BINARIES["win64"]).read_bytes()
+    (pe,) = struct.unpack_from("<I", data, 0x3C)
+    assert data[pe : pe + 4] == b"PE\0\0"
+    machine, sections, optional = struct.unpack_from("<HH12xH", data, pe + 4)
+    assert machine == 0x8664 and len(data) < 200_000
+    (magic,) = struct.unpack_from("<H", data, pe + 24)
+    assert magic == 0x20B
+    directories = [struct.unpack_from("<II", data, pe + 24 + 112 + 8 * i) for i in range(16)]
+    rows = [
+        struct.unpack_from("<IIII", data, pe + 24 + optional + 40 * i + 8) for i in range(sections)
+    ]
+
+    def place(address):
+        return next(
+            address - start + raw for size, start, _, raw in rows if 0 <= address - start < size
+        )
+
+    exports = place(directories[0][0])
+    count, names = struct.unpack_from("<I4xI", data, exports + 24)
+    exported = struct.unpack_from(f"<{count}I", data, place(names))
+    assert {text(data, place(name)) for name in exported} == fmi_functions()
+
+    imported, descriptor = set(), place(directories[1][0])
+    while name := struct.unpack_from("<12xI", data, descriptor)[0]:
+        imported.add(text(data, place(name)).lower())
+        descriptor += 20
+    runtime = ("api-ms-win-crt-", "ucrtbase.dll", "msvcrt.dll")
+    assert {name for name in imported if not name.startswith(runtime)} <= {"kernel32.dll"}
+    assert directories[13] == (0, 0)  # nothing is loaded later
+
+
+def test_mac_library(unzipped):
+    """Mach-O for both architectures, signed where macOS demands it, from macOS 11 on."""
+    data = (unzipped / BINARIES["darwin64"]).read_bytes()
+    magic, count = struct.unpack_from(">II", data)
+    assert (magic, count) == (0xCAFEBABE, 2)
+    found = []
+    for i in range(count):
+        cpu, _, offset, size, align = struct.unpack_from(">5I", data, 8 + 20 * i)
+        assert offset % 2**align == 0 and size < 200_000
+        thin = data[offset : offset + size]
+        assert len(thin) == size
+        header, own_cpu, kind, commands = struct.unpack_from("<II4xII", thin)
+        assert (header, own_cpu, kind) == (0xFEEDFACF, cpu, 6)  # 64 bit, a dynamic library
+        found.append(cpu)
+        place, seen = 32, {}
+        for _ in range(commands):
+            command, length = struct.unpack_from("<II", thin, place)
+            seen.setdefault(command, []).append(place)
+            place += length
+
+        def name(at, thin=thin):
+            return text(thin, at + struct.unpack_from("<I", thin, at + 8)[0])
+
+        assert [name(at) for at in seen[0xD]] == ["@rpath/TwoDof.dylib"]
+        assert {name(at) for at in seen[0xC]} == {"/usr/lib/libSystem.B.dylib"}
+        assert struct.unpack_from("<II", thin, seen[0x32][0] + 8) == (1, 11 << 16)  # macOS, 11.0
+        assert cpu == 0x1000007 or 0x1D in seen  # a code signature
+        symbols, number, strings = struct.unpack_from("<III", thin, seen[0x2][0] + 8)
+        rows = [struct.unpack_from("<IB", thin, symbols + 16 * k) for k in range(number)]
+        exported = {text(thin, strings + row[0]) for row in rows if row[1] & 1 and row[1] & 0xE}
+        exported -= {"___dso_handle", "__mh_dylib_header"}  # zig's linker exports them always
+        assert exported == {f"_{function}" for function in fmi_functions()}
+    assert found == [0x1000007, 0x100000C]  # x86_64, arm64
+
+
+# --- runs ---
+
+
+def variables(fmu: Path) -> tuple[str, dict[str, int]]:
+    """GUID, and value references by name."""
+    description = fmpy.read_model_description(str(fmu))
+    return description.guid, {v.name: v.valueReference for v in description.modelVariables}
+
+
+def drive(unzipped: Path, platform: str, folder: Path, settings: dict[str, float]) -> np.ndarray:
+    """Outputs over 5 s, from an importer compiled for the platform; Windows' runs in wine."""
+    windows = platform == "win64"
+    importer = folder / ("host.exe" if windows else "host")
+    if not importer.exists():
+        zig = [sys.executable, "-m", needs("ziglang"), "cc", "-target", *TARGETS[platform]]
+        flags = ["-std=c99", "-O1", "-I", unzipped / "sources", "-o", importer, HOST]
+        subprocess.run([*zig, *flags, *([] if windows else ["-ldl"])], check=True)
+    library = shutil.copy(unzipped / BINARIES[platform], folder)
+    guid, references = variables(unzipped)
+    first, last = references["q[1]"], references["tau[2]"]
+    arguments = [guid, str(first), str(last - first + 1)]
+    for name, value in settings.items():
+        arguments += [str(references[name]), repr(value)]
+    command, environment = [importer], dict(os.environ)
+    if windows:
+        command = [needs("wine64", "wine", "/usr/lib/wine/wine64"), importer]
+        environment.update(
+            WINEPREFIX=str(folder / "wine"), WINEDEBUG="-all", WINEDLLOVERRIDES="mscoree,mshtml="
+        )
+    name = Path(library).name if windows else library
+    done = subprocess.run(
+        [*command, name, *arguments], cwd=folder, env=environment,
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
+
+
+def test_windows_library_runs_as_linux_library(unzipped, tmp_path):
+    needs("wine64", "wine", "/usr/lib/wine/wine64")
+    for settings in ({}, LIMITED):
+        linux = drive(unzipped, "linux64", tmp_path, settings)
+        windows = drive(unzipped, "win64", tmp_path, settings)
+        assert linux.shape == windows.shape == (51, 8)
+        assert np.abs(windows - linux).max() <= 1e-12
+        assert np.ptp(linux, axis=0).min() > 0.0
+    assert linux[:, 0].max() == 0.6 and linux[:, 1].max() == 1.2  # limits were met
+
+
+def outputs(fmu: Path, **named) -> np.ndarray:
+    names = [f"{group}[{i}]" for group in ("q", "v", "x", "tau") for i in (1, 2)]
+    start = {name: value for name, value in LIMITED.items() if "tau" not in name}
+    result = fmpy.simulate_fmu(
+        str(fmu), stop_time=5.0, output_interval=0.01, output=names, start_values=start, **named
+    )
+    assert len(result) == 501
+    return np.array([result[name] for name in names])
+
+
+needs_linux = pytest.mark.skipif(host_platform() != "linux64", reason="for Linux x86-64")
+
+
+@needs_linux
+def test_fmpy_rebuilds_the_library_from_the_sources(shipped, tmp_path, monkeypatch):
+    """With FMPy's own flags: functions keep their meaning where no flag hides their names."""
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+    needs("cmake")
+    needs("make")
+    fmpy.extract(shipped, tmp_path)
+    shutil.rmtree(tmp_path / "binaries")
+    fmpy.build.build_platform_binary(tmp_path)
+    rebuilt = tmp_path / BINARIES["linux64"]
+    with zipfile.ZipFile(shipped) as archive:
+        assert rebuilt.read_bytes() != archive.read(BINARIES["linux64"])
+    compare(tmp_path, shipped)
+
+
+@in_child_process
+def compare(ours, theirs):
+    assert np.abs(outputs(ours) - outputs(theirs)).max() <= 1e-12
+
+
+@needs_linux
+def test_own_compiler_serves_without_zig(shipped, tmp_path, without_zig):
+    needs("cc", "gcc", "clang")
+    own = native(tmp_path / "own.fmu")  # for this machine
+    with zipfile.ZipFile(shipped) as zig, zipfile.ZipFile(own) as archive:
+        name = BINARIES["linux64"]
+        assert [file for file in archive.namelist() if file.startswith("binaries/")] == [name]
+        assert archive.read(name) != zig.read(name)
+    assert np.abs(outputs(own) - outputs(shipped)).max() <= 1e-12
+
+
+# --- the same inputs, the same bytes ---
+
+
+def build_elsewhere(folder: Path, *platforms: str, **environment: str) -> bytes:
+    """An FMU from a process of its own, in a folder of its own."""
+    folder.mkdir()
+    command = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+    command += ["build", "-o", "arm.fmu", "--native"]
+    for platform in platforms:
+        command += ["--platform", platform]
+    path = os.pathsep.join(filter(None, sys.path))
+    subprocess.run(
+        command, cwd=folder, check=True, stdout=subprocess.DEVNULL, timeout=500,
+        env={**os.environ, "PYTHONPATH": path, **environment},
+    )  # fmt: skip
+    return (folder / "arm.fmu").read_bytes()
+
+
+def test_equal_inputs_give_equal_bytes(shipped, tmp_path):
+    assert build_elsewhere(tmp_path / "other folder", "all") == shipped.read_bytes()
+
+
+def test_equal_bytes_from_an_empty_cache_without_a_home(unzipped, tmp_path):
+    """zig's cache is a temporary one where there is no home to keep it in."""
+    nowhere = {"HOME": "/dev/null", "XDG_CACHE_HOME": "", "ZIG_GLOBAL_CACHE_DIR": ""}
+    content = build_elsewhere(tmp_path / "fresh", "linux64", **nowhere)
+    (tmp_path / "fresh.fmu").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "fresh.fmu") as archive:
+        library = archive.read(BINARIES["linux64"])
+    assert library == (unzipped / BINARIES["linux64"]).read_bytes()
+
+
+# --- bad input, missing and failing compilers ---
+
+
+def refused(folder: Path, *platforms: str) -> str:
+    with pytest.raises(BuildError) as caught:
+        native(folder / "arm.fmu", *platforms)
+    assert not list(folder.glob("*.fmu*"))
+    return str(caught.value)
+
+
+def test_unknown_platform(tmp_path, monkeypatch, capsys):
+    expected = "there is no platform 'solaris'; there are linux64, win64, darwin64"
+    assert refused(tmp_path, "solaris") == expected
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", "--native", "--platform", "solaris"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and expected in captured.err
+    assert not list(tmp_path.iterdir())
+
+
+@needs_linux
+def test_other_platforms_need_zig(tmp_path, without_zig):
+    message = refused(tmp_path, "win64")
+    assert "cannot compile for win64: this machine's own compiler builds for linux64" in message
+    assert "install the package 'ziglang'" in message
+
+
+@needs_linux
+def test_no_compiler_at_all(tmp_path, without_zig, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    message = refused(tmp_path, "linux64")
+    assert "cannot compile for linux64: this machine has no C compiler" in message
+    assert "install the package 'ziglang'" in message
+
+
+@needs_linux
+@pytest.mark.parametrize(
+    "script, expected",
+    [
+        ("#!/bin/sh\necho 'plant.c:1: no room for this' >&2\nexit 3\n", "no room for this"),
+        ("#!/bin/sh\nexit 3\n", "exit status 3"),
+        ("#!/does/not/exist\n", "cannot run the compiler"),
+    ],
+)
+def test_compiler_that_fails(tmp_path, without_zig, monkeypatch, script, expected):
+    compiler = tmp_path / "cc"
+    compiler.write_text(script)
+    compiler.chmod(compiler.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert expected in refused(tmp_path, "linux64")
