@@ -33,10 +33,10 @@ BINARIES = {
     "darwin64": "binaries/darwin64/TwoDof.dylib",
 }
 LIMITED = {
-    "q_max[1]": 0.6, "q_max[2]": 1.2, "x_des[1]": 0.1, "x_des[2]": 0.2,
+    "q_max[1]": 0.6, "q_min[2]": 0.3, "q_max[2]": 1.2, "x_des[1]": 0.1, "x_des[2]": 0.2,
     "tau_ext[1]": 0.3, "tau_ext[2]": -0.2,
 }  # fmt: skip
-"""A run in which joints stop at their limits."""
+"""A run in which joints stop at their limits, away from the singularity at q[2] = 0."""
 
 
 def native(path: Path, *platforms: str) -> Path:

@@ -368,6 +368,11 @@ def test_inertia_written_with_few_digits_is_accepted() -> None:
     assert load_robot(urdf, "tip", "xyz").joints == ("shoulder", "elbow")
 
 
+def test_a_frame_that_no_joint_moves_is_refused() -> None:
+    with pytest.raises(RobotError, match="no joint moves the frame 'base'"):
+        load_robot(arm(), "base", "xyz")
+
+
 def test_frame_is_the_link_where_a_joint_has_the_same_name() -> None:
     loaded = load_robot(arm().replace('joint name="elbow"', 'joint name="tip"'), "tip", "xyz")
     frame = loaded.model.frames[loaded.frame_id]
@@ -407,8 +412,9 @@ def test_example_robot_is_the_one_that_pinocchio_loads(
     robots: Path, name: str, n: int | None
 ) -> None:
     urdf = fixed_where_mimic((robots / name).read_text("utf-8"))
-    last = ET.fromstring(urdf).findall("link")[-1].get("name", "")
-    loaded = load_robot(urdf, last, "xyz")
+    joints = ET.fromstring(urdf).findall("joint")
+    moved = next(j for j in joints if j.get("type") != "fixed").find("child")
+    loaded = load_robot(urdf, str(moved.get("link")), "xyz")
     assert n in (None, len(loaded.joints))
     assert_same_mechanism(loaded, urdf)
 

@@ -89,7 +89,7 @@ def load_robot(urdf: str, frame: str, axes: str) -> Robot:
     xml = {str(joint.get("name")): joint for joint in tree.findall("joint")}
     joints = tuple(model.names)[1:]
     _check_mass_matrix(model, joints)
-    return Robot(
+    robot = Robot(
         name=tree.get("name", ""),
         model=model,
         joints=joints,
@@ -104,6 +104,9 @@ def load_robot(urdf: str, frame: str, axes: str) -> Robot:
         root=root,
         warnings=tuple(warnings),
     )
+    if not any(robot.moves_frame()):
+        raise RobotError(f"no joint moves the frame '{frame}'")
+    return robot
 
 
 def _parse(urdf: str) -> ET.Element:
