@@ -132,3 +132,19 @@ def test_a_jump_of_the_acceleration_neither_hangs_nor_fails():
 def test_a_value_that_is_not_finite_is_an_error():
     with pytest.raises(FloatingPointError, match="not finite"):
         advance(lambda q, v: [float("nan")], [0.0], [0.0], 0.01, FREE, 1e-3, 1e-6, 1e-3)
+
+
+@pytest.mark.parametrize("h", [0.003552920638135623, 0.0095405843, 0.0133802664])
+def test_a_smallest_step_stretched_to_the_end_is_still_taken_as_it_is(h):
+    """What is left at the end may be some bits longer than the smallest step; no step passes."""
+    calls = 0
+
+    def jumping(q, v):
+        nonlocal calls
+        calls += 1
+        assert calls < 10_000, "it does not end"
+        return [1e9 * (-1) ** calls]
+
+    for k in range(20):
+        calls = 0
+        advance(jumping, [0.0], [0.0], h * (1 + 0.013 * k), FREE, 1e-9, 1e-12, 1.0)

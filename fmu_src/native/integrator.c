@@ -244,10 +244,11 @@ static double until_event(Step *step, double t, double end)
     memset(step->stopped, 0, sizeof step->stopped);
     for (;;) {
         const int last = t + next * (1.0 + 1e-9) >= end;
+        const int is_smallest = next <= smallest; /* also where stretched to the end */
         step->size = last ? end - t : next;
         const double norm = dormand_prince(step);
         double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
-        if (norm < 1.0 || (step->size <= smallest && isfinite(norm))) {
+        if (norm < 1.0 || (is_smallest && isfinite(norm))) {
             const double passed = first_event(step);
             memcpy(step->y, step->y_new, sizeof step->y);
             if (last && (passed == 0.0 || passed == step->size))
@@ -259,7 +260,7 @@ static double until_event(Step *step, double t, double end)
             factor = fmax(MIN_FACTOR, fmin(growth, factor));
             next = fmax(smallest, fmin(max_step, step->size * factor));
             growth = MAX_FACTOR;
-        } else if (step->size <= smallest) {
+        } else if (is_smallest) {
             return NAN;
         } else {
             factor = isfinite(norm) ? factor : MIN_FACTOR;

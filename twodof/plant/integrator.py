@@ -139,12 +139,13 @@ def _until_event(
     step, growth = first, MAX_FACTOR
     while True:
         last = t + step * (1 + 1e-9) >= end
+        smallest = step <= floor  # also where it is stretched to the end
         if last:
             step = end - t
         y_new, error = _dormand_prince(acceleration, y, step, stops.held, K)
         ratio = error / (atol + rtol * np.maximum(np.abs(y), np.abs(y_new)))
         norm = sqrt(ratio.dot(ratio) / (2 * n))
-        if norm < 1.0 or (step <= floor and isfinite(norm)):
+        if norm < 1.0 or (smallest and isfinite(norm)):
             event = _first_event(acceleration, y, y_new, step, stops, K)
             if event is not None:
                 passed, y, stopped = event
@@ -156,7 +157,7 @@ def _until_event(
             factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
             step = max(floor, min(max_step, step * max(MIN_FACTOR, min(growth, factor))))
             growth = MAX_FACTOR
-        elif step <= floor:
+        elif smallest:
             raise FloatingPointError("the equations of motion gave a value that is not finite")
         else:
             factor = SAFETY * norm**-0.2 if isfinite(norm) else MIN_FACTOR
