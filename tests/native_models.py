@@ -43,7 +43,7 @@ ROBOTS = {
     "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", "link2", "y"),
     "anymal_c": ("anymal_c_simple_description/urdf/anymal.urdf", "LF_FOOT", "xyz"),
     "tiago": ("tiago_description/robots/tiago_no_hand.urdf", "wrist_ft_tool_link", "xyz"),
-    "baxter": ("baxter_description/urdf/baxter.urdf", "left_gripper", "xyz"),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "l_gripper_l_finger", "xyz"),
     "finger": ("finger_edu_description/robots/finger_edu.urdf", "finger_tip_link", "x"),
 }
 

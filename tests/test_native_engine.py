@@ -162,6 +162,12 @@ def test_default_run():
     assert worst <= 1e-9 and conditioning >= 0.05
 
 
+def test_stiff_gains_make_the_integrator_reject_steps():
+    changes = {"Kp": [1e4, 4e4], "Kd": [1e3, 3e3]}
+    worst, _, conditioning = follow("twodof", changes, [(0.2, 0.1), (0.15, 0.15)], seconds=0.5)
+    assert worst <= 1e-9 and conditioning >= 0.05
+
+
 @pytest.mark.parametrize("h", [0.001, 0.01, 0.05])
 def test_every_stop_and_release(h):
     worst, touched, conditioning = follow("twodof", NARROW, TARGETS, seconds=6.0, h=h)

@@ -122,6 +122,7 @@ def test_outputs_equal_the_python_plant():
 
 def test_tau_follows_inputs_at_once():
     arm, plant = Arm(), model("twodof").plant()
+    assert arm.get("tau") == pytest.approx(plant.tau, abs=1e-12)
     plant.x_des = [0.25, 0.1]
     arm.set("x_des", plant.x_des)
     assert arm.get("tau") == pytest.approx(plant.tau, abs=1e-12)
@@ -370,6 +371,7 @@ def test_foreign_and_damaged_states_are_refused():
 def test_reset_repeats_the_first_run_bit_for_bit():
     arm = Arm()
     first = arm.run(100)
+    arm.set("Kp", [70.0, 80.0])
     arm.reset()
     arm.start()
     assert arm.run(100) == first

@@ -63,7 +63,7 @@ static fmi2Status variables(Instance *c)
     int whole[MANY];
     fmi2String text[MANY] = {"", "", "", "", "", ""};
     const size_t count = pick(MANY + 1);
-    const unsigned range = pick(10) ? N_VARIABLES : 0xffffffffu;
+    const unsigned range = pick(10) ? N_VARIABLES : pick(2) ? N_VARIABLES + 2 : 0xffffffffu;
     for (size_t i = 0; i < MANY; i++) {
         vr[i] = pick(range);
         real[i] = number();
