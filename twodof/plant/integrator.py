@@ -280,6 +280,8 @@ def _bisect(happened: Callable[[float], bool], latest: float, step: float) -> fl
     before = 0.0
     while latest - before > TIME_RESOLUTION * step:
         middle = 0.5 * (before + latest)
+        if not before < middle < latest:  # of two neighbouring numbers
+            break
         if happened(middle):
             latest = middle
         else:
