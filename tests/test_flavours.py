@@ -92,6 +92,12 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
     assert "TwoDof-native.fmu" in captured.out
 
 
+def test_a_machine_that_is_no_fmi_platform_needs_to_be_told_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("twodof.build.host_platform", lambda: "")
+    with pytest.raises(twodof.TwoDofError, match="choose one with --platform"):
+        build_fmu(tmp_path / "A.fmu", FmuOptions(native=True))
+
+
 @pytest.mark.parametrize(
     "options, message",
     [

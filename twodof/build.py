@@ -136,7 +136,10 @@ def _flavour(
         return python_flavour(robot, urdf, starts, options.name, options.link_environment)
     if options.link_environment:
         raise BuildError("a native FMU needs no environment to link (--link-environment)")
-    return native_flavour(robot, table, options.name, options.platforms or (host_platform(),))
+    platforms = options.platforms or (host_platform(),)
+    if platforms == ("",):
+        raise BuildError("this machine is none of the FMI platforms; choose one with --platform")
+    return native_flavour(robot, table, options.name, platforms)
 
 
 def _read_urdf(path: Path) -> str:

@@ -291,7 +291,7 @@ def _length(metres: float) -> str:
     for factor, unit in ((1.0, "m"), (1e3, "mm"), (1e6, "µm")):
         if metres * factor >= 1.0:
             return f"{metres * factor:.3g} {unit}"
-    return f"{metres * 1e9:.3g} nm"
+    return f"{metres * 1e9:.3g} nm" if metres >= 1e-9 else "less than 1 nm"
 
 
 def _info(options: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ class TwoDofError(Exception):
 
 
 class BuildError(TwoDofError):
-    """The FMU cannot be built: the URDF, its meshes or an option is at fault."""
+    """The FMU cannot be built: the URDF, its meshes, an option or the compiler is at fault."""
 
 
 class FmuError(TwoDofError):
