@@ -114,14 +114,15 @@ class Driver:
 
 
 def needs(*names):
-    """A program's path, or a module's name, under the first of its names that is installed.
-
-    Where there is none the test is skipped, and in CI it fails.
-    """
+    """A program's path, or a module's name, under the first of its names that is installed."""
     for name in names:
         if program := shutil.which(name):
             return program
         if "/" not in name and importlib.util.find_spec(name):
             return name
-    missing = f"{names[0]} is not installed"
-    return pytest.fail(missing) if os.environ.get("CI") == "true" else pytest.skip(missing)
+    return cannot_run(f"{names[0]} is not installed")
+
+
+def cannot_run(reason):
+    """Skip a test that this machine cannot run; in CI, which can run all, it fails."""
+    return pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)

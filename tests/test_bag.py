@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import oracles
 import pytest
+from harness import cannot_run
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
@@ -643,11 +644,11 @@ def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
         folder = tmp_path / f"disk{len(mounted)}"
         folder.mkdir()
         if shutil.which("mount") is None:
-            pytest.skip("small disks need the command 'mount'")
+            cannot_run("small disks need the command 'mount'")
         command = ["mount", "-t", "tmpfs", "-o", f"{options},size={size}k", "tmpfs", str(folder)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            pytest.skip(f"small disks cannot be mounted here: {done.stderr.strip()}")
+            cannot_run(f"small disks cannot be mounted here: {done.stderr.strip()}")
         mounted.append(folder)
         return folder
 

@@ -197,6 +197,15 @@ def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
+    urdf = tmp_path / "rough.urdf"
+    text = SHAPES.sub("<sphere radius='0.01'/>", data_file("urdf", "2dof.urdf").read_text())
+    urdf.write_text(text.replace("<limit ", '<dynamics friction="0.3"/><limit ', 1))
+    build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
+    (record,) = caplog.records
+    assert "joint 'joint1': friction is not modelled and is ignored" in record.getMessage()
+
+
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(TwoDofError, match=r"cannot write '.*nowhere/A\.fmu'"):
         build_fmu(tmp_path / "nowhere" / "A.fmu")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import os
 import tempfile
@@ -21,6 +22,8 @@ from .meshes import collect_meshes
 from .model_description import model_description
 from .native import host_platform
 from .plant import Plant, Robot, RobotError, Variable, load_robot, variable_table
+
+logger = logging.getLogger("twodof.build")
 
 DEFAULT_FRAME = "EndEffector"
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
@@ -165,6 +168,8 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         robot = load_robot(urdf, options.frame, axes)
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    for warning in robot.warnings:
+        logger.warning("%s: %s", options.urdf, warning)
     starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": _rest(robot)}
     for key in ("gravity", "q_start"):
         given = getattr(options, key)
