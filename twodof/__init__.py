@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .bag import Bag, Run, read_bag
+    from .bag import Bag, Run, read_bag, recover
     from .build import FmuOptions, build_fmu
     from .errors import TwoDofError
     from .fmu import Fmu, load_fmu
@@ -19,6 +19,7 @@ _HOME = {
     "Bag": "bag",
     "Run": "bag",
     "read_bag": "bag",
+    "recover": "bag",
     "FmuOptions": "build",
     "build_fmu": "build",
     "TwoDofError": "errors",
@@ -42,6 +43,7 @@ __all__ = [
     "experiment",
     "load_fmu",
     "read_bag",
+    "recover",
     "samples",
     "simulate",
 ]

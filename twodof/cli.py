@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .master import Experiment, RealTime, Summary
 
 INTERRUPTED = 130
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -132,11 +133,21 @@ def _parser() -> argparse.ArgumentParser:
         "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
     )
     run.add_argument("--overwrite", action="store_true", help="replace an existing bag")
+    run.add_argument(
+        "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
+    )
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
 
     info = verbs.add_parser("info", help="show what is in an FMU or a bag")
     info.set_defaults(verb=_info)
     info.add_argument("path", metavar="FMU|BAG", type=Path)
+
+    recover = verbs.add_parser(
+        "recover", help="make a bag whose writer died complete",
+        description="Make a bag whose writer died complete, so that every reader opens it.",
+    )  # fmt: skip
+    recover.set_defaults(verb=_recover)
+    recover.add_argument("bag", metavar="BAG", type=Path)
     return parser
 
 
@@ -204,6 +215,7 @@ def _run(options: argparse.Namespace) -> int:
         effort=options.effort,
         stamp_start=options.stamp_start,
         overwrite=options.overwrite,
+        fsync=options.fsync,
         command_line=options.command_line,
     )
     pace = RealTime() if options.realtime else None
@@ -215,9 +227,9 @@ def _run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Whether SIGINT or SIGTERM came; the run reads it between steps, so that a step is never cut.
+    """Whether a signal asked the run to end; read between steps, so that a step is never cut.
 
-    A second Ctrl-C interrupts at once.
+    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second Ctrl-C interrupts at once.
     """
     asked = False
 
@@ -226,7 +238,7 @@ def _asked_to_stop() -> Iterator[Callable[[], bool]]:
         asked = True
         signal.signal(number, before[signal.Signals(number)])
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, ask) for number in SIGNALS}
     try:
         yield lambda: asked
     finally:
@@ -377,6 +389,23 @@ def _print_bag(run: Run) -> None:
     width = max(len(topic.name) for topic in run.topics)
     for topic in run.topics:
         print(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}")
+
+
+def _recover(options: argparse.Namespace) -> int:
+    from .bag import recover
+
+    done = recover(options.bag)
+    if done.original is None:
+        print(f"'{done.path}' is complete; there is nothing to recover")
+        return 0
+    _print_table(
+        ("bag", f"{done.path} ({sum(done.counts.values())} messages)"),
+        *((topic, f"{count}") for topic, count in sorted(done.counts.items())),
+        *([("saved up to", done.damage)] if done.damage else []),
+        ("original", f"{done.original}, as it was; delete it when you are content"),
+    )
+    _print_next(f"twodof info {_quote(done.path)}", f"ros2 bag play {_quote(done.path)}")
+    return 0
 
 
 def _state(run: Run, k: int) -> str:

@@ -1,0 +1,163 @@
+"""Bags whose writer died, made whole again."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sqlite3
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag2 import Reader, ReaderError, WriterError
+from rosbags.rosbag2.metadata import parse_qos
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from ..errors import BagError
+from . import provenance
+from .records import Channel, DamageError, read_messages, storage_files
+from .storage import KINDS, BagWriter, is_being_written, sync
+
+MAX_YAML = 256 * 1024  # bytes that all topics' quality of service may have; it is slow to read
+MAX_DEFINITION = 64 * 1024  # bytes
+NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """A bag that was made whole.
+
+    Attributes:
+        path: its folder.
+        original: where the folder is now that was found; None if it was whole already.
+        counts: messages by topic.
+        damage: why nothing behind was saved; "" where the file merely lacks its end.
+    """
+
+    path: Path
+    original: Path | None
+    counts: dict[str, int]
+    damage: str
+
+
+def recover(path: str | Path) -> Recovered:
+    """Make a bag whose writer died complete: index, metadata.yaml, statistics.
+
+    All messages that can be read are written to a new bag beside it. Only when that is whole and
+    on the disk it takes the place of the old one, which is kept as ``<name>.unfinished``.
+
+    Raises:
+        BagError: there is nothing to recover, the bag is being written, or the new one cannot be.
+    """
+    found = Path(path)
+    folder = found.resolve()
+    try:
+        if not folder.is_dir():
+            raise BagError(f"there is no bag '{found}'")
+        files = storage_files(folder)
+        if not files:
+            raise BagError(f"'{found}' has no .mcap or .db3 file to recover")
+        if len({file.suffix for file in files}) > 1:
+            raise BagError(f"'{found}' has .mcap and .db3 files; leave those of one kind in it")
+        if is_being_written(folder):
+            raise BagError(f"the bag '{found}' is still being written")
+        counts = _counts_if_whole(folder, files)
+        if counts is not None:
+            return Recovered(found, None, counts, "")
+        original = folder.with_name(f"{folder.name}.unfinished")
+        if original.exists():
+            raise BagError(f"'{original}', where the old bag would go, exists; move it away")
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as work:
+            new = Path(work) / folder.name
+            counts, damage = _copy(folder, files, new)
+            folder.rename(original)
+            new.rename(folder)
+            sync(folder.parent)
+    except (OSError, sqlite3.Error, WriterError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise BagError(f"cannot recover the bag '{found}': {reason}; it is as it was") from error
+    return Recovered(found, found.with_name(original.name), counts, damage)
+
+
+def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:
+    """Messages by topic of a bag that lacks nothing, else None."""
+    try:
+        with (folder / "metadata.yaml").open(encoding="utf-8", errors="replace") as content:
+            metadata = content.read(provenance.MAX_SIZE)
+        counts: Counter[str] = Counter()
+        for file in files:
+            counts.update(channel.topic for channel, _, _ in read_messages(file))
+    except (FileNotFoundError, DamageError):
+        return None
+    told = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
+    return dict(counts) if told and int(told[1]) == counts.total() else None
+
+
+def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
+    """Write what can be read into a new bag; messages by topic, and what ended the reading."""
+    damage = []
+    told = folder / provenance.FILE
+    writer = BagWriter(new, KINDS[files[0].suffix])
+    with suppress(BagError):  # damaged: the messages are worth saving without it
+        if provenance.read_provenance(folder):
+            writer.set_custom_data("twodof", told.read_text("utf-8").strip())
+    with writer:
+        topics = _Topics(writer)
+        for file in files:
+            try:
+                for channel, stamp, data in read_messages(file):
+                    writer.write(topics.connection(channel), stamp, data)
+            except DamageError as error:
+                damage.append(str(error))
+    if told.is_file():
+        shutil.copyfile(told, new / told.name)
+    with Reader(new) as reader:  # whole is what another reader opens
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+    sync(*new.iterdir(), new)
+    return counts, "; ".join(damage)
+
+
+class _Topics:
+    """Adds topics to a bag as they come."""
+
+    def __init__(self, writer: BagWriter) -> None:
+        self._writer = writer
+        self._connections: dict[Channel, Connection] = {}
+        self._yaml = 0
+
+    def connection(self, channel: Channel) -> Connection:
+        if channel not in self._connections:
+            self._connections[channel] = self._writer.add_connection(
+                channel.topic,
+                channel.type,
+                msgdef=channel.definition,
+                rihs01=channel.hash or _hash(channel),
+                serialization_format=channel.serialization,
+                offered_qos_profiles=self._qos(channel.qos),
+            )
+        return self._connections[channel]
+
+    def _qos(self, text: str) -> list[Qos]:
+        self._yaml += len(text)
+        if self._yaml > MAX_YAML:
+            return []
+        try:
+            return parse_qos(text)
+        except (ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError):
+            return []  # a player offers its default then
+
+
+def _hash(channel: Channel) -> str:
+    """ROS 2's hash of the type, from the definition that the file carries."""
+    if len(channel.definition) > MAX_DEFINITION:
+        return NO_HASH
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(channel.definition, channel.type))
+        return store.hash_rihs01(channel.type)
+    except (TypesysError, LookupError, ValueError, RecursionError):
+        return NO_HASH

@@ -1,0 +1,159 @@
+"""rosbags' writer, with storages that can be brought to the disk while they are being written.
+
+rosbags commits sqlite3 only at the end and cuts MCAP chunks at 1 MiB, so that a process that is
+killed leaves little or nothing.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import sqlite3
+from contextlib import suppress
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, Literal
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.enums import CompressionMode
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+
+METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
+BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
+
+
+class McapStorage(McapWriter):
+    """MCAP whose chunks are cut at each flush."""
+
+    _end = 0  # of the last chunk that got through
+
+    def close_chunk(self) -> None:
+        """Write the pending chunk and its index."""
+        super().close_chunk()
+        self._end = self.bio.tell()
+
+    def flush(self, sync: bool) -> None:
+        """Hand all messages to the operating system, and with ``sync`` to the disk."""
+        if self.chunk.msgs:
+            self.close_chunk()
+        self.bio.flush()
+        if sync:
+            os.fsync(self.bio.fileno())
+
+    def salvage(self) -> None:
+        """After a failed flush: bring the file into a state from which the next can go on."""
+        self.bio.flush()
+        if self.chunk.msgs:  # the chunk did not get through: cut off what did of it
+            self.bio.seek(self._end)
+            self.bio.truncate()
+
+
+class Sqlite3Storage(Sqlite3Writer):
+    """SQLite whose messages are inserted and committed at each flush, all or none."""
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        super().__init__(path, compression)
+        self.conn.close()
+        self.conn = sqlite3.connect(self.path, check_same_thread=False)
+        self.cursor = self.conn.cursor()
+        self._rows: list[tuple[int, int, bytes | memoryview]] = []
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        """Keep a message until the next flush."""
+        self._rows.append((connection.id, timestamp, data))
+
+    def flush(self, sync: bool) -> None:
+        """Hand all messages to the operating system, and with ``sync`` to the disk."""
+        if not self.conn.in_transaction:  # what else is new, topics, is in one already
+            # a killed process needs no wait for the disk
+            self.conn.execute(f"PRAGMA synchronous = {'FULL' if sync else 'OFF'}")
+        self.conn.executemany(
+            "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", self._rows
+        )
+        self.conn.commit()
+        self._rows.clear()
+
+    def salvage(self) -> None:
+        """After a failed flush: bring the file into a state from which the next can go on."""
+        self.conn.rollback()
+
+    def close(self, version: int, metadata: str) -> None:
+        """Bring everything to the file, and close it."""
+        self.flush(sync=False)
+        super().close(version, metadata)
+
+
+class BagWriter(Writer):
+    """rosbags' writer on these storages.
+
+    Args:
+        path: folder of the bag, must not exist.
+        storage: "mcap" or "sqlite3".
+        fsync: wait for the disk at each flush.
+    """
+
+    STORAGE_PLUGINS = MappingProxyType(
+        {StoragePlugin.MCAP: McapStorage, StoragePlugin.SQLITE3: Sqlite3Storage}
+    )
+    storage: McapStorage | Sqlite3Storage | None
+
+    def __init__(self, path: Path, storage: str, *, fsync: bool = False) -> None:
+        super().__init__(path, version=METADATA_VERSION, storage_plugin=STORAGES[storage])
+        self._fsync = fsync
+        self._pending = 0
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        """Write one message; some hundred KiB are flushed together."""
+        super().write(connection, timestamp, data)
+        self._pending += len(data)
+        if self._pending > BATCH_SIZE:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand all messages to the operating system.
+
+        Raises:
+            OSError, sqlite3.Error: the disk is full, or the file is gone.
+        """
+        assert self.storage is not None
+        if not self.storage.path.exists():  # what has lost its name can be written for ever
+            raise FileNotFoundError(errno.ENOENT, "it was removed while it was being written")
+        self.storage.flush(self._fsync)
+        self._pending = 0
+
+
+def lock(path: Path) -> int:
+    """Mark a bag's folder as being written until the descriptor is closed or the process dies."""
+    folder = os.open(path, os.O_RDONLY)
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return folder
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a living process writes the bag."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(folder)
+    return False
+
+
+def sync(*paths: Path) -> None:
+    """Bring files and folders, as far as they are written, to the disk itself."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,255 @@
+"""The logger: a sink that writes each sample as sensor_msgs/JointState into a ROS 2 bag."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sqlite3
+import time
+from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import WriterError
+
+from ..errors import BagError
+from ..master import Experiment, Sample
+from . import provenance
+from .messages import JOINT_STATES, NANOSECONDS, STORE, Messages
+from .storage import BATCH_SIZE, STORAGES, BagWriter, is_being_written, lock, sync
+
+RESERVE = "reserve"
+RESERVE_SIZE = 2 * 1024**2
+FLUSH_PERIOD = 0.5  # s of wall time
+LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
+
+
+class Bag:
+    """A sink that writes a rosbag2 folder.
+
+    Left in whatever way, the bag is closed and readable with every sample written so far; while
+    the run goes on, what is older than a second survives the death of the process.
+
+    Messages are serialised where ``write`` is called, and stored by a thread of the bag's own:
+    Ctrl-C, which Python raises in the main thread, so never comes between the bytes of a message,
+    and what is written reaches the disk also while the FMU takes its time for a step.
+
+    Args:
+        path: folder of the bag; must not exist, unless ``overwrite`` and it is a bag.
+        run: the experiment whose samples come; goes into the provenance.
+        storage: "mcap" or "sqlite3".
+        scene: add the robot description, transforms, target and end effector.
+        effort: put the control effort into JointState.effort.
+        stamp_start: time of the first stamp, s since the epoch; None: the wall clock.
+        overwrite: replace an existing bag.
+        fsync: wait for the disk at each flush, so that the machine may lose its power too.
+        command_line: for the provenance.
+
+    Raises:
+        BagError: the folder exists or cannot be written; in ``write`` and at the end where the
+            disk is full or the folder is gone.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        run: Experiment,
+        *,
+        storage: str = "mcap",
+        scene: bool = False,
+        effort: bool = False,
+        stamp_start: float | None = None,
+        overwrite: bool = False,
+        fsync: bool = False,
+        command_line: str = "",
+    ) -> None:
+        self.path = Path(path)
+        self._run = run
+        if storage not in STORAGES:
+            raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
+        if storage == "sqlite3" and any(c in str(self.path) for c in "?#%"):
+            raise BagError(f"'{path}': a sqlite3 bag cannot have ?, # or % in its path")
+        self._storage = storage
+        self._overwrite = overwrite
+        self._fsync = fsync
+        self._command_line = command_line
+        if stamp_start is not None and not 0 <= stamp_start * NANOSECONDS <= LATEST_STAMP:
+            raise BagError(f"the first stamp, {stamp_start:g} s, is out of range")
+        # a fraction: a double of today's nanoseconds is good to 256 only
+        exact = None if stamp_start is None else Fraction(stamp_start) * NANOSECONDS
+        self._start = time.time_ns() if exact is None else round(exact)
+        if self._start + run.steps * run.step * NANOSECONDS > LATEST_STAMP:
+            raise BagError(f"the last stamp, {run.steps * run.step:g} s later, is out of range")
+        self._messages = Messages(run, scene=scene, effort=effort)
+        _check_free(self.path, overwrite)
+
+    def __enter__(self) -> Bag:
+        _check_free(self.path, self._overwrite)
+        text = provenance.provenance(self._run, self._start, self._command_line)
+        try:
+            if self.path.exists():
+                shutil.rmtree(self.path)
+            self._writer = BagWriter(self.path, self._storage, fsync=self._fsync)
+            self._open(text)
+        except WriterError as error:  # the folder appeared meanwhile and is not ours
+            raise BagError(f"cannot write the bag '{self.path}': {error}") from error
+        except (OSError, sqlite3.Error) as error:
+            raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
+        self._queue: deque[tuple[Connection, int, bytes | memoryview]] = deque()
+        self._given = self._taken = 0  # bytes, counted by one thread each
+        self._due, self._stored = Event(), Event()
+        self._closing = self._closed = False
+        self._failure: Exception | None = None
+        self._thread = Thread(target=self._keep_storing, name="bag writer")
+        self._thread.start()
+        return self
+
+    def write(self, sample: Sample) -> None:
+        """Write one sample: one JointState, and the scene's messages."""
+        if self._failure is not None:
+            self._thread.join()
+            raise self._error(self._failure) from self._failure
+        stamp = self._start + round(sample.k * self._run.step * NANOSECONDS)
+        if first := not self._given:
+            self._give(self._messages.latched(stamp), stamp)
+        self._give(self._messages.of(sample, stamp), stamp)
+        if first or self._given - self._taken > BATCH_SIZE:
+            self._stored.clear()
+            self._due.set()
+            self._stored.wait()
+
+    def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
+        self._closing = True
+        self._due.set()
+        self._thread.join()  # if this is interrupted, the thread ends its work all the same
+        if self._failure is not None and not isinstance(exception, BagError):
+            raise self._error(self._failure) from self._failure
+
+    def _open(self, text: str) -> None:
+        """Create the bag's folder, or leave nothing of it."""
+        try:
+            self._writer.set_custom_data("twodof", text)
+            self._writer.open()
+            (self.path / provenance.FILE).write_text(text + "\n", "utf-8")
+            with (self.path / RESERVE).open("wb") as reserve:
+                reserve.write(b"\0" * RESERVE_SIZE)
+                reserve.flush()
+                os.fsync(reserve.fileno())
+            self._connections = {
+                name: self._writer.add_connection(
+                    name, topic.type, typestore=STORE, offered_qos_profiles=[topic.qos]
+                )
+                for name, topic in self._messages.topics.items()
+            }
+            self._writer.flush()
+            if self._fsync:
+                sync(self.path / provenance.FILE, self.path, self.path.absolute().parent)
+            self._lock = lock(self.path)
+        except WriterError:
+            raise
+        except BaseException:
+            with suppress(OSError, sqlite3.Error):
+                self._writer.abort()
+            shutil.rmtree(self.path, ignore_errors=True)
+            raise
+
+    def _give(self, messages: Iterable[tuple[str, Any]], stamp: int) -> None:
+        """Queue messages for the thread."""
+        for topic, message in messages:
+            connection = self._connections[topic]
+            data = STORE.serialize_cdr(message, connection.msgtype)
+            self._queue.append((connection, stamp, data))
+            self._given += len(data)
+
+    def _keep_storing(self) -> None:
+        """The thread: stores what is queued twice a second, and when asked to; then closes."""
+        try:
+            closing = False
+            while not closing:
+                self._due.wait(FLUSH_PERIOD)
+                self._due.clear()
+                if closing := self._closing:
+                    (self.path / RESERVE).unlink(missing_ok=True)
+                self._store()
+                self._stored.set()
+        except Exception as error:  # raised in the main thread
+            self._failure = error
+        try:
+            self._close()
+        except Exception as error:
+            self._failure = error
+        finally:
+            self._stored.set()
+            os.close(self._lock)
+
+    def _store(self) -> None:
+        while self._queue:
+            connection, stamp, data = self._queue.popleft()
+            self._writer.write(connection, stamp, data)
+            self._taken += len(data)
+        self._writer.flush()
+
+    def _close(self) -> None:
+        """Close the bag; after a failure give up the reserve and store what is still there."""
+        storage = self._writer.storage
+        assert storage is not None
+        if self._failure is not None:
+            if not storage.path.exists():
+                self._writer.abort()
+                return
+            (self.path / RESERVE).unlink(missing_ok=True)
+            storage.salvage()
+            self._store()
+        self._writer.close()
+        if self._fsync:
+            sync(storage.path, self.path / "metadata.yaml", self.path)
+        self._closed = True
+
+    def _error(self, failure: Exception) -> Exception:
+        """What the main thread raises for a failure of the thread."""
+        if not isinstance(failure, OSError | sqlite3.Error):
+            return failure
+        reason = f"cannot go on writing the bag '{self.path}': {_reason(failure)}"
+        if self._closed:
+            kept = self._writer.counts[self._connections[JOINT_STATES].id]
+            return BagError(f"{reason}; it is closed with its first {kept} samples")
+        if self.path.exists():
+            return BagError(f"{reason}; then make it whole with 'twodof recover {self.path}'")
+        return BagError(reason)
+
+
+def _reason(error: Exception) -> str:
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    if full or "full" in str(error):
+        return "the disk is full"
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+def _check_free(path: Path, overwrite: bool) -> None:
+    try:
+        if not path.exists():
+            return
+    except OSError as error:
+        raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
+    if not overwrite:
+        raise BagError(f"'{path}' exists already; choose another name with -o or use --overwrite")
+    if path.is_symlink() or not _is_bag(path):
+        raise BagError(f"'{path}' is not a bag and is not overwritten")
+    if is_being_written(path):
+        raise BagError(f"'{path}' is being written by another process and is not overwritten")
+
+
+def _is_bag(path: Path) -> bool:
+    """A folder with rosbag2's metadata, or with our provenance where the writer died."""
+    try:
+        with (path / "metadata.yaml").open("rb") as metadata:
+            start = b"rosbag2_bagfile_information:"
+            return metadata.read(len(start)) == start
+    except OSError:
+        return bool(provenance.read_provenance(path))
