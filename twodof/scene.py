@@ -249,11 +249,11 @@ def _place(part: ET.Element, pose: Array) -> None:
     if origin is None:
         origin = ET.SubElement(part, "origin")
     r = pose[:3, :3]
-    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
-    if abs(math.cos(pitch)) > 1e-9:
-        roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
-    else:  # roll and yaw turn about the same axis: all of it is yaw
-        roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
+    # roll from what yaw leaves: exact too where the two turn about the same axis
+    yaw = math.atan2(r[1, 0], r[0, 0])
+    sin, cos = math.sin(yaw), math.cos(yaw)
+    pitch = math.atan2(-r[2, 0], cos * r[0, 0] + sin * r[1, 0])
+    roll = math.atan2(sin * r[0, 2] - cos * r[1, 2], cos * r[1, 1] - sin * r[0, 1])
     origin.set("xyz", _text(pose[:3, 3]))
     origin.set("rpy", _text((roll, pitch, yaw)))
 
