@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import importlib.metadata
+import shutil
+import subprocess
 import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from harness import cannot_run
 
 import twodof
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--full", action="store_true", help="run the long tests in full length")
+
+
+@pytest.fixture(scope="session")
+def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
+    """How much of a long test is run: the first number with --full, else the second."""
+    return lambda full, short: full if request.config.getoption("full") else short
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -20,6 +34,35 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def fmu_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default arm's FMU, built once."""
     return twodof.build_fmu(tmp_path_factory.mktemp("fmu") / "TwoDof.fmu")
+
+
+@pytest.fixture(scope="session")
+def native_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default arm's native FMU, built once."""
+    folder = tmp_path_factory.mktemp("native")
+    return twodof.build_fmu(folder / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
+    """Mounts a small disk of so many KiB, as often as asked."""
+    mounted: list[Path] = []
+
+    def mount(size: int, options: str = "rw") -> Path:
+        folder = tmp_path / f"disk{len(mounted)}"
+        folder.mkdir()
+        if shutil.which("mount") is None:
+            cannot_run("small disks need the command 'mount'")
+        command = ["mount", "-t", "tmpfs", "-o", f"{options},size={size}k", "tmpfs", str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            cannot_run(f"small disks cannot be mounted here: {done.stderr.strip()}")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for folder in mounted:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import re
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -23,26 +22,34 @@ from typing import Any, NamedTuple
 import numpy as np
 import oracles
 import pytest
-from harness import cannot_run
+from bags import (
+    PERIOD,
+    SECOND,
+    START,
+    STORAGES,
+    STORE,
+    JointState,
+    assert_consistent,
+    both_storages,
+    foreign_readers,
+    joint_state,
+    metadata,
+    read_with_rosbags,
+    read_with_sqlite3,
+    sample,
+)
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
-from mcap_ros2.decoder import DecoderFactory
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import StoragePlugin, Writer
 from ruamel.yaml import YAML
 
 import twodof
 from twodof.errors import BagError
 from twodof.master import Experiment, Sample
 
-STORAGES = ("mcap", "sqlite3")
-START = 1_700_000_000  # s since the epoch
-SECOND = 1_000_000_000  # ns
-PERIOD = 10_000_000  # ns, the default communication step
 KIB, MIB = 1024, 1024**2
-STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 # As in the code that ROS 2 generates from the definitions: *__description.c of each message.
 TYPE_HASHES = {
@@ -59,18 +66,6 @@ TYPE_HASHES = {
         "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"
     ),
 }
-
-
-class JointState(NamedTuple):
-    """A message as some reader gives it; numbers as bytes, so that equal is equal to the bit."""
-
-    log_time: int
-    stamp: int
-    frame: str
-    names: list[str]
-    position: bytes
-    velocity: bytes
-    effort: bytes
 
 
 class Collector(list[Sample]):
@@ -117,109 +112,6 @@ def recording(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Recor
 @pytest.fixture(scope="module")
 def run(fmu_path: Path) -> Experiment:
     return twodof.experiment(fmu_path)
-
-
-def sample(run: Experiment, k: int) -> Sample:
-    """A sample that no simulation gave, told apart by its numbers."""
-    inputs = {
-        n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"
-    }
-    return Sample(k, run.time(k), (k / 7, -k / 3), (k / 11, -k), (k, k), (k / 13, k / 17), inputs)
-
-
-def joint_state(k: int, sample: Sample, effort: bool = False) -> JointState:
-    stamp = START * SECOND + k * PERIOD
-    tau = sample.tau if effort else ()
-    numbers = (doubles(sample.q), doubles(sample.v), doubles(tau))
-    return JointState(stamp, stamp, "", ["joint1", "joint2"], *numbers)
-
-
-def doubles(values: Sequence[float]) -> bytes:
-    return np.array(values, dtype="<f8").tobytes()
-
-
-def from_message(log_time: int, message: Any) -> JointState:
-    stamp = message.header.stamp
-    return JointState(
-        log_time,
-        stamp.sec * SECOND + stamp.nanosec,
-        message.header.frame_id,
-        list(message.name),
-        *map(doubles, (message.position, message.velocity, message.effort)),
-    )
-
-
-def read_with_rosbags(bag: Path) -> list[JointState]:
-    with Reader(bag) as reader:
-        chosen = [c for c in reader.connections if c.topic == "/joint_states"]
-        return [
-            from_message(stamp, STORE.deserialize_cdr(data, connection.msgtype))
-            for connection, stamp, data in reader.messages(chosen)
-        ]
-
-
-def read_with_mcap(bag: Path) -> list[JointState]:
-    """Through the index, and decoded by the schema that the file carries."""
-    with (bag / f"{bag.name}.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        states = []
-        for _, _, message, decoded in reader.iter_decoded_messages(topics=["/joint_states"]):
-            assert message.publish_time == message.log_time
-            states.append(from_message(message.log_time, decoded))
-        return states
-
-
-def read_with_sqlite3(bag: Path) -> list[JointState]:
-    with sqlite3.connect(f"file:{bag / f'{bag.name}.db3'}?mode=ro", uri=True) as database:
-        rows = database.execute(
-            "SELECT timestamp, type, data FROM messages JOIN topics ON topic_id = topics.id"
-            " WHERE name = '/joint_states' ORDER BY messages.id"
-        )
-        return [from_message(t, STORE.deserialize_cdr(data, kind)) for t, kind, data in rows]
-
-
-READERS = [
-    ("mcap", read_with_rosbags),
-    ("mcap", read_with_mcap),
-    ("sqlite3", read_with_rosbags),
-    ("sqlite3", read_with_sqlite3),
-]
-foreign_readers = pytest.mark.parametrize(("storage", "read"), READERS)
-both_storages = pytest.mark.parametrize("storage", STORAGES)
-
-
-def metadata(bag: Path) -> dict[str, Any]:
-    text = (bag / "metadata.yaml").read_text("utf-8")
-    return YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
-
-
-def assert_consistent(bag: Path, storage: str) -> int:
-    """The bag opens in all readers of its storage, with as many messages as its metadata says."""
-    with Reader(bag) as reader:
-        stamps = [stamp for _, stamp, _ in reader.messages()]
-        counts = {c.topic: c.msgcount for c in reader.connections}
-    if storage == "mcap":
-        with (bag / f"{bag.name}.mcap").open("rb") as file:
-            summary = make_reader(file).get_summary()
-            assert summary is not None and summary.statistics is not None
-            assert summary.statistics.message_count == len(stamps)
-            assert sum(1 for _ in make_reader(file).iter_messages()) == len(stamps)
-            file.seek(0)  # and from the beginning to the end, without the index
-            streamed = [r for r in StreamReader(file).records if isinstance(r, McapMessage)]
-            assert len(streamed) == len(stamps)
-    else:
-        with sqlite3.connect(f"file:{bag / f'{bag.name}.db3'}?mode=ro", uri=True) as database:
-            assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
-            assert database.execute("SELECT count(*) FROM messages").fetchone() == (len(stamps),)
-    found = metadata(bag)
-    assert found["message_count"] == found["files"][0]["message_count"] == len(stamps)
-    topics = found["topics_with_message_count"]
-    assert {t["topic_metadata"]["name"]: t["message_count"] for t in topics} == counts
-    if stamps:
-        assert found["starting_time"]["nanoseconds_since_epoch"] == min(stamps)
-        assert found["duration"]["nanoseconds"] == max(stamps) - min(stamps)
-    assert not (bag / "reserve").exists()
-    return len(stamps)
 
 
 # --- messages ---
@@ -632,28 +524,6 @@ def test_damaged_bag_is_read_or_refused(run: Experiment, tmp_path: Path, storage
 
 
 # --- where a bag may be written ---
-
-
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    """Mounts a small disk of so many KiB, as often as asked."""
-    mounted: list[Path] = []
-
-    def mount(size: int, options: str = "rw") -> Path:
-        folder = tmp_path / f"disk{len(mounted)}"
-        folder.mkdir()
-        if shutil.which("mount") is None:
-            cannot_run("small disks need the command 'mount'")
-        command = ["mount", "-t", "tmpfs", "-o", f"{options},size={size}k", "tmpfs", str(folder)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            cannot_run(f"small disks cannot be mounted here: {done.stderr.strip()}")
-        mounted.append(folder)
-        return folder
-
-    yield mount
-    for folder in mounted:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 @both_storages

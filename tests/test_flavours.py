@@ -12,12 +12,6 @@ import twodof
 from twodof import FmuOptions, build_fmu
 from twodof.cli import main
 
-
-@pytest.fixture(scope="module")
-def native_fmu(tmp_path_factory):
-    return build_fmu(tmp_path_factory.mktemp("native") / "N.fmu", FmuOptions(native=True))
-
-
 RUNS = {
     "default": {},
     "at limits": {
@@ -30,10 +24,10 @@ RUNS = {
 
 
 @pytest.mark.parametrize("settings", RUNS.values(), ids=RUNS)
-def test_trajectories_of_both_flavours_agree(fmu_path, native_fmu, settings):
+def test_trajectories_of_both_flavours_agree(fmu_path, native_path, settings):
     runs = [
         list(twodof.samples(fmu, stop_time=2.0, settings=settings))
-        for fmu in (fmu_path, native_fmu)
+        for fmu in (fmu_path, native_path)
     ]
     for group in ("q", "v", "x", "tau"):
         python, native = (np.array([getattr(s, group) for s in run]) for run in runs)
@@ -42,8 +36,8 @@ def test_trajectories_of_both_flavours_agree(fmu_path, native_fmu, settings):
     assert [s.inputs for s in runs[0]] == [s.inputs for s in runs[1]]
 
 
-def test_native_end_effector_follows_the_closed_form_into_the_bag(native_fmu, tmp_path):
-    run = twodof.experiment(native_fmu)
+def test_native_end_effector_follows_the_closed_form_into_the_bag(native_path, tmp_path):
+    run = twodof.experiment(native_path)
     twodof.simulate(run, [twodof.Bag(tmp_path / "bag", run)])
     q = twodof.read_bag(tmp_path / "bag").q
     target = np.array([0.2, 0.05])
@@ -51,9 +45,9 @@ def test_native_end_effector_follows_the_closed_form_into_the_bag(native_fmu, tm
     assert np.abs(position(q) - expected).max() <= 1e-9
 
 
-def test_sources_compiled_without_any_flag_show_the_standard_functions_alone(native_fmu, tmp_path):
+def test_sources_compiled_without_any_flag_show_the_standard_functions_alone(native_path, tmp_path):
     """Else libc's own advance(), or another FMU's functions, would be called instead."""
-    with zipfile.ZipFile(native_fmu) as archive:
+    with zipfile.ZipFile(native_path) as archive:
         archive.extractall(tmp_path)
     files = [str(path) for path in sorted(Path(tmp_path, "sources").glob("*.c"))]
     library = tmp_path / "library.so"
@@ -75,8 +69,8 @@ def test_run_native_builds_its_own_fmu_once(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "TwoDof.fmu").exists()
 
 
-def test_run_native_beside_an_fmu_is_refused(native_fmu, capsys):
-    assert main(["run", "--native", str(native_fmu)]) == 1
+def test_run_native_beside_an_fmu_is_refused(native_path, capsys):
+    assert main(["run", "--native", str(native_path)]) == 1
     assert "--native builds the default arm's FMU" in capsys.readouterr().err
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sqlite3
-import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from ..errors import BagError
 from . import provenance
 from .records import Channel, DamageError, read_messages, storage_files
-from .storage import KINDS, BagWriter, is_being_written, sync
+from .storage import KINDS, BagWriter, is_being_written, lock, sync
 
 MAX_YAML = 256 * 1024  # bytes that all topics' quality of service may have; it is slow to read
 MAX_DEFINITION = 64 * 1024  # bytes
@@ -71,16 +71,32 @@ def recover(path: str | Path) -> Recovered:
         original = folder.with_name(f"{folder.name}.unfinished")
         if original.exists():
             raise BagError(f"'{original}', where the old bag would go, exists; move it away")
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as work:
-            new = Path(work) / folder.name
-            counts, damage = _copy(folder, files, new)
+        with _workshop(found, folder) as work:
+            counts, damage = _copy(folder, files, work / folder.name)
             folder.rename(original)
-            new.rename(folder)
+            (work / folder.name).rename(folder)
             sync(folder.parent)
     except (OSError, sqlite3.Error, WriterError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise BagError(f"cannot recover the bag '{found}': {reason}; it is as it was") from error
     return Recovered(found, found.with_name(original.name), counts, damage)
+
+
+@contextmanager
+def _workshop(found: Path, folder: Path) -> Iterator[Path]:
+    """A folder beside the bag, gone in the end; one that a killed process left is cleared."""
+    work = folder.with_name(f".{folder.name}.recovering")
+    if work.exists():
+        if is_being_written(work):
+            raise BagError(f"another process recovers the bag '{found}'")
+        shutil.rmtree(work)
+    work.mkdir()
+    held = lock(work)
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work)
+        os.close(held)
 
 
 def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:

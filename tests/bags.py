@@ -1,0 +1,144 @@
+"""Bags, written with samples that no simulation gave and read by other readers than the package's.
+
+Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
+
+from twodof.master import Experiment, Sample
+
+STORAGES = ("mcap", "sqlite3")
+START = 1_700_000_000  # s since the epoch
+SECOND = 1_000_000_000  # ns
+PERIOD = 10_000_000  # ns, the default communication step
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+class JointState(NamedTuple):
+    """A message as some reader gives it; numbers as bytes, so that equal is equal to the bit."""
+
+    log_time: int
+    stamp: int
+    frame: str
+    names: list[str]
+    position: bytes
+    velocity: bytes
+    effort: bytes
+
+
+def sample(run: Experiment, k: int) -> Sample:
+    """A sample that no simulation gave, told apart by its numbers."""
+    inputs = {
+        n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"
+    }
+    return Sample(k, run.time(k), (k / 7, -k / 3), (k / 11, -k), (k, k), (k / 13, k / 17), inputs)
+
+
+def joint_state(k: int, sample: Sample, effort: bool = False) -> JointState:
+    stamp = START * SECOND + k * PERIOD
+    tau = sample.tau if effort else ()
+    numbers = (doubles(sample.q), doubles(sample.v), doubles(tau))
+    return JointState(stamp, stamp, "", ["joint1", "joint2"], *numbers)
+
+
+def doubles(values: Sequence[float]) -> bytes:
+    return np.array(values, dtype="<f8").tobytes()
+
+
+def from_message(log_time: int, message: Any) -> JointState:
+    stamp = message.header.stamp
+    return JointState(
+        log_time,
+        stamp.sec * SECOND + stamp.nanosec,
+        message.header.frame_id,
+        list(message.name),
+        *map(doubles, (message.position, message.velocity, message.effort)),
+    )
+
+
+def read_with_rosbags(bag: Path) -> list[JointState]:
+    with Reader(bag) as reader:
+        chosen = [c for c in reader.connections if c.topic == "/joint_states"]
+        return [
+            from_message(stamp, STORE.deserialize_cdr(data, connection.msgtype))
+            for connection, stamp, data in reader.messages(chosen)
+        ]
+
+
+def read_with_mcap(bag: Path) -> list[JointState]:
+    """Through the index, and decoded by the schema that the file carries."""
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        states = []
+        for _, _, message, decoded in reader.iter_decoded_messages(topics=["/joint_states"]):
+            assert message.publish_time == message.log_time
+            states.append(from_message(message.log_time, decoded))
+        return states
+
+
+def read_with_sqlite3(bag: Path) -> list[JointState]:
+    with sqlite3.connect(f"file:{bag / f'{bag.name}.db3'}?mode=ro", uri=True) as database:
+        rows = database.execute(
+            "SELECT timestamp, type, data FROM messages JOIN topics ON topic_id = topics.id"
+            " WHERE name = '/joint_states' ORDER BY messages.id"
+        )
+        return [from_message(t, STORE.deserialize_cdr(data, kind)) for t, kind, data in rows]
+
+
+READERS = [
+    ("mcap", read_with_rosbags),
+    ("mcap", read_with_mcap),
+    ("sqlite3", read_with_rosbags),
+    ("sqlite3", read_with_sqlite3),
+]
+foreign_readers = pytest.mark.parametrize(("storage", "read"), READERS)
+both_storages = pytest.mark.parametrize("storage", STORAGES)
+
+
+def metadata(bag: Path) -> dict[str, Any]:
+    text = (bag / "metadata.yaml").read_text("utf-8")
+    return YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
+
+
+def assert_consistent(bag: Path, storage: str) -> int:
+    """The bag opens in all readers of its storage, with as many messages as its metadata says."""
+    with Reader(bag) as reader:
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    if storage == "mcap":
+        with (bag / f"{bag.name}.mcap").open("rb") as file:
+            summary = make_reader(file).get_summary()
+            assert summary is not None and summary.statistics is not None
+            assert summary.statistics.message_count == len(stamps)
+            assert sum(1 for _ in make_reader(file).iter_messages()) == len(stamps)
+            file.seek(0)  # and from the beginning to the end, without the index
+            streamed = [r for r in StreamReader(file).records if isinstance(r, McapMessage)]
+            assert len(streamed) == len(stamps)
+    else:
+        with sqlite3.connect(f"file:{bag / f'{bag.name}.db3'}?mode=ro", uri=True) as database:
+            assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+            assert database.execute("SELECT count(*) FROM messages").fetchone() == (len(stamps),)
+    found = metadata(bag)
+    assert found["message_count"] == found["files"][0]["message_count"] == len(stamps)
+    topics = found["topics_with_message_count"]
+    assert {t["topic_metadata"]["name"]: t["message_count"] for t in topics} == counts
+    if stamps:
+        assert found["starting_time"]["nanoseconds_since_epoch"] == min(stamps)
+        assert found["duration"]["nanoseconds"] == max(stamps) - min(stamps)
+    assert not (bag / "reserve").exists()
+    return len(stamps)

@@ -1,0 +1,426 @@
+"""Bags whose writer died: what survives, and what makes them whole again."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import (
+    PERIOD,
+    SECOND,
+    START,
+    STORE,
+    assert_consistent,
+    both_storages,
+    joint_state,
+    metadata,
+    read_with_mcap,
+    read_with_rosbags,
+    read_with_sqlite3,
+    sample,
+)
+from mcap.exceptions import McapError
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+
+import twodof
+from twodof.cli import main
+from twodof.errors import BagError
+from twodof.master import Experiment
+
+TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+BATCH = 40  # samples between two flushes
+
+
+@pytest.fixture(scope="module")
+def run(fmu_path: Path) -> Experiment:
+    return twodof.experiment(fmu_path)
+
+
+def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
+    """A bag of n samples in the state in which a killed process leaves it."""
+    living = folder / "living" / "bag"
+    with twodof.Bag(living, run, storage=storage, stamp_start=START, **options) as bag:
+        for k in range(n):
+            bag.write(sample(run, k))
+            if k % BATCH == 0:
+                bag._stored.clear()
+                bag._due.set()
+                bag._stored.wait()
+        shutil.copytree(living, folder / "bag")
+    shutil.rmtree(living.parent)
+    return folder / "bag"
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder"
+        for p in folder.rglob("*")
+    }
+
+
+def streamed(file: Path) -> int:
+    """Messages that the MCAP project's own reader gets out of a file that ends anywhere."""
+    count = 0
+    with file.open("rb") as stream:
+        try:
+            for record in StreamReader(stream).records:
+                count += isinstance(record, McapMessage)
+        except (McapError, struct.error):
+            pass
+    return count
+
+
+# --- killed ---
+
+
+def lifetimes(fmu: Path, bags: list[Path], options: list[str], rng: random.Random) -> list[float]:
+    """Kill one run in real time for each bag at a random moment; how long each was logging, s."""
+    command = [*TWODOF, "run", str(fmu), "--realtime", "--stop-time", "60", *options]
+    runs = [subprocess.Popen([*command, "-o", str(bag)]) for bag in bags]
+    found = []
+    for bag, process in zip(bags, runs, strict=True):
+        while not (bag / "metadata.yaml").exists() and not (bag / "run.json").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+    for bag, process in zip(bags, runs, strict=True):
+        time.sleep(rng.uniform(0.0, 1.5))
+        os.kill(process.pid, signal.SIGKILL)
+        found.append(time.time() - (bag / "run.json").stat().st_mtime)
+        assert process.wait() == -signal.SIGKILL
+    return found
+
+
+@pytest.mark.long
+@both_storages
+def test_killed_run_loses_a_second_at_most(
+    native_path: Path, tmp_path: Path, storage: str, length: Callable[[int, int], int]
+) -> None:
+    options = ["--stamp-start", str(START), "--storage", storage]
+    undisturbed = tmp_path / "undisturbed"
+    assert main(["run", str(native_path), "-o", str(undisturbed), "--stop-time=30", *options]) == 0
+    whole = read_with_rosbags(undisturbed)
+    read_with_another = {"mcap": read_with_mcap, "sqlite3": read_with_sqlite3}[storage]
+    rng = random.Random(storage)
+    lost = []
+    for first in range(0, length(200, 4), 4):
+        bags = [tmp_path / f"bag{i}" for i in range(first, first + 4)]
+        for bag, lifetime in zip(bags, lifetimes(native_path, bags, options, rng), strict=True):
+            killed = content(bag)
+            assert main(["recover", str(bag)]) == 0
+            kept = assert_consistent(bag, storage)
+            assert read_with_rosbags(bag) == read_with_another(bag) == whole[:kept]
+            assert content(bag.with_name(f"{bag.name}.unfinished")) == killed
+            lost.append(lifetime - kept * PERIOD / SECOND)
+    print(f"{len(lost)} kills, {storage}: lost {np.mean(lost):.2f} s, at most {max(lost):.2f} s")
+    assert max(lost) <= 1.0
+    assert len(set(lost)) == len(lost)
+
+
+@both_storages
+def test_slow_step_holds_back_nothing_that_came_before(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    with twodof.Bag(tmp_path / "bag", run, storage=storage, stamp_start=START) as bag:
+        for k in range(50):
+            bag.write(sample(run, k))
+        time.sleep(1.0)  # the FMU takes its time
+        shutil.copytree(tmp_path / "bag", tmp_path / "copy")
+    twodof.recover(tmp_path / "copy")
+    assert assert_consistent(tmp_path / "copy", storage) == 50
+
+
+# --- what was lost is the end alone ---
+
+
+@pytest.mark.parametrize("scene", [False, True])
+def test_mcap_cut_anywhere_keeps_what_came_before(
+    run: Experiment, tmp_path: Path, scene: bool
+) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 200, scene=scene)
+    whole = (bag / "bag.mcap").read_bytes()
+    everything = [joint_state(k, sample(run, k)) for k in range(200)]
+    rng = np.random.default_rng(0)
+    counts = set()
+    for size in [len(whole), len(whole) - 1, *rng.integers(8, len(whole), 40).tolist()]:
+        cut = tmp_path / f"cut{size}"
+        shutil.copytree(bag, cut)
+        (cut / "bag.mcap").write_bytes(whole[:size])
+        there = streamed(cut / "bag.mcap")
+        done = twodof.recover(cut)
+        assert sum(done.counts.values()) == assert_consistent(cut, "mcap") == there
+        kept = len(read_with_rosbags(cut))
+        assert read_with_mcap(cut) == read_with_rosbags(cut) == everything[:kept]
+        counts.add(kept)
+    assert max(counts) > 150 and len(counts) > 3
+
+
+def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(
+    run: Experiment, tmp_path: Path
+) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 200)
+    file = bag / "bag.mcap"
+    there = streamed(file)
+    file.write_bytes(file.read_bytes() + bytes(8192))
+    done = twodof.recover(bag)
+    assert done.counts == {"/joint_states": there}
+    assert assert_consistent(bag, "mcap") == there
+
+
+def test_sqlite3_transaction_that_was_cut_is_rolled_back(run: Experiment, tmp_path: Path) -> None:
+    bag = unfinished(tmp_path, run, "sqlite3", 200)
+    file = bag / "bag.db3"
+    committed = len(read_with_sqlite3(bag))
+    database = sqlite3.connect(file)
+    database.execute("PRAGMA cache_size = 2")  # so that pages are written before the commit
+    database.execute("UPDATE messages SET data = zeroblob(length(data))")
+    database.executemany(
+        "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, zeroblob(1000))",
+        [(k,) for k in range(1000)],
+    )
+    cut = tmp_path / "cut"
+    shutil.copytree(bag, cut)
+    database.rollback()
+    database.close()
+    assert (cut / "bag.db3-journal").stat().st_size > 0
+    (cut / "bag.db3").rename(cut / "cut.db3")
+    (cut / "bag.db3-journal").rename(cut / "cut.db3-journal")
+    before = content(cut)
+    twodof.recover(cut)
+    assert read_with_rosbags(cut) == [joint_state(k, sample(run, k)) for k in range(committed)]
+    assert content(tmp_path / "cut.unfinished") == before
+    assert assert_consistent(cut, "sqlite3") == committed > 100
+
+
+@both_storages
+def test_recovered_bag_is_the_one_that_closing_makes(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    bag = unfinished(tmp_path, run, storage, 2 * BATCH + 1, scene=True)
+    with twodof.Bag(
+        tmp_path / "closed" / "bag", run, storage=storage, stamp_start=START, scene=True
+    ) as closed:
+        for k in range(2 * BATCH + 1):
+            closed.write(sample(run, k))
+    twodof.recover(bag)
+    found, expected = metadata(bag), metadata(closed.path)
+    for told in (found, expected):
+        told["topics_with_message_count"].sort(key=lambda topic: topic["topic_metadata"]["name"])
+    assert found == expected
+    assert (bag / "run.json").read_bytes() == (closed.path / "run.json").read_bytes()
+    assert {p.name for p in bag.iterdir()} == {p.name for p in closed.path.iterdir()}
+    assert messages(bag) == messages(closed.path)
+    back, expected_back = twodof.read_bag(bag), twodof.read_bag(closed.path)
+    assert back.topics == expected_back.topics
+    assert back.provenance == expected_back.provenance
+
+
+def messages(bag: Path) -> list[tuple[object, ...]]:
+    with Reader(bag) as reader:
+        return sorted(
+            (c.topic, c.msgtype, c.ext, stamp, bytes(data)) for c, stamp, data in reader.messages()
+        )
+
+
+DEFINITION = "# a comment\nfloat64[] readings\nstring unit\n"
+
+
+@pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.STORAGE])
+def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
+    tmp_path: Path, compression: CompressionMode
+) -> None:
+    """Two files, as of a recorder that splits; the last lacks its end."""
+    from twodof.bag.messages import LATCHED
+
+    text = STORE.types["std_msgs/msg/String"]
+    expected = []
+    for number, folder in enumerate(("rec_9", "rec_10")):
+        writer = Writer(tmp_path / folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+        with writer:
+            talk = writer.add_connection(
+                "/talk", "std_msgs/msg/String", typestore=STORE, offered_qos_profiles=[LATCHED]
+            )
+            mine = writer.add_connection(
+                "/mine", "my_msgs/msg/Readings", msgdef=DEFINITION, rihs01="RIHS01_" + "a" * 64
+            )
+            for k in range(300):
+                stamp = 1000 * number + k
+                data = bytes(STORE.serialize_cdr(text(f"{number} {k}"), "std_msgs/msg/String"))
+                for connection in (talk, mine):
+                    writer.write(connection, stamp, data)
+                    expected.append((connection.topic, connection.msgtype, stamp, data))
+    bag = tmp_path / "rec"
+    bag.mkdir()
+    for folder in ("rec_9", "rec_10"):
+        shutil.copy(tmp_path / folder / f"{folder}.mcap", bag)
+    whole = (bag / "rec_10.mcap").read_bytes()
+    (bag / "rec_10.mcap").write_bytes(whole[: len(whole) - 600])
+    twodof.recover(bag)
+    with Reader(bag) as reader:
+        found = [(c.topic, c.msgtype, stamp, bytes(data)) for c, stamp, data in reader.messages()]
+        connections = {connection.topic: connection for connection in reader.connections}
+    assert sorted(found) == sorted(expected)
+    assert connections["/talk"].ext.offered_qos_profiles == [LATCHED]
+    assert connections["/mine"].msgdef.data == DEFINITION
+    assert connections["/talk"].digest == STORE.hash_rihs01("std_msgs/msg/String")
+
+
+# --- what is said, and what is refused ---
+
+
+@both_storages
+def test_unfinished_bag_is_named_with_the_command(
+    run: Experiment, tmp_path: Path, storage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = unfinished(tmp_path, run, storage, 10)
+    assert main(["info", str(bag)]) == 1
+    said = capsys.readouterr().err
+    assert "unfinished" in said and f"twodof recover {bag}" in said
+    assert main(["recover", str(bag)]) == 0
+    assert f"{bag}.unfinished" in capsys.readouterr().out
+    assert main(["info", str(bag)]) == 0
+
+
+@both_storages
+def test_bag_that_is_being_written_is_left_alone(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    with twodof.Bag(tmp_path / "bag", run, storage=storage) as bag:
+        bag.write(sample(run, 0))
+        for refused in (twodof.recover, twodof.read_bag):
+            with pytest.raises(BagError, match="still being written"):
+                refused(bag.path)
+        (bag.path / "metadata.yaml").write_text("rosbag2_bagfile_information:")
+        with pytest.raises(BagError, match="being written"):
+            twodof.Bag(bag.path, run, overwrite=True)
+    assert assert_consistent(bag.path, storage) == 1
+
+
+@both_storages
+def test_complete_bag_is_left_as_it_is(
+    run: Experiment, tmp_path: Path, storage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with twodof.Bag(tmp_path / "bag", run, storage=storage) as bag:
+        bag.write(sample(run, 0))
+    before = content(tmp_path)
+    assert main(["recover", str(bag.path)]) == 0
+    assert "is complete" in capsys.readouterr().out
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("damage", ["metadata.yaml", "short metadata", "mcap"])
+def test_damaged_bag_is_made_anew(run: Experiment, tmp_path: Path, damage: str) -> None:
+    with twodof.Bag(tmp_path / "bag", run, stamp_start=START) as bag:
+        for k in range(20):
+            bag.write(sample(run, k))
+    file = bag.path / ("bag.mcap" if damage == "mcap" else "metadata.yaml")
+    before = file.read_bytes()
+    file.write_bytes({"metadata.yaml": b"hello", "mcap": before[:-50]}.get(damage, before[:300]))
+    if damage == "mcap":
+        with pytest.raises(BagError, match="twodof recover"):
+            twodof.read_bag(bag.path)
+    twodof.recover(bag.path)
+    assert read_with_rosbags(bag.path) == [joint_state(k, sample(run, k)) for k in range(20)]
+    assert assert_consistent(bag.path, "mcap") == 20
+
+
+def test_damaged_provenance_does_not_keep_the_messages(run: Experiment, tmp_path: Path) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 10)
+    (bag / "run.json").write_text('{"format": 1, "fmu": {"na')
+    twodof.recover(bag)
+    assert assert_consistent(bag, "mcap") > 0
+    assert (bag / "run.json").read_text() == '{"format": 1, "fmu": {"na'
+
+
+@pytest.mark.parametrize("place", ["nowhere", "file", "empty", "no bag", "both", "taken"])
+def test_what_cannot_be_recovered_is_refused_and_left_alone(
+    run: Experiment, tmp_path: Path, place: str
+) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 10)
+    if place == "taken":
+        (tmp_path / "bag.unfinished").mkdir()
+    elif place == "both":
+        (bag / "bag.db3").touch()
+    else:
+        shutil.rmtree(bag)
+        if place == "file":
+            bag.write_text("hello")
+        elif place != "nowhere":
+            bag.mkdir()
+    if place == "no bag":
+        (bag / "notes.txt").write_text("precious")
+    before = content(tmp_path)
+    with pytest.raises(BagError) as caught:
+        twodof.recover(bag)
+    assert str(bag) in str(caught.value) and "\n" not in str(caught.value)
+    assert content(tmp_path) == before
+
+
+@both_storages
+def test_bag_on_a_disk_without_room_for_another_stays_as_it_was(
+    run: Experiment, tmp_path: Path, disk: Callable[..., Path], storage: str
+) -> None:
+    big = unfinished(tmp_path, run, storage, 4000)
+    folder = disk(content_size(big) // 1024 + 200)
+    shutil.copytree(big, folder / "bag")
+    before = content(folder)
+    with pytest.raises(BagError, match=r"cannot recover .*; it is as it was"):
+        twodof.recover(folder / "bag")
+    assert content(folder) == before
+
+
+def content_size(folder: Path) -> int:
+    return sum(p.stat().st_size for p in folder.iterdir())
+
+
+@both_storages
+def test_recovery_that_is_killed_can_be_begun_again(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    bag = unfinished(tmp_path, run, storage, 6000)
+    rng = random.Random(storage)
+    expected = content(bag)
+    for _ in range(4):
+        process = subprocess.Popen([*TWODOF, "recover", str(bag)], stdout=subprocess.DEVNULL)
+        while process.poll() is None and not any(tmp_path.glob(".bag.recovering")):
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0.0, 0.2))
+        process.kill()
+        process.wait()
+        if (bag / "metadata.yaml").exists():
+            break
+        assert content(bag) == expected
+    else:
+        assert main(["recover", str(bag)]) == 0
+        assert {p.name for p in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
+    kept = assert_consistent(bag, storage)
+    assert read_with_rosbags(bag) == [joint_state(k, sample(run, k)) for k in range(kept)]
+    assert kept > 5900
+
+
+def test_two_recoveries_at_once_are_refused(run: Experiment, tmp_path: Path) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 10)
+    work = tmp_path / ".bag.recovering"
+    work.mkdir()
+    held = os.open(work, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with pytest.raises(BagError, match="another process"):
+        twodof.recover(bag)
+    os.close(held)
+    twodof.recover(bag)
+    assert assert_consistent(bag, "mcap") > 0
+    assert not work.exists()
