@@ -60,9 +60,9 @@ MUJOCO_STEP = 0.001  # s
 Q_START, X_DES, KP, KD, LINK = (0.5, 0.35), (0.2, 0.05), 50.0, 40.0, 0.15
 STARTS = {"q_start": Q_START, "x_des": X_DES, "gravity": (0.0, -9.81, 0.0)}
 PASSES, TURN = 3, 10
-LOG_ROUNDS, LOG_TURN = 5, 20_000
+LOG_ROUNDS, LOG_TURN = 7, 20_000
 C_ROUNDS = 15
-FMU_BAR, NATIVE_BAR, MUJOCO_BAR, GROWTH_BAR, LOG_BAR, HELP_BAR = 5.0, 300.0, 4.0, 2.0, 1.5, 0.3
+FMU_BAR, NATIVE_BAR, MUJOCO_BAR, GROWTH_BAR, LOG_BAR, HELP_BAR = 5.0, 300.0, 4.0, 2.0, 0.8, 0.3
 BUSY = 1.1
 
 
@@ -435,30 +435,36 @@ def step_times(simulators: Sequence[Simulator], passes: int = PASSES) -> tuple[l
 def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
     """Time of one JointState in bare rosbags and in this package's bag, s, by storage.
 
-    Medians over turns that are long enough to hold their share of flushes and commits.
+    Medians over bags written in turns, from the first message to the closed file, in processor
+    time of all threads: this package's bag stores in one of its own.
     """
     run = twodof.experiment(fmu)
     first = twodof.Sample(0, 0.0, (0.5, 0.35), (0.1, 0.2), (0.2, 0.1), (1.0, 0.3), {})
-    samples = [first._replace(k=k, t=k * STEP) for k in range(LOG_TURN * LOG_ROUNDS)]
+    samples = [first._replace(k=k, t=k * STEP) for k in range(LOG_TURN)]
     stamps = [1_700_000_000_000_000_000 + round(s.t * 1e9) for s in samples]
-    walls: dict[tuple[str, bool], list[float]] = {}
-    with ExitStack() as stack:
-        writes = []
-        for storage in ("mcap", "sqlite3"):
-            bag = twodof.Bag(folder / f"bag-{storage}", run, storage=storage, stamp_start=1.7e9)
-            ours = stack.enter_context(bag).write
-            theirs = bare_rosbags(stack, folder / f"bare-{storage}", storage)
-            writes.append(((storage, False), theirs, stamps))
-            writes.append(((storage, True), ours, samples))
-        for turn in range(0, len(samples), LOG_TURN):
-            for key, write, items in writes:
-                chosen = items[turn : turn + LOG_TURN]
-                begin = time.perf_counter()
-                for item in chosen:
-                    write(item)
-                walls.setdefault(key, []).append((time.perf_counter() - begin) / LOG_TURN)
-    median = {key: statistics.median(wall) for key, wall in walls.items()}
-    return {key: (median[key, False], median[key, True]) for key in ("mcap", "sqlite3")}
+    found = {}
+    for storage in ("mcap", "sqlite3"):
+        walls: tuple[list[float], list[float]] = ([], [])
+        for turn in range(LOG_ROUNDS):
+            with ExitStack() as stack:
+                write = bare_rosbags(stack, folder / f"bare-{storage}-{turn}", storage)
+                walls[0].append(log_time(stack, write, stamps))
+            with ExitStack() as stack:
+                path = folder / f"bag-{storage}-{turn}"
+                bag = twodof.Bag(path, run, storage=storage, stamp_start=1.7e9)
+                write = stack.enter_context(bag).write
+                walls[1].append(log_time(stack, write, samples))
+        found[storage] = (statistics.median(walls[0]), statistics.median(walls[1]))
+    return found
+
+
+def log_time(stack: ExitStack, write: Callable[[Any], None], items: Sequence[Any]) -> float:
+    """Processor time of one message, s: of writing all and closing the bag on the stack."""
+    begin = time.process_time()
+    for item in items:
+        write(item)
+    stack.close()
+    return (time.process_time() - begin) / len(items)
 
 
 def bare_rosbags(stack: ExitStack, path: Path, storage: str) -> Callable[[int], None]:
@@ -592,13 +598,13 @@ def print_in_c(rows: Sequence[RowInC], times: Sequence[float]) -> None:
 def print_logs(logs: dict[str, tuple[float, float]]) -> None:
     print(
         "\nLogging one JointState of two joints"
-        f" (wall time, medians of {LOG_ROUNDS} turns of {LOG_TURN} messages)\n"
+        f" (processor time, medians of {LOG_ROUNDS} bags of {LOG_TURN} messages)\n"
     )
     line = "  {:10} {:>14} {:>14} {:>8}   {}"
-    print(line.format("storage", "bare rosbags", "twodof.Bag", "ratio", "wanted"))
+    print(line.format("storage", "bare rosbags", "twodof.Bag", "rate", "wanted"))
     for storage, (bare, ours) in logs.items():
-        ratio = ours / bare
-        wanted = f"<= {LOG_BAR:g}: {verdict(ratio <= LOG_BAR)}"
+        ratio = bare / ours
+        wanted = f">= {LOG_BAR:g}: {verdict(ratio >= LOG_BAR)}"
         print(
             line.format(
                 storage, f"{1e6 * bare:.1f} µs", f"{1e6 * ours:.1f} µs", f"{ratio:.2f}", wanted
@@ -607,6 +613,7 @@ def print_logs(logs: dict[str, tuple[float, float]]) -> None:
     print(
         "\n  bare rosbags: serialize_cdr and Writer.write of a message built beforehand, no more."
         "\n  twodof.Bag: from a Sample; builds the message, and flushes twice a second."
+        "\n  rate: messages in the same time, of bare rosbags'."
     )
 
 

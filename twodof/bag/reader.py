@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -12,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
-from .messages import JOINT_STATE, JOINT_STATES, NANOSECONDS, STORE, Message
+from .messages import JOINT_STATE, JOINT_STATES, NANOSECONDS, STORE, Array, JointStateLayout
 from .provenance import read_provenance
 from .records import Channel, DamageError, read_messages, storage_files
 from .storage import is_being_written
 
 BATCH = 8192  # messages that are decoded at once
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 
@@ -166,7 +164,9 @@ class _JointStates:
         try:
             first: Any = STORE.deserialize_cdr(self._data[0], JOINT_STATE)
             stamps = np.array(self._stamps, dtype=np.int64)
-            numbers = _decode_alike(first, self._data)
+            sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
+            layout = JointStateLayout(first.name, first.header.frame_id, sizes)
+            numbers = layout.unpack(self._data)
             if numbers is None or tuple(first.name) != (self.names or tuple(first.name)):
                 numbers = self._decode_each()
         except BagError:
@@ -192,35 +192,3 @@ class _JointStates:
             return [np.array([row[i] for row in rows], dtype=np.float64) for i in range(3)]
         except ValueError as error:
             raise BagError(f"'{self._path}' has joint states of different sizes") from error
-
-
-def _decode_alike(first: Any, data: list[bytes]) -> list[Array] | None:
-    """Positions, velocities and efforts of messages that differ in numbers alone, else None.
-
-    All at once, about a hundred times faster than one by one. Where the numbers lie in a message
-    is found by serialising it with others.
-    """
-    sizes = [len(array) for array in (first.position, first.velocity, first.effort)]
-    plain = _with_numbers(first, map(np.zeros, sizes))
-    if any(len(message) != len(plain) for message in data):
-        return None
-    rows = np.frombuffer(b"".join(data), np.uint8).reshape(len(data), len(plain))
-    fixed = np.ones(len(plain), bool)
-    fixed[4:12] = False  # the stamp, behind the four bytes of the encapsulation
-    numbers = []
-    for i, size in enumerate(sizes):
-        marked = [np.zeros(n) for n in sizes]
-        marked[i].view(np.uint8)[:] = 0xFF
-        found = np.flatnonzero(plain != _with_numbers(first, marked))
-        fixed[found] = False
-        doubles = np.ascontiguousarray(rows[:, found]).view("<f8")
-        numbers.append(doubles.reshape(len(data), size).astype(np.float64, copy=False))
-    return numbers if (rows[:, fixed] == plain[fixed]).all() else None
-
-
-def _with_numbers(joint_state: Any, arrays: Iterable[Array]) -> NDArray[np.uint8]:
-    """The serialised message with the stamp 0 and these positions, velocities and efforts."""
-    stamp = Message["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    header = Message["std_msgs/msg/Header"](stamp=stamp, frame_id=joint_state.header.frame_id)
-    message = Message[JOINT_STATE](header, joint_state.name, *arrays)
-    return np.frombuffer(STORE.serialize_cdr(message, JOINT_STATE), np.uint8)

@@ -13,7 +13,6 @@ from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
@@ -21,7 +20,7 @@ from rosbags.rosbag2 import WriterError
 from ..errors import BagError
 from ..master import Experiment, Sample
 from . import provenance
-from .messages import JOINT_STATES, NANOSECONDS, STORE, Messages
+from .messages import JOINT_STATES, NANOSECONDS, STORE, Messages, Serialised
 from .storage import BATCH_SIZE, STORAGES, BagWriter, is_being_written, lock, sync
 
 RESERVE = "reserve"
@@ -101,7 +100,7 @@ class Bag:
             raise BagError(f"cannot write the bag '{self.path}': {error}") from error
         except (OSError, sqlite3.Error) as error:
             raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
-        self._queue: deque[tuple[Connection, int, bytes | memoryview]] = deque()
+        self._queue: deque[tuple[Connection, int, Serialised]] = deque()
         self._given = self._taken = 0  # bytes, counted by one thread each
         self._due, self._stored = Event(), Event()
         self._closing = self._closed = False
@@ -159,12 +158,10 @@ class Bag:
             shutil.rmtree(self.path, ignore_errors=True)
             raise
 
-    def _give(self, messages: Iterable[tuple[str, Any]], stamp: int) -> None:
+    def _give(self, messages: Iterable[tuple[str, Serialised]], stamp: int) -> None:
         """Queue messages for the thread."""
-        for topic, message in messages:
-            connection = self._connections[topic]
-            data = STORE.serialize_cdr(message, connection.msgtype)
-            self._queue.append((connection, stamp, data))
+        for topic, data in messages:
+            self._queue.append((self._connections[topic], stamp, data))
             self._given += len(data)
 
     def _keep_storing(self) -> None:
