@@ -41,8 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status: int = options.verb(options)
         if sys.stdout is not None:
             sys.stdout.flush()
+        if status == INTERRUPTED:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process is at its end
         return status
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         return _fail("interrupted", INTERRUPTED)
     except TwoDofError as error:
         return _fail(str(error))
@@ -229,14 +232,18 @@ def _run(options: argparse.Namespace) -> int:
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Whether a signal asked the run to end; read between steps, so that a step is never cut.
 
-    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second Ctrl-C interrupts at once.
+    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once;
+    more are ignored, as all that is left is closing the bag.
     """
     asked = False
 
-    def ask(number: int, _frame: object) -> None:
+    def ask(_number: int, _frame: object) -> None:
         nonlocal asked
+        if asked:
+            for number in SIGNALS:
+                signal.signal(number, signal.SIG_IGN)
+            raise KeyboardInterrupt
         asked = True
-        signal.signal(number, before[signal.Signals(number)])
 
     before = {number: signal.signal(number, ask) for number in SIGNALS}
     try:

@@ -102,17 +102,16 @@ class Bag:
             raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
         self._queue: deque[tuple[Connection, int, Serialised]] = deque()
         self._given = self._taken = 0  # bytes, counted by one thread each
-        self._due, self._stored = Event(), Event()
+        self._due, self._stored, self._ended = Event(), Event(), Event()
         self._closing = self._closed = False
         self._failure: Exception | None = None
-        self._thread = Thread(target=self._keep_storing, name="bag writer")
-        self._thread.start()
+        Thread(target=self._keep_storing, name="bag writer").start()
         return self
 
     def write(self, sample: Sample) -> None:
         """Write one sample: one JointState, and the scene's messages."""
         if self._failure is not None:
-            self._thread.join()
+            self._ended.wait()
             raise self._error(self._failure) from self._failure
         stamp = self._start + round(sample.k * self._run.step * NANOSECONDS)
         if first := not self._given:
@@ -126,7 +125,7 @@ class Bag:
     def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
         self._closing = True
         self._due.set()
-        self._thread.join()  # if this is interrupted, the thread ends its work all the same
+        self._ended.wait()  # interrupted or not, the thread ends its work; Thread.join would not
         if self._failure is not None and not isinstance(exception, BagError):
             raise self._error(self._failure) from self._failure
 
@@ -182,8 +181,9 @@ class Bag:
         except Exception as error:
             self._failure = error
         finally:
-            self._stored.set()
             os.close(self._lock)
+            self._stored.set()
+            self._ended.set()
 
     def _store(self) -> None:
         while self._queue:

@@ -1,0 +1,190 @@
+"""Every end of a run is a clean end: signals, a full disk, a folder or a reader that goes."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bags import START, assert_consistent, both_storages, read_with_rosbags
+
+from twodof.cli import main
+
+TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+ENDLESS = ["--stop-time", "1e5", "--stamp-start", str(START)]
+
+
+def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
+    """A run that has written its first sample."""
+    command = [*TWODOF, "run", str(fmu), "-o", str(bag), *ENDLESS, *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while not (bag / "reserve").exists():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    time.sleep(0.3)
+    return process
+
+
+def whole(fmu: Path, folder: Path, n: int) -> list[object]:
+    """The first n messages of a run that nothing disturbs."""
+    stop = str((n - 1) * 0.01)
+    options = ["--stop-time", stop, "--stamp-start", str(START), "-o", str(folder / "whole")]
+    assert main(["run", str(fmu), *options]) == 0
+    return list(read_with_rosbags(folder / "whole"))
+
+
+SIGNALS = {
+    "Ctrl-C": [signal.SIGINT],
+    "Ctrl-C twice": [signal.SIGINT] * 2,
+    "Ctrl-C in anger": [signal.SIGINT] * 30,
+    "terminated": [signal.SIGTERM],
+    "terminal closed": [signal.SIGHUP],
+    "terminated and interrupted": [signal.SIGTERM, signal.SIGINT, signal.SIGINT],
+}
+
+
+@both_storages
+@pytest.mark.parametrize("pace", ["", "--realtime"])
+@pytest.mark.parametrize("signals", SIGNALS.values(), ids=SIGNALS)
+def test_signals_leave_a_complete_bag(
+    native_path: Path, tmp_path: Path, storage: str, pace: str, signals: list[signal.Signals]
+) -> None:
+    bag = tmp_path / "bag"
+    process = begin(native_path, bag, "--storage", storage, *pace.split())
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(0.003)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "Traceback" not in err and len(err.splitlines()) <= 1
+    kept = assert_consistent(bag, storage)
+    assert kept > 10
+    assert {p.suffix for p in bag.iterdir()} <= {".mcap", ".db3", ".yaml", ".json"}
+    if len(signals) == 1:
+        assert f"({kept} messages" in out
+        assert re.search(rf"stopped +on request at {(kept - 1) * 0.01:g} s", out)
+    if kept < 10_000:
+        assert read_with_rosbags(bag) == whole(native_path, tmp_path, kept)
+
+
+LOOP = """
+import sys
+import twodof
+from twodof.master import Sample
+fmu, path, storage = sys.argv[1:]
+run = twodof.experiment(fmu, stop_time=1e4)
+inputs = dict(run.start_values)
+k = 0
+try:
+    with twodof.Bag(path, run, storage=storage, scene=True) as bag:
+        print("open", flush=True)
+        while True:
+            bag.write(Sample(k, run.time(k), (0.1, k), (0.3, -k), (0.5, 0.6), (0.7, 0.8), inputs))
+            k += 1
+except KeyboardInterrupt:
+    print(k)
+"""
+
+
+@both_storages
+def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(
+    native_path: Path, tmp_path: Path, storage: str
+) -> None:
+    """Python raises KeyboardInterrupt anywhere, in the middle of a write too."""
+    for i in range(6):
+        bag = tmp_path / f"bag{i}"
+        process = subprocess.Popen(
+            [sys.executable, "-c", LOOP, str(native_path), str(bag), storage],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None and process.stdout.readline() == "open\n"
+        time.sleep(0.05 + 0.037 * i)
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=20)
+        assert process.returncode == 0
+        assert_consistent(bag, storage)
+        states = read_with_rosbags(bag)
+        assert [float(*memoryview(s.position).cast("d")[1:]) for s in states] == [
+            *range(len(states))
+        ]
+        assert int(said) <= len(states) <= int(said) + 1
+
+
+@both_storages
+@pytest.mark.parametrize("how", ["removed", "moved"])
+def test_folder_that_goes_under_the_run_ends_it(
+    native_path: Path, tmp_path: Path, storage: str, how: str
+) -> None:
+    bag = tmp_path / "bag"
+    process = begin(native_path, bag, "--storage", storage)
+    if how == "removed":
+        shutil.rmtree(bag)
+    else:
+        bag.rename(tmp_path / "moved")
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    (line,) = err.splitlines()
+    assert line.startswith(f"twodof: error: cannot go on writing the bag '{bag}': it was removed")
+    assert not bag.exists()
+    if how == "moved":
+        assert main(["recover", str(tmp_path / "moved")]) == 0
+        kept = assert_consistent(tmp_path / "moved", storage)
+        few = min(kept, 1000)
+        assert read_with_rosbags(tmp_path / "moved")[:few] == whole(native_path, tmp_path, few)
+
+
+@pytest.mark.long
+@both_storages
+def test_full_disk_costs_a_second_at_most(
+    native_path: Path,
+    tmp_path: Path,
+    disk: Callable[..., Path],
+    storage: str,
+    length: Callable[[int, int], int],
+) -> None:
+    """Somebody else fills the disk to the last byte under a run in real time."""
+    expected = whole(native_path, tmp_path, 1000)
+    rng = random.Random(storage)
+    lost = []
+    for _ in range(length(20, 3)):
+        folder = disk(8192)
+        bag = folder / "bag"
+        process = begin(native_path, bag, "--storage", storage, "--realtime")
+        started = (bag / "run.json").stat().st_mtime
+        time.sleep(rng.uniform(0.0, 2.0))
+        with pytest.raises(OSError, match="No space left"), (folder / "other").open("wb") as other:
+            while True:
+                other.write(bytes(256))
+                other.flush()
+        _, err = process.communicate(timeout=20)
+        ended = time.time()
+        assert process.returncode == 1
+        (line,) = err.splitlines()
+        kept = assert_consistent(bag, storage)
+        assert re.search(rf"the disk is full; it is closed with its first {kept} samples", line)
+        assert read_with_rosbags(bag) == expected[:kept]
+        lost.append(ended - started - kept * 0.01)
+    print(f"{len(lost)} full disks, {storage}: lost at most {max(lost):.2f} s")
+    assert max(lost) <= 1.0
+
+
+@both_storages
+def test_reader_of_the_summary_that_leaves_costs_no_sample(
+    native_path: Path, tmp_path: Path, storage: str
+) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [*TWODOF, "run", str(native_path), "-o", str(tmp_path / "bag"), "--storage", storage]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, timeout=20)
+    os.close(writing)
+    assert done.stderr == "" and done.returncode == 1
+    assert assert_consistent(tmp_path / "bag", storage) == 501
