@@ -26,7 +26,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-MAX_TOPICS = 2000
+MAX_TOPICS = 1000
 MAX_CHUNK = 256 * 1024**2  # bytes; writers cut chunks at 1 to 4 MiB
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, FOOTER = 3, 4, 5, 6, 2  # opcodes of the MCAP specification

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from rosbags.interfaces import Connection, Qos
@@ -22,7 +23,7 @@ from . import provenance
 from .records import Channel, DamageError, read_messages, storage_files
 from .storage import KINDS, BagWriter, is_being_written, lock, sync
 
-MAX_YAML = 256 * 1024  # bytes that all topics' quality of service may have; it is slow to read
+MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
 MAX_DEFINITION = 64 * 1024  # bytes
 NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
 
@@ -143,6 +144,7 @@ class _Topics:
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
         self._connections: dict[Channel, Connection] = {}
+        self._profiles: dict[str, list[Qos]] = {}
         self._yaml = 0
 
     def connection(self, channel: Channel) -> Connection:
@@ -151,29 +153,33 @@ class _Topics:
                 channel.topic,
                 channel.type,
                 msgdef=channel.definition,
-                rihs01=channel.hash or _hash(channel),
+                rihs01=channel.hash or _hash(channel.type, channel.definition),
                 serialization_format=channel.serialization,
                 offered_qos_profiles=self._qos(channel.qos),
             )
         return self._connections[channel]
 
     def _qos(self, text: str) -> list[Qos]:
-        self._yaml += len(text)
-        if self._yaml > MAX_YAML:
-            return []
-        try:
-            return parse_qos(text)
-        except (ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError):
-            return []  # a player offers its default then
+        """Profiles of a topic; none, so that players offer their default, where it has no sound."""
+        if text not in self._profiles:
+            self._profiles[text] = []
+            self._yaml += len(text)
+            if self._yaml < MAX_YAML:
+                with suppress(
+                    ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError
+                ):
+                    self._profiles[text] = parse_qos(text)
+        return self._profiles[text]
 
 
-def _hash(channel: Channel) -> str:
-    """ROS 2's hash of the type, from the definition that the file carries."""
-    if len(channel.definition) > MAX_DEFINITION:
+@cache
+def _hash(kind: str, definition: str) -> str:
+    """ROS 2's hash of a type, from the definition that the file carries."""
+    if len(definition) > MAX_DEFINITION:
         return NO_HASH
     store = get_typestore(Stores.EMPTY)
     try:
-        store.register(get_types_from_msg(channel.definition, channel.type))
-        return store.hash_rihs01(channel.type)
+        store.register(get_types_from_msg(definition, kind))
+        return store.hash_rihs01(kind)
     except (TypesysError, LookupError, ValueError, RecursionError):
         return NO_HASH
