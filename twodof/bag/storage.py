@@ -23,6 +23,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
 
@@ -60,6 +61,7 @@ class Sqlite3Storage(Sqlite3Writer):
         super().__init__(path, compression)
         self.conn.close()
         self.conn = sqlite3.connect(self.path, check_same_thread=False)
+        self.conn.execute(SYNCHRONOUS[False])
         self.cursor = self.conn.cursor()
         self._rows: list[tuple[int, int, bytes | memoryview]] = []
 
@@ -69,9 +71,8 @@ class Sqlite3Storage(Sqlite3Writer):
 
     def flush(self, sync: bool) -> None:
         """Hand all messages to the operating system, and with ``sync`` to the disk."""
-        if not self.conn.in_transaction:  # what else is new, topics, is in one already
-            # a killed process needs no wait for the disk
-            self.conn.execute(f"PRAGMA synchronous = {'FULL' if sync else 'OFF'}")
+        if sync and not self.conn.in_transaction:  # new topics open one, the next flush waits
+            self.conn.execute(SYNCHRONOUS[True])
         self.conn.executemany(
             "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", self._rows
         )
