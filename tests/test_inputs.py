@@ -139,6 +139,7 @@ TABLES = {
     "quotes": ('"time","x_des[1]"\n0,1\n', [(0.0, {"x_des[1]": 1.0})]),
     "line ends of Windows": ("time,Kn\r\n0,1\r\n", [(0.0, {"Kn": 1.0})]),
     "empty lines": ("time,Kn\n\n0,1\n\n", [(0.0, {"Kn": 1.0})]),
+    "a quote that is open": ('time,Kn\n0,"1\n', [(0.0, {"Kn": 1.0})]),
     "no line end": ("time,Kn\n0,1", [(0.0, {"Kn": 1.0})]),
     "before the start": ("time,Kn\n-1,1\n", [(-1.0, {"Kn": 1.0})]),
     "two rows of one time": ("time,Kn\n1,1\n1,2\n", [(1.0, {"Kn": 1.0}), (1.0, {"Kn": 2.0})]),
@@ -175,6 +176,8 @@ BAD_TABLES = {
     "parameter": ("time,rtol\n0,1\n", "rtol is not an input"),
     "output": ("time,q[1]\n0,1\n", r"q\[1\] is not an input"),
     "no rows": ("time,Kn\n", "has no rows|is empty"),
+    "cell over two lines": ('time,Kn\n0,"1\n1"\n', "row 3: 1 cells, expected 2"),
+    "long cell": ("time,Kn\n0," + "x" * 200, "Kn = 'x{50}' is not a number"),
     "row below an empty line": ("time,Kn\n\n0,high\n", "row 3"),
 }
 

@@ -134,10 +134,10 @@ def test_symbolic_link_out_of_the_folder_is_refused(disk: Path) -> None:
 
 
 def test_mesh_that_cannot_be_read_is_refused(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(path: Path) -> bytes:
+    def fail(path: Path, _mode: str) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "read_bytes", fail)
+    monkeypatch.setattr(Path, "open", fail)
     with pytest.raises(BuildError, match=r"base\.stl.*Permission denied"):
         collect(disk, PACKAGE, "ws")
 

@@ -128,6 +128,9 @@ REFUSED = {
     "negative inertia": (arm(tip=link("tip", inertial(1, 1, 1, -0.1))), "'tip': its inertia"),
     "NaN inertia": (arm(tip=link("tip", inertial(1, "nan"))), "'tip': <inertia ixx='nan'>"),
     "huge inertia": (arm(tip=link("tip", inertial(1, "1e99"))), "'tip': <inertia ixx='1e99'>"),
+    "mass in other digits": (arm(tip=link("tip", inertial("١"))), "'tip': <mass value='١'>"),
+    "mass with an underscore": (arm(tip=link("tip", inertial("1_0"))), "'tip': <mass value='1_0'>"),
+    "nested deeply": (arm("<b>" * 100 + "</b>" * 100), "nested deeper than 100"),
     "no <inertia>": (arm(tip=link("tip", '<inertial><mass value="1"/></inertial>')), "link 'tip'"),
     "no ixy": (arm(tip=link("tip", inertial().replace('ixy="0"', ""))), "link 'tip'"),
     "singular mass matrix, one joint": (
@@ -351,6 +354,19 @@ def test_shapes_have_no_effect_on_the_mechanism(
         loaded = load_robot(arm(tip=link("tip", inside)), "tip", "xyz")
         assert loaded.model.inertias[2].mass == 1.0
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("inside", ["", '<mass value="1"/>', inertial(1).replace("izz", "i")])
+def test_inertial_of_the_base_has_no_effect(inside: str, capfd: pytest.CaptureFixture[str]) -> None:
+    base = link("base", inside if "inertial" in inside else f"<inertial>{inside}</inertial>")
+    loaded = load_robot(arm(base=base), "tip", "xyz")
+    assert [body.mass for body in loaded.model.inertias] == [0.0, 1.0, 1.0]
+    assert capfd.readouterr().err == ""
+
+
+def test_elements_may_be_nested() -> None:
+    deep = "<gazebo>" * 99 + "</gazebo>" * 99
+    assert load_robot(arm(deep), "tip", "xyz").joints == ("shoulder", "elbow")
 
 
 def test_mass_of_a_moving_body_may_be_in_what_is_fixed_to_it() -> None:

@@ -17,6 +17,7 @@ from . import __version__
 from .data import data_file
 from .documentation import documentation
 from .errors import ZIP_ERRORS, BuildError
+from .files import check_archive, read_file
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
@@ -30,6 +31,7 @@ DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
+MAX_URDF = 8 * 1024**2
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ def _flavour(
 
 def _read_urdf(path: Path) -> str:
     try:
-        return path.read_text("utf-8")
+        return read_file(path, MAX_URDF).decode("utf-8")
     except OSError as error:
         raise BuildError(f"cannot read the URDF '{path}': {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -203,9 +205,12 @@ def _rest(robot: Robot) -> tuple[float, ...]:
 def _holds(path: Path, description: bytes, platforms: Sequence[str]) -> bool:
     """Whether the file is already this FMU; its guid is a digest of all that matters."""
     try:
+        check_archive(path)
         with zipfile.ZipFile(path) as archive:
             found = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
-            return archive.read("modelDescription.xml") == description and found == set(platforms)
+            with archive.open("modelDescription.xml") as file:
+                same = file.read(len(description) + 1) == description
+            return same and found == set(platforms)
     except (*ZIP_ERRORS, KeyError):
         return False
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import logging
+import os
 import re
 import stat
 import tempfile
@@ -22,13 +24,18 @@ from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ModelDescription, ScalarVariable
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
+from .files import check_archive
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 
 MAX_UNZIPPED = 2 * 1024**3
-MAX_DESCRIPTION = 64 * 1024**2
+MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
+MAX_RESOURCE = 256 * 1024**2
+MAX_DEPTH = 50  # of folders in folders
+MAX_WRAPPER = 16 * 1024**2  # it has 0.3 MiB
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,8 @@ def load_fmu(path: str | Path) -> Fmu:
     path = Path(path)
     xml, members = _read(path)
     try:
-        description = fmpy.read_model_description(str(path), validate=True)
+        with path.open("rb") as file:  # by its name FMPy would take an XML file too
+            description = fmpy.read_model_description(file, validate=True)
         root = ET.fromstring(xml)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
         raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
@@ -143,6 +151,7 @@ class Instance:
         )
         addLoggerProxy(byref(self._callbacks))
         identifier = fmu.description.coSimulation.modelIdentifier
+        working_folder = os.getcwd()
         try:
             self._slave = fmi2.FMU2Slave(
                 guid=fmu.guid,
@@ -153,6 +162,8 @@ class Instance:
             self._slave.instantiate(callbacks=self._callbacks, loggingOn=True)
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
+        finally:
+            os.chdir(working_folder)  # FMPy leaves it where a library cannot be loaded
 
     def initialise(
         self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
@@ -238,7 +249,7 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
                 archive.extractall(folder)
         except ZIP_ERRORS as error:
             raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
-        _check_wrapper_reads(fmu, Path(folder))
+        _check_python_wrapper(fmu, Path(folder))
         instance = Instance(fmu, Path(folder))
         try:
             yield instance
@@ -246,43 +257,61 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
             instance.free()
 
 
-def _check_wrapper_reads(fmu: Fmu, folder: Path) -> None:
-    """pythonfmu's wrapper decodes no escape but %20, and crashes where it finds no resources."""
-    escapes = folder.as_uri().replace("%20", "")
-    if "%" in escapes and fmu.description.coSimulation.needsExecutionTool:
+def _check_python_wrapper(fmu: Fmu, folder: Path) -> None:
+    """pythonfmu's wrapper decodes no escape but %20, and crashes where it finds no module."""
+    identifier = fmu.description.coSimulation.modelIdentifier
+    library = folder / "binaries" / fmpy.platform / (identifier + fmpy.sharedLibraryExtension)
+    with library.open("rb") as file:
+        if b"slavemodule.txt" not in file.read(MAX_WRAPPER):
+            return  # it is no such wrapper
+    if "%" in folder.as_uri().replace("%20", ""):
         raise FmuError(
             f"the temporary folder '{folder.parent}' has characters that the FMU's Python wrapper"
             " cannot read; set TMPDIR to a folder with a plain name"
         )
+    if not _names_a_module(folder / "resources"):
+        raise FmuError(f"'{fmu.path}': resources/slavemodule.txt does not name a module beside it")
+
+
+def _names_a_module(resources: Path) -> bool:
+    try:
+        name = (resources / "slavemodule.txt").read_text("utf-8").partition("\n")[0]
+        return "/" not in name and (resources / f"{name}.py").is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def read_resource(fmu: Fmu, name: str) -> bytes | None:
     """A file of the FMU's resources/ folder, None where it has no such file."""
     try:
         with zipfile.ZipFile(fmu.path) as archive:
-            return archive.read(f"resources/{name}")
+            return _content(archive, f"resources/{name}", MAX_RESOURCE)
     except KeyError:
         return None
     except ZIP_ERRORS as error:
         raise FmuError(f"cannot read resources/{name} of '{fmu.path}': {error}") from error
 
 
+def read_urdf(fmu: Fmu) -> str | None:
+    """The text of resources/robot.urdf, None where there is none."""
+    content = read_resource(fmu, "robot.urdf")
+    try:
+        return None if content is None else content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise FmuError(f"'{fmu.path}': resources/robot.urdf is not UTF-8 text") from error
+
+
 def _read(path: Path) -> tuple[bytes, list[str]]:
     """modelDescription.xml and the members' names, after the checks that make unzipping safe."""
     try:
+        check_archive(path)
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             for member in members:
-                name = PurePosixPath(member.filename)
-                link = stat.S_ISLNK(member.external_attr >> 16)
-                if link or name.is_absolute() or ".." in name.parts or "\\" in member.filename:
-                    raise FmuError(f"'{path}' is unsafe: its member '{name}' leaves its folder")
+                _check_member(path, member)
             if sum(member.file_size for member in members) > MAX_UNZIPPED:
                 raise FmuError(f"'{path}' is unsafe: unzipped it exceeds {MAX_UNZIPPED} bytes")
-            description = archive.getinfo("modelDescription.xml")
-            if description.file_size > MAX_DESCRIPTION:
-                raise FmuError(f"'{path}': modelDescription.xml is too large")
-            xml = archive.read(description)
+            xml = _content(archive, "modelDescription.xml", MAX_DESCRIPTION)
     except FileNotFoundError as error:
         raise FmuError(f"there is no FMU '{path}'; build one with 'twodof build'") from error
     except OSError as error:
@@ -291,9 +320,43 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
         raise FmuError(f"'{path}' is no FMU: it has no modelDescription.xml") from error
     except ZIP_ERRORS as error:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
-    if re.search(rb"<!\s*(DOCTYPE|ENTITY)", xml) or b"\0" in xml[:4]:
+    if not _is_plain(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, [member.filename for member in members]
+
+
+def _is_plain(xml: bytes) -> bool:
+    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
+    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
+    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
+    encoding = declared[1] if declared else b"utf-8"
+    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding.lower())
+    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
+    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
+
+
+def _check_member(path: Path, member: zipfile.ZipInfo) -> None:
+    name = PurePosixPath(member.filename)
+    link = stat.S_ISLNK(member.external_attr >> 16)
+    outside = name.is_absolute() or ".." in name.parts or "\\" in member.filename
+    if link or outside or not member.filename:
+        raise FmuError(f"'{path}' is unsafe: its member '{name}' leaves its folder")
+    if len(name.parts) > MAX_DEPTH:
+        raise FmuError(f"'{path}' is unsafe: its folders are nested deeper than {MAX_DEPTH}")
+    if member.compress_type not in METHODS:
+        raise FmuError(
+            f"'{path}': its member '{name}' is compressed by method {member.compress_type};"
+            " FMI allows to store and to deflate"
+        )
+
+
+def _content(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    """A member, of which no more is unzipped than the directory says that there is."""
+    member = archive.getinfo(name)
+    if member.file_size > most:
+        raise FmuError(f"'{archive.filename}': {name} is larger than {most} bytes")
+    with archive.open(member) as file:
+        return file.read(member.file_size)
 
 
 def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
@@ -301,7 +364,7 @@ def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
     found = set()
     for member in members:
         parts = PurePosixPath(member).parts
-        if len(parts) == 3 and parts[0] == "binaries":
+        if not member.endswith("/") and len(parts) == 3 and parts[0] == "binaries":
             suffix = suffixes.get(parts[1].rstrip("0123456789"), "")
             if parts[2] == identifier + suffix:
                 found.add(parts[1])

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+from .files import check_file
 from .fmu import Fmu
 
 Value = float | bool
@@ -17,6 +18,9 @@ Setting = Any
 """A number, a Boolean, or a sequence or array of numbers; checked by ``resolve``."""
 Changes = list[tuple[float, dict[str, Value]]]
 """Times in s, ascending, and the inputs that take new values there."""
+
+MAX_TABLE = 64 * 1024**2
+MAX_CELLS = 1_000_000  # all of them go into the bag's run.json
 
 
 def parse_settings(texts: Iterable[str]) -> dict[str, Setting]:
@@ -103,31 +107,26 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     Raises:
         InputError: naming the file, and the row or column at fault.
     """
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            lines = enumerate(csv.reader(file), start=1)
-            rows = [(number, row) for number, row in lines if any(map(str.strip, row))]
-    except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"'{path}' is not a CSV file: {error}") from error
-    if len(rows) < 2:
-        raise InputError(f"'{path}' {'has no rows' if rows else 'is empty'}")
-    header = [cell.strip() for cell in rows[0][1]]
+    rows = _rows(path)
+    _, names = next(rows, (0, None))
+    if names is None:
+        raise InputError(f"'{path}' is empty")
+    header = [cell.strip() for cell in names]
     if "time" not in header:
         raise InputError(f"'{path}' has no column 'time'")
     for i, name in enumerate(header):
         if name in header[:i]:
-            raise InputError(f"'{path}' has two columns '{name}'")
+            raise InputError(f"'{path}' has two columns '{name:.50}'")
         if name == "time":
             continue
         if name not in fmu.variables:
             known = [element for group in fmu.groups("input").values() for element in group]
-            raise InputError(f"'{path}': there is no variable '{name}'{_suggestion(name, known)}")
+            suggestion = _suggestion(name, known)
+            raise InputError(f"'{path}': there is no variable '{name:.50}'{suggestion}")
         if fmu.variables[name].causality != "input":
             raise InputError(f"'{path}': {name} is not an input")
     changes: Changes = []
-    for number, row in rows[1:]:
+    for number, row in rows:
         if len(row) != len(header):
             raise InputError(f"'{path}' row {number}: {len(row)} cells, expected {len(header)}")
         values: dict[str, Value] = {}
@@ -136,12 +135,33 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
                 values[name] = float(cell)
             except ValueError:
                 raise InputError(
-                    f"'{path}' row {number}: {name} = '{cell}' is not a number"
+                    f"'{path}' row {number}: {name} = '{cell:.50}' is not a number"
                 ) from None
             if not math.isfinite(values[name]):
-                raise InputError(f"'{path}' row {number}: {name} = {cell} is not finite")
+                raise InputError(f"'{path}' row {number}: {name} = {cell:.50} is not finite")
         time = values.pop("time")
         if changes and time < changes[-1][0]:
             raise InputError(f"'{path}' row {number}: time {time:g} is before the row above")
         changes.append((time, values))
+    if not changes:
+        raise InputError(f"'{path}' has no rows")
     return changes
+
+
+def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
+    """Rows that are not empty, with their line numbers: a line is a row, also inside quotes."""
+    cells = 0
+    try:
+        check_file(path, MAX_TABLE)
+        with open(path, encoding="utf-8-sig") as file:
+            for number, line in enumerate(file, start=1):
+                cells += 1 + line.count(",")
+                if cells > MAX_CELLS:
+                    raise InputError(f"'{path}' has more than {MAX_CELLS} cells")
+                for row in csv.reader([line]):
+                    if any(map(str.strip, row)):
+                        yield number, row
+    except OSError as error:
+        raise InputError(f"cannot read '{path}': {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"'{path}' is not a CSV file: {error}") from error

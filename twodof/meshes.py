@@ -9,6 +9,9 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 from .errors import BuildError
+from .files import read_file
+
+MAX_MESHES = 256 * 1024**2  # bytes of all meshes together
 
 
 def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str, dict[str, bytes]]:
@@ -33,8 +36,8 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
             try:
                 path = _find(uri, folder, mesh_dir)
                 names[uri] = _inside(path, files)
-                files[names[uri]] = path.read_bytes()
-            except (OSError, ValueError) as error:
+                files[names[uri]] = read_file(path, MAX_MESHES - sum(map(len, files.values())))
+            except (OSError, ValueError, RuntimeError) as error:  # the last: links in a circle
                 reason = (isinstance(error, OSError) and error.strerror) or error
                 raise BuildError(f"mesh '{uri}' cannot be read: {reason}") from error
         mesh.set("filename", f"package://{names[uri]}")

@@ -9,7 +9,8 @@ from typing import Any
 
 from .. import __version__
 from ..errors import BagError
-from ..fmu import read_resource
+from ..files import read_file
+from ..fmu import read_urdf
 from ..master import Experiment
 
 FILE = "run.json"
@@ -24,7 +25,6 @@ def provenance(run: Experiment, stamp_start: int, command_line: str) -> str:
     Writers of YAML, which holds it too, fold at spaces, and not all do it right.
     """
     fmu = run.fmu
-    urdf = read_resource(fmu, "robot.urdf")
     content = {
         "format": FORMAT,
         "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
@@ -44,7 +44,7 @@ def provenance(run: Experiment, stamp_start: int, command_line: str) -> str:
             **{name: importlib.metadata.version(name) for name in PACKAGES},
         },
         "command_line": command_line,
-        "urdf": None if urdf is None else urdf.decode(),
+        "urdf": read_urdf(fmu),
     }
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020")
 
@@ -56,12 +56,10 @@ def read_provenance(path: Path) -> dict[str, Any]:
         BagError: it cannot be read, or is not what was written.
     """
     file = path / FILE
-    if not file.is_file():
-        return {}
     try:
-        if file.stat().st_size > MAX_SIZE:
-            raise ValueError("it is too large")
-        found = json.loads(file.read_text("utf-8"))
+        found = json.loads(read_file(file, MAX_SIZE).decode("utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
     except (OSError, ValueError, RecursionError) as error:
         raise BagError(f"cannot read '{file}': {error}") from error
     if not isinstance(found, dict) or found.get("format") != FORMAT or "fmu" not in found:

@@ -19,11 +19,13 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..errors import BagError
+from ..files import read_file
 from . import provenance
 from .records import Channel, DamageError, read_messages, storage_files
 from .storage import KINDS, BagWriter, is_being_written, lock, sync
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
+MAX_METADATA = 64 * 1024**2  # bytes
 MAX_DEFINITION = 64 * 1024  # bytes
 NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
 
@@ -103,12 +105,11 @@ def _workshop(found: Path, folder: Path) -> Iterator[Path]:
 def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:
     """Messages by topic of a bag that lacks nothing, else None."""
     try:
-        with (folder / "metadata.yaml").open(encoding="utf-8", errors="replace") as content:
-            metadata = content.read(provenance.MAX_SIZE)
+        metadata = read_file(folder / "metadata.yaml", MAX_METADATA).decode("utf-8", "replace")
         counts: Counter[str] = Counter()
         for file in files:
             counts.update(channel.topic for channel, _, _ in read_messages(file))
-    except (FileNotFoundError, DamageError):
+    except (OSError, DamageError):
         return None
     told = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
     return dict(counts) if told and int(told[1]) == counts.total() else None

@@ -18,11 +18,14 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
+from ..files import read_file
 from ..master import Experiment, Sample
 from . import provenance
 from .messages import JOINT_STATES, NANOSECONDS, STORE, Messages, Serialised
 from .storage import BATCH_SIZE, STORAGES, BagWriter, is_being_written, lock, sync
 
+MAX_METADATA = 64 * 1024**2  # bytes
+PROVENANCE_KEY = "twodof"
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
@@ -122,6 +125,17 @@ class Bag:
             self._due.set()
             self._stored.wait()
 
+    def amend(self, run: Experiment) -> None:
+        """Put another account of the run into the provenance, of what was not known before it."""
+        text = provenance.provenance(run, self._start, self._command_line)
+        self._writer.set_custom_data(PROVENANCE_KEY, text)
+        file = self.path / provenance.FILE
+        try:
+            file.with_suffix(".new").write_text(text + "\n", "utf-8")
+            file.with_suffix(".new").replace(file)
+        except OSError as error:
+            raise BagError(f"cannot write '{file}': {_reason(error)}") from error
+
     def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
         self._closing = True
         self._due.set()
@@ -132,7 +146,7 @@ class Bag:
     def _open(self, text: str) -> None:
         """Create the bag's folder, or leave nothing of it."""
         try:
-            self._writer.set_custom_data("twodof", text)
+            self._writer.set_custom_data(PROVENANCE_KEY, text)
             self._writer.open()
             (self.path / provenance.FILE).write_text(text + "\n", "utf-8")
             with (self.path / RESERVE).open("wb") as reserve:
@@ -245,8 +259,7 @@ def _check_free(path: Path, overwrite: bool) -> None:
 def _is_bag(path: Path) -> bool:
     """A folder with rosbag2's metadata, or with our provenance where the writer died."""
     try:
-        with (path / "metadata.yaml").open("rb") as metadata:
-            start = b"rosbag2_bagfile_information:"
-            return metadata.read(len(start)) == start
+        metadata = read_file(path / "metadata.yaml", MAX_METADATA)
+        return metadata.startswith(b"rosbag2_bagfile_information:")
     except OSError:
         return bool(provenance.read_provenance(path))

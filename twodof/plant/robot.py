@@ -19,6 +19,7 @@ UNBOUNDED = 1.7976931348623157e308
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 MAX_LINKS = 1000
 MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
+MAX_DEPTH = 100  # of elements in elements
 LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
 
 
@@ -118,6 +119,11 @@ def _parse(urdf: str) -> ET.Element:
         raise RobotError(f"the URDF is not XML: {error}") from error
     if tree.tag != "robot":
         raise RobotError(f"the URDF's root element is <{tree.tag}>, expected <robot>")
+    depth, level = 1, [tree]
+    while level := [child for element in level for child in element]:
+        depth += 1
+        if depth > MAX_DEPTH:  # what writes XML goes down by recursion
+            raise RobotError(f"the URDF's elements are nested deeper than {MAX_DEPTH}")
     return tree
 
 
@@ -185,7 +191,7 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
         for found in element.iter(tag):
             for key, text in found.attrib.items():
                 try:
-                    numbers = [float(word) for word in text.split()]
+                    numbers = [_number(word) for word in text.split()]
                 except ValueError:
                     numbers = []
                 if len(numbers) != counts.get(key, 1):
@@ -194,6 +200,13 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
                     if tag == "limit" and not any(map(math.isnan, numbers)):
                         continue  # a huge limit is a common way to write "none"
                     raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not finite or too large")
+
+
+def _number(word: str) -> float:
+    """A number that urdfdom reads as Python does: without underscores and other digits."""
+    if not word.isascii() or "_" in word:
+        raise ValueError(word)
+    return float(word)
 
 
 def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> str:
@@ -250,11 +263,8 @@ def _check_body(
 
 def _check_inertia(link: str, inertial: ET.Element) -> float:
     """The link's mass, after the checks."""
-    for tag, keys in (("mass", ("value",)), ("inertia", _INERTIA_KEYS)):
-        element = inertial.find(tag)
-        missing = [key for key in keys if element is None or element.get(key) is None]
-        if missing:
-            raise RobotError(f"link '{link}': its <inertial> has no <{tag} {' '.join(missing)}>")
+    if missing := _missing(inertial):
+        raise RobotError(f"link '{link}': its <inertial> has no {missing}")
     mass = _attribute(inertial, "mass", "value", 0.0)
     if mass < 0.0:
         raise RobotError(f"link '{link}': negative mass {mass:g} kg")
@@ -273,6 +283,16 @@ def _check_inertia(link: str, inertial: ET.Element) -> float:
 _INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
+def _missing(inertial: ET.Element) -> str:
+    """The first element and those of its attributes that are not there; "" where all are."""
+    for tag, keys in (("mass", ("value",)), ("inertia", _INERTIA_KEYS)):
+        element = inertial.find(tag)
+        missing = [key for key in keys if element is None or element.get(key) is None]
+        if missing:
+            return f"<{tag} {' '.join(missing)}>"
+    return ""
+
+
 def _mechanism(tree: ET.Element) -> ET.Element:
     """The URDF of the bare mechanism: inertias, joints, limits, and nothing else.
 
@@ -282,7 +302,7 @@ def _mechanism(tree: ET.Element) -> ET.Element:
     bare = ET.Element("robot", name=tree.get("name") or "robot")
     for link in tree.findall("link"):
         copy = ET.SubElement(bare, "link", name=str(link.get("name")))
-        copy.extend(link.findall("inertial"))
+        copy.extend(e for e in link.findall("inertial") if not _missing(e))
     for joint in tree.findall("joint"):
         kind = str(joint.get("type"))
         copy = ET.SubElement(bare, "joint", name=str(joint.get("name")), type=kind)

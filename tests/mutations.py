@@ -1,0 +1,673 @@
+"""Seeded mutations of files: blind ones of bytes, and ones that know the structure of a format.
+
+Each takes a ``random.Random`` and the bytes of a good file and gives the bytes of another. They
+use the standard library alone, and no code of the package.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import re
+import sqlite3
+import stat
+import struct
+import tempfile
+import xml.etree.ElementTree as ET
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from random import Random
+from typing import Any
+
+Mutation = Callable[[Random, bytes], bytes]
+
+NUMBERS = (
+    "", "0", "-0.0", "-1", "3", "nan", "inf", "-inf", "INF", "1e308", "-1e308", "1e999", "1e-320",
+    "1e9", "1e15", "99999999999999999999", "18446744073709551615", "-9223372036854775809",
+    "0x10", "1,5", "1_0", "1 2", "1 2 3", "1e308 1e308 1e308", "true", "None", "٣", "1" * 5000,
+)  # fmt: skip
+PATHS = (
+    "package://../../secret", "package://meshes/../../../secret", "package://%2e%2e/%2e%2e/secret",
+    "../../secret", "/etc/passwd", "file:///etc/passwd", "file:///dev/zero", "/dev/zero",
+    "file:///proc/self/mem", "package://meshes/", "package://", "http://[", "C:\\x", "\x7f",
+    "package://meshes/" + "a" * 5000, "package://" + "a/" * 3000, "package://meshes/%00",
+)  # fmt: skip
+WORDS = (
+    " ", "x", "x" * 100_000, "ö→𝄞", "\u202eabc", "a\nb", "a\tb", "%s%n%d", "${x}", "'\"<>&",
+    "__init__", "..", "/", "\\", "2.0", "3.0", "1.0", "input", "output", "parameter", "local",
+    "Real", "Integer", "revolute", "prismatic", "continuous", "fixed", "floating", "planar",
+)  # fmt: skip
+
+
+def value(rng: Random) -> str:
+    return rng.choice(rng.choice((NUMBERS, NUMBERS, PATHS, WORDS)))
+
+
+def several(*edits: Mutation, most: int = 3) -> Mutation:
+    """One to ``most`` edits, one after the other."""
+
+    def mutate(rng: Random, data: bytes) -> bytes:
+        for _ in range(rng.randint(1, most)):
+            data = rng.choice(edits)(rng, data)
+        return data
+
+    return mutate
+
+
+# --- bytes ---
+
+
+def _region(rng: Random, data: bytes) -> tuple[int, int]:
+    start = rng.randrange(len(data) + 1)
+    most = rng.choice((1, 4, 64, 4096, len(data)))
+    return start, min(len(data), start + rng.randint(0, most))
+
+
+def flip(rng: Random, data: bytes) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 8)) if data else 0):
+        changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def overwrite(rng: Random, data: bytes) -> bytes:
+    """An integer of 1 to 8 bytes that is often one too many."""
+    size = rng.choice((1, 2, 4, 8))
+    number = rng.choice((0, 1, 255, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1))
+    at = rng.randrange(len(data) + 1)
+    new = (number % 256**size).to_bytes(size, rng.choice(("little", "big")))
+    return data[:at] + new + data[at + size :]
+
+
+def delete(rng: Random, data: bytes) -> bytes:
+    start, end = _region(rng, data)
+    return data[:start] + data[end:]
+
+
+def duplicate(rng: Random, data: bytes) -> bytes:
+    start, end = _region(rng, data)
+    return data[:end] + data[start:end] * rng.randint(1, 3) + data[end:]
+
+
+def splice(rng: Random, data: bytes) -> bytes:
+    start, end = _region(rng, data)
+    at = rng.randrange(len(data) + 1)
+    return data[:at] + data[start:end] + data[at + (end - start) :]
+
+
+def fill(rng: Random, data: bytes) -> bytes:
+    start, end = _region(rng, data)
+    new = rng.choice((b"\0", b"\xff", b" ", b"<"))
+    return data[:start] + new * (end - start) + data[end:]
+
+
+def noise(rng: Random, data: bytes) -> bytes:
+    at = rng.randrange(len(data) + 1)
+    return data[:at] + rng.randbytes(rng.choice((1, 16, 1000))) + data[at:]
+
+
+def truncate(rng: Random, data: bytes) -> bytes:
+    return data[: rng.randrange(len(data) + 1)]
+
+
+def magic(rng: Random, data: bytes) -> bytes:
+    new = rng.choice((b"PK\3\4", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"<?xml", b"\0" * 8))
+    return new + data[len(new) :]
+
+
+def nothing(rng: Random, data: bytes) -> bytes:
+    return data
+
+
+blind = several(flip, overwrite, delete, duplicate, splice, fill, noise, truncate, magic)
+
+
+# --- text ---
+
+
+def _token(rng: Random, data: bytes) -> bytes:
+    """A word or a number replaced."""
+    found = list(re.finditer(rb"[\w.+-]+", data))
+    if not found:
+        return data
+    token = rng.choice(found)
+    return data[: token.start()] + value(rng).encode() + data[token.end() :]
+
+
+def _lines(rng: Random, data: bytes) -> bytes:
+    lines = data.splitlines(keepends=True) or [b""]
+    i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
+    kind = rng.randrange(4)
+    if kind == 0:
+        del lines[i]
+    elif kind == 1:
+        lines.insert(j, lines[i])
+    elif kind == 2:
+        lines[i], lines[j] = lines[j], lines[i]
+    else:
+        lines[i] = rng.choice((b" ", b"\t", b"  - ", b"#")) + lines[i]
+    return b"".join(lines)
+
+
+def _encoding(rng: Random, data: bytes) -> bytes:
+    change = rng.choice(("utf-16", "utf-32", "utf-7", "cp037", "latin-1", "BOM", "NUL", "ends"))
+    if change == "BOM":
+        return b"\xef\xbb\xbf" + data
+    if change == "NUL":
+        at = rng.randrange(len(data) + 1)
+        return data[:at] + b"\0" + data[at:]
+    if change == "ends":
+        return data.replace(b"\n", rng.choice((b"\r", b"\r\n", b"\n\n", b"", b"\x0b")))
+    return data.decode("utf-8", "replace").encode(change, "replace")
+
+
+text = several(_token, _token, _lines, _encoding, flip, truncate, noise)
+
+
+# --- XML ---
+
+
+def _set_value(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    holder = element if element.attrib else rng.choice([e for e in root.iter() if e.attrib])
+    holder.set(rng.choice(list(holder.attrib)), value(rng))
+
+
+def _take_value(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    """The value that another element has: one name twice, two parents, parents in a circle."""
+    holders = [e for e in root.iter() if e.attrib]
+    holder = element if element.attrib else rng.choice(holders)
+    key = rng.choice(list(holder.attrib))
+    holder.set(key, rng.choice([e.get(key, "") for e in holders if key in e.attrib]))
+
+
+def _drop_attribute(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    if element.attrib:
+        del element.attrib[rng.choice(list(element.attrib))]
+
+
+def _drop(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    parent.remove(element)
+
+
+def _copy(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    for _ in range(rng.choice((1, 1, 3, 200))):
+        parent.insert(rng.randrange(len(parent) + 1), copy.deepcopy(element))
+
+
+def _move(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    parent.remove(element)
+    rng.choice(list(root.iter())).append(element)
+
+
+def _rename(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    others = [e.tag for e in root.iter()]
+    element.tag = rng.choice((rng.choice(others), "x", "{http://x}y", element.tag.upper()))
+
+
+def _write_text(rng: Random, root: ET.Element, element: ET.Element, parent: ET.Element) -> None:
+    element.text = value(rng)
+
+
+TREE_EDITS = (
+    _set_value, _set_value, _set_value, _take_value, _take_value, _drop_attribute, _drop, _copy,
+    _move, _rename, _write_text,
+)  # fmt: skip
+
+
+def _xml_tree(rng: Random, data: bytes) -> bytes:
+    """One to three changes of elements and attributes."""
+    try:
+        root = ET.fromstring(data)
+        for _ in range(rng.randint(1, 3)):
+            parents = {child: parent for parent in root.iter() for child in parent}
+            element = rng.choice(list(parents) or [root])
+            rng.choice(TREE_EDITS)(rng, root, element, parents.get(element, root))
+        return ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    except (ET.ParseError, ValueError, LookupError, RecursionError):
+        return data  # an earlier edit has left no tree to change
+
+
+def _xml_text(rng: Random, data: bytes) -> bytes:
+    """What a tree cannot say: document types, entities, declarations, depth, width."""
+    first = data.find(b"\n") + 1
+    inside = data.find(b">", first) + 1
+    last = data.rfind(b"</")
+    kind = rng.randrange(8)
+    if kind == 0:
+        entity = b'<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]>'
+        return data[:first] + entity + data[first:last] + b"&b;" + data[last:]
+    if kind == 1:
+        entity = b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+        return data[:first] + entity + data[first:last] + b"&a;" + data[last:]
+    if kind == 2:
+        name = rng.choice((b"utf-16", b"utf-7", b"cp037", b"latin-1", b"none", b"utf-8"))
+        body = re.sub(rb"^<\?xml[^>]*\?>", b"", data)
+        return b'<?xml version="1.0" encoding="' + name + b'"?>' + body
+    if kind == 3:
+        depth = rng.choice((10, 300, 3000))
+        return data[:inside] + b"<x>" * depth + b"</x>" * depth + data[inside:]
+    if kind == 4:
+        return data[:inside] + b"<x/>" * rng.choice((10, 30_000)) + data[inside:]
+    if kind == 5:
+        many = b" ".join(b'a%d="1"' % i for i in range(rng.choice((2, 10_000))))
+        return data[:inside] + b"<x " + many + b"/>" + data[inside:]
+    if kind == 6:
+        comment = b"<!--" + b"-" * rng.choice((0, 1, 9)) + b"--><?x y?>"
+        return data[:inside] + comment + data[inside:]
+    return data[:inside] + b"<![CDATA[" + rng.choice((b"]]>", b"x]]>", b"")) + data[inside:]
+
+
+xml = several(_xml_tree, _xml_tree, _xml_tree, _xml_tree, _xml_text, _token, blind, most=2)
+
+
+# --- CSV ---
+
+
+def _cells(rng: Random, data: bytes) -> bytes:
+    rows = [line.split(",") for line in data.decode("utf-8", "replace").splitlines()] or [[""]]
+    row = rng.choice(rows)
+    i = rng.randrange(len(row))
+    kind = rng.randrange(9)
+    if kind <= 1:
+        row[i] = value(rng)
+    elif kind == 2:
+        row[i] = rng.choice(
+            ('"', '"1', '1"2', '"1,2"', "'1'", "\0", ";", "1;2", "x_des[3]", "q[1]")
+        )
+    elif kind == 3:
+        for other in rows:
+            del other[i : i + 1]
+    elif kind == 4:
+        for other in rows:
+            other.insert(i, other[i] if i < len(other) else "0")
+    elif kind == 5:
+        rng.shuffle(rows)
+    elif kind == 6:
+        rows.insert(rng.randrange(len(rows) + 1), list(row) * rng.choice((1, 2, 50_000)))
+    elif kind == 7:
+        rows.extend([list(row)] * rng.choice((1, 20_000)))
+    else:
+        row[i] = row[i] * rng.choice((2, 200_000))
+    return "\n".join(",".join(row) for row in rows).encode()
+
+
+csv = several(_cells, _cells, _cells, _lines, _encoding, _token, blind)
+
+
+# --- zip ---
+
+LOCAL, CENTRAL, END = b"PK\3\4", b"PK\1\2", b"PK\5\6"
+ZIP_FIELDS = {
+    # offset and size of what a reader believes, by record
+    LOCAL: [(4, 2), (6, 2), (8, 2), (10, 4), (14, 4), (18, 4), (22, 4), (26, 2), (28, 2)],
+    CENTRAL: [(6, 2), (8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (32, 2),
+              (34, 2), (38, 4), (42, 4)],
+    END: [(4, 2), (6, 2), (8, 2), (10, 2), (12, 4), (16, 4), (20, 2)],
+}  # fmt: skip
+ZIP_NAMES = (
+    "../evil", "resources/../../evil", "/evil", "//evil", "..\\evil", "C:evil", "C:\\evil", "",
+    ".", "..", "resources", "resources/robot.urdf/x", "modelDescription.xml", "./x", "~/evil",
+    "modelDescription.xml/", "binaries/linux64/../../../evil", "a" * 300, "a/" * 2100 + "b", "a\nb",
+    "\x1b[31m", "con", "ö", "resources/robot.urdf", "binaries/linux64/other.so", "x/", "a\0b",
+)  # fmt: skip
+
+
+def _zip_field(rng: Random, data: bytes) -> bytes:
+    """A field of a header: sizes, offsets, flags (encryption, data descriptors), methods."""
+    kind = rng.choice((LOCAL, CENTRAL, CENTRAL, CENTRAL, END))
+    places = [found.start() for found in re.finditer(re.escape(kind), data)]
+    if not places:
+        return data
+    offset, size = rng.choice(ZIP_FIELDS[kind])
+    at = rng.choice(places) + offset
+    old = int.from_bytes(data[at : at + size], "little")
+    top = 256**size - 1
+    new = rng.choice((0, 1, 8, 9, 12, 14, 93, 95, 99, old ^ 1, old ^ 8, old + 1, old - 1, 2 * old,
+                      old // 2, top, top - 1, top // 2, rng.randrange(top)))  # fmt: skip
+    return data[:at] + (new % (top + 1)).to_bytes(size, "little") + data[at + size :]
+
+
+def _zip_member(rng: Random, data: bytes) -> bytes:
+    """One member more, or one changed."""
+    members = _members(data)
+    if not members:
+        return data
+    name = rng.choice(ZIP_NAMES)
+    victim = rng.choice(list(members))
+    link = (stat.S_IFLNK | 0o777) << 16
+    kind = rng.randrange(6)
+    if kind == 0:
+        return zip_of({**members, name: rng.randbytes(20)})
+    if kind == 1:
+        return zip_of({name if key == victim else key: value for key, value in members.items()})
+    if kind == 2:  # a link, and a member behind it
+        target = rng.choice((b"/", b"..", b"/etc/passwd", b"../../secret", victim.encode()))
+        linked = {"resources/l": target, "resources/l/evil": b"x", **members}
+        return zip_of(linked, attributes={"resources/l": link})
+    if kind == 3:
+        return zip_of(members, twice=victim)
+    if kind == 4:
+        attributes = rng.choice((link, 0o40755 << 16, stat.S_IFIFO << 16, 0x10, 0xFFFFFFFF))
+        return zip_of(members, attributes={victim: attributes})
+    return zip_of({key: value for key, value in members.items() if key != victim})
+
+
+def _zip_method(rng: Random, data: bytes) -> bytes:
+    """Another compression method, its data damaged or not."""
+    method = rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
+    members = _members(data)
+    if members is None:
+        return data
+    return rng.choice((flip, flip, overwrite, nothing))(rng, zip_of(members, method=method))
+
+
+def _zip_ends(rng: Random, data: bytes) -> bytes:
+    start, end = data.find(CENTRAL), data.rfind(END)
+    if not 0 <= start < end:
+        return data
+    kind = rng.randrange(6)
+    if kind == 0:
+        return data + rng.randbytes(rng.choice((1, 100, 70_000)))
+    if kind == 1:
+        return rng.randbytes(rng.choice((1, 100, 5000))) + data
+    if kind == 2:
+        return data[: rng.randrange(start, len(data))]
+    if kind == 3:
+        return data[: rng.randrange(start, end)] + data[end:]
+    if kind == 4:
+        return data[:end] + data[start:end] + data[end:]
+    locator = struct.pack("<4sIQI", b"PK\6\7", 0, rng.choice((0, start, 2**63, 2**64 - 1)), 1)
+    return data[:end] + locator + data[end:]
+
+
+container = several(_zip_field, _zip_field, _zip_member, _zip_method, _zip_ends, blind, most=2)
+
+
+def _members(data: bytes) -> dict[str, bytes] | None:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > 2**26:
+                return None
+            return {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # an earlier edit has damaged it
+        return None
+
+
+def zip_of(
+    members: Mapping[str, bytes],
+    *,
+    method: int = zipfile.ZIP_STORED,
+    attributes: Mapping[str, int] | None = None,
+    twice: str | None = None,
+) -> bytes:
+    """A zip; names are written as they are, and one of them twice."""
+    again = [] if twice is None else [(twice, b"x")]
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in [*members.items(), *again]:
+            entry = zipfile.ZipInfo("x")
+            entry.filename = name
+            entry.compress_type = method
+            entry.external_attr = (attributes or {}).get(name, 0o644 << 16)
+            archive.NameToInfo.pop(name, None)  # or zipfile warns
+            archive.writestr(entry, content)
+    return file.getvalue()
+
+
+def raw_zip(members: Iterable[tuple[str, bytes, int, int]]) -> bytes:
+    """A zip of names, deflated data, and the size and checksum that are said of it.
+
+    Data that is the same object is written once: its members overlap.
+    """
+    body, directory = bytearray(), bytearray()
+    offsets: dict[int, int] = {}
+    for name, packed, size, crc in members:
+        fields = (0, 8, 0, 33, crc, len(packed), size, len(name), 0)
+        if id(packed) not in offsets:
+            offsets[id(packed)] = len(body)
+            body += struct.pack("<4s5H3L2H", LOCAL, 20, *fields) + name.encode() + packed
+        directory += struct.pack("<4s2H", CENTRAL, 20, 20) + struct.pack("<4H3L2H", *fields)
+        directory += struct.pack("<3H2L", 0, 0, 0, 0, offsets[id(packed)]) + name.encode()
+    return bytes(body + directory) + struct.pack(
+        "<4s4H2LH", END, 0, 0, 0xFFFF, 0xFFFF, len(directory), len(body), 0
+    )
+
+
+def deflated_zeros(size: int) -> bytes:
+    """That many zeros, a multiple of 1 MiB, without compressing them all."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
+    return block * (size // 2**20) + zlib.compressobj(9, zlib.DEFLATED, -15).flush()
+
+
+def member(mutations: Mapping[str, Mutation], kept: str = "$") -> Mutation:
+    """The content of one member changed by the mutation of one of the patterns that it matches.
+
+    Members that match ``kept`` stay as they are.
+    """
+
+    def mutate(rng: Random, data: bytes) -> bytes:
+        members = dict(_members(data) or {})
+        pattern = rng.choice(list(mutations))
+        name = rng.choice([n for n in members if re.match(pattern, n) and not re.match(kept, n)])
+        members[name] = mutations[pattern](rng, members[name])
+        return zip_of(members)
+
+    return mutate
+
+
+# --- YAML and JSON ---
+
+SCALARS = (
+    "", "~", "-1", ".nan", ".inf", "1e999", "9" * 30, "[]", "{}", "[[[[]]]]", "'x'", "0x10", "1.5",
+    "2001-01-01", "!!binary aGk=", "!!python/object:os.system x", "&a [*a]", "*a", "|", "'", "- x",
+    "{a: b}", "true", "../../secret", "/etc/passwd", "x" * 10_000, "\x01", "mcap",
+    "sqlite3", "zstd", "FILE", "MESSAGE", "STORAGE", "cdr", "sensor_msgs/msg/JointState",
+    "std_msgs/msg/String",
+)  # fmt: skip
+
+
+def _yaml_scalar(rng: Random, data: bytes) -> bytes:
+    found = list(re.finditer(rb"(?m): (.*)$|- (.*)$", data))
+    if not found:
+        return data
+    place = rng.choice(found)
+    return data[: place.start() + 2] + rng.choice(SCALARS).encode() + data[place.end() :]
+
+
+def _yaml_text(rng: Random, data: bytes) -> bytes:
+    kind = rng.randrange(3)
+    if kind == 0:
+        depth = rng.choice((10, 2000))
+        return data + b"\nx: " + b"[" * depth + b"]" * depth
+    if kind == 1:
+        return laughs() + _yaml_scalar(rng, data)
+    return data.replace(b"\n", b"\n" + rng.choice((b" ", b"\t", b"---\n")), 1)
+
+
+def laughs() -> bytes:
+    """YAML anchors; the last, ``*l8``, stands for 9⁸ of the first."""
+    rows = [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 9)]
+    return ("l0: &l0 [x]\n" + "".join(rows)).encode()
+
+
+yaml = several(_yaml_scalar, _yaml_scalar, _yaml_scalar, _yaml_text, _lines, _token, blind)
+
+
+def _json_node(rng: Random, data: bytes) -> bytes:
+    try:
+        tree = json.loads(data)
+        node, key = rng.choice(list(_json_places(tree)))
+    except (ValueError, IndexError, RecursionError):
+        return data  # an earlier edit has left no tree to change
+    kind = rng.randrange(4)
+    if kind == 0:
+        del node[key]
+    elif kind == 1:
+        node[key] = value(rng)
+    else:
+        node[key] = rng.choice(
+            (None, True, -1, 0, 1e308, float("nan"), float("inf"), 10**30, "", [], {}, [[]],
+             {"": 0}, [None], [1, "2"], [[0, {}]], [["a", 1]])
+        )  # fmt: skip
+    return json.dumps(tree).encode()
+
+
+def _json_places(node: Any) -> Iterator[tuple[Any, Any]]:
+    if isinstance(node, dict | list):
+        for key, child in list(node.items() if isinstance(node, dict) else enumerate(node)):
+            yield node, key
+            yield from _json_places(child)
+
+
+def _json_text(rng: Random, data: bytes) -> bytes:
+    return rng.choice((b"[" * 5000 + b"]" * 5000, b"[" * 200_000, b"[1e400]", b"9" * 5000, b'"'))
+
+
+json_tree = several(_json_node, _json_node, _json_node, _json_text, _token, blind, most=2)
+
+
+# --- MCAP ---
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+CHUNK = b"\x06"
+
+
+def mcap_records(data: bytes) -> list[bytes]:
+    """Records with their heads; the last is what is left over, the closing magic in a good file."""
+    found = []
+    start = len(MCAP_MAGIC)
+    while start + 9 <= len(data):
+        end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
+        if end > len(data):
+            break
+        found.append(data[start:end])
+        start = end
+    return [*found, data[start:]]
+
+
+def _mcap_records(rng: Random, data: bytes) -> bytes:
+    """Records dropped, repeated, exchanged, of another kind or of another length."""
+    records = mcap_records(data)
+    i, j = rng.randrange(len(records)), rng.randrange(len(records))
+    kind = rng.randrange(6)
+    if kind == 0:
+        del records[i]
+    elif kind == 1:
+        records[j:j] = [records[i]] * rng.choice((1, 2, 500))
+    elif kind == 2:
+        records[i], records[j] = records[j], records[i]
+    elif kind == 3:
+        records[i] = bytes([rng.randrange(20)]) + records[i][1:]
+    elif kind == 4:
+        size = rng.choice((0, 1, 2**31, 2**32, 2**40, 2**63 - 1, 2**64 - 1, len(records[i])))
+        records[i] = records[i][:1] + size.to_bytes(8, "little") + records[i][9:]
+    else:
+        records[i] = records[i][:9] + blind(rng, records[i][9:])
+    return data[: len(MCAP_MAGIC)] + b"".join(records)
+
+
+def _mcap_number(rng: Random, data: bytes) -> bytes:
+    """A number inside a record, lengths and offsets among them; those of chunks more often."""
+    records = mcap_records(data)
+    chunks = [i for i, record in enumerate(records) if record[:1] == CHUNK]
+    i = rng.choice(chunks) if chunks and rng.random() < 0.4 else rng.randrange(len(records))
+    at = 9 + rng.randrange(min(len(records[i]), 64) + 1)
+    size = rng.choice((2, 4, 8))
+    number = rng.choice((0, 1, 2**16, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1, len(data)))
+    new = (number % 256**size).to_bytes(size, "little")
+    records[i] = records[i][:at] + new + records[i][at + size :]
+    return data[: len(MCAP_MAGIC)] + b"".join(records)
+
+
+def _mcap_chunk(rng: Random, data: bytes) -> bytes:
+    """What is in a chunk, which then has no checksum."""
+    records = mcap_records(data)
+    chunks = [i for i, record in enumerate(records) if record[:1] == CHUNK and len(record) > 49]
+    if not chunks:
+        return data
+    i = rng.choice(chunks)
+    body = records[i][9:]
+    name_end = 32 + int.from_bytes(body[28:32], "little")
+    inner = body[name_end + 8 :]
+    compressed = name_end > 32
+    inner = blind(rng, inner) if compressed else _mcap_records(rng, MCAP_MAGIC + inner)[8:]
+    size = len(inner).to_bytes(8, "little")
+    unzipped = body[16:24] if compressed else size
+    body = body[:16] + unzipped + bytes(4) + body[28:name_end] + size + inner
+    records[i] = CHUNK + len(body).to_bytes(8, "little") + body
+    return data[: len(MCAP_MAGIC)] + b"".join(records)
+
+
+mcap = several(_mcap_records, _mcap_records, _mcap_number, _mcap_number, _mcap_chunk, blind)
+
+
+# --- SQLite ---
+
+SQLITE_FIELDS = [
+    (16, 2), (18, 1), (19, 1), (20, 1), (21, 1), (24, 4), (28, 4), (32, 4), (36, 4), (40, 4),
+    (44, 4), (52, 4), (56, 4), (60, 4), (64, 4), (92, 4), (96, 4),
+]  # fmt: skip
+STATEMENTS = (
+    "DROP TABLE {table}", "DELETE FROM {table}", "ALTER TABLE {table} RENAME TO other",
+    "UPDATE messages SET timestamp = {number}", "UPDATE messages SET topic_id = {number}",
+    "UPDATE messages SET data = x'00'", "UPDATE messages SET data = 'text'",
+    "UPDATE messages SET data = zeroblob(3000000) WHERE id < 10",
+    "UPDATE messages SET data = substr(data, 1, 40) WHERE id = 3",
+    "UPDATE messages SET timestamp = 'noon' WHERE id = 2",
+    "UPDATE messages SET timestamp = timestamp + {number} WHERE id = 4",
+    "UPDATE topics SET type = 'no/msg/Such'", "UPDATE topics SET name = {number}",
+    "UPDATE topics SET offered_qos_profiles = '- [', serialization_format = 'json'",
+    "UPDATE topics SET offered_qos_profiles = x'ff'",
+    "INSERT INTO topics SELECT id + 100, name, type, serialization_format,"
+    " offered_qos_profiles, type_description_hash FROM topics",
+    "UPDATE message_definitions SET encoding = 'x'",
+    "UPDATE message_definitions SET encoded_message_definition = x'ff'",
+    "UPDATE schema SET schema_version = {number}", "UPDATE metadata SET metadata = '['",
+    "INSERT INTO messages(topic_id, timestamp, data)"
+    " SELECT topic_id, timestamp, data FROM messages",
+)  # fmt: skip
+TABLES = ("messages", "topics", "schema", "metadata", "message_definitions")
+
+
+def _sqlite_header(rng: Random, data: bytes) -> bytes:
+    at, size = rng.choice(SQLITE_FIELDS)
+    new = rng.choice((0, 1, 2, 512, 4096, 65535, 2**31 - 1, 2**31, 2**32 - 1)) % 256**size
+    return data[:at] + new.to_bytes(size, "big") + data[at + size :]
+
+
+def _sqlite_page(rng: Random, data: bytes) -> bytes:
+    """The head of a page: its kind, free blocks, cells and their pointers."""
+    page = 4096 * rng.randrange(max(1, len(data) // 4096))
+    at = page + (100 if page == 0 else 0) + rng.randrange(16)
+    size = rng.choice((1, 2, 4))
+    new = rng.choice((0, 1, 2, 5, 10, 13, 255, 4096, 65535, rng.randrange(2**31))) % 256**size
+    return data[:at] + new.to_bytes(size, "big") + data[at + size :]
+
+
+def _sqlite_statement(rng: Random, data: bytes) -> bytes:
+    number = rng.choice((0, -1, 2**62, -(2**62), 2**63 - 1, 1.5, 1e300))
+    return sqlite_after(
+        data, rng.choice(STATEMENTS).format(table=rng.choice(TABLES), number=number)
+    )
+
+
+def sqlite_after(data: bytes, script: str) -> bytes:
+    """The database after some SQL; as it is where that fails."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "db")
+        path.write_bytes(data)
+        connection = sqlite3.connect(path)
+        try:
+            connection.executescript(script)
+        except sqlite3.Error:  # an earlier edit has damaged it
+            return data
+        finally:
+            connection.close()
+        return path.read_bytes()
+
+
+sqlite = several(_sqlite_header, _sqlite_page, _sqlite_page, _sqlite_statement, blind)
