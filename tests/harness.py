@@ -35,13 +35,55 @@ def _call(module, name, arguments, named):
     getattr(importlib.import_module(module), name).__wrapped__(*arguments, **named)
 
 
+class Worker:
+    """A process for many calls; a call that ends it or hangs fails, and the next has a new one."""
+
+    def __init__(self):
+        self._start()
+
+    def _start(self):
+        context = multiprocessing.get_context("spawn")
+        self._pipe, pipe = context.Pipe()
+        self._process = context.Process(target=_serve, args=(pipe,), daemon=True)
+        self._process.start()
+        pipe.close()
+
+    def __call__(self, function, *arguments):
+        self._pipe.send((function, arguments))
+        try:
+            if self._pipe.poll(60.0):
+                return self._pipe.recv()
+            failure = "hangs"
+        except EOFError:
+            self._process.join()
+            failure = f"ended its process with exit code {self._process.exitcode}"
+        self.end()
+        self._start()
+        raise AssertionError(f"the call {failure}")
+
+    def end(self):
+        self._process.kill()
+        self._process.join()
+
+
+def _serve(pipe):
+    while True:
+        function, arguments = pipe.recv()
+        pipe.send(function(*arguments))
+
+
+_description = functools.cache(fmpy.read_model_description)
+
+
 class Driver:
-    """One instance; ``log`` collects (status, message), ``status`` is that of the last call."""
+    """One instance; ``log`` collects (status, message), ``status`` is that of the last call.
+
+    ``folder`` is where the FMU is unzipped already, if it is.
+    """
 
     def __init__(self, fmu, folder=None, guid=None):
-        self.folder = folder or tempfile.mkdtemp(prefix="fmu ")
-        fmpy.extract(fmu, self.folder)
-        self.description = fmpy.read_model_description(str(fmu))
+        self.folder = folder or fmpy.extract(fmu, tempfile.mkdtemp(prefix="fmu "))
+        self.description = _description(self.folder)
         self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
         self.log = []
         self.status = 0

@@ -1,0 +1,589 @@
+"""Random programs of calls: every state that an FMU reaches is that of its history alone.
+
+A program sets, steps, saves, restores, serialises, frees, resets and reads, and makes calls that
+are refused. What has been set and stepped since the last initialisation is its history: a straight
+line, which saving leaves, restoring takes back and resetting empties. After every operation the FMU
+gives, bit for bit, what a fresh instance gives that carries out the history and nothing else; and
+the flavours agree on histories that keep away from singularities. All FMUs run in a process beside
+the tests: where one crashes, its program fails.
+"""
+
+import re
+from collections import Counter
+from functools import partial
+from itertools import chain
+from math import inf, nan
+from typing import NamedTuple
+
+import fmpy
+import numpy as np
+import pinocchio as pin
+import pytest
+from fmpy.fmi2 import fmi2FMUstate
+from harness import Driver, Worker
+from hypothesis import Phase, event, given, settings
+from hypothesis import strategies as st
+from oracles import REST
+
+from twodof import FmuOptions, build_fmu
+from twodof.data import data_file
+from twodof.plant import Robot, load_robot
+
+OK, DISCARD, ERROR = 0, 2, 3
+OUTPUTS = ("q", "v", "x", "tau")
+INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "Kn")
+PARAMETERS = (
+    "q_start", "v_start", "q_min", "q_max", "gravity",
+    "rcond", "rtol", "atol", "max_step", "limit_effort",
+)  # fmt: skip
+
+
+class Program(list):
+    """Operations, each a tuple of a name and arguments; shown one a line."""
+
+    def __repr__(self):
+        return "".join(["[\n", *(f"    {operation},\n" for operation in self), "]"])
+
+
+# --- carrying out a program ---
+
+
+class Master:
+    """Carries out operations, which are its methods; keeps the time and the saved states."""
+
+    def __init__(self, fmu, folder):
+        self.fmu = fmu
+        self.driver = Driver(fmu, folder)
+        self.time, self.saved = 0.0, {}
+
+    def answer(self, operation):
+        """The statuses of the operation's calls, whether the FMU complained, what was read."""
+        self.statuses = []
+        self.driver.log.clear()
+        name, *arguments = operation
+        values = getattr(self, name)(*arguments)
+        return self.statuses, self.complained(), values
+
+    def complained(self):
+        return any(status >= DISCARD for status, _ in self.driver.log)
+
+    def call(self, name, *arguments, **named):
+        value = self.driver.call(name, *arguments, **named)
+        self.statuses.append(self.driver.status)
+        return value
+
+    def enter(self, start):
+        self.call("setupExperiment", startTime=start)
+        if not self.complained():
+            self.call("enterInitializationMode")
+            self.time = start
+
+    def exit(self):
+        self.call("exitInitializationMode")
+
+    def set(self, name, value):
+        self.driver.set(**{name: value})
+        self.statuses.append(self.driver.status)
+
+    def read(self, *groups):
+        groups = groups or OUTPUTS + INPUTS + PARAMETERS
+        references = {group: self.driver.references(group) for group in groups}
+        truth = references.pop("limit_effort", [])
+        values = self.call("getReal", [*chain.from_iterable(references.values())])
+        truths = self.call("getBoolean", truth)
+        if self.complained():
+            return None
+        rest = iter(values)
+        found = {group: [next(rest) for _ in vrs] for group, vrs in references.items()}
+        return {**found, "limit_effort": truths} if truth else found
+
+    def step(self, h, late=0.0):
+        """A step that is discarded is tried once more."""
+        point = self.time + late
+        self.call("doStep", point, h)
+        if self.statuses == [DISCARD]:
+            self.call("doStep", point, h)
+        if self.statuses[-1] == OK:
+            self.time = point + h
+
+    def terminate(self):
+        self.call("terminate")
+
+    def reset(self):
+        self.call("reset")
+
+    def fail_to_start(self, name, value):
+        """An initialisation that is refused for a parameter, between two resets."""
+        self.reset()
+        self.set(name, value)
+        self.enter(0.0)
+        self.exit()
+        self.reset()
+
+    def save(self, slot):
+        """Over the state that was saved there, if there is one."""
+        state, _ = self.saved.get(slot, (fmi2FMUstate(), 0.0))
+        self.call("fmi2GetFMUstate", self.driver.slave.component, state)
+        self.saved[slot] = state, self.time
+
+    def restore(self, slot):
+        state, self.time = self.saved[slot]
+        self.call("setFMUstate", state)
+
+    def free(self, slot):
+        state, _ = self.saved.pop(slot)
+        self.call("freeFMUstate", state)
+
+    def serialise(self, slot):
+        """Replace a saved state by what its bytes give."""
+        state, time = self.saved[slot]
+        data = self.call("serializeFMUstate", state)
+        self.call("freeFMUstate", state)
+        self.saved[slot] = self.call("deSerializeFMUstate", data), time
+
+    def damage(self, slot):
+        """Restore a state whose last bytes are missing."""
+        state, _ = self.saved[slot]
+        data = self.call("serializeFMUstate", state)
+        state = self.call("deSerializeFMUstate", data[:-9])
+        if state is not None:
+            self.call("setFMUstate", state)
+            self.call("freeFMUstate", state)
+
+    def wreck(self, slot):
+        """Set inputs that no step can be taken with, try one, and restore."""
+        for name, huge in (("Kp", 1e308), ("x_des", 1e300)):
+            self.set(name, (huge,) * len(self.driver.references(name)))
+        self.call("doStep", self.time, 0.01)
+        self.read()
+        self.restore(slot)
+
+    def move(self):
+        """Go on in a new instance; it takes over the state and all saved ones as bytes."""
+        self.save("present")
+        old, self.driver = self.driver, Driver(self.fmu, self.driver.folder)
+        for slot, (state, time) in self.saved.items():
+            data = old.call("serializeFMUstate", state)
+            old.call("freeFMUstate", state)
+            self.saved[slot] = self.call("deSerializeFMUstate", data), time
+        old.slave.freeInstance()
+        self.restore("present")
+        self.free("present")
+
+
+def carry_out(fmu, folder, program):
+    """The answers of a fresh instance to the operations of a program."""
+    master = Master(fmu, folder)
+    answers = [master.answer(operation) for operation in program]
+    for slot in list(master.saved):
+        master.free(slot)
+    master.driver.slave.freeInstance()
+    return answers
+
+
+# --- what is to come of it ---
+
+
+class Expected(NamedTuple):
+    """What an operation leads to."""
+
+    history: tuple  # operations, this one among them where it counts
+    refused: bool
+    discards: bool  # a call before was refused: the Python flavour discards the next step
+
+
+def expectations(program):
+    history, discards, saved = (), False, {}
+    for operation in program:
+        refused, discards_now = not is_legal(operation, history), discards
+        match operation:
+            case ("set" | "enter" | "exit" | "step" | "terminate", *_):
+                history = history if refused else (*history, operation)
+                discards = (discards or refused) and operation[0] != "step"
+            case ("damage", _):
+                discards = True
+            case ("reset",) | ("fail_to_start", *_):
+                history, discards = (), False
+            case ("save", slot):
+                saved[slot] = history, discards
+            case ("restore" | "wreck", slot):
+                history, discards = saved[slot]
+        yield Expected(history, refused, discards_now)
+
+
+def is_legal(operation, history):
+    """By the state machine of FMI 2.0.4, section 4.2.4, and the checks of values."""
+    done = {name for name, *_ in history}
+    phase = next((name for name in ("terminate", "exit", "enter") if name in done), "")
+    match operation:
+        case ("set", name, value):
+            group = name.partition("[")[0]
+            phases = {"", "enter", "exit"} if group in INPUTS else {"", "enter"}
+            return group not in OUTPUTS and phase in phases and bool(np.isfinite(value).all())
+        case ("enter", start):
+            return phase == "" and abs(start) < inf
+        case ("exit",):
+            return phase == "enter"
+        case ("step", h, *late):
+            return phase == "exit" and 0.0 < h < inf and abs(sum(late)) <= 1e-9
+        case ("terminate",):
+            return phase == "exit"
+        case ("read", *_):
+            return phase != ""
+        case ("damage", _) | ("fail_to_start", *_):
+            return False
+    return True
+
+
+def is_right(flavour, operation, expected, answer):
+    """Whether statuses and log are as they are to be.
+
+    The native flavour refuses by fmi2Error. The Python one cannot: it logs, and discards the next
+    step, which is then taken at the second attempt.
+    """
+    statuses, complained, _ = answer
+    refused = expected.refused
+    if operation[0] == "wreck":
+        return statuses[-1] == OK  # of restoring; what was before may fail or not
+    if flavour == "native":
+        return complained == refused and max(statuses) == (ERROR if refused else OK)
+    if operation[0] != "step":
+        return complained == refused and max(statuses) == OK
+    if refused or expected.discards:
+        return complained and statuses == [DISCARD, DISCARD if refused else OK]
+    return not complained and statuses == [OK]
+
+
+def run(carry_out, flavour, program):
+    """What is read after the operations of a program: (index, history, values by group)."""
+    readings = []
+    answers = carry_out(program)
+    for i, (operation, expected) in enumerate(zip(program, expectations(program))):
+        assert is_right(flavour, operation, expected, answers[i]), (
+            f"{flavour} flavour, operation {i}, {operation}: {answers[i][0]}, {expected}"
+        )
+        if operation[0] == "read" and not expected.refused:
+            readings.append((i, expected.history, answers[i][2]))
+    return readings
+
+
+def states(carry_out, flavour, program):
+    """What all histories of a program lead to, each run alone; the program is checked by it.
+
+    Values by group by history; histories before initialisation mode have none.
+    """
+    readings = run(carry_out, flavour, program)
+    alone = {}
+    histories = {expected.history for expected in expectations(program)}
+    for history in sorted(histories, key=len, reverse=True):
+        if history not in alone:  # it is not the beginning of a longer one
+            line = [part for operation in history for part in (operation, ("read",))]
+            alone |= dict.fromkeys(history[:i] for i in range(len(history) + 1))
+            alone |= {past: values for _, past, values in run(carry_out, flavour, line)}
+    for i, history, values in readings:
+        for group, value in values.items():
+            assert repr(value) == repr(alone[history][group]), (
+                f"{flavour} flavour, operation {i}: {group} is not that of {Program(history)}"
+            )
+    return alone
+
+
+def compared(arm, python, native):
+    """The histories that are compared, and found to agree; others go near a singularity."""
+    found = set()
+    for history in sorted(python, key=len):
+        before, ours, theirs = python.get(history[:-1]), python[history], native[history]
+        if ours is None:
+            found.add(history)
+        elif (before is None or history[:-1] in found) and arm.keeps_away(history, before, ours):
+            found.add(history)
+            for group in OUTPUTS:
+                scale = np.maximum(1.0, np.abs(ours[group]))
+                difference = np.abs(np.subtract(theirs[group], ours[group])) / scale
+                assert difference.max() <= 1e-9, (
+                    f"the flavours' {group} differ by {difference.max():g} after {Program(history)}"
+                )
+    return found
+
+
+# --- the robots ---
+
+
+class Arm(NamedTuple):
+    """A robot, its FMUs and where its programs move it."""
+
+    robot: Robot
+    fmus: dict  # flavour: (file, folder where it is unzipped)
+    rest: tuple  # joint positions
+    target: tuple  # where the end effector then is
+
+    def keeps_away(self, history, before, after):
+        """Whether the last operation keeps away from singularities.
+
+        σ_min/σ_max of J is at least 0.05 where it ends, and so it is anywhere within the angle of a
+        step at the speeds of its ends, as it changes by about 1 per radian at most.
+        """
+        robot, frame = self.robot, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        q, data = np.array(after["q"]), robot.model.createData()
+        J = pin.computeFrameJacobian(robot.model, data, q, robot.frame_id, frame)
+        sigma = np.linalg.svd(J[["xyz".index(axis) for axis in robot.axes]], compute_uv=False)
+        name, *arguments = history[-1]
+        angle = arguments[0] * max(map(abs, before["v"] + after["v"])) if name == "step" else 0.0
+        return sigma[-1] / sigma[0] - angle >= 0.05
+
+
+@pytest.fixture(scope="module", params=["twodof", "panda"])
+def arm(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    if request.param == "twodof":
+        urdf, frame, axes = data_file("urdf", "2dof.urdf").read_text(), "EndEffector", "xy"
+        rest, options = (0.2, 2.0), {}
+    else:
+        urdf, frame, axes = request.getfixturevalue("panda"), "panda_hand_tcp", "xyz"
+        path, rest = folder / "panda.urdf", REST["panda"]
+        path.write_text(re.sub(r"<mesh [^>]*>", "<sphere radius='0.01'/>", urdf))
+        options = {"urdf": path, "frame": frame, "name": "Panda"}
+    fmus = {}
+    for flavour in ("python", "native"):
+        chosen = FmuOptions(**options, q_start=rest, native=flavour == "native")
+        fmu = build_fmu(folder / f"{flavour}.fmu", chosen)
+        fmus[flavour] = str(fmu), fmpy.extract(fmu, str(folder / flavour))
+    robot = load_robot(urdf, frame, axes)
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, np.array(rest))
+    position = data.oMf[robot.frame_id].translation
+    return Arm(robot, fmus, rest, tuple(float(position["xyz".index(axis)]) for axis in axes))
+
+
+# --- random programs ---
+
+
+def number(low, high, digits=3):
+    whole = st.integers(round(low * 10**digits), round(high * 10**digits))
+    return whole.map(lambda i: i / 10**digits)
+
+
+def near(centre, distance):
+    return st.tuples(*(number(c - distance, c + distance) for c in centre))
+
+
+def one(name, *arguments):
+    """A phrase, which is a list of operations, of one; from strategies for its arguments."""
+    return st.tuples(st.just(name), *arguments).map(lambda operation: [operation])
+
+
+def phrase(*parts):
+    return st.tuples(*parts).map(lambda phrases: list(chain.from_iterable(phrases)))
+
+
+def some(part, least, most):
+    phrases = st.lists(part, min_size=least, max_size=most)
+    return phrases.map(lambda phrases: list(chain.from_iterable(phrases)))
+
+
+def choice(*phrases):
+    """One of these; inside a phrase, as ``one_of`` deals with what is in it as with its own."""
+    return phrase(st.one_of(*phrases))
+
+
+def setting(values):
+    """Set one of these, given strategies for the values."""
+    return choice(*(one("set", st.just(name), value) for name, value in values.items()))
+
+
+@st.composite
+def read_along(draw, phrases):
+    """A phrase with one way of reading, or none, after each of its operations."""
+    reading = draw(st.sampled_from([[("read",)], [("read",)], [("read", "tau")], []]))
+    return [part for operation in draw(phrases) for part in (operation, *reading)]
+
+
+def programs(arm):
+    """Programs that begin with an initialisation and end by reading all."""
+    n, m = len(arm.rest), len(arm.target)
+    inputs = setting({
+        "x_des": near(arm.target, 0.07),
+        "x_des[1]": number(arm.target[0] - 0.07, arm.target[0] + 0.07),
+        "xd_des": near((0.0,) * m, 0.3),
+        "xdd_des": near((0.0,) * m, 3.0),
+        "Kp": st.sampled_from([50.0, 400.0, 8000.0]).map(lambda gain: (gain,) * m),
+        "Kd": near((30.0,) * m, 25.0),
+        "tau_ext": near((0.0,) * n, 0.1),
+        "Kn": number(0.0, 20.0),
+    })  # fmt: skip
+    parameters = setting({
+        "q_start": near(arm.rest, 0.3),
+        "v_start": near((0.0,) * n, 1.0),
+        "gravity": near((0.0, -9.81, 0.0), 5.0),
+        "rcond": st.sampled_from([0.005, 0.02]),
+        "rtol": st.sampled_from([1e-6, 1e-2]),
+        "atol": st.sampled_from([1e-9, 1e-3]),
+        "max_step": st.sampled_from([5e-4, 5e-3, 0.1]),
+    })  # fmt: skip
+    limits = setting({
+        "q_min": near([q - 0.1 for q in arm.rest], 0.09),
+        "q_max": near([q + 0.1 for q in arm.rest], 0.09),
+        "limit_effort": st.just(True),
+    })  # fmt: skip
+    value = choice(inputs, parameters, limits)
+    slot = st.sampled_from("abc")
+    save, restore, reset = one("save", slot), one("restore", slot), one("reset")
+    h = st.one_of(number(0.0001, 0.01, digits=4), number(0.001, 0.05))
+    step = choice(one("step", h), one("step", h, st.just(1e-10)))
+    go = phrase(some(inputs, 0, 2), some(step, 1, 3))
+    begin = phrase(
+        some(limits, 0, 2),
+        some(value, 0, 3),
+        some(save, 0, 1),
+        one("enter", st.sampled_from([0.0, 2.5, -1.0])),
+        some(value, 0, 2),
+        some(save, 0, 1),
+        one("exit"),
+    )
+    restart = choice(
+        phrase(reset, begin),
+        phrase(one("terminate"), reset, begin),
+        phrase(one("fail_to_start", st.just("rtol"), st.just(0.0)), begin),
+    )
+    refused = choice(
+        one("set", st.just("x_des"), st.sampled_from([(*arm.target[1:], nan), (inf,) * m])),
+        one("set", st.just("q"), st.just(arm.rest)),
+        parameters,  # in step mode
+        one("step", st.sampled_from([0.0, -0.01, nan, inf])),
+        one("step", h, st.sampled_from([1e-3, -0.5, nan])),
+        one("enter", st.sampled_from([0.0, nan])),
+        one("exit"),
+    )
+
+    def with_a_state(slot):
+        """Save, and do with that state what there is to do."""
+        save, restore, serialise, damage, wreck, free = (
+            one(name, st.just(slot))
+            for name in ("save", "restore", "serialise", "damage", "wreck", "free")
+        )
+        return choice(
+            phrase(save, go, some(serialise, 0, 1), restore),
+            phrase(refused, save, some(serialise, 0, 1), go, restore, go),
+            phrase(save, refused, restore, go),
+            phrase(save, restart, some(go, 0, 1), restore),
+            phrase(save, reset, some(value, 0, 2), restore),
+            phrase(save, go, damage, go),
+            phrase(save, go, wreck),
+            phrase(save, go, restore, go, restore, free),
+        )
+
+    part = choice(
+        st.just([]),  # what the others shrink to
+        go,
+        go,
+        restore,
+        restart,
+        phrase(refused, some(save, 0, 1), go),
+        one("move"),
+        *4 * [slot.flatmap(with_a_state)],
+    )
+    whole = phrase(read_along(begin), some(read_along(part), 10, 20), one("read"))
+    return whole.map(without_empty_slots)
+
+
+def without_empty_slots(program):
+    """Without the operations on saved states that there are not."""
+    kept, filled = Program(), set()
+    for operation in program:
+        match operation:
+            case ("save", slot):
+                filled.add(slot)
+            case ("restore" | "serialise" | "damage" | "wreck" | "free", slot):
+                if slot not in filled:
+                    continue
+                if operation[0] == "free":
+                    filled.remove(slot)
+        kept.append(operation)
+    return kept
+
+
+# --- the test, and what its programs are to contain ---
+
+CONTAINED = (
+    "parameter after a reset", "set tau_ext", "set Kp", "set limit_effort", "two states alive",
+    "save at a limit", "save before a discard", "restore after set", "restore after step",
+    "restore after reset", "restore after serialise", "move", "wreck", "terminate", "refused set",
+    "refused step", "refused damage", "refused fail_to_start",
+)  # fmt: skip
+"""What one program in fifty contains at least; most are in every second to fourth."""
+
+
+def features(arm, program, values):
+    """What a program contains, given the values that its histories lead to."""
+    found, since, history = set(), {}, ()  # since each state was saved: what happened to it
+    for operation, expected in zip(program, expectations(program)):
+        name, before, history = operation[0], history, expected.history
+        found.add(f"refused {name}" if expected.refused else name)
+        match operation:
+            case ("set", group, _) if not expected.refused:
+                found.add(f"set {group}")
+                if group in PARAMETERS and "reset" in found:
+                    found.add("parameter after a reset")
+            case ("reset",) | ("serialise", _):
+                for slot in operation[1:] or since:
+                    since[slot].add(name)
+            case ("save", slot):
+                since[slot] = set()
+                found |= {"two states alive"} if len(since) > 1 else set()
+                found |= {"save before a discard"} if expected.discards else set()
+                if "step" in {name for name, *_ in history} and at_a_limit(values[history]):
+                    found.add("save at a limit")
+            case ("free", slot):
+                del since[slot]
+            case ("restore", slot):
+                later = before[len(history) :] if before[: len(history)] == history else ()
+                found |= {f"restore after {name}" for name in since[slot]}
+                found |= {f"restore after {name}" for name, *_ in later}
+    limited = [read["tau"] for read in values.values() if read and read["limit_effort"] == [True]]
+    if any(np.any(np.abs(tau) == arm.robot.effort) for tau in limited):
+        found.add("effort at its limit")
+    return found
+
+
+def at_a_limit(values):
+    joints = zip(values["q"], values["v"], values["q_min"], values["q_max"])
+    return any(v == 0.0 and q in (low, high) for q, v, low, high in joints)
+
+
+@pytest.fixture(scope="module")
+def worker():
+    worker = Worker()
+    yield worker
+    worker.end()
+
+
+@pytest.mark.long
+def test_every_state_is_that_of_its_history_alone(arm, worker, request):
+    full = request.config.getoption("full", default=False)
+    few, many = (50, 2000) if len(arm.rest) == 2 else (10, 300)
+    seen = Counter()
+
+    @settings(
+        max_examples=many if full else few,
+        derandomize=not full,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate, Phase.shrink],
+    )
+    @given(programs(arm))
+    def holds(program):
+        python, native = (
+            states(partial(worker, carry_out, *fmu), flavour, program)
+            for flavour, fmu in arm.fmus.items()
+        )
+        found = features(arm, program, python)
+        if compared(arm, python, native) == python.keys():
+            found.add("all histories compared")
+        seen.update(found | {"programs"})
+        for feature in found:
+            event(feature)
+
+    holds()
+    rare = [what for what in CONTAINED if seen[what] < seen["programs"] // 50]
+    assert not rare, seen
+    assert seen["all histories compared"] > 0.5 * seen["programs"], seen
