@@ -1,9 +1,10 @@
-"""Makes docs/arm.png, the README's picture, and fmu_src/model.png, the icon in FMI tools.
+"""Makes docs/arm.png and docs/plot.png, the README's pictures, and fmu_src/model.png, the icon.
 
     python docs/make_pictures.py
 
-The picture shows the default run, from the samples of the FMU itself, with the arm drawn from its
-meshes as seen from above. The icon suits the FMU of any robot. Needs matplotlib.
+The first picture shows the default run, from the samples of the FMU itself, with the arm drawn from
+its meshes as seen from above. The second is what ``twodof plot`` makes of three runs. The icon is
+for FMI tools and suits the FMU of any robot. Needs matplotlib.
 """
 
 from __future__ import annotations
@@ -24,23 +25,26 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import twodof  # noqa: E402
+from twodof.plot import plot_bags  # noqa: E402
 
 LINK = 0.15  # m
 LINK_COLOURS = {"link1": (0.33, 0.40, 0.49), "link2": (0.96, 0.55, 0.14)}
 INK, GREY, BLUE, ORANGE = "#1f2933", "#8a94a0", "#0060a8", "#f58c24"
 WINDOW = (-0.110, 0.470, -0.148, 0.236)  # m: left, right, bottom, top
 WIDTH = 1200  # pixels
+GAINS = (20, 50, 400)  # 1/s²
 OVERSAMPLING = 3
 LIGHT = np.array([-0.45, 0.60, 0.66])
 STEP_IN_DEPTH = 0.0012  # m: an edge is drawn where the depth jumps by more
 
 
 def main() -> None:
-    """Make both pictures."""
+    """Make all pictures."""
     plt.rcParams.update({"font.family": "DejaVu Sans", "text.color": INK})
     with tempfile.TemporaryDirectory() as folder:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
         samples = list(twodof.samples(fmu))
+        draw_plot(fmu, ROOT / "docs" / "plot.png")
     draw_arm(samples, ROOT / "docs" / "arm.png")
     draw_icon(ROOT / "fmu_src" / "model.png")
 
@@ -187,6 +191,19 @@ def fill(
     seen = (u >= -1e-9) & (v >= -1e-9) & (w >= -1e-9) & (new > depth[window])
     depth[window][seen] = new[seen]
     image[window][seen] = (*colour, 1.0)
+
+
+# --- the plot ---
+
+
+def draw_plot(fmu: Path, path: Path) -> None:
+    """Three runs of the default arm that differ in their gain."""
+    bags = [fmu.parent / f"Kp{gain}" for gain in GAINS]
+    for gain, bag in zip(GAINS, bags, strict=True):
+        run = twodof.experiment(fmu, settings={"Kp": gain})
+        twodof.simulate(run, [twodof.Bag(bag, run)])
+    figure = plot_bags(*bags)
+    figure.savefig(path, dpi=135, pil_kwargs={"optimize": True}, metadata={"Software": None})
 
 
 # --- the icon ---

@@ -491,3 +491,23 @@ def test_requirements_name_what_the_plant_imports(fmu_path):
         imported |= set(re.findall(r"^(?:import|from) ([a-z]\w*)", path.read_text(), re.M))
     third_party = imported - set(sys.stdlib_module_names)
     assert third_party == {"numpy", "pinocchio"}
+
+
+@in_child_process
+def test_a_robot_with_one_joint_runs(tmp_path):
+    urdf = tmp_path / "one.urdf"
+    urdf.write_text(
+        '<robot name="one"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/>'
+        '<mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+        '</inertial></link><link name="tip"/>'
+        '<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>'
+        '<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="0" velocity="1"/></joint>'
+        '<joint name="end" type="fixed"><parent link="arm"/><child link="tip"/>'
+        '<origin xyz="0.3 0 0"/></joint></robot>'
+    )
+    options = FmuOptions(urdf=urdf, frame="tip", axes="y", name="One")
+    arm = Driver(build_fmu(tmp_path / "One.fmu", options)).initialise(x_des=(0.1,))
+    rows = np.array(arm.run(200))
+    t = 0.01 * np.arange(1, 201)
+    expected = 0.1 - task_error([0.1], 50.0, 40.0, t)[:, 0]
+    np.testing.assert_allclose(0.3 * np.sin(rows[:, 0]), expected, rtol=0.0, atol=1e-9)

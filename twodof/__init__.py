@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .errors import TwoDofError
     from .fmu import Fmu, load_fmu
     from .master import Sample, Summary, experiment, samples, simulate
+    from .plot import plot_bags
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOME = {
@@ -28,6 +29,7 @@ _HOME = {
     "Sample": "master",
     "Summary": "master",
     "experiment": "master",
+    "plot_bags": "plot",
     "samples": "master",
     "simulate": "master",
 }
@@ -42,6 +44,7 @@ __all__ = [
     "build_fmu",
     "experiment",
     "load_fmu",
+    "plot_bags",
     "read_bag",
     "recover",
     "samples",

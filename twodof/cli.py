@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .master import Experiment, RealTime, Summary
 
 INTERRUPTED = 130
+LONGEST_LINE = 2000
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -59,7 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, status: int = 1) -> int:
-    print("twodof: error:", " ".join(message.split()), file=sys.stderr)
+    line = " ".join(message.split())
+    if len(line) > LONGEST_LINE:  # a name of a file from elsewhere can have any length
+        line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
+    print("twodof: error:", line, file=sys.stderr)
     return status
 
 
@@ -145,6 +149,50 @@ def _parser() -> argparse.ArgumentParser:
     info.set_defaults(verb=_info)
     info.add_argument("path", metavar="FMU|BAG", type=Path)
 
+    plot = verbs.add_parser(
+        "plot", help="draw bags into one figure",
+        description="Draw joint positions and velocities, the end effector's path and its error.",
+    )  # fmt: skip
+    plot.set_defaults(verb=_plot)
+    plot.add_argument("bags", nargs="+", metavar="BAG", help="several are compared")
+    plot.add_argument(
+        "-o", dest="output", metavar="FILE", help=".png, .svg, .pdf or .html (a window)"
+    )
+    _add_robot_options(plot)
+
+    view = verbs.add_parser(
+        "view", help="replay a bag in the browser",
+        description="Replay a bag in the browser, or write a page that replays it offline.",
+    )  # fmt: skip
+    view.set_defaults(verb=_view)
+    view.add_argument("bag", metavar="BAG", type=Path)
+    view.add_argument("--export", metavar="FILE.html", help="write one self-contained file instead")
+    _add_robot_options(view)
+    view.add_argument(
+        "--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes"
+    )
+    view.add_argument("--fmu", metavar="FMU", help="where the robot's meshes are")
+    _add_page_options(view)
+
+    live = verbs.add_parser(
+        "live", help="drive an FMU in the browser",
+        description="Step an FMU in real time behind a page in the browser: drag the target.",
+    )  # fmt: skip
+    live.set_defaults(verb=_live)
+    live.add_argument("fmu", nargs="?", metavar="FMU", help="default: as of 'run'")
+    live.add_argument(
+        "--native", action="store_true", help="build and run the native default FMU instead"
+    )
+    live.add_argument("-o", dest="output", metavar="BAG", help="name of recordings")
+    live.add_argument(
+        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
+    )
+    live.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
+        help="start value of an input or parameter",
+    )  # fmt: skip
+    _add_page_options(live)
+
     recover = verbs.add_parser(
         "recover", help="make a bag whose writer died complete",
         description="Make a bag whose writer died complete, so that every reader opens it.",
@@ -152,6 +200,19 @@ def _parser() -> argparse.ArgumentParser:
     recover.set_defaults(verb=_recover)
     recover.add_argument("bag", metavar="BAG", type=Path)
     return parser
+
+
+def _add_robot_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--urdf", metavar="U", help="the robot of a bag that carries none")
+    parser.add_argument("--frame", metavar="LINK", help="its end effector")
+
+
+def _add_page_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (%(default)s, this machine alone)"
+    )
+    parser.add_argument("--port", type=int, default=8080, help="(%(default)s); 0: any that is free")
+    parser.add_argument("--no-browser", action="store_true", help="open no browser")
 
 
 def _build(options: argparse.Namespace) -> int:
@@ -191,20 +252,12 @@ def _platforms(chosen: Sequence[str]) -> tuple[str, ...]:
 
 def _run(options: argparse.Namespace) -> int:
     from .bag import Bag
-    from .build import FmuOptions, build_fmu
     from .inputs import parse_settings
     from .master import RealTime, experiment, simulate
-    from .native import host_platform
 
     settings = parse_settings(options.settings)
-    if options.native and options.fmu:
-        raise InputError("--native builds the default arm's FMU; leave it out beside an FMU")
-    native = options.native or host_platform() != "linux64"
-    if native and not options.native and not options.fmu:
-        print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
-    path = Path(options.fmu) if options.fmu else build_fmu(None, FmuOptions(native=native))
     run = experiment(
-        path,
+        _chosen_fmu(options),
         stop_time=options.stop_time,
         step=options.step,
         settings=settings,
@@ -226,6 +279,21 @@ def _run(options: argparse.Namespace) -> int:
         summary = simulate(run, [bag, _Progress(run)], pace=pace, stop=asked)
     _print_summary(run, bag.path, options.storage, summary, pace)
     return INTERRUPTED if summary.stopped else 0
+
+
+def _chosen_fmu(options: argparse.Namespace) -> Path:
+    """The FMU that is named, else the default arm's, built if need be."""
+    from .build import FmuOptions, build_fmu
+    from .native import host_platform
+
+    if options.fmu:
+        if options.native:
+            raise InputError("--native builds the default arm's FMU; leave it out beside an FMU")
+        return Path(options.fmu)
+    native = options.native or host_platform() != "linux64"
+    if native and not options.native:
+        print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
+    return build_fmu(None, FmuOptions(native=native))
 
 
 @contextmanager
@@ -396,6 +464,69 @@ def _print_bag(run: Run) -> None:
     width = max(len(topic.name) for topic in run.topics)
     for topic in run.topics:
         print(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}")
+
+
+def _plot(options: argparse.Namespace) -> int:
+    from .plot import file_kind, save, show
+    from .track import labels, outcome, read_tracks
+
+    if options.output is not None:
+        file_kind(options.output)  # before the bags are read
+    tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
+    if options.output is None and sys.stdout.isatty() and show(tracks):
+        return 0
+    path = save(tracks, options.output)
+    results = zip(labels(tracks), map(outcome, tracks))
+    _print_table(
+        ("plot", f"{path} ({path.stat().st_size / 1024:.0f} KB)"),
+        *((label, text) for label, text in results if text),
+    )
+    return 0
+
+
+def _view(options: argparse.Namespace) -> int:
+    from .view import export, view
+
+    robot = {name: getattr(options, name) for name in ("urdf", "mesh_dir", "frame", "fmu")}
+    if options.export:
+        for remark in export(options.bag, options.export, **robot):
+            print(f"WARNING: {remark}", file=sys.stderr)
+        print(f"page  {options.export}; it needs no network")
+        return 0
+    with _asked_to_stop() as asked:
+        view(
+            options.bag, asked, lambda url, remarks: _open(options, url, remarks),
+            host=options.host, port=options.port, **robot,
+        )  # fmt: skip
+    return 0
+
+
+def _live(options: argparse.Namespace) -> int:
+    from .inputs import parse_settings
+    from .live import live
+
+    with _asked_to_stop() as asked:
+        bags = live(
+            _chosen_fmu(options), asked, lambda url: _open(options, url),
+            host=options.host, port=options.port, step=options.step,
+            settings=parse_settings(options.settings), bag=options.output,
+            command_line=options.command_line,
+        )  # fmt: skip
+    for bag in bags:
+        print(f"bag   {bag}")
+    if bags:
+        _print_next(f"twodof plot {_quote(bags[-1])}", f"twodof view {_quote(bags[-1])}")
+    return INTERRUPTED
+
+
+def _open(options: argparse.Namespace, url: str, remarks: Sequence[str] = ()) -> None:
+    for remark in remarks:
+        print(f"WARNING: {remark}", file=sys.stderr)
+    print(f"open  {url} (Ctrl-C ends)", flush=True)
+    if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+        import webbrowser
+
+        webbrowser.open(url)
 
 
 def _recover(options: argparse.Namespace) -> int:

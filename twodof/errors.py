@@ -35,3 +35,11 @@ class SimulationError(TwoDofError):
 
 class BagError(TwoDofError):
     """A bag cannot be written or read."""
+
+
+class PlotError(TwoDofError):
+    """A bag cannot be drawn: matplotlib, the robot, its joints or the output file is at fault."""
+
+
+class PageError(TwoDofError):
+    """A page cannot be shown: viser, its port, the robot or the output file is at fault."""

@@ -157,6 +157,10 @@ class RealTime:
         self.worst = 0.0
         self._start: float | None = None
 
+    def restart(self) -> None:
+        """The next sample is due at once, and those after it by that."""
+        self._start = None
+
     def wait(self, elapsed: float) -> None:
         """Wait until the wall clock is ``elapsed`` s after the first call."""
         now = time.perf_counter()

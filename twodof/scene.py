@@ -95,27 +95,28 @@ class Scene:
 
 def _read_joint(element: ET.Element, joints: Sequence[str]) -> _Joint:
     name = element.get("name", "")
-    axis = _floats(element.find("axis"), "xyz", "1 0 0")
+    axis = floats(element.find("axis"), "xyz", "1 0 0")
     return _Joint(
         parent=element.find("parent").get("link", ""),  # type: ignore[union-attr]
         child=element.find("child").get("link", ""),  # type: ignore[union-attr]
         kind=element.get("type", ""),
-        origin=_origin(element.find("origin")),
+        origin=origin(element.find("origin")),
         axis=axis / (np.linalg.norm(axis) or 1.0),  # fixed joints may have a zero axis
         coordinate=joints.index(name) if name in joints else None,
     )
 
 
-def _floats(element: ET.Element | None, key: str, default: str) -> Array:
+def floats(element: ET.Element | None, key: str, default: str) -> Array:
+    """The numbers of an attribute."""
     text = default if element is None else element.get(key, default)
     return np.array([float(word) for word in text.split()])
 
 
-def _origin(element: ET.Element | None) -> Array:
+def origin(element: ET.Element | None) -> Array:
     """URDF's xyz and rpy (fixed axes x, y, z) as a homogeneous matrix."""
     pose = np.eye(4)
-    pose[:3, 3] = _floats(element, "xyz", "0 0 0")
-    roll, pitch, yaw = _floats(element, "rpy", "0 0 0")
+    pose[:3, 3] = floats(element, "xyz", "0 0 0")
+    roll, pitch, yaw = floats(element, "rpy", "0 0 0")
     pose[:3, :3] = (
         _rotation(np.array([0.0, 0.0, 1.0]), yaw)
         @ _rotation(np.array([0.0, 1.0, 0.0]), pitch)
@@ -144,10 +145,10 @@ def _pose(joint: _Joint, q: float) -> Array:
 def _transform(joint: _Joint, q: float) -> Transform:
     pose = _pose(joint, q)
     x, y, z = pose[:3, 3].tolist()
-    return Transform(joint.parent, joint.child, (x, y, z), _quaternion(pose[:3, :3]))
+    return Transform(joint.parent, joint.child, (x, y, z), quaternion(pose[:3, :3]))
 
 
-def _quaternion(r: Array) -> tuple[float, float, float, float]:
+def quaternion(r: Array) -> tuple[float, float, float, float]:
     """Unit quaternion of a rotation matrix, from its largest component (Shepperd, 1978)."""
     squares = np.array(
         [
@@ -180,7 +181,7 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
                 continue
             key = (mesh.get("filename", ""), mesh.get("scale", "1 1 1"))
             if key not in fitted:
-                fitted[key] = _fit(key[0], _floats(mesh, "scale", "1 1 1"), read)
+                fitted[key] = _fit(key[0], floats(mesh, "scale", "1 1 1"), read)
             found = fitted[key]
             if found is None:
                 link.remove(part)
@@ -188,7 +189,7 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
             shape, placement = found
             geometry.remove(mesh)
             geometry.append(shape)
-            _place(part, _origin(part.find("origin")) @ placement)
+            _place(part, origin(part.find("origin")) @ placement)
 
 
 def _fit(

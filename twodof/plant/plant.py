@@ -138,7 +138,7 @@ class Plant:
         """q̈_cmd of the controller at a state, n values."""
         model, data, frame = self._model, self._data, self.robot.frame_id
         forward_kinematics(model, data, q, v, self._still)
-        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).tolist()
+        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).reshape(6, -1).tolist()
         # with q̈ = 0 the frame's acceleration is the drift J̇v
         drift = frame_acceleration(model, data, frame, WORLD_ALIGNED).linear.tolist()
         x = self._placement.translation.tolist()

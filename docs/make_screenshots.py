@@ -1,0 +1,74 @@
+"""Makes docs/view.png and docs/live.png, the README's screenshots of the pages.
+
+    python docs/make_screenshots.py
+
+The first is the replay of a real run of the default arm, whose target changes; the second a live
+arm, whose target has just been dragged. Needs chromium and the packages 'viser' and 'playwright'.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import browser  # noqa: E402
+from playwright.sync_api import Browser, Page  # noqa: E402
+
+import twodof  # noqa: E402
+
+SIZE = {"width": 1280, "height": 800}
+INPUTS = "time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n4,0.22,-0.08\n"
+
+
+def main() -> None:
+    """Make both."""
+    browser.VIEWPORT.update(SIZE)
+    with tempfile.TemporaryDirectory() as name, browser.chromium() as chromium:
+        folder = Path(name)
+        fmu = twodof.build_fmu(folder / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
+        (folder / "targets.csv").write_text(INPUTS)
+        run = twodof.experiment(fmu, stop_time=6, input_file=folder / "targets.csv")
+        twodof.simulate(run, [twodof.Bag(folder / "my_bag", run)])
+        view(chromium, folder)
+        live(chromium, folder, fmu)
+
+
+def view(chromium: Browser, folder: Path) -> None:
+    """The replay, 0.6 s after the target has changed."""
+    with (
+        browser.served("view", "my_bag", cwd=folder) as command,
+        browser.opened(chromium, command.url) as page,
+    ):
+        browser.type_into(page, "time, s", 4.6)
+        browser.until(page, lambda found: found["time"] == "4.600 s")
+        shoot(page, "view.png")
+
+
+def live(chromium: Browser, folder: Path, fmu: Path) -> None:
+    """The live arm, paused on its way to a target that was moved."""
+    with (
+        browser.served("live", fmu, cwd=folder) as command,
+        browser.opened(chromium, command.url) as page,
+    ):
+        browser.until(page, lambda found: browser.numbers(found["error"])[0] < 2.0)
+        browser.type_into(page, "x", 0.14)
+        browser.type_into(page, "y", 0.19)
+        browser.until(page, lambda found: browser.numbers(found["error"])[0] > 80.0)
+        browser.until(page, lambda found: browser.numbers(found["error"])[0] < 60.0)
+        browser.press(page, "Pause")
+        shoot(page, "live.png")
+
+
+def shoot(page: Page, name: str) -> None:
+    """Save what is shown, without the notice that the browser renders in software."""
+    page.locator(".mantine-Notification-closeButton").first.click()
+    page.wait_for_timeout(1500)
+    page.screenshot(path=ROOT / "docs" / name)
+
+
+if __name__ == "__main__":
+    main()

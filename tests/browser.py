@@ -1,0 +1,194 @@
+"""A browser on a page of ``twodof view`` or ``twodof live``, and the command behind the page."""
+
+from __future__ import annotations
+
+import io
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import viser
+import websockets.sync.client
+from harness import needs
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+from viser import _messages
+from websockets import Subprotocol
+
+VIEWPORT = {"width": 900, "height": 560}
+ARGUMENTS = (
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
+)  # fmt: skip
+COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
+ROWS = """() => Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
+    cell => [cell.dataset.value, cell.textContent]))"""
+PLOTS = """() => Object.values(window.__viserTestpoints.uplots).map(({chart}) =>
+    [chart.root.querySelector(".u-title").textContent, chart.data.map(line => [...line].map(
+        value => Number.isFinite(value) ? value : null))])"""
+LATENCY = """([label, text, row]) => new Promise(resolve => {
+    const cell = () => document.querySelector(`[data-value="${row}"]`);
+    const before = cell().textContent;
+    const input = [...document.querySelectorAll("label")].find(
+        e => e.textContent.trim() === label).closest("[class*=Group], div:has(input)");
+    const field = input.querySelector("input") || document.getElementById(input.htmlFor);
+    const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set;
+    set.call(field, text);
+    const start = performance.now();
+    field.dispatchEvent(new Event("input", {bubbles: true}));
+    const observer = new MutationObserver(() => {
+        if (cell() && cell().textContent !== before) {
+            observer.disconnect();
+            resolve((performance.now() - start) / 1000);
+        }
+    });
+    observer.observe(document.body, {subtree: true, childList: true, characterData: true});
+})"""
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A headless browser that renders in software."""
+    program = needs("chromium", "chromium-browser", "google-chrome")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def opened(browser: Browser, url: str, *, ready: str = "[data-value]") -> Iterator[Page]:
+    """A page that is shown; at its end, no error is in its console."""
+    with browser.new_context(viewport=VIEWPORT) as context:
+        page = context.new_page()
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+        page.goto(url)
+        page.wait_for_selector("canvas")
+        page.wait_for_selector(ready)
+        yield page
+        assert errors == []
+
+
+class Served:
+    """A command with a page: started, its URL read; ended by Ctrl-C."""
+
+    def __init__(self, *arguments: str | Path, cwd: Path) -> None:
+        self.process = subprocess.Popen(
+            [*COMMAND, *map(str, arguments), "--port", "0", "--no-browser"],
+            cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        found = re.match(r"open +(http://127\.0\.0\.1:\d+)", line)
+        if not found:
+            self.process.kill()
+            raise AssertionError(line + self.process.communicate()[1])
+        self.url = found[1]
+
+    def interrupt(self, number: int = signal.SIGINT) -> tuple[int, str, str]:
+        """Ctrl-C; exit status and what was printed on stdout and stderr."""
+        self.process.send_signal(number)
+        output, errors = self.process.communicate(timeout=20)
+        return self.process.returncode, output, errors
+
+    def children(self) -> list[int]:
+        """Processes that it has started."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return [int(word) for word in children.read_text().split()]
+
+    def status(self, name: str, pid: int | None = None) -> int:
+        """A number of /proc/…/status, e.g. Threads, or VmRSS in KiB."""
+        text = Path(f"/proc/{pid or self.process.pid}/status").read_text()
+        return int(re.search(rf"^{name}:\s+(\d+)", text, re.M)[1])
+
+
+@contextmanager
+def served(*arguments: str | Path, cwd: Path) -> Iterator[Served]:
+    """A command that is killed at the end, if it still runs."""
+    command = Served(*arguments, cwd=cwd)
+    try:
+        yield command
+    finally:
+        command.process.kill()
+        command.process.communicate()
+
+
+def connect(url: str) -> None:
+    """Connect as a browser does that has the page open, and leave at once."""
+    camera = _messages.ViewerCameraMessage(
+        wxyz=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, 1.0), fov=0.6, near=0.01, far=10.0,
+        image_height=100, image_width=100, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 1.0, 0.0),
+    )  # fmt: skip
+    address = url.replace("http:", "ws:")
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    with websockets.sync.client.connect(
+        address, subprotocols=[protocol], compression=None, max_size=None
+    ) as connection:
+        connection.send(msgspec.msgpack.encode(camera.as_serializable_dict()))
+        connection.recv()
+        time.sleep(0.1)
+
+
+def rows(page: Page) -> dict[str, str]:
+    """All of the readout at one moment."""
+    return page.evaluate(ROWS)
+
+
+def numbers(text: str) -> list[float]:
+    """Numbers in a text."""
+    return [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", text)]
+
+
+def until(page: Page, condition: Callable[[dict[str, str]], bool], timeout: float = 15.0) -> Any:
+    """The readout once it fulfils a condition."""
+    end = time.monotonic() + timeout
+    while not condition(found := rows(page)):
+        assert time.monotonic() < end, found
+        page.wait_for_timeout(20)
+    return found
+
+
+def press(page: Page, name: str) -> None:
+    """Press a button whose label begins so."""
+    page.get_by_role("button", name=re.compile(f"^{name}")).first.click()
+
+
+def type_into(page: Page, label: str, value: float) -> None:
+    """Type a number into the field or the slider's field of that label."""
+    field = field_of(page, label)
+    field.fill(f"{value:g}")  # "0.0" is taken for a number that is yet to be ended
+    field.press("Enter")
+    page.wait_for_timeout(150)  # the page sends the latest of what changes faster than 50 ms
+
+
+def field_of(page: Page, label: str) -> Any:
+    """The input for a label's number."""
+    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
+    return row.locator("input[inputmode=decimal]").first
+
+
+def latency(page: Page, label: str, value: float) -> float:
+    """Time from a change of the field to the first change of the end effector, s."""
+    return float(page.evaluate(LATENCY, [label, f"{value}", "end effector"]))
+
+
+def picture(page: Page) -> np.ndarray:
+    """What the 3D scene shows, height × width × 3."""
+    shot = page.screenshot(clip=page.locator("canvas").first.bounding_box())
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
+
+
+def colours(shown: np.ndarray) -> int:
+    """Number of different colours."""
+    return len(np.unique(shown.reshape(-1, 3), axis=0))

@@ -1,0 +1,280 @@
+"""The replay of a bag, seen in a browser. Truth is the bag as MCAP's own reader gives it."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import time as clock
+from collections.abc import Iterator
+from pathlib import Path
+
+import browser
+import numpy as np
+import oracles
+import pytest
+from browser import (
+    Served,
+    chromium,
+    colours,
+    connect,
+    numbers,
+    opened,
+    picture,
+    press,
+    rows,
+    served,
+    until,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from playwright.sync_api import Browser, Page
+
+import twodof
+from twodof.page import BUCKETS, outline
+from twodof.view import nearest
+
+CHANGE = 2.0  # s
+TARGETS = ((0.2, 0.05), (0.1, 0.2))
+
+
+@pytest.fixture(scope="module")
+def shown() -> Iterator[Browser]:
+    with chromium() as program:
+        yield program
+
+
+@pytest.fixture(scope="module")
+def folder(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an FMU and the bag of a run whose target changes."""
+    folder = tmp_path_factory.mktemp("view")
+    fmu = folder / native_path.name
+    fmu.write_bytes(native_path.read_bytes())
+    inputs = folder / "inputs.csv"
+    inputs.write_text("time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n")
+    run = twodof.experiment(fmu, stop_time=4, input_file=inputs)
+    twodof.simulate(run, [twodof.Bag(folder / "bag", run)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def command(folder: Path) -> Iterator[Served]:
+    with served("view", "bag", cwd=folder) as command:
+        yield command
+
+
+@pytest.fixture(scope="module")
+def page(shown: Browser, command: Served) -> Iterator[Page]:
+    with opened(shown, command.url) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def truth(folder: Path) -> np.ndarray:
+    """Time and joint positions of each sample, by another reader."""
+    with (folder / "bag/bag.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = [
+            (message.log_time, *state.position)
+            for _, _, message, state in reader.iter_decoded_messages(topics=["/joint_states"])
+        ]
+    table = np.array(found, dtype=object)
+    return np.column_stack([(table[:, 0] - table[0, 0]) / 1e9, table[:, 1:]]).astype(float)
+
+
+def scrub(page, time: float) -> dict[str, str]:
+    browser.type_into(page, "time, s", time)
+    return until(page, lambda found: found["time"] == f"{time:.3f} s")
+
+
+def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: np.ndarray) -> None:
+    first = until(page, lambda found: numbers(found["time"])[0] > 0.0)
+    until(page, lambda found: numbers(found["time"])[0] > numbers(first["time"])[0])
+    pictures = []
+    for time in (1.23, 0.05, 3.99):
+        found = scrub(page, time)
+        k = round(time / 0.01)
+        q = truth[k, 1:]
+        assert truth[k, 0] == pytest.approx(time, abs=1e-9)
+        assert found["sample"] == f"{k} of 400"
+        assert numbers(found["joint1"] + found["joint2"]) == pytest.approx(q, abs=6e-6)
+        place = numbers(found["end effector"])
+        assert place == pytest.approx([*oracles.position(q), 0.0], abs=6e-6)
+        target = TARGETS[time > CHANGE]
+        assert numbers(found["target"])[:2] == pytest.approx(target)
+        error = 1e3 * np.linalg.norm(oracles.position(q) - target)
+        assert numbers(found["error"])[0] == pytest.approx(error, rel=1e-3)
+        page.wait_for_timeout(600)  # some frames, rendered in software
+        pictures.append(picture(page))
+    assert all(colours(shot) > 100 for shot in pictures)
+    assert (pictures[0] != pictures[1]).any() and (pictures[1] != pictures[2]).any()
+    held = rows(page)
+    page.wait_for_timeout(300)
+    assert rows(page) == held  # scrubbing has stopped the replay
+    press(page, "Play")
+    until(page, lambda found: found["sample"] == "400 of 400")
+    page.wait_for_timeout(1000)  # what is typed while the field is being set may be lost
+
+
+def test_picture_is_the_arm_at_that_time(page: Page, truth: np.ndarray) -> None:
+    """The middle of the orange link, in pixels, is that of the link from elbow to tip, in metres.
+
+    Seen from the front: x to the right, y upwards, one scale; where on the link its middle is, the
+    picture tells. It is good to 2 cm: the link's sides are seen too, and the marker hides a part.
+    """
+    pixels, rows_of_arm = [], []
+    for time in (0.0, 0.3, 0.9, 2.2, 2.6, 4.0):
+        scrub(page, time)
+        page.wait_for_timeout(800)
+        r, g, b = np.moveaxis(picture(page).astype(int), -1, 0)
+        orange = (r > 190) & (g > 110) & (g < 180) & (b < 100)
+        assert orange.sum() > 500
+        y, x = np.argwhere(orange).mean(axis=0)
+        q = truth[round(time / 0.01), 1:]
+        elbow = oracles.LINK * np.array([np.cos(q[0]), np.sin(q[0])])
+        link = oracles.position(q) - elbow
+        pixels += [x, y]
+        rows_of_arm += [[1, 0, elbow[0], link[0]], [0, 1, -elbow[1], -link[1]]]
+    found, *_ = np.linalg.lstsq(np.array(rows_of_arm), np.array(pixels), rcond=None)
+    assert np.abs(np.array(rows_of_arm) @ found - pixels).max() < 20.0
+    scale, along = found[2], found[3] / found[2]
+    assert scale > 500  # pixels a metre
+    assert 0.2 < along < 0.6
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.25])
+def test_speed_is_that_of_the_wall_clock(page: Page, speed: float) -> None:
+    page.get_by_role("combobox").last.click()
+    page.get_by_role("option", name=f"{speed:g} ×", exact=True).click()
+    scrub(page, 0.5)
+    press(page, "Play")
+    before = numbers(until(page, lambda found: numbers(found["time"])[0] > 0.5)["time"])[0]
+    begin = clock.monotonic()
+    until(page, lambda found: numbers(found["time"])[0] > before + speed)
+    elapsed = clock.monotonic() - begin
+    press(page, "Pause")
+    page.wait_for_timeout(1000)
+    assert 0.7 < elapsed < 3.0  # s; a browser that renders in software may show it late
+
+
+def test_plots_hold_the_bag_and_a_mark_at_the_time(page: Page, truth: np.ndarray) -> None:
+    scrub(page, 1.5)
+    page.wait_for_timeout(400)
+    plots = page.evaluate(browser.PLOTS)
+    positions = next(data for title, data in plots if title == "position, rad")
+    times, q1, q2, mark = np.array(positions, dtype=float)
+    assert np.column_stack([times, q1, q2]) == pytest.approx(truth)
+    assert times[np.isfinite(mark)] == pytest.approx([1.49, 1.5])
+
+
+def test_two_viewers_see_the_same(shown: Browser, command: Served, page: Page) -> None:
+    with opened(shown, command.url) as other:
+        scrub(page, 2.5)
+        assert until(other, lambda found: found["time"] == "2.500 s") == rows(page)
+        scrub(other, 0.5)
+        until(page, lambda found: found["time"] == "0.500 s")
+
+
+def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:
+    """Threads and memory are as they were after the first few."""
+    for i in range(25):
+        connect(command.url)
+        if i == 4:
+            threads, memory = command.status("Threads"), command.status("VmRSS")
+    assert command.status("Threads") <= threads + 2
+    assert command.status("VmRSS") <= memory + 10_000  # KiB
+    scrub(page, 1.5)
+
+
+def test_exported_file_replays_offline(shown: Browser, folder: Path) -> None:
+    done = subprocess.run(
+        [*browser.COMMAND, "view", "bag", "--export", "replay.html"],
+        cwd=folder, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stderr == ""
+    with shown.new_context(viewport=browser.VIEWPORT, offline=True) as context:
+        page = context.new_page()
+        asked, errors = [], []
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto((folder / "replay.html").as_uri())
+        page.wait_for_selector("canvas")
+        pictures = []
+        for _ in range(2):
+            page.wait_for_timeout(900)
+            pictures.append(picture(page))
+    assert colours(pictures[0]) > 100
+    assert (pictures[0] != pictures[1]).any()
+    assert errors == []
+    assert all(url.startswith(("file:", "blob:", "data:")) for url in asked)
+    assert (folder / "replay.html").stat().st_size < 5e6
+
+
+def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(
+    shown: Browser, folder: Path, tmp_path: Path
+) -> None:
+    bag = tmp_path / "foreign"
+    bag.mkdir()
+    for file in (folder / "bag").iterdir():
+        if file.name != "run.json":
+            (bag / file.name).write_bytes(file.read_bytes())
+    with served("view", "foreign", cwd=tmp_path) as command, opened(shown, command.url) as page:
+        assert set(rows(page)) == {"time", "sample", "joint1", "joint2"}
+        status, _, errors = command.interrupt()
+    assert status == 0
+    assert errors == "WARNING: 'foreign' carries no robot; give one with --urdf\n"
+
+
+def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [*browser.COMMAND, "view", *map(str, arguments), "--no-browser"]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_port_in_use(folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = run_view("bag", "--port", f"{port}", cwd=folder)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1
+    assert f"port {port} of 127.0.0.1 is in use" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere"], "'nowhere'"),
+        (["bag", "--urdf", "other.urdf"], "no joint 'shoulder'"),
+        (["bag", "--fmu", "none.fmu"], "no FMU 'none.fmu'"),
+        (["bag", "--host", "192.0.2.1"], "cannot listen on 192.0.2.1"),
+        (["bag", "--export", "no/where.html"], "cannot write 'no/where.html'"),
+    ],
+)
+def test_bad_input_gets_one_line(arguments: list[str], said: str, folder: Path) -> None:
+    urdf = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text()
+    (folder / "other.urdf").write_text(urdf.replace('"joint1"', '"shoulder"'))
+    done = run_view(*arguments, "--port", "0", cwd=folder)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(r"twodof: error: [^\n]+\n", done.stderr)
+    assert said in done.stderr
+
+
+@given(st.lists(st.floats(0, 1e4), min_size=1, max_size=50).map(sorted), st.floats(-1, 1.1e4))
+def test_nearest_is_nearest(times: list[float], time: float) -> None:
+    t = np.array(times)
+    assert abs(t[nearest(t, time)] - time) == np.abs(t - time).min()
+
+
+@given(st.integers(2 * BUCKETS + 1, 20_000), st.integers(0, 2**32 - 1))
+def test_outline_keeps_extremes_and_their_places(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t, values = np.sort(rng.uniform(0, 100, count)), rng.normal(size=(count, 2))
+    times, few = outline(t, values)
+    assert len(times) == len(few) == 2 * BUCKETS
+    assert (np.diff(times) >= 0).all() and t[0] <= times[0] and times[-1] <= t[-1]
+    assert (few.max(axis=0) == values.max(axis=0)).all()
+    assert (few.min(axis=0) == values.min(axis=0)).all()
+    peak = int(values[:, 0].argmax())
+    width = max(np.diff(times[::2]).max(), t[-1] - times[-2])
+    assert abs(times[int(few[:, 0].argmax())] - t[peak]) <= width

@@ -1,0 +1,574 @@
+"""An FMU stepped in real time behind a page in the browser.
+
+The loop that steps has a process of its own, so that nothing that the page does holds it up. The
+two talk through a pipe: the page tells what its controls ask for, which is done between two steps,
+and thirty times a second that it is ready for more, whereupon the loop tells what has happened.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from itertools import chain, count
+from math import dist, isfinite
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bag import Bag
+from .errors import BagError, PageError, SimulationError, TwoDofError
+from .fmu import Fmu, load_fmu, read_resource, read_urdf
+from .inputs import Setting, Value, resolve
+from .master import Experiment, RealTime, Sample, experiment, samples
+from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Figure, Page, Plot, Readout
+from .plant import Robot, RobotError, load_robot
+
+Array = NDArray[np.float64]
+
+Change = Callable[[dict[str, Setting]], None]
+"""Asks for inputs by name."""
+
+LONGEST = 1e7  # s: no run that anybody watches is longer
+PLOTTED = 10.0  # s
+TRAIL_POINTS = 45
+MOST_ROWS = 10_000  # that wait for a page to ask
+WINDOW = 1.0  # s over which the real-time factor is taken
+IDLE = 0.05  # s between two looks at whether to go on
+
+
+class Recording:
+    """A bag that begins in the midst of a run, with the sample that is at hand.
+
+    Its provenance is that of a run which starts there: from the joint positions and velocities and
+    with the inputs of its first sample; what was changed later is added when it is closed.
+    """
+
+    def __init__(self, path: Path, run: Experiment, first: Sample, command_line: str) -> None:
+        state = {
+            name: value
+            for group, values in (("q_start", first.q), ("v_start", first.v))
+            for name, value in zip(run.fmu.vector(group), values)
+        }
+        starts = {**run.start_values, **first.inputs, **state}
+        run = replace(
+            run, start_time=first.t, steps=run.steps - first.k, start_values=starts,
+            given={**run.given, **first.inputs, **state}, changes=[],
+        )  # fmt: skip
+        self.path, self._run = path, run
+        self._first = self._last = first
+        self._changes: list[tuple[float, dict[str, Value]]] = []
+        self._bag = Bag(path, run, scene=True, effort=bool(first.tau), command_line=command_line)
+        self._bag.__enter__()
+        self.write(first)
+
+    def write(self, sample: Sample) -> None:
+        """Write one sample."""
+        before = self._last
+        if sample.inputs is not before.inputs:
+            changed = {n: v for n, v in sample.inputs.items() if v != before.inputs[n]}
+            if changed:  # since the sample before, to which they were the answer
+                self._changes.append((before.t, changed))
+        self._last = sample
+        self._bag.write(sample._replace(k=sample.k - self._first.k))
+
+    @property
+    def count(self) -> int:
+        """Number of samples so far."""
+        return self._last.k - self._first.k + 1
+
+    def close(self) -> None:
+        """Close the bag, and complete its provenance."""
+        self._bag.amend(replace(self._run, steps=self.count - 1, changes=self._changes))
+        self._bag.__exit__(None, None, None)
+
+
+class News(NamedTuple):
+    """What the loop tells the page.
+
+    Attributes:
+        sample: the latest.
+        rows: joint positions and distance from the target, mm, of each sample since the last news.
+        again: whether the run has begun again since.
+        playing: whether it is to go on.
+        missed, steps, worst: deadlines missed, of how many steps, and the largest delay, s.
+        recorded: number of samples in the bag that is being recorded, 0 where there is none.
+        notes: what to tell the user, titles and texts.
+    """
+
+    sample: Sample
+    rows: list[tuple[float, ...]]
+    again: bool
+    playing: bool
+    missed: int
+    steps: int
+    worst: float
+    recorded: int
+    notes: list[tuple[str, str]]
+
+
+class Loop:
+    """Steps an FMU as a page asks.
+
+    Args:
+        run: what to run; a long one.
+        bag: name of the first recording; None: rosbag2_<date and time>.
+        command_line: for the provenance of recordings.
+
+    Attributes:
+        recorded: the bags that were written.
+        pace: keeps the time.
+        steps: number of steps in real time.
+
+    Raises:
+        PageError: the FMU carries no robot, or no target.
+        FmuError, SimulationError: it cannot be instantiated.
+    """
+
+    def __init__(self, run: Experiment, *, bag: str | None = None, command_line: str = "") -> None:
+        fmu = run.fmu
+        if read_urdf(fmu) is None or not fmu.axes or not fmu.vector("x_des"):
+            raise PageError(f"'{fmu.path}' carries no robot, or has no inputs x_des[k]")
+        self._run, self._bag, self._command_line = run, bag, command_line
+        self.recorded: list[Path] = []
+        self.pace = RealTime()
+        self.steps = 0
+        self._recording: Recording | None = None
+        self._changes: dict[str, Setting] = {}
+        self._notes: list[tuple[str, str]] = []
+        self._playing, self._watched, self._singles = True, False, 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Instantiate the FMU and take its first sample."""
+        self._source = samples(self._run, pace=self.pace)
+        self.pace.restart()
+        self._rows: list[tuple[float, ...]] = []
+        self._again, self._broken = True, False
+        self._take(next(self._source))
+
+    def play(self, page: Connection, stop: Callable[[], bool]) -> None:
+        """Step the FMU as the page asks, until ``stop`` is true.
+
+        Raises:
+            PageError: the page's process has ended.
+        """
+        try:
+            while not stop():
+                if self._singles and not self._broken:
+                    self._singles -= 1
+                    self.pace.restart()
+                    self._step()
+                elif self._playing and self._watched and not self._broken:
+                    self._step()
+                    self.steps += 1
+                else:
+                    self.pace.restart()
+                    page.poll(IDLE)
+                while page.poll():
+                    self._obey(page, *page.recv())
+        except (EOFError, OSError) as error:
+            raise PageError("the process of the page has ended") from error
+        finally:
+            self._end_recording()
+            self._source.close()
+
+    def news(self) -> News:
+        """What has happened since it was asked before."""
+        rows, self._rows = self._rows, []
+        notes, self._notes = self._notes, []
+        again, self._again = self._again, False
+        return News(
+            self._sample, rows, again, self._playing, self.pace.missed, self.steps, self.pace.worst,
+            0 if self._recording is None else self._recording.count, notes,
+        )  # fmt: skip
+
+    def _obey(self, page: Connection, order: str, value: Any) -> None:
+        if order == "more":
+            self._watched = value
+            page.send(self.news())
+        elif order == "change":
+            self._changes.update(value)
+        elif order == "play":
+            self._playing = value
+        elif order == "step":
+            self._playing = False
+            self._singles += 1
+        elif order == "reset":
+            self._reset()
+        elif not value:
+            self._end_recording()
+        elif self._recording is None:
+            self._record()
+
+    def _step(self) -> None:
+        changes, self._changes = self._changes, {}
+        try:
+            self._take(self._source.send(changes or None))
+        except (SimulationError, StopIteration) as error:
+            self._broken = True
+            self._notes.append(("The simulation has ended", f"{error or 'its time is over'}"))
+            self._end_recording()
+
+    def _take(self, sample: Sample) -> None:
+        self._sample = sample
+        self._rows.append((*sample.q, 1e3 * dist(sample.x, _target(sample))))
+        del self._rows[:-MOST_ROWS]  # while no page asks
+        if self._recording is not None:
+            try:
+                self._recording.write(sample)
+            except BagError as error:
+                self._notes.append(("The recording has ended", str(error)))
+                self._recording = None
+
+    def _reset(self) -> None:
+        """The arm back to its start; the inputs stay."""
+        self._end_recording()
+        self._source.close()
+        inputs = {**self._sample.inputs, **resolve(self._run.fmu, self._changes)}
+        self._changes = {}
+        self._run = replace(
+            self._run,
+            start_values={**self._run.start_values, **inputs},
+            given={**self._run.given, **inputs},
+        )
+        self._begin()
+
+    def _record(self) -> None:
+        path = self._free_name()
+        try:
+            self._recording = Recording(path, self._run, self._sample, self._command_line)
+        except BagError as error:
+            self._notes.append(("There is no recording", str(error)))
+        self.pace.restart()  # opening a bag may wait for the disk: time has stood still
+
+    def _end_recording(self) -> None:
+        recording, self._recording = self._recording, None
+        if recording is None:
+            return
+        try:
+            recording.close()
+            self.recorded.append(recording.path)
+            self._notes.append(("Recorded", f"{recording.path}, {recording.count} samples"))
+        except BagError as error:
+            self._notes.append(("The recording has ended", str(error)))
+        self.pace.restart()
+
+    def _free_name(self) -> Path:
+        name = self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
+        names = chain([name], (f"{name}-{i}" for i in count(2)))
+        return next(path for path in map(Path, names) if not path.exists())
+
+
+def _target(sample: Sample) -> list[float]:
+    return [float(sample.inputs[f"x_des[{k + 1}]"]) for k in range(len(sample.x))]
+
+
+class Controls:
+    """A page that shows what a loop tells, and asks what its controls say.
+
+    Args:
+        page: the page.
+        fmu: the FMU that is run.
+        start_values: its inputs and parameters at the start.
+        step: communication step, s.
+        loop: the connection to the loop.
+
+    Raises:
+        PageError: the FMU's robot cannot be read.
+    """
+
+    def __init__(
+        self, page: Page, fmu: Fmu, start_values: Mapping[str, Value], step: float, loop: Connection
+    ) -> None:
+        urdf = read_urdf(fmu) or ""
+        try:
+            robot = load_robot(urdf, fmu.frame, fmu.axes)
+        except RobotError as error:
+            raise PageError(f"'{fmu.path}': {error}") from error
+        self._page, self._fmu, self._starts, self._loop = page, fmu, start_values, loop
+        self._sending = Lock()
+        self._news: News = self._ask("more", False)
+        self._past: deque[tuple[float, float]] = deque()  # wall clock and time, s
+        self._step, self._most = step, max(2, round(PLOTTED / step))
+        self._rows = np.array(self._news.rows[-1:])
+        self._figure = Figure(page, urdf, fmu.joints, fmu.frame, partial(read_resource, fmu))
+        self._set_scene()
+        self._add_controls(robot)
+
+    def _tell(self, order: str, value: Any = None) -> None:
+        with self._sending:
+            self._loop.send((order, value))
+
+    def _ask(self, order: str, value: Any) -> Any:
+        self._tell(order, value)
+        return self._loop.recv()
+
+    def show(self) -> None:
+        """Show what the loop tells, until it ends."""
+        trail: deque[Array] = deque(maxlen=TRAIL_POINTS)
+        shown, plotted = -1.0, 0.0
+        while True:
+            begin = time.perf_counter()
+            news: News = self._ask("more", self._page.viewers > 0)
+            self._news, sample = news, news.sample
+            if news.again:
+                trail.clear()
+                self._rows = np.array(news.rows[:1])
+                shown = -1.0
+            if news.rows:
+                self._rows = np.concatenate([self._rows, news.rows])[-self._most :]
+            if sample.t != shown:
+                trail.append(self._figure.end_effector(sample.q))
+                with self._page.atomic():
+                    self._figure.pose(sample.q)
+                    self._trail.show(np.array(trail))
+            self._show_numbers(begin)
+            if sample.t != shown and begin - plotted > 1 / PLOT_RATE:
+                plotted = begin
+                age = np.arange(1.0 - len(self._rows), 1.0) * self._step
+                self._plots[0].show(age, self._rows[:, :-1])
+                self._plots[1].show(age, self._rows[:, -1:])
+            shown = sample.t
+            for title, text in news.notes:
+                self._page.notify(title, text)
+            time.sleep(max(0.0, begin + 1 / RATE - time.perf_counter()))
+
+    def _set_scene(self) -> None:
+        fmu, sample = self._fmu, self._news.sample
+        starts = self._starts
+        end = self._figure.end_effector(sample.q)
+        self._target_place = end.copy()
+        for axis, value in zip(fmu.axes, _target(sample)):
+            self._target_place["xyz".index(axis)] = value
+        shown = np.vstack([self._figure.points(sample.q), end, self._target_place])
+        gravity = [-float(starts.get(f"gravity[{i}]", 0.0)) for i in (1, 2, 3)]
+        middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+        around = middle + 1.35 * (shown - middle)  # room to drag the target
+        size = self._page.frame(around, fmu.axes, gravity if any(gravity) else (0.0, 0.0, 1.0))
+        self._target = self._page.add_target(size, fmu.axes, draggable=True)
+        self._target.position = self._target_place
+        self._trail = self._page.add_line("/trail", TRAIL, 4.0)
+        self._figure.pose(sample.q)
+
+    def _add_controls(self, robot: Robot) -> None:
+        page, gui, fmu = self._page, self._page.gui, self._fmu
+        self._play_button = gui.add_button("Pause")
+        self._play_button.on_click(
+            lambda event: self._tell("play", self._play_button.label == "Play")
+        )
+        others = gui.add_button_group("", ("Single step", "Reset"))
+        others.on_click(
+            lambda event: self._tell("step" if others.value == "Single step" else "reset")
+        )
+        self._record_button = gui.add_button("Record", color="red")
+        self._record_button.on_click(
+            lambda event: self._tell("record", self._record_button.label == "Record")
+        )
+        self._readout = Readout(page, fmu.joints)
+
+        change = partial(self._tell, "change")
+        self._add_target_fields(change)
+        with gui.add_folder("Gains"):
+            for group, unit in (("Kp", "s⁻²"), ("Kd", "s⁻¹")):
+                self._add_gain(group, unit, change)
+        if fmu.vector("tau_ext"):
+            self._add_disturbance(robot, change)
+        units = "rad or m" if any(robot.prismatic) else "rad"
+        age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
+        joints, error = f"position, {units}", "distance from the target, mm"
+        self._plots = (
+            Plot(page, joints, fmu.joints, age, rows[:, :-1], marked=False),
+            Plot(page, error, ["error"], age, rows[:, -1:], marked=False),
+        )
+
+    def _add_target_fields(self, change: Change) -> None:
+        """Numbers that go with the marker in the scene."""
+        target, gui = self._target, self._page.gui
+        axes = {axis: "xyz".index(axis) for axis in self._fmu.axes}
+        with gui.add_folder("Target, m"):
+            fields = {
+                axis: gui.add_number(axis, float(self._target_place[k]), step=0.001)
+                for axis, k in axes.items()
+            }
+
+        moving = Lock()  # viser calls from several threads
+
+        def move(place: Array) -> None:
+            change({"x_des": tuple(float(place[k]) for k in axes.values())})
+
+        def dragged(event: Any) -> None:
+            with moving:
+                for axis, k in axes.items():
+                    fields[axis].value = round(float(target.position[k]), 4)
+                move(target.position)
+
+        def typed(k: int, event: Any) -> None:
+            if event.client is None:  # set by ``dragged``
+                return
+            with moving:
+                place = np.array(target.position)
+                place[k] = event.target.value
+                target.position = place
+                move(place)
+
+        target.on_update(dragged)
+        for axis, k in axes.items():
+            fields[axis].on_update(partial(typed, k))
+
+    def _add_disturbance(self, robot: Robot, change: Change) -> None:
+        names, starts = self._fmu.vector("tau_ext"), self._starts
+        sliders = {}
+        with self._page.gui.add_folder("Disturbance", expand_by_default=len(names) <= 3):
+            for name, joint, effort, prismatic in zip(
+                names, robot.joints, robot.effort, robot.prismatic
+            ):
+                start = float(starts[name])
+                most = max(0.1 * effort if isfinite(effort) else 1.0, abs(start))
+                sliders[name] = self._page.gui.add_slider(
+                    f"{joint}, {'N' if prismatic else 'N·m'}", -most, most, most / 100, start
+                )
+            release = self._page.gui.add_button("No disturbance")
+
+        def pushed(event: Any) -> None:
+            change({name: float(slider.value) for name, slider in sliders.items()})
+
+        def released(event: Any) -> None:
+            for slider in sliders.values():
+                slider.value = 0.0
+
+        for slider in sliders.values():
+            slider.on_update(pushed)
+        release.on_click(released)
+
+    def _add_gain(self, group: str, unit: str, change: Change) -> None:
+        names = self._fmu.vector(group)
+        if not names:
+            return
+        start = float(self._starts[names[0]])
+        most = max(4 * start, 200.0 if group == "Kp" else 100.0)
+        slider = self._page.gui.add_slider(f"{group}, {unit}", 0.0, most, most / 400, start)
+        slider.on_update(lambda event: change({group: float(slider.value)}))
+
+    def _show_numbers(self, now: float) -> None:
+        news, sample = self._news, self._news.sample
+        self._play_button.label = "Pause" if news.playing else "Play"
+        self._record_button.label = (
+            f"Stop recording ({news.recorded} samples)" if news.recorded else "Record"
+        )
+        if not news.playing or (self._past and sample.t < self._past[-1][1]):
+            self._past.clear()
+        self._past.append((now, sample.t))
+        while now - self._past[0][0] > WINDOW:
+            self._past.popleft()
+        elapsed = now - self._past[0][0]
+        factor = (sample.t - self._past[0][1]) / elapsed if elapsed > 0.5 * WINDOW else None
+        x, target = sample.x, _target(sample)
+        rows = {
+            "time": f"{sample.t:.2f} s",
+            "real-time factor": "-" if factor is None else f"{factor:.2f}",
+            "deadlines missed": f"{news.missed} of {news.steps}, worst {1e3 * news.worst:.1f} ms",
+            "end effector": f"({', '.join(f'{value:+.5f}' for value in x)}) m",
+            "target": f"({', '.join(f'{value:+.5f}' for value in target)}) m",
+            "error": f"{1e3 * dist(x, target):.4g} mm",
+            **{name: f"{q:+.5f}" for name, q in zip(self._fmu.joints, sample.q)},
+        }
+        self._readout.show(rows)
+
+
+def serve_page(
+    loop: Connection, path: Path, start_values: Mapping[str, Value], step: float,
+    host: str, port: int,
+) -> None:  # fmt: skip
+    """The process of the page: tells the loop its URL, or what is wrong; ends with the loop."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the loop
+    try:
+        fmu = load_fmu(path)
+        with Page(f"twodof - {fmu.name}", host, port) as page:
+            controls = Controls(page, fmu, start_values, step, loop)
+            loop.send(("url", page.url))
+            controls.show()
+    except TwoDofError as error:
+        loop.send(("error", error))
+    except (EOFError, OSError):
+        pass  # the loop has ended
+
+
+@contextmanager
+def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Iterator[tuple[str, Connection]]:
+    """The URL of a loop's page, and the connection to its process.
+
+    Raises:
+        PageError: it cannot be shown.
+    """
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(
+        target=serve_page,
+        args=(theirs, run.fmu.path, dict(run.start_values), run.step, host, port),
+        daemon=True,
+    )
+    process.start()
+    theirs.close()
+    try:
+        try:
+            order, value = ours.recv()
+            while order == "more":
+                ours.send(loop.news())
+                order, value = ours.recv()
+        except (EOFError, OSError) as error:
+            raise PageError("the process of the page has ended") from error
+        if order == "error":
+            raise value
+        yield value, ours
+    finally:
+        ours.close()
+        process.join(5.0)
+        process.kill()
+
+
+def live(
+    fmu: Fmu | str | Path,
+    stop: Callable[[], bool],
+    opened: Callable[[str], None] = lambda url: None,
+    *,
+    host: str = HOST,
+    port: int = PORT,
+    step: float = 0.01,
+    settings: Mapping[str, Setting] | None = None,
+    bag: str | None = None,
+    command_line: str = "",
+) -> list[Path]:
+    """Step an FMU in real time behind a page until ``stop`` is true; the bags recorded.
+
+    Args:
+        fmu: the FMU or its path.
+        stop: asked between two steps.
+        opened: told the URL, when it can be opened.
+        host, port: where to listen.
+        step: communication step, s.
+        settings: start values, as of ``experiment``.
+        bag: name of the first recording; None: rosbag2_<date and time>.
+        command_line: for the provenance of recordings.
+    """
+    run = long_run(fmu, step=step, settings=settings)
+    loop = Loop(run, bag=bag, command_line=command_line)
+    with page_of(loop, run, host, port) as (url, page):
+        opened(url)
+        loop.play(page, stop)
+    return loop.recorded
+
+
+def long_run(fmu: Fmu | str | Path, *, step: float, **options: Any) -> Experiment:
+    """An experiment without end; arguments and errors as of ``experiment``."""
+    run = experiment(fmu, step=step, stop_time=step, **options)
+    return replace(run, steps=round(LONGEST / step))

@@ -1,0 +1,589 @@
+"""A page in the browser: the robot in 3D, its target and trail, a readout, plots.
+
+viser is a web server of its own thread; all of it is here. What is set on a page is shown in every
+browser that has it open.
+"""
+
+from __future__ import annotations
+
+import errno
+import html
+import socket
+import sys
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from itertools import cycle
+from math import ceil, floor, log10, pi, tan
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import PageError
+from .scene import Scene, Transform, floats, origin, quaternion
+
+try:
+    import viser
+except ImportError as missing:
+    raise PageError(
+        f"cannot show a page: {missing}; install the package 'viser' (the extra 'view')"
+    ) from missing
+
+Array = NDArray[np.float64]
+ReadMesh = Callable[[str], bytes | None]
+"""The bytes of a mesh by its name ``meshes/…``, None where it is missing."""
+
+HOST, PORT = "127.0.0.1", 8080
+RATE = 30.0  # Hz, of what moves
+PLOT_RATE = 8.0  # Hz, of what is drawn anew
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Of Okabe & Ito, "Color universal design", 2008, as in the plots."""
+NO_MATERIAL = (0.62, 0.66, 0.70)
+TARGET, TRAIL, PATH = (213, 94, 0), (0, 114, 178), (170, 180, 190)
+SMALLEST_RANGE = 1e-3  # of values in a plot
+BUCKETS = 400
+"""Parts of a long line over time that each keep their extremes; a plot is as many pixels wide."""
+FIELD_OF_VIEW = 0.6  # rad, vertical
+
+
+class Page:
+    """A page that is served as long as its context lasts.
+
+    Args:
+        title: of the control panel.
+        host, port: where to listen; port 0: any that is free.
+
+    Attributes:
+        gui, scene: viser's interfaces to the control panel and to the 3D scene.
+
+    Raises:
+        PageError: the port is in use, or the host is not this machine's.
+    """
+
+    def __init__(self, title: str, host: str = HOST, port: int = PORT) -> None:
+        _check_address(host, port)
+        with _quiet():  # viser prints a table
+            self._server = _Server(host=host, port=port, label=title, verbose=False)
+        self.gui: Any = self._server.gui
+        self.scene = self._server.scene
+        if port and self._server.get_port() != port:  # taken since: viser has gone on to the next
+            self.close()
+            raise _in_use(host, port)
+        shown = "127.0.0.1" if host in ("0.0.0.0", "") else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self._server.get_port()}"
+        self.gui.configure_theme(
+            control_width="large", show_logo=False, show_share_button=False, dark_mode=False
+        )
+        self.gui.main_panel.dock_right()
+        self.scene.configure_environment_map(None)  # it is slow where the browser has no GPU
+        self.scene.configure_default_lights(False)
+        self.scene.world_axes.visible = False
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop serving."""
+        with _quiet():
+            self._server.stop()
+
+    @property
+    def viewers(self) -> int:
+        """Number of browsers that have the page open."""
+        return len(self._server.get_clients())
+
+    def atomic(self) -> Any:
+        """A context whose changes browsers show at once."""
+        return self._server.atomic()
+
+    def notify(self, title: str, text: str) -> None:
+        """Tell all browsers, until it is read."""
+        for client in self._server.get_clients().values():
+            client.add_notification(title, text, auto_close_seconds=8.0)
+
+    def frame(self, points: Array, axes: str, up: Sequence[float]) -> float:
+        """Place the camera so that points (N × 3, m) fill the picture; the size of what is seen, m.
+
+        Args:
+            points: what must be seen.
+            axes: the task axes; two of them are a plane, which is seen from the front.
+            up: what points upwards, three values.
+        """
+        low, high = points.min(axis=0), points.max(axis=0)
+        size = max(float(np.linalg.norm(high - low)), 1e-3)
+        centre = (low + high) / 2
+        vertical = np.eye(3)[int(np.argmax(np.abs(up)))] * (np.sign(up)[np.argmax(np.abs(up))])
+        plane = axes if len(axes) == 2 else ""
+        if plane:
+            front = np.eye(3)["xyz".index(({*"xyz"} - {*plane}).pop())]
+            if not front @ vertical:
+                right = np.cross(vertical, front)
+                front *= 1.0 if right.sum() > 0 else -1.0  # the axis across points to the right
+            else:
+                front, vertical = vertical, np.eye(3)["xyz".index(plane[1])]
+        else:
+            across = np.roll(np.abs(vertical), 1)
+            front = across * 1.0 - 1.0 * np.cross(vertical, across) + 0.55 * vertical
+            front /= np.linalg.norm(front)
+        self.scene.set_up_direction(tuple(vertical))
+        distance = 0.62 * size / tan(FIELD_OF_VIEW / 2)
+        camera = self._server.initial_camera
+        camera.fov = FIELD_OF_VIEW
+        camera.near = distance / 100
+        camera.far = distance * 100
+        camera.up = vertical
+        camera.position = centre + distance * front
+        camera.look_at = centre
+        light = front + 0.6 * vertical - 0.5 * np.cross(vertical, front)
+        self.scene.add_light_ambient("/ambient", intensity=1.3)
+        self.scene.add_light_directional("/light", intensity=2.2, position=tuple(light))
+        self._add_grid(centre, low, size, front if plane else vertical)
+        return size
+
+    def _add_grid(self, centre: Array, low: Array, size: float, normal: Array) -> None:
+        cell = 0.5 * 10.0 ** floor(log10(size))
+        k = int(np.argmax(np.abs(normal)))
+        position = np.round(centre / cell) * cell
+        position[k] = 0.0 if low[k] > -0.1 * size else low[k]
+        position[k] -= np.sign(normal[k]) * 0.06 * size
+        width = 8 * cell * max(1, ceil(size / cell))
+        self.scene.add_grid(
+            "/grid", width, width, plane=("yz", "xz", "xy")[k], position=tuple(position),
+            cell_size=cell, section_size=2 * cell, cell_color=(222, 227, 232),
+            section_color=(196, 204, 212), fade_distance=12 * size, shadow_opacity=0.0,
+        )  # fmt: skip
+
+    def add_target(self, size: float, axes: str, draggable: bool) -> Any:
+        """The target's marker; where ``draggable``, with handles along the task axes."""
+        active = ("x" in axes, "y" in axes, "z" in axes)
+        handle: Any
+        if draggable:
+            handle = self.scene.add_transform_controls(
+                "/target", scale=0.17 * size, active_axes=active, disable_rotations=True,
+                depth_test=False, line_width=4.0, opacity=0.85,
+            )  # fmt: skip
+        else:
+            handle = self.scene.add_frame("/target", show_axes=False)
+        front = np.zeros(3)
+        circles = [(0, 1), (1, 2), (2, 0)]
+        if len(axes) == 2:
+            plane = ["xyz".index(axis) for axis in axes]
+            circles = [(plane[0], plane[1])]
+            if not draggable:  # what is across the plane is free: the marker is before the robot
+                front[3 - sum(plane)] = 0.12 * size
+        self.scene.add_icosphere(
+            "/target/ball", 0.011 * size, color=TARGET, position=front, cast_shadow=False
+        )
+        angles = np.linspace(0.0, 2 * pi, 49)
+        for i, (a, b) in enumerate(circles):
+            circle = np.tile(front, (len(angles), 1))
+            circle[:, a] += 0.035 * size * np.cos(angles)
+            circle[:, b] += 0.035 * size * np.sin(angles)
+            self.add_line(f"/target/circle{i}", TARGET, 3.0).show(circle)
+        return handle
+
+    def add_line(self, name: str, colour: tuple[int, int, int], width: float) -> Line:
+        """A line through points that are yet to come; width in pixels."""
+        return Line(self.scene, name, colour, width)
+
+    def recording(self, frames: Iterator[float], title: str) -> bytes:
+        """One HTML file that replays the scene offline.
+
+        Args:
+            frames: sets the scene for one frame after the other; gives each one's duration, s.
+            title: of the window.
+        """
+        serializer = self._server.get_scene_serializer()
+        for duration in frames:
+            serializer.insert_sleep(duration)
+        text: str = serializer.as_html()
+        return text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>").encode()
+
+
+class _Server(viser.ViserServer):  # type: ignore[misc, unused-ignore]
+    """viser's server, which otherwise any page could ask to become public by a foreign server."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+class Line:
+    """A line in the scene."""
+
+    def __init__(
+        self, scene: viser.SceneApi, name: str, colour: tuple[int, int, int], width: float
+    ) -> None:
+        nothing = np.zeros((1, 2, 3), dtype=np.float32)
+        self._handle = scene.add_line_segments(
+            name, nothing, colour, thickness=width, thickness_units="screen"
+        )
+
+    def show(self, points: Array) -> None:
+        """Draw it through points, N × 3; a single one is nothing."""
+        pairs = points if len(points) > 1 else np.repeat(points, 2, axis=0)
+        self._handle.points = np.stack([pairs[:-1], pairs[1:]], axis=1).astype(np.float32)
+
+
+# --- the robot ---
+
+
+class _Shape(NamedTuple):
+    """Triangles: vertices V × 3 in m, indices T × 3."""
+
+    vertices: Array
+    triangles: NDArray[np.uint32]
+
+
+class Figure:
+    """A robot in the scene of a page.
+
+    Args:
+        page: the page.
+        urdf: XML text.
+        joints: names of the moving joints in the order of q.
+        frame: the end effector's link.
+        read: where the meshes are from.
+
+    Attributes:
+        missing: names of meshes that are not at hand; where no mesh is, links are drawn as sticks.
+    """
+
+    def __init__(
+        self, page: Page, urdf: str, joints: Sequence[str], frame: str, read: ReadMesh
+    ) -> None:
+        tree = ET.fromstring(urdf)
+        self.missing: list[str] = []
+        visuals = {
+            link.get("name", ""): list(self._visuals(tree, link, read))
+            for link in tree.findall("link")
+        }
+        for link in tree.findall("link"):
+            for part in list(link):
+                link.remove(part)
+        self._kinematics = Scene(
+            ET.tostring(tree, encoding="unicode"), joints, frame, lambda name: None
+        )
+        self._transforms = {
+            transform.child: transform
+            for transform in (*self._kinematics.fixed, *self._at([0.0] * len(joints)))
+        }
+        self._nodes: dict[str, Any] = {}
+        names = {link: f"link{i}" for i, link in enumerate(visuals)}
+        for name, shapes in visuals.items():
+            path = "/".join(names[ancestor] for ancestor in self._chain(name))
+            self._nodes[name] = page.scene.add_frame(f"/robot/{path}", show_axes=False)
+            for i, (shape, pose, colour) in enumerate(shapes):
+                page.scene.add_mesh_simple(
+                    f"/robot/{path}/visual{i}", shape.vertices, shape.triangles,
+                    color=colour, flat_shading=True, side="double", cast_shadow=False,
+                    receive_shadow=False,
+                    position=pose[:3, 3], wxyz=_wxyz(quaternion(pose[:3, :3])),
+                )  # fmt: skip
+        if not any(visuals.values()):
+            self._add_sticks(page, names)
+        for transform in self._kinematics.fixed:
+            _place(self._nodes[transform.child], transform)
+
+    def pose(self, q: Sequence[float]) -> None:
+        """Show it at joint positions q, rad or m."""
+        for transform in self._at(q):
+            _place(self._nodes[transform.child], transform)
+
+    def points(self, q: Sequence[float]) -> Array:
+        """Origins of all links in the root frame, L × 3, m."""
+        transforms = {**self._transforms, **{t.child: t for t in self._at(q)}}
+        places: dict[str, Array] = {}
+
+        def place(link: str) -> Array:
+            if link not in places:
+                transform = transforms.get(link)
+                own = np.eye(4) if transform is None else _matrix(transform)
+                places[link] = own if transform is None else place(transform.parent) @ own
+            return places[link]
+
+        return np.array([place(link)[:3, 3] for link in self._nodes])
+
+    def end_effector(self, q: Sequence[float]) -> Array:
+        """Position of the end effector in the root frame, m."""
+        return np.array(self._kinematics.end_effector(q))
+
+    def _at(self, q: Sequence[float]) -> list[Transform]:
+        return self._kinematics.moving(q)
+
+    def _chain(self, link: str) -> list[str]:
+        """The links from the root to this one."""
+        chain = [link]
+        while (transform := self._transforms.get(chain[-1])) is not None:
+            chain.append(transform.parent)
+        return chain[::-1]
+
+    def _visuals(
+        self, tree: ET.Element, link: ET.Element, read: ReadMesh
+    ) -> Iterator[tuple[_Shape, Array, tuple[float, float, float]]]:
+        """Shapes of a link, their poses in its frame, 4 × 4, and their colours."""
+        for visual in link.findall("visual"):
+            shape = self._shape(visual.find("geometry"), read)
+            if shape is not None:
+                yield shape, origin(visual.find("origin")), _colour(tree, visual)
+
+    def _shape(self, geometry: ET.Element | None, read: ReadMesh) -> _Shape | None:
+        element = None if geometry is None or not len(geometry) else geometry[0]
+        if element is None:
+            return None
+        if element.tag == "box":
+            return _box(floats(element, "size", "1 1 1"))
+        if element.tag == "sphere":
+            return _sphere(float(element.get("radius", 1)))
+        if element.tag == "cylinder":
+            return _cylinder(float(element.get("radius", 1)), float(element.get("length", 1)))
+        if element.tag != "mesh":
+            return None
+        name = element.get("filename", "").removeprefix("package://")
+        shape = _mesh(name, read(name), floats(element, "scale", "1 1 1"))
+        if shape is None:
+            self.missing.append(name)
+        return shape
+
+    def _add_sticks(self, page: Page, names: Mapping[str, str]) -> None:
+        """A stick from each link's origin to those of its children."""
+        lengths = [float(np.linalg.norm(t.translation)) for t in self._transforms.values()]
+        radius = 0.05 * max(lengths, default=1.0)
+        for i, transform in enumerate(self._transforms.values()):
+            length = float(np.linalg.norm(transform.translation))
+            path = "/".join(names[ancestor] for ancestor in self._chain(transform.parent))
+            r, g, b = (int(COLOURS[i % 6][k : k + 2], 16) for k in (1, 3, 5))
+            ball = _sphere(1.4 * radius)
+            page.scene.add_mesh_simple(
+                f"/robot/{path}/joint{i}", *ball, color=(70, 78, 88), position=transform.translation
+            )
+            if length > radius:
+                direction = np.array(transform.translation) / length
+                pose = np.eye(3)
+                pose[:, 2] = direction
+                pose[:, 0] = np.cross(np.eye(3)[int(np.argmin(np.abs(direction)))], direction)
+                pose[:, 0] /= np.linalg.norm(pose[:, 0])
+                pose[:, 1] = np.cross(direction, pose[:, 0])
+                page.scene.add_mesh_simple(
+                    f"/robot/{path}/stick{i}", *_cylinder(radius, length), color=(r, g, b),
+                    position=np.array(transform.translation) / 2, wxyz=_wxyz(quaternion(pose)),
+                )  # fmt: skip
+
+
+def _place(node: Any, transform: Transform) -> None:
+    node.position = transform.translation
+    node.wxyz = _wxyz(transform.rotation)
+
+
+def _wxyz(xyzw: Sequence[float]) -> tuple[float, float, float, float]:
+    x, y, z, w = xyzw
+    return w, x, y, z
+
+
+def _matrix(transform: Transform) -> Array:
+    x, y, z, w = transform.rotation
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = transform.translation
+    return pose
+
+
+def _colour(tree: ET.Element, visual: ET.Element) -> tuple[float, float, float]:
+    material = visual.find("material")
+    if material is not None:
+        named = [m for m in tree.findall("material") if m.get("name") == material.get("name")]
+        for found in (material, *named):
+            if (colour := found.find("color")) is not None:
+                r, g, b = floats(colour, "rgba", "1 1 1 1")[:3].tolist()
+                return r, g, b
+    return NO_MATERIAL
+
+
+def _mesh(name: str, content: bytes | None, scale: Array) -> _Shape | None:
+    if content is None:
+        return None
+    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+        file = Path(folder, Path(name).name)
+        file.write_bytes(content)
+        try:
+            mesh = coal.MeshLoader().load(str(file), scale)
+        except ValueError:
+            return None
+    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
+    triangles = [(corner[0], corner[1], corner[2]) for corner in corners]
+    return _Shape(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32))
+
+
+def _box(size: Array) -> _Shape:
+    corners = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)]) - 0.5
+    faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+    return _Shape(corners * size, np.array(triangles, dtype=np.uint32))
+
+
+def _cylinder(radius: float, length: float) -> _Shape:
+    """About z, its centre at the origin."""
+    return _turned(
+        [(0.0, -length / 2), (radius, -length / 2), (radius, length / 2), (0, length / 2)]
+    )
+
+
+def _sphere(radius: float) -> _Shape:
+    angles = np.linspace(-pi / 2, pi / 2, 17)
+    return _turned([(radius * float(np.cos(a)), radius * float(np.sin(a))) for a in angles])
+
+
+def _turned(profile: Sequence[tuple[float, float]], sides: int = 32) -> _Shape:
+    """A body of revolution about z from its radii and heights."""
+    angles = np.linspace(0.0, 2 * pi, sides, endpoint=False)
+    rings = [
+        np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(sides, z)])
+        for r, z in profile
+    ]
+    triangles = []
+    for ring in range(len(profile) - 1):
+        for i in range(sides):
+            a, b = ring * sides + i, ring * sides + (i + 1) % sides
+            triangles += [(a, b, b + sides), (a, b + sides, a + sides)]
+    return _Shape(np.vstack(rings), np.array(triangles, dtype=np.uint32))
+
+
+# --- readout and plots ---
+
+
+class Readout:
+    """A table of names and numbers.
+
+    Each number is the text of an element with the attribute ``data-value``, its name. ``names``
+    are those of lines in the plots, whose colours they have.
+    """
+
+    def __init__(self, page: Page, names: Sequence[str] = ()) -> None:
+        self._handle = page.gui.add_html("")
+        self._colours = dict(zip(names, cycle(COLOURS)))
+
+    def show(self, rows: Mapping[str, str]) -> None:
+        """Show values by their names."""
+        lines = "".join(
+            f'<tr><td style="color:{self._colours.get(name, "#5b6570")};padding:1px 10px 1px 0">'
+            f"{html.escape(name)}</td>"
+            f'<td data-value="{html.escape(name)}">{html.escape(value)}</td></tr>'
+            for name, value in rows.items()
+        )
+        self._handle.content = (
+            '<table style="font-size:12.5px;font-variant-numeric:tabular-nums;margin:2px 10px">'
+            f"{lines}</table>"
+        )
+
+
+class Plot:
+    """Lines over time, with a mark at the present time.
+
+    Args:
+        page: the page.
+        title: what is drawn, with its unit.
+        names: of the lines.
+        t: times, N values, s.
+        rows: values, N × lines.
+        marked: with the mark, and a range of values that is that of the rows for good.
+    """
+
+    def __init__(
+        self, page: Page, title: str, names: Sequence[str], t: Array, rows: Array, *, marked: bool
+    ) -> None:
+        times, values = outline(t, rows)
+        self._lines = (times, *values.T)
+        self._marked = marked
+        dots = {"show": False}
+        series: list[Any] = [{"label": "t"}]
+        for name, colour in zip(names, cycle(COLOURS)):
+            series.append({"label": name, "stroke": colour, "width": 1.5, "points": dots})
+        # a line of rounding errors is drawn flat
+        soft = {"pad": 0.1, "soft": SMALLEST_RANGE, "mode": 1}
+        y: Any = {"range": {"min": {**soft, "soft": 0.0}, "max": soft}}
+        if marked:
+            series.append({"label": "now", "stroke": "#d0342c", "width": 1.0, "points": dots})
+            finite = values[np.isfinite(values)]
+            low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 1.0)
+            margin = max(0.06 * (high - low), SMALLEST_RANGE)
+            self._range = float(low - margin), float(high + margin)
+            y = {"range": self._range}
+        self._handle = page.gui.add_uplot(
+            self._data(0.0), tuple(series), title=title, height=150,
+            scales={"x": {"time": False}, "y": y},
+            legend={"show": False}, cursor={"show": False},
+        )  # fmt: skip
+
+    def show(self, t: Array, rows: Array) -> None:
+        """Draw other lines."""
+        self._lines = (t, *rows.T)
+        self._handle.data = self._data(0.0)
+
+    def mark(self, time: float) -> None:
+        """Move the mark."""
+        self._handle.data = self._data(time)
+
+    def _data(self, time: float) -> tuple[Array, ...]:
+        if not self._marked:
+            return self._lines
+        line = np.full(len(self._lines[0]), np.nan)
+        at = min(max(int(np.searchsorted(self._lines[0], time)), 1), len(line) - 1)
+        line[at - 1 : at + 1] = self._range[: len(line)]
+        return (*self._lines, line)
+
+
+def outline(t: Array, rows: Array) -> tuple[Array, Array]:
+    """At most 2·BUCKETS points of N that keep each line's extremes; times and values."""
+    if len(t) <= 2 * BUCKETS:
+        return t, rows
+    edges = np.linspace(0, len(t), BUCKETS + 1).astype(int)[:-1]
+    times = np.repeat(t[edges], 2)
+    times[1::2] = (t[edges] + np.append(t[edges[1:]], t[-1])) / 2
+    values = np.empty((2 * BUCKETS, rows.shape[1]))
+    values[0::2] = np.minimum.reduceat(rows, edges, axis=0)
+    values[1::2] = np.maximum.reduceat(rows, edges, axis=0)
+    return times, values
+
+
+# --- the server ---
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    with redirect_stdout(StringIO()):
+        yield
+
+
+def _check_address(host: str, port: int) -> None:
+    """viser would try a thousand ports, one after the other, whatever is wrong."""
+    if not 0 <= port <= 65535:
+        raise PageError(f"port {port} is not in 0…65535")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind, protocol) as probe:
+            if sys.platform != "win32":
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
+            raise _in_use(host, port) from error
+        raise PageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+
+
+def _in_use(host: str, port: int) -> PageError:
+    return PageError(
+        f"port {port} of {host} is in use; choose another with --port, or 0 for any that is free"
+    )

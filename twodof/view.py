@@ -1,0 +1,331 @@
+"""Replay of a bag in the browser, and as one file that replays offline."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from math import inf, nextafter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bag import Run, read_bag
+from .data import data_file
+from .errors import BuildError, FmuError, PageError
+from .files import write_file
+from .fmu import load_fmu, read_resource
+from .meshes import collect_meshes
+from .page import (
+    HOST,
+    PATH,
+    PLOT_RATE,
+    PORT,
+    RATE,
+    TRAIL,
+    Figure,
+    Page,
+    Plot,
+    ReadMesh,
+    Readout,
+)
+from .track import read_tracks
+
+Array = NDArray[np.float64]
+
+SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}
+SETTLING = 0.3  # s after which scrubbing is over
+SENT = 100  # times that a browser may still send back
+TRAIL_TIME = 1.5  # s
+TRAIL_POINTS, PATH_POINTS = 60, 1500
+MOST_FRAMES = 2000
+SMALLEST_ERROR = 1e-12  # m: what is below is rounding
+
+
+class Replay:
+    """A bag on a page: robot, target, end effector's path, plots, and what moves them.
+
+    Args:
+        page: the page.
+        bag: the bag, or its folder.
+        urdf: the robot; None: the one that the bag carries, if any.
+        mesh_dir: folder of that URDF's packages or meshes.
+        frame: the end effector's link; None: as in the run.
+        fmu: the FMU that the meshes are in; None: the one that made the bag, where it lies in the
+            working directory or beside the bag.
+
+    Attributes:
+        remarks: what is not as it should be, one line each.
+
+    Raises:
+        BagError, PlotError, PageError, FmuError, BuildError: naming what is wrong.
+    """
+
+    def __init__(
+        self,
+        page: Page,
+        bag: Run | str | Path,
+        *,
+        urdf: str | Path | None = None,
+        mesh_dir: str | Path | None = None,
+        frame: str | None = None,
+        fmu: str | Path | None = None,
+    ) -> None:
+        run = bag if isinstance(bag, Run) else read_bag(bag)
+        self._page = page
+        self._track = track = read_tracks([run], urdf=urdf, frame=frame)[0]
+        self._t = track.t
+        self.remarks: list[str] = []
+        self._figure: Figure | None = None
+        if track.motion is None:
+            self.remarks.append(f"'{run.path}' carries no robot; give one with --urdf")
+        else:
+            text, read = self._robot(run, urdf, mesh_dir, fmu)
+            names = [joint.name for joint in track.joints]
+            self._figure = Figure(page, text, names, track.motion.frame, read)
+            if self._figure.missing:
+                missing = ", ".join(self._figure.missing[:3])
+                self.remarks.append(f"without the meshes {missing}; give them with --fmu or --urdf")
+        self._set_scene()
+
+    def _robot(
+        self, run: Run, urdf: str | Path | None, mesh_dir: str | Path | None, fmu: str | Path | None
+    ) -> tuple[str, ReadMesh]:
+        """The URDF's text, and where its meshes are from."""
+        if urdf is not None:
+            text, folder = Path(urdf).read_text("utf-8"), Path(urdf).parent
+            packages = None if mesh_dir is None else Path(mesh_dir)
+            try:
+                renamed, files = collect_meshes(text, folder, packages)
+            except BuildError as error:
+                if mesh_dir is not None:
+                    raise
+                self.remarks.append(str(error))
+                return text, lambda name: None
+            return renamed, files.get
+        text = run.provenance["urdf"]
+        if fmu is not None:
+            given = load_fmu(fmu)
+            return text, partial(read_resource, given)
+        made = run.provenance["fmu"]
+        for folder in (Path(), run.path.resolve().parent):
+            try:
+                found = load_fmu(folder / Path(made["file"]).name)
+            except FmuError:
+                continue
+            if found.guid == made["guid"]:
+                return text, partial(read_resource, found)
+        shipped = data_file("urdf", "2dof.urdf")
+        renamed, files = collect_meshes(shipped.read_text("utf-8"), shipped.parent, None)
+        return text, files.get if text.strip() == renamed.strip() else lambda name: None
+
+    # --- what is shown ---
+
+    def _set_scene(self) -> None:
+        page, track, motion = self._page, self._track, self._track.motion
+        made = track.run.provenance
+        self._target: Any = None
+        self._targets = np.empty((0, 3))
+        if motion is not None and self._figure is not None:
+            q = track.run.q
+            shown = [self._figure.points(q[k]) for k in np.linspace(0, len(q) - 1, 9).astype(int)]
+            points = [*shown, motion.path[:: max(1, len(q) // PATH_POINTS)]]
+            if track.task is not None:
+                self._targets = motion.path.copy()
+                for k, axis in enumerate(track.task.axes):
+                    self._targets[:, "xyz".index(axis)] = track.task.target[:, k]
+                points.append(self._targets[:: max(1, len(q) // PATH_POINTS)])
+            gravity = [-made.get("start_values", {}).get(f"gravity[{i}]", 0.0) for i in (1, 2, 3)]
+            up = gravity if any(gravity) else (0.0, 0.0, 1.0)
+            size = page.frame(np.vstack(points), track.task.axes if track.task else "", up)
+            if track.task is not None:
+                self._target = page.add_target(size, track.task.axes, draggable=False)
+            chosen = np.unique(np.linspace(0, len(q) - 1, PATH_POINTS).astype(int))
+            page.add_line("/path", PATH, 1.5).show(motion.path[chosen])
+            self._trail = page.add_line("/trail", TRAIL, 4.0)
+
+    def add_controls(self) -> None:
+        """The control panel: time line, play, speed, readout and plots."""
+        page, gui, track = self._page, self._page.gui, self._track
+        self._duration = float(self._t[-1])
+        self._time = self._shown = -1.0
+        self._playing, self._speed, self._echoed = True, 1.0, False
+        self._sent: deque[float] = deque(maxlen=SENT)  # to the slider
+        self._jump: float | None = 0.0
+        step = 0.001 if self._duration >= 1.0 else max(self._duration / 1000, 1e-9)
+        self._slider = gui.add_slider("time, s", 0.0, max(self._duration, step), step, 0.0)
+        self._button = gui.add_button("Pause")
+        speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
+
+        def scrubbed(event: Any) -> None:
+            time = float(self._slider.value)
+            if event.client is None:  # moved by the replay itself
+                return
+            if any(abs(time - sent) < step for sent in tuple(self._sent)):
+                self._echoed = True  # a field that has the focus sends back what it was sent
+                return
+            self._jump, self._playing = time, False
+
+        def pressed(event: Any) -> None:
+            self._playing = self._button.label == "Play"
+            if self._playing and self._time >= self._duration:
+                self._jump = 0.0
+
+        def sped(event: Any) -> None:
+            self._speed = SPEEDS[speed.value]
+
+        self._slider.on_update(scrubbed)
+        self._button.on_click(pressed)
+        speed.on_update(sped)
+        names = [joint.name for joint in track.joints]
+        self._readout = Readout(page, names)
+        units = " or ".join(dict.fromkeys(j.unit for j in track.joints if j.unit)) or "rad or m"
+        lines = {f"position, {units}": (names, track.run.q)}
+        if track.run.v.shape == track.run.q.shape:
+            lines[f"velocity, {units} per s"] = (names, track.run.v)
+        if track.task is not None:
+            error = np.log10(np.maximum(track.task.error, SMALLEST_ERROR))
+            lines["log₁₀ of the distance from the target in m"] = (["error"], error[:, None])
+        self._plots = [
+            Plot(page, title, names, self._t, rows, marked=True)
+            for title, (names, rows) in lines.items()
+        ]
+        for remark in self.remarks:
+            gui.add_markdown(remark)
+
+    def show(self, k: int) -> None:
+        """Set the scene to sample k."""
+        track = self._track
+        with self._page.atomic():
+            if self._figure is not None and track.motion is not None:
+                self._figure.pose(track.run.q[k])
+                first = nearest(self._t, self._t[k] - TRAIL_TIME)
+                chosen = np.unique(np.linspace(first, k, TRAIL_POINTS).astype(int))
+                self._trail.show(track.motion.path[chosen])
+            if self._target is not None:
+                self._target.position = self._targets[k]
+
+    def _tell(self, k: int) -> None:
+        track = self._track
+        rows = {"time": f"{self._t[k]:.3f} s", "sample": f"{k} of {len(self._t) - 1}"}
+        for joint in track.joints:
+            rows[joint.name] = f"{joint.q[k]:+.5f} {joint.unit}"
+        if track.motion is not None:
+            place = ", ".join(f"{value:+.5f}" for value in track.motion.path[k])
+            rows["end effector"] = f"({place}) m"
+        if track.task is not None:
+            place = ", ".join(f"{value:+.4f}" for value in self._targets[k])
+            rows["target"] = f"({place}) m"
+            rows["error"] = f"{track.task.error[k] * 1e3:.4g} mm"
+        self._readout.show(rows)
+
+    # --- what moves ---
+
+    def play(self, stop: Callable[[], bool]) -> None:
+        """Replay, as the page's controls say, until ``stop`` is true."""
+        marked = before = time.perf_counter()
+        labelled, settled = True, inf
+        while not stop():
+            now = time.perf_counter()
+            if self._jump is not None:
+                self._time, self._jump = self._jump, None
+                settled = now + SETTLING
+            elif self._echoed:
+                self._echoed, settled = False, now + SETTLING
+            elif now > settled:
+                settled = inf
+                self._sent.clear()
+                if not self._playing:
+                    # what was sent while the user moved it may have come after; equal is not sent
+                    self._slider.value = nextafter(self._time, self._duration / 2)
+            elif self._playing and self._page.viewers:
+                self._time = min(self._time + (now - before) * self._speed, self._duration)
+                self._playing = self._time < self._duration
+            before = now
+            if self._playing != labelled:
+                labelled = self._playing
+                self._button.label = "Pause" if labelled else "Play"
+            if self._time != self._shown:
+                k = nearest(self._t, self._time)
+                if self._playing or self._time == self._duration:
+                    self._sent.append(self._time)
+                    self._slider.value = self._time
+                self.show(k)
+                self._tell(k)
+                if now - marked > 1 / PLOT_RATE or not self._playing:
+                    marked = now
+                    for plot in self._plots:
+                        plot.mark(self._time)
+                self._shown = self._time
+            time.sleep(1 / RATE)
+
+    # --- a file ---
+
+    def export(self, path: Path) -> None:
+        """Write one HTML file that replays the scene offline.
+
+        Raises:
+            PageError: it cannot be written.
+        """
+        content = self._page.recording(self._frames(), f"{self._track.name} - twodof")
+        _write(path, content)
+
+    def _frames(self) -> Iterator[float]:
+        duration = float(self._t[-1])
+        count = max(2, min(MOST_FRAMES, int(duration * RATE) + 1))
+        pause = duration / (count - 1)
+        for i in range(count):
+            self.show(nearest(self._t, i * pause))
+            yield pause
+
+
+def nearest(t: Array, time: float) -> int:
+    """Index of the time in t, ascending, that is nearest to a time."""
+    k = int(np.searchsorted(t, time))
+    if k == 0:
+        return 0
+    return k - 1 if k == len(t) or time - t[k - 1] <= t[k] - time else k
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        write_file(path, content)
+    except OSError as error:
+        raise PageError(f"cannot write '{path}': {error.strerror}") from error
+
+
+def view(
+    bag: Run | str | Path,
+    stop: Callable[[], bool],
+    opened: Callable[[str, Sequence[str]], None] = lambda url, remarks: None,
+    *,
+    host: str = HOST,
+    port: int = PORT,
+    **robot: Any,
+) -> None:
+    """Replay a bag in the browser until ``stop`` is true.
+
+    Args:
+        bag: the bag, or its folder.
+        stop: asked 30 times a second.
+        opened: told the URL, when it can be opened, and of what is not as it should be.
+        host, port: where to listen.
+        robot: options of ``Replay``.
+    """
+    bag = bag if isinstance(bag, Run) else read_bag(bag)
+    with Page(f"twodof - {bag.path.resolve().name}", host, port) as page:
+        replay = Replay(page, bag, **robot)
+        replay.add_controls()
+        opened(page.url, replay.remarks)
+        replay.play(stop)
+
+
+def export(bag: Run | str | Path, path: str | Path, **robot: Any) -> Sequence[str]:
+    """Write a replay as one HTML file; what is not as it should be. Options as ``Replay``'s."""
+    with Page("twodof", HOST, 0) as page:
+        replay = Replay(page, bag, **robot)
+        replay.export(Path(path))
+        return replay.remarks
