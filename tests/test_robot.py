@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 import textwrap
@@ -361,6 +362,17 @@ def test_inertial_of_the_base_has_no_effect(inside: str, capfd: pytest.CaptureFi
     base = link("base", inside if "inertial" in inside else f"<inertial>{inside}</inertial>")
     loaded = load_robot(arm(base=base), "tip", "xyz")
     assert [body.mass for body in loaded.model.inertias] == [0.0, 1.0, 1.0]
+    assert capfd.readouterr().err == ""
+
+
+def test_numbers_may_have_spaces_around_them(capfd: pytest.CaptureFixture[str]) -> None:
+    """urdfdom would take them for 0."""
+    spaced = re.sub(r'(value|i..|xyz)="([^"]*)"', r'\1=" \2\n"', inertial(2.0, 0.3, 0.4, 0.5))
+    plain = load_robot(arm(tip=link("tip", inertial(2.0, 0.3, 0.4, 0.5))), "tip", "xyz").model
+    found = load_robot(
+        arm(tip=link("tip", spaced), elbow=elbow(axis=" 0 0  1 ")), "tip", "xyz"
+    ).model
+    assert found == plain
     assert capfd.readouterr().err == ""
 
 

@@ -24,6 +24,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
+REMOVED = "it was removed while it was being written"
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
 
@@ -123,7 +124,7 @@ class BagWriter(Writer):
         """
         assert self.storage is not None
         if not self.storage.path.exists():  # what has lost its name can be written for ever
-            raise FileNotFoundError(errno.ENOENT, "it was removed while it was being written")
+            raise FileNotFoundError(errno.ENOENT, REMOVED)
         self.storage.flush(self._fsync)
         self._pending = 0
 

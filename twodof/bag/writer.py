@@ -22,7 +22,7 @@ from ..files import read_file
 from ..master import Experiment, Sample
 from . import provenance
 from .messages import JOINT_STATES, NANOSECONDS, STORE, Messages, Serialised
-from .storage import BATCH_SIZE, STORAGES, BagWriter, is_being_written, lock, sync
+from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, is_being_written, lock, sync
 
 MAX_METADATA = 64 * 1024**2  # bytes
 PROVENANCE_KEY = "twodof"
@@ -226,11 +226,13 @@ class Bag:
         """What the main thread raises for a failure of the thread."""
         if not isinstance(failure, OSError | sqlite3.Error):
             return failure
-        reason = f"cannot go on writing the bag '{self.path}': {_reason(failure)}"
+        gone = not self.path.exists()  # the storage fails with this or that then
+        reason = REMOVED if gone else _reason(failure)
+        reason = f"cannot go on writing the bag '{self.path}': {reason}"
         if self._closed:
             kept = self._writer.counts[self._connections[JOINT_STATES].id]
             return BagError(f"{reason}; it is closed with its first {kept} samples")
-        if self.path.exists():
+        if not gone:
             return BagError(f"{reason}; then make it whole with 'twodof recover {self.path}'")
         return BagError(reason)
 

@@ -16,6 +16,7 @@ import pinocchio as pin
 UNBOUNDED = 1.7976931348623157e308
 """Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
 
+NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 MAX_LINKS = 1000
 MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
@@ -187,7 +188,7 @@ def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
 
 def _check_numbers(element: ET.Element, owner: str) -> None:
     counts = {"xyz": 3, "rpy": 3}
-    for tag in ("origin", "axis", "limit", "dynamics", "mass", "inertia"):
+    for tag in NUMERIC_TAGS:
         for found in element.iter(tag):
             for key, text in found.attrib.items():
                 try:
@@ -203,7 +204,7 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
 
 
 def _number(word: str) -> float:
-    """A number that urdfdom reads as Python does: without underscores and other digits."""
+    """A number that other readers read as Python does: without underscores and other digits."""
     if not word.isascii() or "_" in word:
         raise ValueError(word)
     return float(word)
@@ -296,8 +297,9 @@ def _missing(inertial: ET.Element) -> str:
 def _mechanism(tree: ET.Element) -> ET.Element:
     """The URDF of the bare mechanism: inertias, joints, limits, and nothing else.
 
-    urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here.
-    Continuous joints become revolute without limits, so that Pinocchio's state is the angle.
+    urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here, and
+    takes a number with a space behind it for 0. Continuous joints become revolute without limits,
+    so that Pinocchio's state is the angle.
     """
     bare = ET.Element("robot", name=tree.get("name") or "robot")
     for link in tree.findall("link"):
@@ -314,6 +316,10 @@ def _mechanism(tree: ET.Element) -> ET.Element:
         ET.SubElement(copy, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
         if kind == "continuous":
             copy.set("type", "revolute")
+    for tag in NUMERIC_TAGS:
+        for element in bare.iter(tag):
+            for key, text in element.attrib.items():
+                element.set(key, " ".join(repr(_number(word)) for word in text.split()))
     return bare
 
 
