@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+LARGEST = 1e6  # m
 logger = logging.getLogger("twodof.scene")
 
 
@@ -237,10 +238,15 @@ def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Ar
             file.write_bytes(content)
             try:
                 mesh = coal.MeshLoader().load(str(file), scale)
-                return np.asarray(mesh.vertices(), dtype=np.float64)
+                vertices = np.asarray(mesh.vertices(), dtype=np.float64)
             except ValueError as error:
-                logger.warning("mesh '%s' is left out of the scene: %s", uri, error)
+                reason = " ".join(str(error).split())  # coal's has many lines
+                logger.warning("mesh '%s' is left out of the scene: %s", uri, reason)
                 return None
+            if np.abs(vertices).max(initial=0.0) < LARGEST:  # false where one is not a number
+                return vertices
+            logger.warning("mesh '%s' is left out of the scene: it has no sound size", uri)
+            return None
     logger.warning("mesh '%s' is left out of the scene: the FMU does not carry it", uri)
     return None
 
