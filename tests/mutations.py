@@ -663,7 +663,7 @@ def sqlite_after(data: bytes, script: str) -> bytes:
         connection = sqlite3.connect(path)
         try:
             connection.executescript(script)
-        except sqlite3.Error:  # an earlier edit has damaged it
+        except (sqlite3.Error, UnicodeDecodeError):  # an earlier edit has damaged it
             return data
         finally:
             connection.close()

@@ -84,7 +84,12 @@ def truth(folder: Path) -> np.ndarray:
     return np.column_stack([(table[:, 0] - table[0, 0]) / 1e9, table[:, 1:]]).astype(float)
 
 
-def scrub(page, time: float) -> dict[str, str]:
+def scrub(page: Page, time: float) -> dict[str, str]:
+    """What the page says after a time was typed; while it plays, the field is not still."""
+    pause = page.get_by_role("button", name="Pause")
+    if pause.count():
+        pause.click()
+        page.get_by_role("button", name="Play").wait_for()
     browser.type_into(page, "time, s", time)
     return until(page, lambda found: found["time"] == f"{time:.3f} s")
 

@@ -7,6 +7,7 @@ and thirty times a second that it is ready for more, whereupon the loop tells wh
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections import deque
@@ -491,6 +492,8 @@ def serve_page(
 ) -> None:  # fmt: skip
     """The process of the page: tells the loop its URL, or what is wrong; ends with the loop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the loop
+    if hasattr(os, "nice"):
+        os.nice(5)  # the loop goes first
     try:
         fmu = load_fmu(path)
         with Page(f"twodof - {fmu.name}", host, port) as page:

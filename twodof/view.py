@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}
 SETTLING = 0.3  # s after which scrubbing is over
-SENT = 100  # times that a browser may still send back
+SENT = 30  # times that a browser may still send back, those of a second
 TRAIL_TIME = 1.5  # s
 TRAIL_POINTS, PATH_POINTS = 60, 1500
 MOST_FRAMES = 2000
