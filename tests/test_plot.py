@@ -35,8 +35,9 @@ from rosbags.typesys import Stores, get_typestore
 import twodof
 from twodof.cli import main
 from twodof.errors import PlotError, TwoDofError
+from twodof.figure import file_kind, save
 from twodof.master import Sample
-from twodof.plot import file_kind, plot_bags, save
+from twodof.plot import drawing, plot_bags
 from twodof.track import labels, read_tracks
 
 START = 1_700_000_000  # s since the epoch
@@ -937,11 +938,11 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
 
 
 def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Path) -> None:
-    expected = save(read_tracks([default.bag]), tmp_path / "a.svg").read_bytes()
+    expected = save(drawing(read_tracks([default.bag])), tmp_path / "a.svg").read_bytes()
     with matplotlib.rc_context(
         {"lines.linewidth": 9.0, "axes.grid": False, "font.size": 30, "svg.fonttype": "none"}
     ):
-        found = save(read_tracks([default.bag]), tmp_path / "b.svg").read_bytes()
+        found = save(drawing(read_tracks([default.bag])), tmp_path / "b.svg").read_bytes()
         assert matplotlib.rcParams["lines.linewidth"] == 9.0
         figure = plot_bags(default.bag)
         FigureCanvasAgg(figure).draw()  # as windows and notebooks do
@@ -990,7 +991,7 @@ def test_noise_in_a_long_bag_keeps_its_extremes(default: Recording, tmp_path: Pa
     assert len(path) < 10_000
     np.testing.assert_allclose(np.ptp(path, axis=0), np.ptp(exact, axis=0), rtol=1e-12)
     for kind in ("svg", "pdf", "png", "html"):
-        assert save(tracks, tmp_path / f"long.{kind}").stat().st_size < 1_500_000
+        assert save(drawing(tracks), tmp_path / f"long.{kind}").stat().st_size < 1_500_000
 
 
 def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> None:
@@ -1007,7 +1008,7 @@ def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> No
     path = only(panels(plot_bags(run)).views[0], "path")
     for corner in corners:
         assert np.hypot(*(path - corner).T).min() < 1e-12
-    svg = save(read_tracks([run]), tmp_path / "long.svg")
+    svg = save(drawing(read_tracks([run])), tmp_path / "long.svg")
     assert svg.stat().st_size < 500_000
 
 
@@ -1016,7 +1017,9 @@ def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> No
 
 def test_each_kind_of_file_opens(gains: dict[int, Recording], tmp_path: Path) -> None:
     tracks = read_tracks([recording.bag for recording in gains.values()])
-    png, svg, pdf, page = (save(tracks, tmp_path / f"a.{k}") for k in ("PNG", "svg", "pdf", "html"))
+    png, svg, pdf, page = (
+        save(drawing(tracks), tmp_path / f"a.{k}") for k in ("PNG", "svg", "pdf", "html")
+    )
     with Image.open(png) as image:
         image.load()
         assert image.format == "PNG"
@@ -1062,7 +1065,7 @@ def test_a_page_needs_no_network(default: Recording, tmp_path: Path) -> None:
     """And names in it are text, whatever they are."""
     bag = tmp_path / "<script src=x> & co"
     shutil.copytree(default.bag, bag)
-    page = save(read_tracks([bag]), tmp_path / "a.html").read_text("utf-8")
+    page = save(drawing(read_tracks([bag])), tmp_path / "a.html").read_text("utf-8")
     links = Links()
     links.feed(page)
     assert links.found == []
@@ -1073,10 +1076,11 @@ def test_a_page_needs_no_network(default: Recording, tmp_path: Path) -> None:
 
 PLOT = """
 import sys
-from twodof.plot import save
+from twodof.figure import save
+from twodof.plot import drawing
 from twodof.track import read_tracks
 for kind in ("png", "svg", "pdf", "html"):
-    save(read_tracks([sys.argv[1]]), f"{sys.argv[2]}.{kind}")
+    save(drawing(read_tracks([sys.argv[1]])), f"{sys.argv[2]}.{kind}")
 """
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
@@ -1098,18 +1102,18 @@ def test_without_a_name_the_plot_has_that_of_the_bag(
     """A plot of ours is replaced, and nothing else is."""
     monkeypatch.chdir(tmp_path)
     tracks = read_tracks([gains[50].bag])
-    assert save(tracks) == Path("Kp50.png")
+    assert save(drawing(tracks)) == Path("Kp50.png")
     first = Path("Kp50.png").read_bytes()
     Path("Kp50.png").write_bytes(first + b"older")
-    assert save(tracks) == Path("Kp50.png")
+    assert save(drawing(tracks)) == Path("Kp50.png")
     assert Path("Kp50.png").read_bytes() == first
     Image.new("RGB", (9, 9)).save("Kp50.png")
     theirs = Path("Kp50.png").read_bytes()
     Path("Kp50-2.png").symlink_to("nowhere")
-    assert save(tracks) == Path("Kp50-3.png")
+    assert save(drawing(tracks)) == Path("Kp50-3.png")
     assert Path("Kp50.png").read_bytes() == theirs
     assert Path("Kp50-2.png").is_symlink()
-    assert save(read_tracks([gains[50].bag, gains[20].bag])) == Path("Kp50-and-1-more.png")
+    assert save(drawing(read_tracks([gains[50].bag, gains[20].bag]))) == Path("Kp50-and-1-more.png")
     monkeypatch.chdir(gains[50].bag)
     assert read_tracks(["."])[0].name == "Kp50"
 
@@ -1124,7 +1128,7 @@ def test_a_file_is_written_whole_or_not_at_all(
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(PlotError, match=r"cannot write '.*a\.png': No space left on device"):
-        save(read_tracks([default.bag]), tmp_path / "a.png")
+        save(drawing(read_tracks([default.bag])), tmp_path / "a.png")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     assert (tmp_path / "a.png").read_bytes() == b"before"
 
@@ -1150,9 +1154,10 @@ SHOW = """
 import sys
 import matplotlib.cbook
 matplotlib.cbook._get_running_interactive_framework = lambda: None  # stands in for a display
-from twodof.plot import show
+from twodof.figure import show
+from twodof.plot import drawing
 from twodof.track import read_tracks
-print(show(read_tracks([sys.argv[1]])), "matplotlib.pyplot" in sys.modules)
+print(show(drawing(read_tracks([sys.argv[1]]))), "matplotlib.pyplot" in sys.modules)
 """
 
 
@@ -1279,7 +1284,7 @@ def test_what_else_is_wrong_is_named(
         "folder.png": "cannot write 'folder.png': Is a directory",
     }.items():
         with pytest.raises(PlotError, match=f"^{re.escape(message)}"):
-            save(tracks, output)
+            save(drawing(tracks), output)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
     with pytest.raises(PlotError, match=r"^cannot read the URDF 'gone\.urdf': No such file"):
         plot_bags(default.bag, urdf="gone.urdf")
@@ -1301,13 +1306,13 @@ def test_without_matplotlib_it_says_what_to_install() -> None:
     assert last.endswith("install the package 'matplotlib' (the extra 'view')")
 
 
-def test_no_other_file_imports_matplotlib() -> None:
+def test_figures_alone_import_matplotlib() -> None:
     importing = [
         path.name
         for path in (Path(twodof.__file__).parent).rglob("*.py")
         if re.search(r"^\s*(import|from) matplotlib", path.read_text("utf-8"), re.MULTILINE)
     ]
-    assert importing == ["plot.py"]
+    assert sorted(importing) == ["figure.py", "map.py", "plot.py"]
 
 
 # --- the command ---

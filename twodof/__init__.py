@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from .fmu import Fmu, load_fmu
     from .master import Sample, Summary, experiment, samples, simulate
     from .plot import plot_bags
+    from .sweeps import read_sweep, sweep
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOME = {
     "Bag": "bag",
     "Run": "bag",
     "read_bag": "bag",
+    "read_sweep": "sweeps",
     "recover": "bag",
     "FmuOptions": "build",
     "build_fmu": "build",
@@ -32,6 +34,7 @@ _HOME = {
     "plot_bags": "plot",
     "samples": "master",
     "simulate": "master",
+    "sweep": "sweeps",
 }
 __all__ = [
     "Bag",
@@ -46,9 +49,11 @@ __all__ = [
     "load_fmu",
     "plot_bags",
     "read_bag",
+    "read_sweep",
     "recover",
     "samples",
     "simulate",
+    "sweep",
 ]
 
 

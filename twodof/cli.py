@@ -18,10 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import __version__
-from .errors import InputError, TwoDofError
+from .errors import BuildError, InputError, TwoDofError
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from .bag import Run
+    from .figure import Drawing
     from .fmu import Fmu
     from .master import Experiment, RealTime, Summary
 
@@ -120,14 +123,7 @@ def _parser() -> argparse.ArgumentParser:
         "--native", action="store_true", help="build and run the native default FMU instead"
     )
     run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
-    run.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
-    run.add_argument(
-        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
-    )
-    run.add_argument(
-        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
-        help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
-    )  # fmt: skip
+    _add_run_options(run)
     run.add_argument(
         "--input", metavar="CSV", help="inputs over time: a column 'time' and one for each input"
     )
@@ -150,11 +146,12 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("path", metavar="FMU|BAG", type=Path)
 
     plot = verbs.add_parser(
-        "plot", help="draw bags into one figure",
-        description="Draw joint positions and velocities, the end effector's path and its error.",
+        "plot", help="draw bags, or the map of a sweep, into one figure",
+        description="Draw joint positions and velocities, the end effector's path and its error;"
+        " of a sweep, each metric over the variables.",
     )  # fmt: skip
     plot.set_defaults(verb=_plot)
-    plot.add_argument("bags", nargs="+", metavar="BAG", help="several are compared")
+    plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
     plot.add_argument(
         "-o", dest="output", metavar="FILE", help=".png, .svg, .pdf or .html (a window)"
     )
@@ -179,19 +176,38 @@ def _parser() -> argparse.ArgumentParser:
         description="Step an FMU in real time behind a page in the browser: drag the target.",
     )  # fmt: skip
     live.set_defaults(verb=_live)
-    live.add_argument("fmu", nargs="?", metavar="FMU", help="default: as of 'run'")
-    live.add_argument(
-        "--native", action="store_true", help="build and run the native default FMU instead"
-    )
+    live.add_argument("fmu", nargs="?", metavar="FMU", help="default: the default arm's")
     live.add_argument("-o", dest="output", metavar="BAG", help="name of recordings")
-    live.add_argument(
-        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
-    )
-    live.add_argument(
-        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
-        help="start value of an input or parameter",
-    )  # fmt: skip
+    _add_model_options(live)
     _add_page_options(live)
+
+    sweep = verbs.add_parser(
+        "sweep", help="run an FMU over many gains, and map what comes out",
+        description="Run an FMU over a grid or random values of any of its inputs and parameters."
+        " The native default FMU is built where none is named.",
+    )  # fmt: skip
+    sweep.set_defaults(verb=_sweep)
+    sweep.add_argument("fmu", nargs="?", metavar="FMU", help="default: the default arm's")
+    sweep.add_argument(
+        "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",
+        help="values evenly spaced; all combinations of several",
+    )  # fmt: skip
+    sweep.add_argument("--random", type=int, default=0, metavar="N", help="draws of each --range")
+    sweep.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="of the draws (%(default)s)"
+    )
+    sweep.add_argument(
+        "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH",
+        help="values drawn uniformly",
+    )  # fmt: skip
+    _add_run_options(sweep)
+    sweep.add_argument("-o", dest="output", metavar="OUT", help="default: sweep_<date and time>")
+    sweep.add_argument(
+        "--resume", action="store_true", help="go on with OUT; what is done is not repeated"
+    )
+    sweep.add_argument("--bags", action="store_true", help="keep a bag of each run in OUT/bags")
+    sweep.add_argument("--workers", type=int, metavar="N", help="local processes (one for a core)")
+    sweep.add_argument("--scheduler", metavar="tcp://…", help="of a Dask cluster to use instead")
 
     recover = verbs.add_parser(
         "recover", help="make a bag whose writer died complete",
@@ -200,6 +216,21 @@ def _parser() -> argparse.ArgumentParser:
     recover.set_defaults(verb=_recover)
     recover.add_argument("bag", metavar="BAG", type=Path)
     return parser
+
+
+def _add_run_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
+    _add_model_options(parser)
+
+
+def _add_model_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
+    )
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
+        help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
+    )  # fmt: skip
 
 
 def _add_robot_options(parser: argparse.ArgumentParser) -> None:
@@ -279,6 +310,19 @@ def _run(options: argparse.Namespace) -> int:
         summary = simulate(run, [bag, _Progress(run)], pace=pace, stop=asked)
     _print_summary(run, bag.path, options.storage, summary, pace)
     return INTERRUPTED if summary.stopped else 0
+
+
+def _fast_fmu(options: argparse.Namespace) -> Path:
+    """The FMU that is named, else the default arm's, native where it can be built."""
+    from .build import FmuOptions, build_fmu
+
+    if options.fmu:
+        return Path(options.fmu)
+    try:
+        return build_fmu(None, FmuOptions(native=True))
+    except BuildError as error:
+        print(f"{error}; running the Python flavour, which is slower", file=sys.stderr)
+        return build_fmu(None, FmuOptions())
 
 
 def _chosen_fmu(options: argparse.Namespace) -> Path:
@@ -467,21 +511,107 @@ def _print_bag(run: Run) -> None:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from .plot import file_kind, save, show
-    from .track import labels, outcome, read_tracks
+    from .figure import file_kind
 
     if options.output is not None:
         file_kind(options.output)  # before the bags are read
+    sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
+    if not sweeps:
+        return _plot_bags(options)
+    if len(options.bags) > 1:
+        raise InputError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
+    return _plot_sweep(options, Path(sweeps[0]))
+
+
+def _plot_bags(options: argparse.Namespace) -> int:
+    from .plot import drawing
+    from .track import labels, outcome, read_tracks
+
     tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
-    if options.output is None and sys.stdout.isatty() and show(tracks):
-        return 0
-    path = save(tracks, options.output)
-    results = zip(labels(tracks), map(outcome, tracks))
-    _print_table(
-        ("plot", f"{path} ({path.stat().st_size / 1024:.0f} KB)"),
-        *((label, text) for label, text in results if text),
-    )
+    results = [pair for pair in zip(labels(tracks), map(outcome, tracks)) if pair[1]]
+    _show_or_save(drawing(tracks), options.output, *results)
     return 0
+
+
+def _plot_sweep(options: argparse.Namespace, folder: Path) -> int:
+    from .sweeps import read_sweep
+    from .sweeps.map import drawing
+
+    table, provenance = read_sweep(folder)
+    _show_or_save(drawing(table, provenance, folder.resolve().name), options.output)
+    _print_best(table)
+    return 0
+
+
+def _show_or_save(drawing: Drawing, output: str | None, *results: tuple[str, str]) -> None:
+    """A window where there is a terminal and a display, else a file and a word about it."""
+    from .figure import save, show
+
+    if output is None and sys.stdout.isatty() and show(drawing):
+        return
+    path = save(drawing, output)
+    _print_table(("plot", f"{path} ({path.stat().st_size / 1024:.0f} KB)"), *results)
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from .inputs import parse_settings
+    from .sweeps import parse_grids, parse_ranges, sweep
+
+    if options.resume and not options.output:
+        raise InputError("--resume needs the sweep to go on with: -o OUT")
+    grid, ranges = parse_grids(options.grids), parse_ranges(options.ranges)
+    settings = parse_settings(options.settings)
+    fmu = _fast_fmu(options)
+    output = Path(options.output or time.strftime("sweep_%Y_%m_%d-%H_%M_%S"))
+    begin = time.perf_counter()
+    total = 0
+    with (
+        _asked_to_stop() as asked,
+        tqdm(unit="run", disable=None, leave=False, desc="sweeping", smoothing=0.05) as bar,
+    ):
+
+        def progress(done: int, runs: int) -> None:
+            nonlocal total
+            bar.total = total = runs
+            bar.update(done - bar.n)
+
+        table = sweep(
+            fmu, grid=grid, ranges=ranges, random=options.random, seed=options.seed,
+            stop_time=options.stop_time, step=options.step, settings=settings, output=output,
+            resume=options.resume, bags=options.bags, workers=options.workers,
+            scheduler=options.scheduler, progress=progress, stop=asked,
+            command_line=options.command_line,
+        )  # fmt: skip
+    stopped = len(table) < total
+    counts = table["outcome"].value_counts()
+    outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    _print_table(
+        ("FMU", f"{fmu}"),
+        ("sweep", f"{output} ({len(table)} of {total} runs{outcomes and f': {outcomes}'})"),
+        ("time", f"{time.perf_counter() - begin:.1f} s"),
+    )
+    _print_best(table)
+    again = options.command_line if options.resume else f"{options.command_line} --resume"
+    again += "" if options.output else f" -o {_quote(output)}"
+    _print_next(*([again] if stopped else []), f"twodof plot {_quote(output)}")
+    return INTERRUPTED if stopped else 0
+
+
+def _print_best(table: DataFrame) -> None:
+    """The first few runs by settling time, effort and final error."""
+    from .sweeps import METRICS, ranked
+
+    best = ranked(table).head(5)
+    columns = [*best.columns]
+    columns = columns[: columns.index("end_time")]
+    units = [METRICS[name].unit if name in METRICS else "" for name in columns]
+    rows = [[f"{row[name]:.4g}" for name in columns] for row in best.to_dict("records")]
+    widths = [max(map(len, cells)) for cells in zip(columns, units, *rows)]
+    print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
+    for cells in [columns, units, *rows] if rows else []:
+        print("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
 
 
 def _view(options: argparse.Namespace) -> int:
@@ -505,9 +635,10 @@ def _live(options: argparse.Namespace) -> int:
     from .inputs import parse_settings
     from .live import live
 
+    fmu = _fast_fmu(options)
     with _asked_to_stop() as asked:
         bags = live(
-            _chosen_fmu(options), asked, lambda url: _open(options, url),
+            fmu, asked, lambda url: _open(options, url),
             host=options.host, port=options.port, step=options.step,
             settings=parse_settings(options.settings), bag=options.output,
             command_line=options.command_line,

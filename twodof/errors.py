@@ -26,15 +26,24 @@ class InputError(TwoDofError):
 
 
 class SimulationError(TwoDofError):
-    """The FMU refused or failed a call; ``k`` is the number of steps that were done."""
+    """The FMU refused or failed a call, or gave a value that is not finite.
 
-    def __init__(self, message: str, k: int = 0) -> None:
+    Attributes:
+        k: number of communication steps that were done.
+        outcome: "discarded" (fmi2Discard), "diverged" (not finite) or "failed" (all else).
+    """
+
+    def __init__(self, message: str, k: int = 0, outcome: str = "failed") -> None:
         super().__init__(message)
-        self.k = k
+        self.k, self.outcome = k, outcome
 
 
 class BagError(TwoDofError):
     """A bag cannot be written or read."""
+
+
+class SweepError(TwoDofError):
+    """A sweep cannot be run, stored or read: Dask, its workers or the folder is at fault."""
 
 
 class PlotError(TwoDofError):

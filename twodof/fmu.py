@@ -174,6 +174,10 @@ class Instance:
         self._accept(self._slave.enterInitializationMode)
         self._accept(self._slave.exitInitializationMode)
 
+    def reset(self) -> None:
+        """Back to where it was when it was instantiated."""
+        self._accept(self._slave.reset)
+
     def set(self, values: Mapping[str, float | bool]) -> None:
         """Set variables by name."""
         for kind, setter in (("Real", self._slave.setReal), ("Boolean", self._slave.setBoolean)):
@@ -214,7 +218,8 @@ class Instance:
             function(*arguments, **named)
         except FMICallException as error:
             self._fatal = error.status == fmi2.fmi2Fatal
-            raise SimulationError(self._said or str(error)) from error
+            outcome = "discarded" if error.status == fmi2.fmi2Discard else "failed"
+            raise SimulationError(self._said or str(error), outcome=outcome) from error
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""

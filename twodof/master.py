@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from itertools import accumulate
 from math import dist, isfinite
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from .errors import InputError, SimulationError
-from .fmu import Fmu, instantiate, load_fmu
+from .fmu import Fmu, Instance, instantiate, load_fmu
 from .inputs import Changes, Setting, Value, read_changes, resolve
 
 TIME_TOLERANCE = 1e-9
@@ -179,6 +179,7 @@ def samples(
     *,
     pace: RealTime | None = None,
     stop: Callable[[], bool] | None = None,
+    instance: Instance | None = None,
     **options: Any,
 ) -> Generator[Sample, Mapping[str, Setting] | None, None]:
     """Run an FMU; the initial state, then one sample a communication step.
@@ -190,6 +191,8 @@ def samples(
         run: the experiment, or an FMU with the options of ``experiment`` beside it.
         pace: waits before each sample until its time has come.
         stop: asked between two steps; True ends the run.
+        instance: one of that FMU which is as instantiated, and stays when the run has ended;
+            None: an own one.
 
     Raises:
         FmuError, InputError: before the first sample.
@@ -210,7 +213,7 @@ def samples(
             latest.update(due.popleft()[1])
         return latest
 
-    with instantiate(fmu) as instance:
+    with instantiate(fmu) if instance is None else nullcontext(instance) as instance:
         first = changes_until(run.start_time)
         inputs.update(first)
         instance.initialise(run.start_time, run.time(run.steps), {**run.given, **first})
@@ -219,7 +222,8 @@ def samples(
             t = run.time(k)
             values = read()
             if not all(map(isfinite, values)):
-                raise SimulationError(f"the FMU gave a value that is not finite at t = {t:g} s", k)
+                text = f"the FMU gave a value that is not finite at t = {t:g} s"
+                raise SimulationError(text, k, "diverged")
             if pace is not None:
                 pace.wait(t - run.start_time)
             q, v, x, tau = (values[part] for part in slices)
@@ -233,7 +237,8 @@ def samples(
                     inputs = {**inputs, **latest}
                 instance.step(t, run.step)
             except SimulationError as error:
-                raise SimulationError(f"step {k + 1} at t = {t:g} s: {error}", k) from error
+                text = f"step {k + 1} at t = {t:g} s: {error}"
+                raise SimulationError(text, k, error.outcome) from error
 
 
 @dataclass(frozen=True)
@@ -265,13 +270,14 @@ def simulate(
     *,
     pace: RealTime | None = None,
     stop: Callable[[], bool] | None = None,
+    instance: Instance | None = None,
     **options: Any,
 ) -> Summary:
     """Run an FMU and hand every sample to every sink. Arguments and errors as in ``samples``."""
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
     with ExitStack() as stack:
-        source = stack.enter_context(closing(samples(run, pace=pace, stop=stop)))
+        source = stack.enter_context(closing(samples(run, pace=pace, stop=stop, instance=instance)))
         sample = next(source)
         writes = [stack.enter_context(sink).write for sink in sinks]
         begin = time.perf_counter()

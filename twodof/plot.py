@@ -1,19 +1,16 @@
 """One figure of one run or of several: joints, the arm in its workspace, and the error.
 
 Sizes are in inches of paper. Printed 17 cm wide, as the text of an A4 page is, the smallest letters
-are 5 pt high. All of matplotlib is here.
+are 5 pt high.
 """
 
 from __future__ import annotations
 
-import html
-import io
-import os
-import sys
 import textwrap
 from collections.abc import Sequence
 from copy import copy
-from itertools import chain, count, product
+from functools import partial
+from itertools import chain, product
 from math import ceil, floor, log10
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,44 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__
 from .bag import Run
-from .errors import PlotError
-from .files import write_file
+from .figure import COLOURS, DASHES, GREY, INK, PALE, TICK_STYLE, Drawing, drawn
 from .track import Joint, Track, common_settings, labels, number, outcome, read_tracks, summary
 
-try:
-    import matplotlib.style
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-    from matplotlib.path import Path as Polyline
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
-except ImportError as missing:
-    raise PlotError(
-        f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
-    ) from missing
+# isort: split
+from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.path import Path as Polyline
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 Array = NDArray[np.float64]
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of Okabe & Ito, "Color universal design", 2008, without their yellow, too pale on paper."""
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (7, 1.5, 1, 1.5)), (0, (1.5, 1)))
-"""With the colours, whose number this does not divide, 28 tracks look different."""
-INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
-STYLE = {
-    "font.size": 8.0, "axes.titlesize": 8.5, "axes.labelsize": 8.0, "axes.titlelocation": "left",
-    "text.color": INK, "text.parse_math": False, "axes.labelcolor": INK, "axes.edgecolor": GREY,
-    "axes.linewidth": 0.7, "axes.grid": True, "axes.axisbelow": True, "lines.linewidth": 1.4,
-    "lines.dash_capstyle": "butt", "legend.fontsize": 7.5, "legend.frameon": False,
-    "legend.borderpad": 0.0, "legend.borderaxespad": 0.0, "savefig.dpi": 200,
-    "svg.hashsalt": "twodof", "pdf.fonttype": 42,
-}  # fmt: skip
-TICK_STYLE: dict[str, Any] = {
-    "direction": "in", "width": 0.7, "color": GREY, "labelsize": 7.0, "labelcolor": INK,
-    "grid_color": HAIR, "grid_linewidth": 0.6,
-}  # fmt: skip
-"""Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
 
 NAMES, TICKS, PANEL, GAP, SIDE, MARGIN = 0.65, 0.5, 1.75, 0.6, 2.8, 0.15
 """Widths: joints' names, ticks' numbers, joints' panels and between them, the workspace, margin."""
@@ -81,13 +52,6 @@ SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 MANY_TARGETS = 12
 
 
-class Plot(Figure):
-    """A figure that notebooks show without being asked."""
-
-    def _repr_png_(self) -> bytes:
-        return _rendered(self, "png")
-
-
 def plot_bags(
     *bags: Run | str | Path, urdf: str | Path | None = None, frame: str | None = None
 ) -> Figure:
@@ -100,61 +64,13 @@ def plot_bags(
     Raises:
         BagError, PlotError: naming what is wrong.
     """
-    figure = Plot()
-    draw(figure, read_tracks(bags, urdf=urdf, frame=frame))
-    return figure
+    return drawn(drawing(read_tracks(bags, urdf=urdf, frame=frame)))
 
 
-def save(tracks: Sequence[Track], output: str | Path | None = None) -> Path:
-    """Draw tracks into a file, written whole or not at all; its path.
-
-    Args:
-        tracks: what to draw.
-        output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the bag's
-            name and .png in the working directory, with a number where another file has that name.
-
-    Raises:
-        PlotError: another kind of file, or it cannot be written.
-    """
-    path = Path(output) if output is not None else _free_name(tracks)
-    kind = file_kind(path)
-    figure = Plot()
-    draw(figure, tracks)
-    _write(path, _html(figure, tracks) if kind == "html" else _rendered(figure, kind))
-    return path
-
-
-def file_kind(path: str | Path) -> str:
-    """The kind of file that a name asks for: "png", "svg", "pdf" or "html".
-
-    Raises:
-        PlotError: any other.
-    """
-    kind = Path(path).suffix.lower().removeprefix(".")
-    if kind not in ("png", "svg", "pdf", "html"):
-        raise PlotError(f"'{path}': the name of a plot ends in .png, .svg, .pdf or .html")
-    return kind
-
-
-def show(tracks: Sequence[Track]) -> bool:
-    """Draw tracks in a window and wait until it is closed; False where there is no display."""
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
-        return False  # saves the third of a second that pyplot takes
-    from matplotlib import pyplot as plt
-
-    try:
-        figure = plt.figure()
-    except Exception:  # each toolkit has its own; a file is as good
-        return False
-    if figure.canvas.required_interactive_framework is None:
-        plt.close(figure)
-        return False
-    draw(figure, tracks)
-    plt.show()
-    return True
-
-
-# --- the figure ---
+def drawing(tracks: Sequence[Track]) -> Drawing:
+    """What to draw of tracks; the table has a column for each."""
+    name = tracks[0].name + (f"-and-{len(tracks) - 1}-more" if len(tracks) > 1 else "")
+    return Drawing(_title(tracks), name, partial(_draw, tracks), [*map(summary, tracks)])
 
 
 class _Look(NamedTuple):
@@ -227,27 +143,25 @@ class _Page:
         return axes
 
 
-def draw(figure: Figure, tracks: Sequence[Track]) -> None:
-    """Draw tracks into an empty figure, whose size is set to what they need."""
-    with matplotlib.style.context(["default", STYLE]):
-        looks = _looks(tracks)
-        page = _Page(figure, tracks, looks)
-        _draw_head(page, tracks, looks)
-        _draw_joints(page, tracks, looks)
-        if page.error:
-            height = page.bottom - ERROR
-            _draw_error(page.panel(page.left, height, page.across, ERROR), tracks, looks)
-        views = []
-        for i, plane in enumerate(page.planes):
-            axes = page.panel(page.side, page.top + i * (page.view + BELOW), SIDE, page.view)
-            _draw_view(axes, plane, tracks, looks, aspect=page.view / SIDE)
-            views.append(axes)
-        if views:
-            views[0].set_title(_workspace(tracks), pad=ABOVE)
-            views[-1].legend(
-                handles=_key(views), loc="upper left", ncols=3, handlelength=1.7,
-                columnspacing=1.0, bbox_to_anchor=(0.0, -BELOW / page.view),
-            )  # fmt: skip
+def _draw(tracks: Sequence[Track], figure: Figure) -> None:
+    looks = _looks(tracks)
+    page = _Page(figure, tracks, looks)
+    _draw_head(page, tracks, looks)
+    _draw_joints(page, tracks, looks)
+    if page.error:
+        height = page.bottom - ERROR
+        _draw_error(page.panel(page.left, height, page.across, ERROR), tracks, looks)
+    views = []
+    for i, plane in enumerate(page.planes):
+        axes = page.panel(page.side, page.top + i * (page.view + BELOW), SIDE, page.view)
+        _draw_view(axes, plane, tracks, looks, aspect=page.view / SIDE)
+        views.append(axes)
+    if views:
+        views[0].set_title(_workspace(tracks), pad=ABOVE)
+        views[-1].legend(
+            handles=_key(views), loc="upper left", ncols=3, handlelength=1.7,
+            columnspacing=1.0, bbox_to_anchor=(0.0, -BELOW / page.view),
+        )  # fmt: skip
 
 
 def _draw_head(page: _Page, tracks: Sequence[Track], looks: Sequence[_Look]) -> None:
@@ -603,77 +517,3 @@ def _decades(axes: Axes, error: Array) -> None:
 def _power_of_ten(value: float, _position: int | None = None) -> str:
     digits = str(round(log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{digits}"
-
-
-# --- files ---
-
-
-def _rendered(figure: Figure, kind: str) -> bytes:
-    """The figure as a file's content; equal figures give equal bytes."""
-    metadata: dict[str, dict[str, str | None]] = {
-        "png": {"Software": f"twodof {__version__}"},
-        "svg": {"Creator": f"twodof {__version__}", "Date": None},
-        "pdf": {"Creator": f"twodof {__version__}", "CreationDate": None},
-    }
-    content = io.BytesIO()
-    with matplotlib.style.context(["default", STYLE]):
-        figure.savefig(content, format=kind, metadata=metadata[kind])
-    return content.getvalue()
-
-
-def _html(figure: Figure, tracks: Sequence[Track]) -> bytes:
-    """A page that needs nothing else: the figure as SVG and a table with a column for each bag."""
-    svg = _rendered(figure, "svg").decode()
-    title = html.escape(_title(tracks))
-    columns = [summary(track) for track in tracks]
-    rows = "\n".join(
-        f"<tr><th>{html.escape(key)}</th>"
-        + "".join(f"<td>{html.escape(column.get(key, ''))}</td>" for column in columns)
-        + "</tr>"
-        for key in dict.fromkeys(chain(*columns))
-    )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8"/>
-<title>{title}</title>
-<style>
-body {{ font: 14px/1.5 sans-serif; color: {INK}; max-width: 1100px; margin: 2em auto; }}
-svg {{ width: 100%; height: auto; }}
-table {{ border-collapse: collapse; margin-top: 1em; }}
-th, td {{ text-align: left; vertical-align: top; padding: 0.2em 1.5em 0.2em 0; }}
-th {{ color: {GREY}; font-weight: normal; white-space: nowrap; }}
-tr {{ border-top: 1px solid {HAIR}; }}
-</style>
-</head>
-<body>
-{svg[svg.index("<svg") :]}
-<table>
-{rows}
-</table>
-</body>
-</html>
-""".encode()
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_file(path, content)
-    except OSError as error:
-        raise PlotError(f"cannot write '{path}': {error.strerror}") from error
-
-
-def _free_name(tracks: Sequence[Track]) -> Path:
-    """The first of NAME.png, NAME-2.png, … that does not exist or is a plot of ours."""
-    name = tracks[0].name + (f"-and-{len(tracks) - 1}-more" if len(tracks) > 1 else "")
-    candidates = (Path(f"{name}.png" if i == 1 else f"{name}-{i}.png") for i in count(1))
-    return next(path for path in candidates if not os.path.lexists(path) or _is_ours(path))
-
-
-def _is_ours(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            start = file.read(1024)
-    except OSError:
-        return False
-    return start.startswith(b"\x89PNG") and b"tEXtSoftware\0twodof " in start

@@ -39,14 +39,17 @@ def provenance(run: Experiment, stamp_start: int, command_line: str) -> str:
         "stamp_start_ns": stamp_start,
         "start_values": dict(run.start_values),
         "input_changes": [[t, values] for t, values in run.changes],
-        "versions": {
-            "twodof": __version__,
-            **{name: importlib.metadata.version(name) for name in PACKAGES},
-        },
+        "versions": versions(*PACKAGES),
         "command_line": command_line,
         "urdf": read_urdf(fmu),
     }
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020")
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """Of this package, and of others that are installed."""
+    installed = {name: importlib.metadata.version(name) for name in packages}
+    return {"twodof": __version__, **installed}
 
 
 def read_provenance(path: Path) -> dict[str, Any]:

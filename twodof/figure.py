@@ -1,0 +1,199 @@
+"""Figures that go into files, windows and notebooks: their style, and how they are written.
+
+All that is common to the figures of bags and of sweeps.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain, count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from . import __version__
+from .errors import PlotError
+from .files import write_file
+
+try:
+    import matplotlib.style
+    from matplotlib.figure import Figure
+except ImportError as missing:
+    raise PlotError(
+        f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
+    ) from missing
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Of Okabe & Ito, "Color universal design", 2008, without their yellow, too pale on paper."""
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (7, 1.5, 1, 1.5)), (0, (1.5, 1)))
+"""With the colours, whose number this does not divide, 28 tracks look different."""
+INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
+STYLE = {
+    "font.size": 8.0, "axes.titlesize": 8.5, "axes.labelsize": 8.0, "axes.titlelocation": "left",
+    "text.color": INK, "text.parse_math": False, "axes.labelcolor": INK, "axes.edgecolor": GREY,
+    "axes.linewidth": 0.7, "axes.grid": True, "axes.axisbelow": True, "lines.linewidth": 1.4,
+    "lines.dash_capstyle": "butt", "legend.fontsize": 7.5, "legend.frameon": False,
+    "legend.borderpad": 0.0, "legend.borderaxespad": 0.0, "savefig.dpi": 200,
+    "svg.hashsalt": "twodof", "pdf.fonttype": 42,
+}  # fmt: skip
+TICK_STYLE: dict[str, Any] = {
+    "direction": "in", "width": 0.7, "color": GREY, "labelsize": 7.0, "labelcolor": INK,
+    "grid_color": HAIR, "grid_linewidth": 0.6,
+}  # fmt: skip
+"""Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
+
+
+class Plot(Figure):
+    """A figure that notebooks show without being asked."""
+
+    def _repr_png_(self) -> bytes:
+        return _rendered(self, "png")
+
+
+class Drawing(NamedTuple):
+    """What can be drawn into a figure.
+
+    Attributes:
+        title: for people.
+        name: of the file where the user gives none.
+        draw: draws it into an empty figure, and sets the figure's size.
+        columns: of the table that stands below it on a page.
+    """
+
+    title: str
+    name: str
+    draw: Callable[[Figure], None]
+    columns: Sequence[Mapping[str, str]]
+
+
+def drawn(drawing: Drawing) -> Figure:
+    """A figure of it."""
+    return _draw(drawing, Plot())
+
+
+def save(drawing: Drawing, output: str | Path | None = None) -> Path:
+    """Draw into a file, written whole or not at all; its path.
+
+    Args:
+        drawing: what to draw.
+        output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the
+            drawing's name and .png in the working directory, with a number where another file has
+            that name.
+
+    Raises:
+        PlotError: another kind of file, or it cannot be written.
+    """
+    path = Path(output) if output is not None else _free_name(drawing.name)
+    kind = file_kind(path)
+    figure = drawn(drawing)
+    _write(path, _html(figure, drawing) if kind == "html" else _rendered(figure, kind))
+    return path
+
+
+def file_kind(path: str | Path) -> str:
+    """The kind of file that a name asks for: "png", "svg", "pdf" or "html".
+
+    Raises:
+        PlotError: any other.
+    """
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("png", "svg", "pdf", "html"):
+        raise PlotError(f"'{path}': the name of a plot ends in .png, .svg, .pdf or .html")
+    return kind
+
+
+def show(drawing: Drawing) -> bool:
+    """Draw in a window and wait until it is closed; False where there is no display."""
+    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+        return False  # saves the third of a second that pyplot takes
+    from matplotlib import pyplot as plt
+
+    try:
+        figure = plt.figure()
+    except Exception:  # each toolkit has its own; a file is as good
+        return False
+    if figure.canvas.required_interactive_framework is None:
+        plt.close(figure)
+        return False
+    _draw(drawing, figure)
+    plt.show()
+    return True
+
+
+def _draw(drawing: Drawing, figure: Figure) -> Figure:
+    with matplotlib.style.context(["default", STYLE]):
+        drawing.draw(figure)
+    return figure
+
+
+def _rendered(figure: Figure, kind: str) -> bytes:
+    """The figure as a file's content; equal figures give equal bytes."""
+    metadata: dict[str, dict[str, str | None]] = {
+        "png": {"Software": f"twodof {__version__}"},
+        "svg": {"Creator": f"twodof {__version__}", "Date": None},
+        "pdf": {"Creator": f"twodof {__version__}", "CreationDate": None},
+    }
+    content = io.BytesIO()
+    with matplotlib.style.context(["default", STYLE]):
+        figure.savefig(content, format=kind, metadata=metadata[kind])
+    return content.getvalue()
+
+
+def _html(figure: Figure, drawing: Drawing) -> bytes:
+    """A page that needs nothing else: the figure as SVG and a table."""
+    svg = _rendered(figure, "svg").decode()
+    title = html.escape(drawing.title)
+    columns = drawing.columns
+    rows = "\n".join(
+        f"<tr><th>{html.escape(key)}</th>"
+        + "".join(f"<td>{html.escape(column.get(key, ''))}</td>" for column in columns)
+        + "</tr>"
+        for key in dict.fromkeys(chain(*columns))
+    )
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8"/>
+<title>{title}</title>
+<style>
+body {{ font: 14px/1.5 sans-serif; color: {INK}; max-width: 1100px; margin: 2em auto; }}
+svg {{ width: 100%; height: auto; }}
+table {{ border-collapse: collapse; margin-top: 1em; }}
+th, td {{ text-align: left; vertical-align: top; padding: 0.2em 1.5em 0.2em 0; }}
+th {{ color: {GREY}; font-weight: normal; white-space: nowrap; }}
+tr {{ border-top: 1px solid {HAIR}; }}
+</style>
+</head>
+<body>
+{svg[svg.index("<svg") :]}
+<table>
+{rows}
+</table>
+</body>
+</html>
+""".encode()
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        write_file(path, content)
+    except OSError as error:
+        raise PlotError(f"cannot write '{path}': {error.strerror}") from error
+
+
+def _free_name(name: str) -> Path:
+    """The first of NAME.png, NAME-2.png, … that does not exist or is a plot of ours."""
+    candidates = (Path(f"{name}.png" if i == 1 else f"{name}-{i}.png") for i in count(1))
+    return next(path for path in candidates if not os.path.lexists(path) or _is_ours(path))
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            start = file.read(1024)
+    except OSError:
+        return False
+    return start.startswith(b"\x89PNG") and b"tEXtSoftware\0twodof " in start

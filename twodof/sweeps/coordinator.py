@@ -1,0 +1,124 @@
+"""Many runs of one FMU: a design, its runs on Dask's workers, and a table of their metrics."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+
+from ..bag.provenance import versions
+from ..fmu import Fmu, load_fmu
+from ..inputs import Setting
+from ..master import experiment
+from .cluster import run_all
+from .design import make_design
+from .results import Results, read_sweep
+from .runner import Job, Point
+
+PACKAGES = ("numpy", "fmpy", "distributed", "pandas", "pyarrow")
+
+
+def sweep(
+    fmu: Fmu | str | Path,
+    *,
+    grid: Mapping[str, Iterable[float]] | None = None,
+    ranges: Mapping[str, Sequence[float]] | None = None,
+    random: int = 0,
+    seed: int = 0,
+    stop_time: float = 5.0,
+    step: float = 0.01,
+    settings: Mapping[str, Setting] | None = None,
+    output: str | Path | None = None,
+    resume: bool = False,
+    bags: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, runs: None,
+    stop: Callable[[], bool] = lambda: False,
+    command_line: str = "",
+) -> pandas.DataFrame:
+    """Run every point of a design; the table, one row a run.
+
+    The columns are ``run``, the variables that are varied, the metrics (``METRICS``), ``end_time``
+    in s, ``outcome`` (finished, discarded, diverged, failed or crashed) and ``message``. A local
+    worker is a new Python process that imports the program's main module: keep the call under
+    ``if __name__ == "__main__":``.
+
+    Args:
+        fmu: the FMU or its path.
+        grid: values by variable; a name without an index sets all elements. All combinations.
+        ranges: low and high by variable, drawn uniformly, ``random`` times, beside each
+            combination of the grid.
+        random, seed: number of draws, and what makes them reproducible.
+        stop_time, step: of each run, s.
+        settings: start values of other inputs and parameters, as of ``experiment``.
+        output: folder for the table; None: it is not kept.
+        resume: go on with the sweep in ``output``; what is done is not repeated.
+        bags: write a bag of each run, ``output``/bags/<run>; workers must see that folder.
+        workers: local processes; None: as many as there are cores.
+        scheduler: address of a Dask scheduler whose workers are to be used instead.
+        progress: told the number of runs that are done, and of all.
+        stop: asked twice a second; True ends the sweep with what it has.
+        command_line: for the provenance.
+
+    Raises:
+        InputError, FmuError: the design or the FMU is wrong.
+        SweepError: naming the folder, the scheduler or the workers at fault.
+        BagError: a bag cannot be written.
+    """
+    fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
+    run = experiment(fmu, stop_time=stop_time, step=step, settings=settings)
+    options = {"stop_time": stop_time, "step": step, "settings": dict(run.given)}
+    design = make_design(fmu, grid or {}, ranges or {}, random, seed, run.given)
+    content = fmu.path.read_bytes()
+    provenance = {
+        "fmu": {
+            "file": fmu.path.name, "name": fmu.name, "guid": fmu.guid,
+            "sha256": hashlib.sha256(content).hexdigest(),
+        },
+        "design": design.record(),
+        "options": options,
+        "bags": bags,
+        "versions": versions(*PACKAGES),
+        "command_line": command_line,
+    }  # fmt: skip
+    units = [_unit(fmu, name) for name in design.names]
+    with _folder(output) as path:
+        folder = str(path.resolve() / "bags") if bags else None
+        job = Job(content, fmu.path.name, design.names, options, folder)
+        with Results(path, design.names, units, len(design), provenance, resume=resume) as results:
+            progress(int(results.done.sum()), len(design))
+            missing = np.flatnonzero(~results.done)
+            if len(missing):
+                points = _points(missing, design.points())
+                found = run_all(job, points, workers=workers, scheduler=scheduler, stop=stop)
+                with closing(found):
+                    for rows in found:
+                        results.add(rows)
+                        progress(int(results.done.sum()), len(design))
+        table, _ = read_sweep(path)
+    return table
+
+
+def _points(numbers: Iterable[int], values: Any) -> Iterator[Point]:
+    return ((int(number), tuple(values[number].tolist())) for number in numbers)
+
+
+def _unit(fmu: Fmu, name: str) -> str:
+    elements = [name] if name in fmu.variables else fmu.vector(name)
+    return " or ".join(dict.fromkeys(fmu.variables[element].unit or "" for element in elements))
+
+
+@contextmanager
+def _folder(output: str | Path | None) -> Iterator[Path]:
+    if output is not None:
+        yield Path(output)
+        return
+    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+        yield Path(folder) / "sweep"

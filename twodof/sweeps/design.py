@@ -1,0 +1,150 @@
+"""The design of a sweep: which values which variables take in which run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import isfinite, prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..fmu import Fmu
+from ..inputs import Setting, resolve
+
+MAX_RUNS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Design:
+    """Runs 0 … N − 1: every combination of the grids, each with the same random draws.
+
+    Attributes:
+        grids: values by variable; the last one changes fastest.
+        ranges: low and high by variable; drawn uniformly.
+        draws: number of draws of all ranges, 1 where there are none.
+        seed: of the draws.
+    """
+
+    grids: Mapping[str, tuple[float, ...]]
+    ranges: Mapping[str, tuple[float, float]]
+    draws: int = 1
+    seed: int = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The variables, grids first."""
+        return (*self.grids, *self.ranges)
+
+    def __len__(self) -> int:
+        """Number of runs."""
+        return prod(map(len, self.grids.values())) * self.draws
+
+    def points(self) -> NDArray[np.float64]:
+        """Values of ``names`` in each run, N × number of variables."""
+        low, high = np.array([*self.ranges.values()]).reshape(-1, 2).T
+        drawn = np.random.default_rng(self.seed).uniform(low, high, (self.draws, len(low)))
+        combinations = np.array([*product(*self.grids.values())]).reshape(-1, len(self.grids))
+        return np.hstack(
+            [np.repeat(combinations, self.draws, axis=0), np.tile(drawn, (len(combinations), 1))]
+        )
+
+    def record(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {
+            "grids": {name: list(values) for name, values in self.grids.items()},
+            "ranges": {name: list(limits) for name, limits in self.ranges.items()},
+            "draws": self.draws,
+            "seed": self.seed,
+        }
+
+
+def make_design(
+    fmu: Fmu,
+    grid: Mapping[str, Iterable[float]],
+    ranges: Mapping[str, Sequence[float]],
+    random: int,
+    seed: int,
+    settings: Mapping[str, Setting],
+) -> Design:
+    """The design, checked against the FMU and what else is set.
+
+    Raises:
+        InputError: naming the variable or the number that is wrong.
+    """
+    grids = {name: tuple(map(float, values)) for name, values in grid.items()}
+    limits = {}
+    for name, pair in ranges.items():
+        low, high = map(float, pair)
+        if not (isfinite(low) and isfinite(high) and low < high):
+            raise InputError(f"the range of {name}, {low:g} to {high:g}, does not ascend")
+        limits[name] = (low, high)
+    if not grids and not limits:
+        raise InputError("there is nothing to vary; give a grid, or ranges and a number of draws")
+    if limits and random < 1:
+        raise InputError(f"{random} random draws of {', '.join(limits)}; at least 1 is needed")
+    if random and not limits:
+        raise InputError(f"{random} random draws of nothing; give a range")
+    if seed < 0:
+        raise InputError(f"the seed {seed} is negative")
+    owner = dict.fromkeys(resolve(fmu, settings), "the settings")
+    for name, values in {**grids, **limits}.items():
+        if not values:
+            raise InputError(f"the grid of {name} is empty")
+        if len(set(values)) < len(values):
+            raise InputError(f"the grid of {name} has a value twice")
+        for value in values:
+            elements = resolve(fmu, {name: value})
+        for element in elements:
+            if element in owner:
+                raise InputError(f"{element} gets values from {owner[element]} and from {name}")
+            owner[element] = f"the design of {name}"
+    design = Design(grids, limits, max(1, random), seed)
+    if len(design) > MAX_RUNS:
+        raise InputError(f"the design has {len(design)} runs; at most {MAX_RUNS} are possible")
+    return design
+
+
+def parse_grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
+    """NAME=LOW:HIGH:COUNT texts of a command line: evenly spaced values, both ends included."""
+    grids: dict[str, tuple[float, ...]] = {}
+    for text in texts:
+        name, (low, high, number) = _parse("--grid", text, "NAME=LOW:HIGH:COUNT", grids)
+        if number != int(number) or number < 2:
+            raise InputError(f"--grid {text}: COUNT {number:g} must be a whole number from 2 on")
+        if number > MAX_RUNS:
+            raise InputError(f"--grid {text}: COUNT must be at most {MAX_RUNS}")
+        if not low < high:
+            raise InputError(f"--grid {text}: LOW {low:g} must be below HIGH {high:g}")
+        grids[name] = tuple(np.linspace(low, high, int(number)).tolist())
+    return grids
+
+
+def parse_ranges(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """NAME=LOW:HIGH texts of a command line."""
+    ranges: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, (low, high) = _parse("--range", text, "NAME=LOW:HIGH", ranges)
+        if not low < high:
+            raise InputError(f"--range {text}: LOW {low:g} must be below HIGH {high:g}")
+        ranges[name] = (low, high)
+    return ranges
+
+
+def _parse(option: str, text: str, form: str, before: Iterable[str]) -> tuple[str, list[float]]:
+    name, equals, value = text.partition("=")
+    name = name.strip()
+    try:
+        numbers = [float(part) for part in value.split(":")]
+    except ValueError:
+        numbers = []
+    if not equals or not name or len(numbers) != form.count(":") + 1:
+        raise InputError(f"{option} {text}: expected {form}")
+    if not all(map(isfinite, numbers)):
+        raise InputError(f"{option} {text}: its numbers must be finite")
+    if name in before:
+        raise InputError(f"{option} {name} is given twice")
+    return name, numbers

@@ -1,0 +1,252 @@
+"""The gain map: what a sweep's metrics look like over the variables that were varied.
+
+One variable: a curve for each metric. Two: a heat map for each, or dots where values are random.
+More: a row of such maps for each pair, which show the best over all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import combinations
+from math import ceil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas
+from numpy.typing import NDArray
+
+from ..errors import PlotError
+from ..figure import COLOURS, GREY, INK, PALE, TICK_STYLE, Drawing
+from .metrics import METRICS
+from .results import RANKED, ranked
+
+# isort: split
+from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
+from matplotlib.axis import Axis
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+Array = NDArray[np.float64]
+
+PAIRED = ("settling_time", "overshoot", "peak_effort")
+"""Metrics of which maps of pairs are drawn: speed, its price in precision and in effort."""
+MOST_PAIRS = 10
+WIDTH, HEIGHT, LEFT, RIGHT, GAP, TOP, BELOW = 2.05, 1.7, 0.7, 0.85, 1.15, 1.2, 0.85
+"""Inches: a panel, beside the outer ones, between them, above them, and below each."""
+WIDE = 10.0  # ratio of largest to smallest from which on colours are logarithmic
+BEST: dict[str, Any] = {
+    "marker": "*",
+    "s": 90,
+    "color": COLOURS[1],
+    "edgecolors": "white",
+    "linewidths": 0.7,
+}
+CRITICAL: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
+MISSING: dict[str, Any] = {
+    "facecolor": "#e6e9ec",
+    "hatch": "////",
+    "edgecolor": "#c3cad1",
+    "linewidth": 0.0,
+}
+
+
+SMALLEST_ERROR = 1e-12  # m: what is below is rounding
+
+
+class _Panel(NamedTuple):
+    """One picture: a metric over one variable or two."""
+
+    metric: str
+    x: str
+    y: str | None
+
+
+def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -> Drawing:
+    """What to draw of a sweep, as ``read_sweep`` gives it.
+
+    Raises:
+        PlotError: it has no finished run.
+    """
+    varied = _varied(provenance)
+    best = ranked(table)
+    if best.empty:
+        raise PlotError(f"'{name}' has no run that was finished")
+    shown = {"run": "run", **{variable: variable for variable in varied}}
+    shown |= {key: f"{metric.title}{_in(metric.unit)}" for key, metric in METRICS.items()}
+    columns = [
+        {title: f"{row[key]:.4g}" for key, title in shown.items()}
+        for row in best.head(5).to_dict("records")
+    ]
+    title = f"{provenance['fmu']['name']}: {len(table)} runs over {', '.join(varied)}"
+    grids = frozenset(provenance["design"]["grids"])
+    draw = partial(_draw, table, varied, grids, title, _settings(provenance))
+    return Drawing(title, Path(name).name, draw, columns)
+
+
+def _varied(provenance: Mapping[str, Any]) -> list[str]:
+    design = provenance["design"]
+    return [*design["grids"], *design["ranges"]]
+
+
+def _in(unit: str) -> str:
+    return f", {unit.replace('N.m', 'N·m')}" if unit else ""
+
+
+def _settings(provenance: Mapping[str, Any]) -> str:
+    options = provenance["options"]
+    given = [f"{name} = {value:g}" for name, value in options["settings"].items()]
+    return ", ".join([f"{options['stop_time']:g} s each in steps of {options['step']:g} s", *given])
+
+
+def _draw(
+    table: pandas.DataFrame,
+    varied: Sequence[str],
+    grids: frozenset[str],
+    title: str,
+    settings: str,
+    figure: Figure,
+) -> None:
+    panels, across = _panels(table, varied)
+    rows = ceil(len(panels) / across)
+    width = LEFT + across * (WIDTH + GAP) - GAP + RIGHT
+    height = TOP + rows * (HEIGHT + BELOW) - 0.2
+    figure.set_size_inches(width, height)
+    figure.text(0.15 / width, 1 - 0.3 / height, title, fontsize=11, fontweight="bold")
+    figure.text(0.15 / width, 1 - 0.5 / height, settings, color=GREY)
+    key = "★ least"
+    if len(varied) > 1:
+        key += "    hatched, hollow: not defined, as the settling time of a run that did not settle"
+    if {"Kp", "Kd"} <= {*varied}:
+        key += "    dashed: critical damping, Kd = 2 √Kp"
+    figure.text(0.15 / width, 1 - 0.68 / height, key, color=GREY)
+    for i, panel in enumerate(panels):
+        row, column = divmod(i, across)
+        left, top = LEFT + column * (WIDTH + GAP), TOP + row * (HEIGHT + BELOW)
+        box = (left / width, 1 - (top + HEIGHT) / height, WIDTH / width, HEIGHT / height)
+        axes = figure.add_axes(box)
+        axes.set_label(f"{panel.metric} over {panel.x}" + (f" and {panel.y}" if panel.y else ""))
+        axes.tick_params(which="both", **TICK_STYLE)
+        if panel.y is None:
+            _draw_curve(axes, table, panel)
+        else:
+            rows = table
+            if len(varied) > 2:  # of all runs at one place, the best
+                rows = table.groupby([panel.x, panel.y], as_index=False)[panel.metric].min()
+            on_grid = {panel.x, panel.y} <= grids and min(
+                rows[panel.x].nunique(), rows[panel.y].nunique()
+            ) > 1
+            shown = _draw_cells(axes, rows, panel) if on_grid else _draw_dots(axes, rows, panel)
+            _draw_critical(axes, panel, "white" if draw is _draw_cells else GREY)
+            _mark_best(axes, table, panel)
+            _draw_bar(figure, axes, shown)
+
+
+def _panels(table: pandas.DataFrame, varied: Sequence[str]) -> tuple[list[_Panel], int]:
+    """The panels, and how many are side by side."""
+    telling = [metric for metric in METRICS if table[metric].nunique() > 1]
+    if not telling:
+        telling = [metric for metric in METRICS if table[metric].notna().any()]
+    if len(varied) == 1:
+        return [_Panel(metric, varied[0], None) for metric in telling], 3
+    if len(varied) == 2:
+        return [_Panel(metric, *varied) for metric in telling], 3
+    chosen = [metric for metric in PAIRED if metric in telling] or telling[:1]
+    pairs = list(combinations(varied, 2))[:MOST_PAIRS]
+    return [_Panel(metric, *pair) for pair in pairs for metric in chosen], len(chosen)
+
+
+def _draw_curve(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
+    rows = table.sort_values(panel.x)
+    values = rows[panel.metric].to_numpy(dtype=float)
+    style = "-" if len(rows) > 60 else "o-"
+    axes.plot(rows[panel.x], values, style, color=COLOURS[0], markersize=3.0)
+    if isinstance(_norm(values), LogNorm):
+        axes.set_yscale("log")
+        _label_decades(axes.yaxis)
+    _mark_best(axes, table, panel)
+
+
+def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
+    cells = rows.pivot(index=panel.y, columns=panel.x, values=panel.metric)
+    values = np.ma.masked_invalid(cells.to_numpy(dtype=float))
+    axes.grid(False)
+    axes.patch.set(**MISSING)
+    return axes.pcolormesh(
+        _edges(cells.columns.to_numpy()), _edges(cells.index.to_numpy()), values,
+        norm=_norm(values.compressed()), cmap="viridis", rasterized=values.size > 2500,
+    )  # fmt: skip
+
+
+def _draw_dots(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
+    missing = rows[rows[panel.metric].isna()]
+    axes.scatter(missing[panel.x], missing[panel.y], s=7, facecolors="none", edgecolors=PALE)
+    return axes.scatter(
+        rows[panel.x], rows[panel.y], c=rows[panel.metric], s=12, linewidths=0.0, cmap="viridis",
+        norm=_norm(rows[panel.metric].to_numpy(dtype=float)),
+    )  # fmt: skip
+
+
+def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
+    """Where e'' + Kd e' + Kp e = 0 is critically damped: Kd = 2 √Kp."""
+    if {panel.x, panel.y} == {"Kp", "Kd"}:
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        gains = np.linspace(max(left, 0.0), right, 200)
+        critical = 2 * np.sqrt(gains) if panel.x == "Kp" else gains**2 / 4
+        axes.plot(gains, critical, color=colour, **CRITICAL)
+        axes.set(xlim=(left, right), ylim=(low, high))
+
+
+def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
+    """Where the metric is least; of equal ones, the one that ranks first."""
+    order = list(dict.fromkeys((panel.metric, *RANKED)))
+    best = table.dropna(subset=[panel.metric]).sort_values(order, kind="stable").iloc[0]
+    axes.scatter([best[panel.x]], [best[panel.y or panel.metric]], zorder=3, **BEST)
+    metric = METRICS[panel.metric]
+    axes.set_title(f"{metric.title}{_in(metric.unit)}", pad=14.0)
+    at = ", ".join(f"{name} {best[name]:.4g}" for name in (panel.x, panel.y) if name)
+    axes.annotate(
+        f"★ {best[panel.metric]:.3g} at {at}", (0, 1), (0, 4), xycoords="axes fraction",
+        textcoords="offset points", fontsize=7.0, color=GREY,
+    )  # fmt: skip
+    axes.set(xlabel=panel.x, ylabel=panel.y or "")
+
+
+def _draw_bar(figure: Figure, axes: Axes, shown: Any) -> None:
+    bar = figure.colorbar(shown, ax=axes, cax=axes.inset_axes((1.04, 0.0, 0.06, 1.0)))
+    bar.ax.tick_params(labelsize=7.0, color=GREY, labelcolor=INK, width=0.7)
+    bar.outline.set_visible(False)
+    if isinstance(shown.norm, LogNorm):
+        _label_decades(bar.ax.yaxis)
+    else:
+        bar.locator = MaxNLocator(5)
+
+
+def _label_decades(axis: Axis) -> None:
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,), numticks=7))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def _edges(values: Array) -> Array:
+    """Edges of the cells around ascending values."""
+    if len(values) == 1:  # a sweep that has just begun
+        return np.array([values[0] - 0.5, values[0] + 0.5])
+    middles = (values[1:] + values[:-1]) / 2
+    return np.array([2 * values[0] - middles[0], *middles, 2 * values[-1] - middles[-1]])
+
+
+def _norm(values: Array) -> Normalize:
+    """Colours of values, linear or logarithmic."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return Normalize(0.0, 1.0)
+    low, high = max(known.min(), SMALLEST_ERROR), known.max()
+    return (
+        LogNorm(low, high)
+        if known.min() > 0.0 and high > WIDE * low
+        else Normalize(known.min(), high)
+    )

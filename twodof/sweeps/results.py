@@ -1,0 +1,236 @@
+"""The table of a sweep: a folder of Parquet files that any reader of Parquet opens as one.
+
+While the sweep runs, its rows come in parts; when all are there, they become one file, in the order
+of the runs. All of pyarrow is here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bag.storage import is_being_written, lock
+from ..errors import SweepError
+from ..files import write_file
+from .metrics import METRICS
+from .runner import Row
+
+try:
+    import pandas
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+except ImportError as missing:
+    raise SweepError(
+        f"cannot store a table: {missing}; install the extra 'sweep' (pip install 'twodof[sweep]')"
+    ) from missing
+
+WHOLE = "runs.parquet"
+PART = re.compile(r"part-(\d{6})\.parquet")
+KEY = b"twodof"
+PERIOD = 1.0  # s between two parts
+COMPARED = ("fmu", "design", "options", "bags")
+"""What must be equal for a sweep to be resumed; so must the version of this package."""
+
+RANKED = ("settling_time", "peak_effort", "final_error")
+"""The best run has settled first; of those that settle at the same sample, that of least effort."""
+
+
+class Results:
+    """The table of one sweep, while it is made.
+
+    Args:
+        path: the folder; it must not exist, unless ``resume``.
+        names, units: variables that are varied.
+        runs: how many there will be.
+        provenance: where the numbers come from.
+        resume: go on with what is there.
+
+    Attributes:
+        done: for each run, whether its row is there.
+
+    Raises:
+        SweepError: the folder exists; or, to be resumed, it does not, or is another sweep's.
+    """
+
+    def __init__(
+        self, path: str | Path, names: Sequence[str], units: Sequence[str], runs: int,
+        provenance: dict[str, Any], *, resume: bool = False,
+    ) -> None:  # fmt: skip
+        self.path = Path(path)
+        self._schema = _schema(names, units, provenance)
+        self._rows: list[Row] = []
+        self._part = 0
+        self.done: NDArray[np.bool_] = np.zeros(runs, dtype=bool)
+        if resume:
+            self._resume(provenance)
+        else:
+            self._begin()
+        self._lock = lock(self.path)
+        self._stored = time.monotonic()
+
+    def __enter__(self) -> Results:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        try:
+            self._store()
+            if self.done.all():
+                self._unite()
+        finally:
+            os.close(self._lock)
+
+    def _begin(self) -> None:
+        """A part without rows says from the first moment on which sweep this is."""
+        try:
+            self.path.mkdir(parents=True)
+        except FileExistsError:
+            raise SweepError(
+                f"'{self.path}' exists; resume it with --resume, or choose another with -o"
+            ) from None
+        except OSError as error:
+            raise SweepError(f"cannot make '{self.path}': {error.strerror}") from error
+        self._write(self._table([]))
+
+    def _resume(self, provenance: dict[str, Any]) -> None:
+        if not self.path.is_dir():
+            raise SweepError(f"there is no sweep '{self.path}' to resume")
+        if is_being_written(self.path):
+            raise SweepError(f"'{self.path}' is being written by another process")
+        for file in _files(self.path):
+            table = _read(file)
+            _check_same(self.path, _provenance(file, table.schema), provenance)
+            self._schema = table.schema
+            self.done[table.column("run").to_numpy()] = True
+            if number := PART.fullmatch(file.name):
+                self._part = int(number[1]) + 1
+
+    def add(self, rows: Iterable[Row]) -> None:
+        """Take rows, stored within a second or two."""
+        for row in rows:
+            self._rows.append(row)
+            self.done[row[0]] = True
+        if time.monotonic() - self._stored > PERIOD:
+            self._store()
+
+    def _store(self) -> None:
+        rows, self._rows = self._rows, []
+        if rows:
+            self._write(self._table(rows))
+        self._stored = time.monotonic()
+
+    def _table(self, rows: Sequence[Row]) -> pa.Table:
+        columns = list(zip(*rows)) or [()] * len(self._schema)
+        arrays = [
+            pa.array(column, field.type, from_pandas=True)  # NaN is null
+            for column, field in zip(columns, self._schema, strict=True)
+        ]
+        return pa.table(arrays, schema=self._schema)
+
+    def _write(self, table: pa.Table) -> None:
+        _write(self.path / f"part-{self._part:06d}.parquet", table)
+        self._part += 1
+
+    def _unite(self) -> None:
+        """One file in place of the parts, which go when it is whole."""
+        parts = [file for file in _files(self.path) if file.name != WHOLE]
+        if parts:
+            tables = [table for file in parts if len(table := _read(file))]
+            _write(self.path / WHOLE, pa.concat_tables(tables).sort_by("run").combine_chunks())
+        _remove_parts(self.path)
+
+
+def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
+    """A sweep's table in the order of the runs, and its provenance; it need not be finished.
+
+    Raises:
+        SweepError: it cannot be read.
+    """
+    path = Path(path)
+    files = _files(path)
+    if not files:
+        raise SweepError(f"'{path}' is no sweep: it has no {WHOLE} and no parts")
+    table = pa.concat_tables(map(_read, files)).sort_by("run")
+    return table.to_pandas(), _provenance(files[0], table.schema)
+
+
+def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
+    """The runs that were finished, the best first: by settling time, effort and final error."""
+    finished = table[table["outcome"] == "finished"]
+    return finished.sort_values(list(RANKED), kind="stable")
+
+
+def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, Any]) -> pa.Schema:
+    def number(name: str, unit: str, text: str) -> pa.Field:
+        return pa.field(name, pa.float64(), metadata={"unit": unit, "description": text})
+
+    return pa.schema(
+        [
+            pa.field("run", pa.int64(), nullable=False),
+            *(number(name, unit, "varied") for name, unit in zip(names, units)),
+            *(number(name, metric.unit, metric.text) for name, metric in METRICS.items()),
+            number("end_time", "s", "time of the last communication point that was reached"),
+            pa.field("outcome", pa.string(), nullable=False),
+            pa.field("message", pa.string()),
+        ],
+        metadata={KEY: json.dumps(provenance)},
+    )
+
+
+def _files(path: Path) -> list[Path]:
+    """The whole table; the parts where there is none."""
+    if (path / WHOLE).exists():
+        return [path / WHOLE]
+    return sorted(file for file in path.iterdir() if PART.fullmatch(file.name))
+
+
+def _remove_parts(path: Path) -> None:
+    for file in path.iterdir():
+        if PART.fullmatch(file.name):
+            file.unlink()
+
+
+def _read(file: Path) -> pa.Table:
+    try:
+        return pq.read_table(file)
+    except (OSError, pa.ArrowException) as error:
+        raise SweepError(f"cannot read '{file}': {' '.join(str(error).split()):.300}") from error
+
+
+def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
+    try:
+        found = json.loads((schema.metadata or {})[KEY])
+        assert isinstance(found, dict) and {*COMPARED, "versions"} <= {*found}
+    except (KeyError, ValueError, AssertionError):
+        raise SweepError(f"'{file}' was not written by twodof") from None
+    return found
+
+
+def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    for key in COMPARED:
+        if found[key] != wanted[key]:
+            other = {"fmu": f"of another FMU ({found['fmu']['file']}, {found['fmu']['guid']})"}
+            raise SweepError(
+                f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(found[key]):.300}')};"
+                " resume it with those, or choose another folder with -o"
+            )
+    if found["versions"]["twodof"] != wanted["versions"]["twodof"]:
+        raise SweepError(
+            f"'{path}' was begun by twodof {found['versions']['twodof']}; go on with that version"
+        )
+
+
+def _write(path: Path, table: pa.Table) -> None:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    try:
+        write_file(path, sink.getvalue().to_pybytes())
+    except OSError as error:
+        raise SweepError(f"cannot write '{path}': {error.strerror}") from error
