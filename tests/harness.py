@@ -7,8 +7,10 @@ import importlib
 import importlib.util
 import multiprocessing
 import os
+import re
 import shutil
 import tempfile
+import zipfile
 from concurrent.futures import ProcessPoolExecutor
 from ctypes import byref
 
@@ -168,3 +170,20 @@ def needs(*names):
 def cannot_run(reason):
     """Skip a test that this machine cannot run; in CI, which can run all, it fails."""
     return pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)
+
+
+def changed_plant(fmu_path, folder, old, new):
+    """The default FMU with other code inside, under another digest."""
+    other = folder / "Changed.fmu"
+    with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
+        (tag,) = {m[1] for n in archive.namelist() if (m := re.search(r"slave_(\w+)\.py", n))}
+        own = format(abs(hash((old, new))), "x")
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name.endswith("plant/plant.py"):
+                assert old in content
+                content = content.replace(old, new)
+            if name.endswith("slavemodule.txt"):
+                content = content.replace(tag.encode(), own.encode())
+            changed.writestr(name.replace(tag, own), content)
+    return other

@@ -1,14 +1,13 @@
 """The master: times, order, ends, and FMUs that misbehave."""
 
 import logging
-import re
 import time
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import in_child_process
+from harness import changed_plant, in_child_process
 from oracles import position, task_error
 from pythonfmu import FmuBuilder
 
@@ -179,23 +178,6 @@ def test_a_refusal_of_the_fmu_comes_with_its_own_words(fmu_path):
     with pytest.raises(SimulationError, match=r"^rtol = -1 must be > 0$") as error:
         twodof.simulate(fmu_path, stop_time=1.0, settings={"rtol": -1.0})
     assert error.value.k == 0
-
-
-def changed_plant(fmu_path, folder, old, new):
-    """The default FMU with other code inside, under another digest."""
-    other = folder / "Changed.fmu"
-    with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
-        (tag,) = {m[1] for n in archive.namelist() if (m := re.search(r"slave_(\w+)\.py", n))}
-        own = format(abs(hash((old, new))), "x")
-        for name in archive.namelist():
-            content = archive.read(name)
-            if name.endswith("plant/plant.py"):
-                assert old in content
-                content = content.replace(old, new)
-            if name.endswith("slavemodule.txt"):
-                content = content.replace(tag.encode(), own.encode())
-            changed.writestr(name.replace(tag, own), content)
-    return other
 
 
 @in_child_process

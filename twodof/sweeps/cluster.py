@@ -8,7 +8,8 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
 from math import nan
 from threading import Lock
 from typing import Any
@@ -35,7 +36,8 @@ except ImportError as missing:
         f"cannot sweep: {missing}; install the extra 'sweep' (pip install 'twodof[sweep]')"
     ) from missing
 
-PATIENCE = 10.0  # s for a scheduler to answer
+PATIENCE = 5.0  # s for a scheduler to answer
+NO_WORKER = 60.0  # s after which nobody hopes for another
 BATCH_TIME = 0.5  # s, of one task
 MAX_BATCH = 256
 IN_HAND = 2  # tasks a worker, so that it never waits for the next
@@ -43,6 +45,7 @@ CONFIG = {
     # the scheduler of a local cluster would remember every task
     "distributed.admin.log-length": 100,
     "distributed.admin.low-level-log-length": 100,
+    "distributed.scheduler.allowed-failures": 1,
     "distributed.worker.preload": ["twodof.sweeps.cluster"],
     "distributed.comm.timeouts.connect": PATIENCE,
 }
@@ -90,41 +93,59 @@ def run_batch(name: str, points: Sequence[Point]) -> tuple[list[Row], float]:
     return plugin.run(points)
 
 
-def run_all(
-    job: Job,
-    points: Iterator[Point],
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    stop: Callable[[], bool] = lambda: False,
-) -> Generator[list[Row], None, None]:
-    """Rows of all points as they come, in any order.
-
-    A run whose worker dies is done again elsewhere; one that brings death to several workers has
-    the outcome "crashed".
+class Cluster:
+    """Workers that can run a job; a context.
 
     Args:
         job: what all runs share.
-        points: the runs.
         workers: local processes; None: as many as there are cores.
         scheduler: address of a cluster's scheduler, in place of local workers.
-        stop: asked twice a second; True ends the iteration.
 
     Raises:
         SweepError: there are no workers, or they cannot run the job.
-        FmuError, InputError, BagError: from a run, for a reason that others will meet too.
     """
-    with ExitStack() as stack:
-        client = stack.enter_context(
-            _local(workers or os.cpu_count() or 1) if scheduler is None else _remote(scheduler)
-        )
-        name = stack.enter_context(_registered(client, job))
+
+    def __init__(self, job: Job, workers: int | None, scheduler: str | None) -> None:
+        if workers is not None and workers < 1:
+            raise SweepError(f"{workers} workers; at least 1 is needed")
+        self._job, self._scheduler = job, scheduler
+        self._workers = workers or os.cpu_count() or 1
+
+    def __enter__(self) -> Cluster:
+        with ExitStack() as stack:
+            client = _local(self._workers) if self._scheduler is None else _remote(self._scheduler)
+            self._client = stack.enter_context(client)
+            self._name = stack.enter_context(_registered(self._client, self._job))
+            self._exit = stack.pop_all()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._exit.close()
+
+    def run(
+        self, points: Iterator[Point], stop: Callable[[], bool]
+    ) -> Generator[list[Row], None, None]:
+        """Rows of all points as they come, in any order, until ``stop`` is true.
+
+        A run whose worker dies is done again elsewhere. Where that happens to it repeatedly, Dask
+        gives it up, or its neighbours; each of them is then run once more with nothing beside it,
+        and has the outcome "crashed" if that kills workers again.
+
+        Raises:
+            FmuError, InputError, BagError: from a run, for a reason that others will meet too.
+            SweepError: a worker failed otherwise, or the scheduler is gone.
+        """
         batches = _Batches(points)
         tasks: dict[Future, list[Point]] = {}
+        seen = time.monotonic()
         while not stop():
-            width = IN_HAND * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-            while len(tasks) < width and (batch := batches.next()):
-                tasks[client.submit(run_batch, name, batch, pure=False)] = batch
+            workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
+            seen = time.monotonic() if workers else seen
+            if time.monotonic() - seen > NO_WORKER:
+                raise SweepError("no worker is left; go on with --resume")
+            width = IN_HAND * max(1, workers)
+            while len(tasks) < width and (batch := batches.next(alone=not tasks)):
+                tasks[self._client.submit(run_batch, self._name, batch, pure=False)] = batch
             if not tasks:
                 return
             for future in _finished(tasks):
@@ -132,16 +153,16 @@ def run_all(
                 try:
                     rows, duration = future.result()
                 except KilledWorker:
-                    if len(batch) > 1:
-                        batches.again_alone(batch)
-                        continue
-                    rows, duration = [_crashed(*batch[0])], 0.0
+                    rows, duration = batches.suspect(batch), 0.0
                 except TwoDofError:
                     raise
+                except CancelledError as error:
+                    raise SweepError("the scheduler is gone; go on with --resume") from error
                 except Exception as error:
                     raise SweepError(f"a worker failed: {error!r:.300}") from error
                 batches.adapt(len(rows), duration)
-                yield rows
+                if rows:
+                    yield rows
 
 
 class _Batches:
@@ -149,18 +170,27 @@ class _Batches:
 
     def __init__(self, points: Iterator[Point]) -> None:
         self._points = points
-        self._alone: deque[Point] = deque()
+        self._suspects: deque[Point] = deque()
+        self._tried: Point | None = None
         self._size = 1
 
-    def next(self) -> list[Point]:
-        """The next one; empty at the end."""
-        if self._alone:
-            return [self._alone.popleft()]
-        return [point for _, point in zip(range(self._size), self._points)]
+    def next(self, *, alone: bool) -> list[Point]:
+        """The next one; empty at the end, or if what is left must run with nothing beside it."""
+        if self._tried is not None and not alone:
+            return []
+        self._tried = None
+        batch = [point for _, point in zip(range(self._size), self._points)]
+        if not batch and alone and self._suspects:
+            self._tried = self._suspects.popleft()
+            return [self._tried]
+        return batch
 
-    def again_alone(self, batch: Sequence[Point]) -> None:
-        """One of them kills workers: which one, each alone will show."""
-        self._alone.extend(batch)
+    def suspect(self, batch: Sequence[Point]) -> list[Row]:
+        """Take back what Dask gave up; the rows of what ran alone and is at fault."""
+        if self._tried is not None:
+            return [_crashed(*self._tried)]
+        self._suspects.extend(batch)
+        return []
 
     def adapt(self, count: int, duration: float) -> None:
         """Learn how long runs take, s."""
@@ -185,16 +215,17 @@ def _crashed(number: int, values: tuple[float, ...]) -> Row:
 @contextmanager
 def _local(workers: int) -> Iterator[Client]:
     """Processes of this machine; those that die are replaced."""
-    with (
-        _silent(logging.getLogger("distributed")),
-        dask.config.set(CONFIG),
-        LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True,
-            dashboard_address="127.0.0.1:0", memory_limit=None, silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
-    ):  # fmt: skip
-        yield client
+    with ExitStack() as stack:
+        stack.enter_context(_silent(logging.getLogger("distributed")))
+        stack.enter_context(dask.config.set(CONFIG))
+        try:
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True,
+                dashboard_address="127.0.0.1:0", memory_limit=None, silence_logs=logging.CRITICAL,
+            )  # fmt: skip
+        except RuntimeError as error:
+            raise SweepError(f"cannot start {workers} workers: {error}") from error
+        yield stack.enter_context(Client(stack.enter_context(cluster)))
 
 
 @contextmanager
@@ -229,9 +260,13 @@ def _registered(client: Client, job: Job) -> Iterator[str]:
     name = f"twodof-{os.urandom(8).hex()}"
     try:
         client.register_plugin(JobPlugin(job, __version__), name=name)
-    except ImportError as error:
-        raise SweepError(f"a worker cannot import {error.name}; install twodof there") from error
+    except TwoDofError:
+        raise
+    except Exception as error:  # Dask hands on what a worker said, as one of these
+        remedy = f"install twodof {__version__} and its extra 'sweep' there"
+        raise SweepError(f"a worker cannot take the job: {error!s:.300}; {remedy}") from error
     try:
         yield name
     finally:
-        client.unregister_worker_plugin(name)
+        with suppress(OSError):  # from a worker that dies at this moment
+            client.unregister_worker_plugin(name)

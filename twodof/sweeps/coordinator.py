@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from ..bag.provenance import versions
 from ..fmu import Fmu, load_fmu
 from ..inputs import Setting
 from ..master import experiment
-from .cluster import run_all
+from .cluster import Cluster
 from .design import make_design
 from .results import Results, read_sweep
 from .runner import Job, Point
@@ -92,16 +92,17 @@ def sweep(
     with _folder(output) as path:
         folder = str(path.resolve() / "bags") if bags else None
         job = Job(content, fmu.path.name, design.names, options, folder)
-        with Results(path, design.names, units, len(design), provenance, resume=resume) as results:
-            progress(int(results.done.sum()), len(design))
-            missing = np.flatnonzero(~results.done)
+        results = Results(path, design.names, units, len(design), provenance, resume=resume)
+        progress(int(results.done.sum()), len(design))
+        missing = np.flatnonzero(~results.done)
+        with ExitStack() as stack:
             if len(missing):
-                points = _points(missing, design.points())
-                found = run_all(job, points, workers=workers, scheduler=scheduler, stop=stop)
-                with closing(found):
-                    for rows in found:
-                        results.add(rows)
-                        progress(int(results.done.sum()), len(design))
+                cluster = stack.enter_context(Cluster(job, workers, scheduler))
+            stack.enter_context(results)  # writes nothing before the workers are there
+            if len(missing):
+                for rows in cluster.run(_points(missing, design.points()), stop):
+                    results.add(rows)
+                    progress(int(results.done.sum()), len(design))
         table, _ = read_sweep(path)
     return table
 

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..fmu import Fmu
 from ..inputs import Setting, resolve
 
-MAX_RUNS = 10_000_000
+MAX_RUNS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Design:
         """Values of ``names`` in each run, N × number of variables."""
         low, high = np.array([*self.ranges.values()]).reshape(-1, 2).T
         drawn = np.random.default_rng(self.seed).uniform(low, high, (self.draws, len(low)))
-        combinations = np.array([*product(*self.grids.values())]).reshape(-1, len(self.grids))
+        combinations = np.array([*product(*self.grids.values())])
         return np.hstack(
             [np.repeat(combinations, self.draws, axis=0), np.tile(drawn, (len(combinations), 1))]
         )
@@ -90,21 +90,21 @@ def make_design(
         raise InputError(f"{random} random draws of nothing; give a range")
     if seed < 0:
         raise InputError(f"the seed {seed} is negative")
+    design = Design(grids, limits, max(1, random), seed)
+    if len(design) > MAX_RUNS:
+        raise InputError(f"the design has {len(design)} runs; at most {MAX_RUNS} are possible")
     owner = dict.fromkeys(resolve(fmu, settings), "the settings")
     for name, values in {**grids, **limits}.items():
         if not values:
             raise InputError(f"the grid of {name} is empty")
         if len(set(values)) < len(values):
             raise InputError(f"the grid of {name} has a value twice")
-        for value in values:
-            elements = resolve(fmu, {name: value})
-        for element in elements:
+        if not all(map(isfinite, values)):
+            raise InputError(f"the grid of {name} has a value that is not finite")
+        for element in resolve(fmu, {name: values[0]}):
             if element in owner:
                 raise InputError(f"{element} gets values from {owner[element]} and from {name}")
             owner[element] = f"the design of {name}"
-    design = Design(grids, limits, max(1, random), seed)
-    if len(design) > MAX_RUNS:
-        raise InputError(f"the design has {len(design)} runs; at most {MAX_RUNS} are possible")
     return design
 
 

@@ -135,10 +135,8 @@ def _draw(
             rows = table
             if len(varied) > 2:  # of all runs at one place, the best
                 rows = table.groupby([panel.x, panel.y], as_index=False)[panel.metric].min()
-            on_grid = {panel.x, panel.y} <= grids and min(
-                rows[panel.x].nunique(), rows[panel.y].nunique()
-            ) > 1
-            shown = _draw_cells(axes, rows, panel) if on_grid else _draw_dots(axes, rows, panel)
+            draw = _draw_cells if {panel.x, panel.y} <= grids else _draw_dots
+            shown = draw(axes, rows, panel)
             _draw_critical(axes, panel, "white" if draw is _draw_cells else GREY)
             _mark_best(axes, table, panel)
             _draw_bar(figure, axes, shown)

@@ -71,12 +71,14 @@ class Results:
         self.done: NDArray[np.bool_] = np.zeros(runs, dtype=bool)
         if resume:
             self._resume(provenance)
-        else:
+        elif self.path.exists():
+            raise self._taken()
+
+    def __enter__(self) -> Results:
+        if not self._part:
             self._begin()
         self._lock = lock(self.path)
         self._stored = time.monotonic()
-
-    def __enter__(self) -> Results:
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -92,12 +94,15 @@ class Results:
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
-            raise SweepError(
-                f"'{self.path}' exists; resume it with --resume, or choose another with -o"
-            ) from None
+            raise self._taken() from None
         except OSError as error:
             raise SweepError(f"cannot make '{self.path}': {error.strerror}") from error
         self._write(self._table([]))
+
+    def _taken(self) -> SweepError:
+        return SweepError(
+            f"'{self.path}' exists; resume it with --resume, or choose another with -o"
+        )
 
     def _resume(self, provenance: dict[str, Any]) -> None:
         if not self.path.is_dir():
@@ -109,8 +114,10 @@ class Results:
             _check_same(self.path, _provenance(file, table.schema), provenance)
             self._schema = table.schema
             self.done[table.column("run").to_numpy()] = True
-            if number := PART.fullmatch(file.name):
-                self._part = int(number[1]) + 1
+            number = PART.fullmatch(file.name)
+            self._part = int(number[1]) + 1 if number else 1
+        if not self._part:
+            raise SweepError(f"'{self.path}' is no sweep; there is nothing to resume")
 
     def add(self, rows: Iterable[Row]) -> None:
         """Take rows, stored within a second or two."""

@@ -1,0 +1,653 @@
+"""Sweeps: the metrics against closed forms, the table whatever dies, the map by what it draws."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event, Thread
+
+import duckdb
+import numpy as np
+import oracles
+import pandas
+import pytest
+from harness import changed_plant
+
+import twodof
+from twodof import TwoDofError, sweep
+from twodof.cli import main
+from twodof.figure import drawn, save
+from twodof.sweeps import METRICS, read_sweep
+from twodof.sweeps import runner as runner_module
+from twodof.sweeps.map import drawing
+from twodof.sweeps.runner import Job, Runner
+
+Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
+STEP, STOP = 0.01, 5.0
+COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
+SMALL = {"Kp": (20.0, 60.0, 180.0), "Kd": (8.0, 30.0)}
+GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
+
+
+def table_of(path: Path) -> pandas.DataFrame:
+    """A sweep's table by another reader of Parquet."""
+    return duckdb.sql(f"select * from '{path}/*.parquet' order by run").df()
+
+
+def same(found: pandas.DataFrame, expected: pandas.DataFrame) -> None:
+    """Equal to the bit, row by row."""
+    pandas.testing.assert_frame_equal(found, expected, check_exact=True, check_dtype=False)
+
+
+# --- metrics ---
+
+
+def response(kp: float, kd: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """φ and φ' of φ'' + kd φ' + kp φ = 0, φ(0) = 1, φ'(0) = 0; sound at critical damping too."""
+    a = kd / 2
+    w = np.sqrt(complex(a * a - kp))
+    z = w * t
+    small = np.abs(z) < 1e-4
+    sinhc = np.where(small, 1 + z * z / 6, np.sinh(z) / np.where(small, 1, z))
+    phi = np.exp(-a * t) * (np.cosh(z) + a * t * sinhc)
+    slope = -kp * t * np.exp(-a * t) * sinhc
+    return phi.real, slope.real
+
+
+def gains() -> list[tuple[float, float]]:
+    """200 pairs: under-, over- and critically damped."""
+    rng = np.random.default_rng(7)
+    pairs = []
+    for i in range(200):
+        kp = rng.uniform(10.0, 250.0)
+        damping = (rng.uniform(0.15, 0.95), 1.0, rng.uniform(1.05, 4.0))[i % 3]
+        pairs.append((kp, 2 * damping * np.sqrt(kp)))
+    return pairs
+
+
+@pytest.fixture(scope="module")
+def judged(native_path: Path) -> list[dict[str, float]]:
+    """The metrics of the pairs, by the runs themselves."""
+    options = {"stop_time": STOP, "step": STEP, "settings": {}}
+    job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)
+    with Runner(job) as runner:
+        rows = [runner.run((i, pair)) for i, pair in enumerate(gains())]
+    assert {row[-2] for row in rows} == {"finished"}
+    return [dict(zip(METRICS, row[3:])) for row in rows]
+
+
+def test_metrics_are_those_of_the_closed_form(judged: list[dict[str, float]]) -> None:
+    t = np.arange(501) * STEP
+    e0 = TARGET - oracles.position(Q0)
+    size = np.linalg.norm(e0)
+    settled = 0
+    for (kp, kd), found in zip(gains(), judged):
+        phi, _ = response(kp, kd, t)
+        error = np.abs(phi) * size
+        close = {"rel": 1e-6, "abs": 1e-9}
+        assert found["final_error"] == pytest.approx(error[-1], **close)
+        assert found["rms_error"] == pytest.approx(np.sqrt((error**2).sum() / 501), **close)
+        assert found["overshoot"] == pytest.approx(max(0.0, -phi.min()), **close)
+        assert found["time_at_limits"] == 0.0
+        late = [k for k in range(501) if abs(phi[k]) > 0.02]
+        if late[-1] == 500:
+            assert np.isnan(found["settling_time"])
+        else:
+            settled += 1
+            assert abs(found["settling_time"] - (late[-1] + 1) * STEP) <= STEP
+    assert 150 < settled < 200
+
+
+def test_peaks_are_those_of_the_closed_form(judged: list[dict[str, float]]) -> None:
+    """Joint velocities by the inverse of the Jacobian, torques by the textbook's dynamics."""
+    t = np.arange(501) * STEP
+    start = oracles.position(Q0)
+    arm = oracles.TwoLinkArm(Path(__file__).parents[1] / "urdf/2dof.urdf", 9.81)
+    for (kp, kd), found in list(zip(gains(), judged))[::10]:
+        phi, slope = response(kp, kd, t)
+        speed, effort = 0.0, 0.0
+        for p, s in zip(phi, slope):
+            x = TARGET - p * (TARGET - start)
+            c2 = (x @ x) / (2 * oracles.LINK**2) - 1.0
+            q2 = np.arccos(c2)  # the elbow stays on the side on which it starts
+            q = np.array([np.arctan2(x[1], x[0]) - q2 / 2, q2])
+            v = np.linalg.solve(oracles.jacobian(q), -s * (TARGET - start))
+            a_cmd = -kd * -s * (TARGET - start) + kp * p * (TARGET - start)
+            a = np.linalg.solve(oracles.jacobian(q), a_cmd - oracles.drift(q, v))
+            tau = arm.mass_matrix(q) @ a + arm.nonlinear_effects(q, v)
+            speed, effort = max(speed, *np.abs(v)), max(effort, *np.abs(tau))
+        assert found["peak_velocity"] == pytest.approx(speed, rel=1e-6)
+        assert found["peak_effort"] == pytest.approx(effort, rel=1e-6)
+
+
+def test_time_at_limits_is_that_of_the_samples(native_path: Path) -> None:
+    """The first joint would pass 0.2 rad on its way down; samples tell how long it stays there."""
+    settings = {"q_min": (0.2, -3.0)}
+    (row,) = sweep(native_path, grid={"Kp": [50.0]}, settings=settings).to_dict("records")
+    samples = list(twodof.samples(native_path, settings={**settings, "Kp": 50.0}))
+    at_limit = sum(sample.q[0] == 0.2 for sample in samples)
+    assert at_limit > 50
+    assert row["time_at_limits"] == pytest.approx(at_limit * STEP)
+
+
+def test_what_is_not_defined_is_null(native_path: Path) -> None:
+    at_rest = {"x_des": tuple(oracles.position(Q0))}
+    (row,) = sweep(native_path, grid={"Kp": [50.0]}, settings=at_rest).to_dict("records")
+    assert np.isnan(row["settling_time"]) and np.isnan(row["overshoot"])
+    assert row["final_error"] < 1e-12 and row["outcome"] == "finished"
+
+
+# --- the design ---
+
+
+def test_design_is_the_product_of_grids_with_the_same_draws(native_path: Path) -> None:
+    options = {"grid": SMALL, "ranges": {"tau_ext[2]": (-0.01, 0.02)}, "random": 4, "seed": 5}
+    table = sweep(native_path, stop_time=0.05, **options)
+    assert list(table["run"]) == list(range(24))
+    draws = np.random.default_rng(5).uniform(-0.01, 0.02, 4)
+    expected = [(kp, kd, d) for kp in SMALL["Kp"] for kd in SMALL["Kd"] for d in draws]
+    assert table[["Kp", "Kd", "tau_ext[2]"]].to_numpy() == pytest.approx(np.array(expected), abs=0)
+    same(sweep(native_path, stop_time=0.05, **options), table)
+
+
+def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
+    both = sweep(native_path, grid={"Kp": [80.0]})
+    one = sweep(native_path, grid={"Kp[1]": [80.0]}, settings={"Kp[2]": 80.0})
+    columns = list(METRICS)
+    same(both[columns], one[columns])
+    assert not sweep(native_path, grid={"Kp[1]": [80.0]})[columns].equals(one[columns])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--grid", "Kpp=1:2:3"], "there is no variable 'Kpp'; did you mean 'Kp"),
+        (["--grid", "q=1:2:3"], "q[1] is of causality 'output' and cannot be set"),
+        (["--grid", "Kp=5:1:3"], "LOW 5 must be below HIGH 1"),
+        (["--grid", "Kp=1:2:0"], "COUNT 0 must be a whole number from 2 on"),
+        (["--grid", "Kp=1:2:2.5"], "COUNT 2.5 must be a whole number from 2 on"),
+        (["--grid", "Kp=1:2"], "--grid Kp=1:2: expected NAME=LOW:HIGH:COUNT"),
+        (["--grid", "Kp=1:nan:3"], "its numbers must be finite"),
+        (["--grid", "Kp=1:2:3", "--grid", "Kp=1:2:3"], "--grid Kp is given twice"),
+        (["--grid", "Kp=1:2:3", "--range", "Kp[2]=1:2", "--random", "2"],
+         "Kp[2] gets values from the design of Kp and from Kp[2]"),
+        (["--grid", "Kp=1:2:3", "--set", "Kp[1]=4"],
+         "Kp[1] gets values from the settings and from Kp"),
+        (["--range", "Kp=1:2"], "0 random draws of Kp; at least 1 is needed"),
+        (["--range", "Kp=2:1", "--random", "3"], "LOW 2 must be below HIGH 1"),
+        (["--random", "3"], "there is nothing to vary"),
+        (["--grid", "Kp=1:2:3", "--random", "3"], "3 random draws of nothing; give a range"),
+        ([], "there is nothing to vary"),
+        (["--grid", "Kp=1:2:3", "--stop-time", "-1"], "stop time -1 s must be after"),
+        (["--grid", "Kp=1:2:99999", "--grid", "Kd=1:2:99"], "runs; at most"),
+        (["--grid", "limit_effort=0:1:2"], "limit_effort = 0.0: expected true or false"),
+        (["--grid", "Kp=1:2:3", "--resume"], "--resume needs the sweep to go on with: -o OUT"),
+        (["--grid", "Kp=1:2:3", "--resume", "-o", "none"], "there is no sweep 'none' to resume"),
+        (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists; resume it with --resume"),
+        (["--grid", "Kp=1:2:3", "--workers", "0"], "0 workers; at least 1 is needed"),
+        (["--grid", "Kp=1:2:3", "--scheduler", "tcp://127.0.0.1:9"],
+         "the scheduler 'tcp://127.0.0.1:9' does not answer"),
+        (["--grid", "Kp=1:2:3", "--scheduler", "nonsense://x"], "does not answer"),
+    ],
+)  # fmt: skip
+def test_bad_input_gets_one_line(
+    arguments: list[str], said: str, native_path: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    begin = time.monotonic()
+    assert main(["sweep", str(native_path), *arguments]) == 1
+    assert time.monotonic() - begin < 12.0
+    out, err = capsys.readouterr()
+    assert out == ""
+    (line,) = err.splitlines()
+    assert line.startswith("twodof: error: ") and said in line
+    assert [path.name for path in tmp_path.iterdir()] in (["taken"], [])
+
+
+# --- one instance, any outcome ---
+
+
+def test_a_runner_instantiates_once_and_repeats_to_the_bit(
+    native_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In any order, what a run gives is what a fresh instance gives."""
+    made = []
+    instantiate = runner_module.instantiate
+    monkeypatch.setattr(
+        runner_module, "instantiate", lambda fmu: made.append(fmu) or instantiate(fmu)
+    )
+    options = {"stop_time": 1.0, "step": STEP, "settings": {}}
+    points = [(i, pair) for i, pair in enumerate(gains()[:12])]
+    job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)
+    with Runner(job) as runner:
+        forth = [runner.run(point) for point in points]
+        back = [runner.run(point) for point in reversed(points)]
+    assert len(made) == 1
+    alone = []
+    for point in points:
+        with Runner(job) as runner:
+            alone.append(runner.run(point))
+    assert forth == back[::-1] == alone
+
+
+ODD = b"""        if self.Kp[0] == 2.0:
+            raise FloatingPointError('broken inside')
+        if self.Kp[0] == 3.0:
+            self.v = [float('nan')] * 2; return
+        if self.Kp[0] == 4.0:
+            import os, signal; os.kill(os.getpid(), signal.SIGKILL)
+        self._hold_inputs()
+        limits"""
+
+
+def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: Path) -> None:
+    odd = changed_plant(fmu_path, tmp_path, b"        self._hold_inputs()\n        limits", ODD)
+    grid = {"Kp": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], "rtol": [1e-3, -1.0]}
+    table = sweep(odd, grid=grid, stop_time=0.05)
+    wanted = []
+    for kp in grid["Kp"]:
+        odd_one = {2.0: "discarded", 3.0: "diverged", 4.0: "crashed"}
+        wanted += [odd_one.get(kp, "finished"), "failed"]
+    assert list(table["outcome"]) == wanted
+    finished = table["outcome"] == "finished"
+    assert table[list(METRICS)][~finished].isna().all(axis=None)
+    assert table["final_error"][finished].notna().all()
+    assert table["message"][finished].isna().all() and table["message"][~finished].notna().all()
+    said = dict(zip(table["outcome"], table["message"], strict=True))
+    assert "broken inside" in said["discarded"] and "rtol = -1 must be > 0" in said["failed"]
+    assert list(table["end_time"][finished]) == [0.05] * finished.sum()
+    expected = sweep(fmu_path, grid={"Kp": [1.0, 5.0, 6.0]}, stop_time=0.05)
+    columns = list(METRICS)
+    assert table[columns][finished].to_numpy() == pytest.approx(
+        expected[columns].to_numpy(), nan_ok=True, abs=0
+    )
+
+
+def test_flavours_agree(fmu_path: Path, native_path: Path) -> None:
+    grid = {"Kp": [20.0, 90.0], "Kd": [15.0, 30.0]}
+    python, native = (sweep(path, grid=grid, stop_time=2.0) for path in (fmu_path, native_path))
+    for name in METRICS:
+        assert python[name].to_numpy() == pytest.approx(
+            native[name].to_numpy(), rel=1e-9, abs=1e-9, nan_ok=True
+        )
+
+
+def test_bags_hold_the_runs(native_path: Path, tmp_path: Path) -> None:
+    table = sweep(native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", bags=True)
+    for run in table.to_dict("records"):
+        bag = twodof.read_bag(tmp_path / "s/bags" / f"{run['run']:06d}")
+        assert np.abs(bag.v).max() == run["peak_velocity"]
+        assert bag.provenance["start_values"]["Kp[2]"] == run["Kp"]
+    assert len(list((tmp_path / "s/bags").iterdir())) == 6
+
+
+# --- the table ---
+
+
+def test_table_is_parquet_with_units_and_provenance(native_path: Path, tmp_path: Path) -> None:
+    table = sweep(
+        native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", command_line="by hand"
+    )
+    assert [path.name for path in (tmp_path / "s").iterdir()] == ["runs.parquet"]
+    same(table_of(tmp_path / "s"), table)
+    found = duckdb.sql(f"select key, value from parquet_kv_metadata('{tmp_path}/s/runs.parquet')")
+    (text,) = [value for key, value in found.fetchall() if key == b"twodof"]
+    made = json.loads(text)
+    fmu = twodof.load_fmu(native_path)
+    assert made["fmu"]["guid"] == fmu.guid and made["command_line"] == "by hand"
+    assert made["design"]["grids"] == {name: list(values) for name, values in SMALL.items()}
+    assert made["versions"]["twodof"] == twodof.__version__
+    types = dict(duckdb.sql(f"select * from '{tmp_path}/s/runs.parquet'").description and [
+        (row[0], str(row[1])) for row in
+        duckdb.sql(f"describe select * from '{tmp_path}/s/runs.parquet'").fetchall()
+    ])  # fmt: skip
+    assert types["run"] == "BIGINT" and types["outcome"] == types["message"] == "VARCHAR"
+    assert {types[name] for name in ("Kp", "Kd", *METRICS, "end_time")} == {"DOUBLE"}
+
+
+def begin(fmu: Path, output: Path, *options: str) -> subprocess.Popen[str]:
+    command = [*COMMAND, "sweep", str(fmu), *GRIDS, "-o", str(output), *options]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+@pytest.fixture(scope="module")
+def undisturbed(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of 320 runs that nothing disturbs."""
+    path = tmp_path_factory.mktemp("sweep") / "whole"
+    done = begin(native_path, path)
+    out, err = done.communicate(timeout=120)
+    assert (done.returncode, err) == (0, "")
+    assert "320 of 320 runs: 320 finished" in out and f"twodof plot {path}" in out
+    return path
+
+
+@pytest.mark.long
+def test_what_is_interrupted_is_resumed(
+    native_path: Path, undisturbed: Path, tmp_path: Path, length: Callable[[int, int], int]
+) -> None:
+    """By Ctrl-C to all processes of the terminal, or by the death of the sweep's own."""
+    rng = random.Random(3)
+    expected = table_of(undisturbed)
+    kept = []
+    for i in range(length(20, 2)):
+        path = tmp_path / f"s{i}"
+        process = begin(native_path, path)
+        while not any(path.glob("part-000001*")):
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0.0, 1.0))
+        if i % 2:
+            process.kill()
+            process.communicate()
+        else:
+            os.killpg(process.pid, signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+            assert err == "", err
+            if process.returncode != 0:  # it was not at its end
+                assert process.returncode == 130
+                assert re.search(r"^  twodof sweep .* --resume$", out, re.M)
+        kept.append(len(table_of(path)))
+        os.utime(path)
+        again = begin(native_path, path, "--resume")
+        out, err = again.communicate(timeout=120)
+        assert (again.returncode, err) == (0, ""), err
+        same(table_of(path), expected)
+        assert [file.name for file in path.iterdir()] == ["runs.parquet"]
+    print(f"rows kept of 320 when interrupted: {kept}")
+    assert 0 < min(kept) < 320
+
+
+def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
+    stop = Event()
+    path, done = tmp_path / "s", []
+
+    def progress(count: int, runs: int) -> None:
+        done.append(count)
+        if count >= 3:
+            stop.set()
+
+    options = {"grid": {"Kp": np.linspace(10, 90, 40)}, "stop_time": 20.0, "output": path}
+    table = sweep(native_path, workers=1, progress=progress, stop=stop.is_set, **options)
+    assert 3 <= len(table) < 40
+    parts = {file: file.read_bytes() for file in path.iterdir()}
+    counts: list[int] = []
+    resumed = sweep(
+        native_path, resume=True, progress=lambda count, runs: counts.append(count), **options
+    )
+    assert counts[0] == len(table) and len(parts) > 1
+    same(resumed, sweep(native_path, **{**options, "output": None}))
+    made = {file.name: file.read_bytes() for file in path.iterdir()}
+    sweep(native_path, resume=True, **options)  # is finished: nothing is run, nothing changes
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == made
+
+
+def test_what_is_another_sweep_is_not_resumed(
+    native_path: Path, tmp_path: Path, fmu_path: Path
+) -> None:
+    path = tmp_path / "s"
+    options = {"grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True}
+    sweep(native_path, **{**options, "resume": False})
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    for change, said in (
+        ({"grid": {"Kp": [1.0, 3.0]}}, "other design"),
+        ({"stop_time": 0.06}, "other options"),
+        ({"bags": True}, "other bags"),
+    ):
+        with pytest.raises(TwoDofError, match=said):
+            sweep(native_path, **{**options, **change})
+    with pytest.raises(TwoDofError, match="of another FMU"):
+        sweep(fmu_path, **options)
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
+
+
+def test_damaged_and_foreign_tables_get_one_line(native_path: Path, tmp_path: Path) -> None:
+    for name, content in (("cut", None), ("empty", b""), ("other", b"PAR1 no")):
+        path = tmp_path / name
+        sweep(native_path, grid={"Kp": [1.0]}, stop_time=0.02, output=path)
+        file = path / "runs.parquet"
+        file.write_bytes(file.read_bytes()[:-100] if content is None else content)
+        with pytest.raises(TwoDofError, match=f"cannot read '.*{name}/runs.parquet'"):
+            read_sweep(path)
+    pandas.DataFrame({"run": [1]}).to_parquet(tmp_path / "cut/runs.parquet")
+    with pytest.raises(TwoDofError, match="was not written by twodof"):
+        read_sweep(tmp_path / "cut")
+    with pytest.raises(TwoDofError, match="is no sweep"):
+        read_sweep(tmp_path)
+
+
+@pytest.mark.long
+def test_memory_of_the_coordinator_is_flat(
+    native_path: Path, length: Callable[[int, int], int]
+) -> None:
+    code = """
+import sys, twodof
+from pathlib import Path
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+if __name__ == "__main__":
+    fmu, runs = sys.argv[1], int(sys.argv[2])
+    seen = {}
+    twodof.sweep(fmu, ranges={"Kp": (10, 90)}, random=runs, stop_time=0.1,
+                 progress=lambda done, runs: seen.setdefault(done // 100, resident()))
+    first = min(key for key in seen if key)
+    print((max(seen.values()) - seen[first]) / 2**20, max(seen))
+"""
+    runs = length(10_000, 1_000)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(native_path), str(runs)],
+        capture_output=True, text=True, check=True, timeout=500,
+    )  # fmt: skip
+    growth, seen = map(float, done.stdout.split())
+    print(f"coordinator: {growth:.1f} MiB more at {runs} runs than at 100")
+    assert seen == runs // 100
+    assert growth < 10.0
+
+
+# --- workers ---
+
+
+def workers_of(process: int) -> list[int]:
+    """Processes that run tasks: Python's spawned children, without the tracker of resources."""
+    tasks = Path(f"/proc/{process}/task").iterdir()
+    found = []
+    for child in [word for task in tasks for word in (task / "children").read_text().split()]:
+        try:
+            if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
+                found.append(int(child))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.long
+def test_workers_that_are_killed_cost_no_run(
+    native_path: Path, length: Callable[[int, int], int]
+) -> None:
+    runs, pause, stop_time = length(2000, 200), length(5, 1.5), length(20, 40)
+    grid = {"Kp": np.linspace(10.0, 200.0, runs)}
+    expected = sweep(native_path, grid=grid, stop_time=stop_time)
+    begun, ended, killed = Event(), Event(), []
+    rng = random.Random(1)
+
+    def kill() -> None:
+        begun.wait()
+        while not ended.wait(pause):
+            if workers := workers_of(os.getpid()):
+                killed.append(rng.choice(workers))
+                os.kill(killed[-1], signal.SIGKILL)
+
+    thread = Thread(target=kill)
+    thread.start()
+    try:
+        found = sweep(
+            native_path, grid=grid, stop_time=stop_time,
+            progress=lambda done, runs: begun.set() if done else None,
+        )  # fmt: skip
+    finally:
+        ended.set()
+        begun.set()
+        thread.join()
+    print(f"{len(killed)} workers killed during {runs} runs")
+    assert len(killed) >= 2
+    assert list(found["run"]) == list(range(runs))
+    same(found, expected)
+
+
+@contextmanager
+def cluster(folder: Path, workers: int, **environment: str) -> Iterator[str]:
+    """Address of a scheduler of its own process, with workers of theirs."""
+    file = folder / "scheduler.json"
+    programs = [["scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1"]]
+    programs += [["worker", "--nthreads", "2", "--no-dashboard"]] * workers
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *program, "--scheduler-file", str(file)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+            env={**os.environ, **environment},
+        )
+        for program in programs
+    ]  # fmt: skip
+    try:
+        while not file.exists() or not file.read_text():
+            assert processes[0].poll() is None
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in processes[::-1]:
+            os.killpg(process.pid, signal.SIGTERM)
+        for process in processes:
+            process.wait(30)
+
+
+def test_a_cluster_gives_the_table_of_local_workers(native_path: Path, tmp_path: Path) -> None:
+    grid = {"Kp": np.linspace(10.0, 200.0, 30), "Kd": [10.0, 40.0]}
+    expected = sweep(native_path, grid=grid)
+    with cluster(tmp_path, 2) as address:
+        for _ in range(2):  # the workers stay, and nothing of a sweep stays with them
+            same(sweep(native_path, grid=grid, scheduler=address), expected)
+
+
+BLOCK = """
+import sys
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "twodof":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+def test_workers_without_the_package_are_named(native_path: Path, tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(BLOCK)
+    with (
+        cluster(tmp_path, 1, PYTHONPATH=str(tmp_path)) as address,
+        pytest.raises(TwoDofError, match=r"a worker cannot take the job: .*; install twodof \d"),
+    ):
+        sweep(native_path, grid={"Kp": [1.0]}, scheduler=address)
+
+
+def test_a_scheduler_without_workers_is_named(native_path: Path, tmp_path: Path) -> None:
+    with cluster(tmp_path, 0) as address, pytest.raises(TwoDofError, match="has no workers"):
+        sweep(native_path, grid={"Kp": [1.0]}, scheduler=address)
+
+
+# --- the map ---
+
+
+def panels(path: Path) -> dict[str, object]:
+    table, provenance = read_sweep(path)
+    figure = drawn(drawing(table, provenance, "a"))
+    return {axes.get_label(): axes for axes in figure.axes if " over " in axes.get_label()}
+
+
+def test_map_of_two_variables_holds_the_table_and_marks_the_best(undisturbed: Path) -> None:
+    table = table_of(undisturbed)
+    found = panels(undisturbed)
+    assert list(found) == [
+        f"{metric} over Kp and Kd" for metric in METRICS if metric != "time_at_limits"
+    ]
+    for label, axes in found.items():
+        metric = label.split()[0]
+        (mesh,) = (c for c in axes.collections if hasattr(c, "get_coordinates"))
+        cells = np.ma.filled(mesh.get_array(), np.nan).reshape(16, 20)
+        assert np.asarray(cells).T.ravel() == pytest.approx(
+            table[metric].to_numpy(), nan_ok=True, abs=0
+        )
+        (best,) = axes.collections[-1].get_offsets()
+        least = table[metric].min()
+        chosen = table[(table["Kp"] == best[0]) & (table["Kd"] == best[1])]
+        assert chosen[metric].item() == least
+        edges = np.asarray(mesh.get_coordinates())
+        x, y = edges[0, :, 0], edges[:, 0, 1]
+        assert (x[:-1] + x[1:]) / 2 == pytest.approx(np.linspace(10, 200, 20))
+        assert (y[:-1] + y[1:]) / 2 == pytest.approx(np.linspace(5, 80, 16))
+        critical = axes.get_lines()[0].get_xydata()
+        assert critical[:, 1] ** 2 == pytest.approx(4 * critical[:, 0])
+
+
+def test_map_of_one_variable_is_curves(native_path: Path, tmp_path: Path) -> None:
+    table = sweep(native_path, grid={"Kp": np.linspace(10, 90, 9)}, output=tmp_path / "s")
+    for label, axes in panels(tmp_path / "s").items():
+        metric = label.split()[0]
+        x, y = axes.get_lines()[0].get_data()
+        assert np.array(x) == pytest.approx(np.linspace(10, 90, 9))
+        assert np.array(y) == pytest.approx(table[metric].to_numpy(), nan_ok=True, abs=0)
+
+
+def test_map_of_three_variables_is_the_best_over_the_third(
+    native_path: Path, tmp_path: Path
+) -> None:
+    grid = {**SMALL, "tau_ext[1]": [-0.05, 0.0, 0.05]}
+    table = sweep(native_path, grid=grid, stop_time=2.0, output=tmp_path / "s")
+    found = panels(tmp_path / "s")
+    assert len(found) == 9
+    (mesh,) = (
+        c for c in found["overshoot over Kp and Kd"].collections if hasattr(c, "get_coordinates")
+    )
+    cells = mesh.get_array().reshape(2, 3)
+    for i, kd in enumerate(SMALL["Kd"]):
+        for j, kp in enumerate(SMALL["Kp"]):
+            runs = table[(table["Kp"] == kp) & (table["Kd"] == kd)]
+            assert len(runs) == 3 and cells[i, j] == runs["overshoot"].min()
+
+
+def test_map_of_random_values_is_dots(native_path: Path, tmp_path: Path) -> None:
+    ranges = {"Kp": (10, 90), "Kd": (10, 30)}
+    table = sweep(native_path, ranges=ranges, random=25, stop_time=2.0, output=tmp_path / "s")
+    axes = panels(tmp_path / "s")["peak_effort over Kp and Kd"]
+    dots = axes.collections[1]
+    assert np.asarray(dots.get_offsets()) == pytest.approx(table[["Kp", "Kd"]].to_numpy(), abs=0)
+    assert np.asarray(dots.get_array()) == pytest.approx(table["peak_effort"].to_numpy(), abs=0)
+
+
+def test_plot_of_a_sweep_prints_the_best_runs(
+    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert main(["plot", str(undisturbed)]) == 0
+    out = capsys.readouterr().out
+    assert "plot  whole.png" in out and (tmp_path / "whole.png").stat().st_size > 20_000
+    table = table_of(undisturbed)
+    best = table.sort_values(["settling_time", "peak_effort"]).iloc[0]
+    row = out.splitlines()[5].split()
+    assert [float(cell) for cell in row[:4]] == pytest.approx(
+        [best["run"], best["Kp"], best["Kd"], best["settling_time"]]
+    )
+    assert main(["plot", str(undisturbed), str(undisturbed)]) == 1
+    assert "is a sweep; it is drawn alone" in capsys.readouterr().err
+    found = drawing(*read_sweep(undisturbed), "a")
+    assert f"{best['Kp']:g}" in save(found, tmp_path / "a.html").read_text("utf-8")
