@@ -1,10 +1,11 @@
-"""Makes docs/arm.png and docs/plot.png, the README's pictures, and fmu_src/model.png, the icon.
+"""Makes docs/arm.png, plot.png and map.png, the README's pictures, and fmu_src/model.png, the icon.
 
     python docs/make_pictures.py
 
 The first picture shows the default run, from the samples of the FMU itself, with the arm drawn from
-its meshes as seen from above. The second is what ``twodof plot`` makes of three runs. The icon is
-for FMI tools and suits the FMU of any robot. Needs matplotlib.
+its meshes as seen from above. The second is what ``twodof plot`` makes of three runs, the third is
+what it makes of the README's sweep. The icon is for FMI tools and suits the FMU of any robot. Needs
+the extras 'view', 'sweep' and 'native'.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import twodof  # noqa: E402
+from twodof.figure import drawn  # noqa: E402
 from twodof.plot import plot_bags  # noqa: E402
+from twodof.sweeps.map import drawing  # noqa: E402
 
 LINK = 0.15  # m
 LINK_COLOURS = {"link1": (0.33, 0.40, 0.49), "link2": (0.96, 0.55, 0.14)}
@@ -45,6 +48,7 @@ def main() -> None:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
         samples = list(twodof.samples(fmu))
         draw_plot(fmu, ROOT / "docs" / "plot.png")
+        draw_map(Path(folder), ROOT / "docs" / "map.png")
     draw_arm(samples, ROOT / "docs" / "arm.png")
     draw_icon(ROOT / "fmu_src" / "model.png")
 
@@ -204,6 +208,15 @@ def draw_plot(fmu: Path, path: Path) -> None:
         twodof.simulate(run, [twodof.Bag(bag, run)])
     figure = plot_bags(*bags)
     figure.savefig(path, dpi=135, pil_kwargs={"optimize": True}, metadata={"Software": None})
+
+
+def draw_map(folder: Path, path: Path) -> None:
+    """The default arm's gain map."""
+    fmu = twodof.build_fmu(folder / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
+    grid = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
+    twodof.sweep(fmu, grid=grid, output=folder / "gains")
+    figure = drawn(drawing(*twodof.read_sweep(folder / "gains"), "gains"))
+    figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
 
 
 # --- the icon ---

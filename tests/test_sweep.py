@@ -476,7 +476,7 @@ def workers_of(process: int) -> list[int]:
 def test_workers_that_are_killed_cost_no_run(
     native_path: Path, length: Callable[[int, int], int]
 ) -> None:
-    runs, pause, stop_time = length(2000, 200), length(5, 1.5), length(20, 40)
+    runs, pause, stop_time = length(2000, 150), length(5, 2.5), length(20, 60)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
     expected = sweep(native_path, grid=grid, stop_time=stop_time)
     begun, ended, killed = Event(), Event(), []

@@ -38,7 +38,7 @@ except ImportError as missing:
 
 PATIENCE = 5.0  # s for a scheduler to answer
 NO_WORKER = 60.0  # s after which nobody hopes for another
-BATCH_TIME = 0.5  # s, of one task
+BATCH_TIME = 0.25  # s, of one task
 MAX_BATCH = 256
 IN_HAND = 2  # tasks a worker, so that it never waits for the next
 CONFIG = {
@@ -166,7 +166,7 @@ class Cluster:
 
 
 class _Batches:
-    """Cuts points into batches of about half a second."""
+    """Cuts points into batches of about a quarter of a second."""
 
     def __init__(self, points: Iterator[Point]) -> None:
         self._points = points
