@@ -430,42 +430,44 @@ def test_damaged_and_foreign_tables_get_one_line(native_path: Path, tmp_path: Pa
 
 @pytest.mark.long
 def test_memory_of_the_coordinator_is_flat(
-    native_path: Path, length: Callable[[int, int], int]
+    native_path: Path, tmp_path: Path, length: Callable[[int, int], int]
 ) -> None:
+    """Once pyarrow has written its first rows, for which it takes some 15 MiB."""
     code = """
 import sys, twodof
 from pathlib import Path
-def resident():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+def look(done, runs):
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    seen.append((len(list(Path(output).glob("part-*"))), done, pages * 4096 / 2**20))
 if __name__ == "__main__":
-    fmu, runs = sys.argv[1], int(sys.argv[2])
-    seen = {}
-    twodof.sweep(fmu, ranges={"Kp": (10, 90)}, random=runs, stop_time=0.1,
-                 progress=lambda done, runs: seen.setdefault(done // 100, resident()))
-    first = min(key for key in seen if key)
-    print((max(seen.values()) - seen[first]) / 2**20, max(seen))
+    fmu, output, runs = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    seen = []
+    twodof.sweep(fmu, ranges={"Kp": (10, 90)}, random=runs, stop_time=0.2, output=output,
+                 progress=look)
+    late = [row for row in seen if row[0] >= 2]
+    print(late[0][1], max(row[2] for row in late) - late[0][2], seen[-1][2] - seen[1][2])
 """
-    runs = length(10_000, 1_000)
+    runs = length(10_000, 3_000)
     done = subprocess.run(
-        [sys.executable, "-c", code, str(native_path), str(runs)],
+        [sys.executable, "-c", code, str(native_path), str(tmp_path / "s"), str(runs)],
         capture_output=True, text=True, check=True, timeout=500,
     )  # fmt: skip
-    growth, seen = map(float, done.stdout.split())
-    print(f"coordinator: {growth:.1f} MiB more at {runs} runs than at 100")
-    assert seen == runs // 100
-    assert growth < 10.0
+    first, growth, all_growth = map(float, done.stdout.split())
+    print(f"coordinator: {growth:.1f} MiB from run {first:.0f} to {runs}; {all_growth:.1f} in all")
+    assert first < 0.7 * runs
+    assert growth < 8.0  # it goes up and down by 5
 
 
 # --- workers ---
 
 
 def workers_of(process: int) -> list[int]:
-    """Processes that run tasks: Python's spawned children, without the tracker of resources."""
+    """Processes that run tasks."""
     tasks = Path(f"/proc/{process}/task").iterdir()
     found = []
     for child in [word for task in tasks for word in (task / "children").read_text().split()]:
         try:
-            if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
+            if "dask_worker" in Path(f"/proc/{child}/cmdline").read_text():
                 found.append(int(child))
         except OSError:
             continue
@@ -476,7 +478,7 @@ def workers_of(process: int) -> list[int]:
 def test_workers_that_are_killed_cost_no_run(
     native_path: Path, length: Callable[[int, int], int]
 ) -> None:
-    runs, pause, stop_time = length(2000, 150), length(5, 2.5), length(20, 60)
+    runs, pause, stop_time = length(2000, 100), length(5, 2.5), length(20, 60)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
     expected = sweep(native_path, grid=grid, stop_time=stop_time)
     begun, ended, killed = Event(), Event(), []

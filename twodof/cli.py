@@ -574,7 +574,9 @@ def _sweep(options: argparse.Namespace) -> int:
 
         def progress(done: int, runs: int) -> None:
             nonlocal total
-            bar.total = total = runs
+            if not total:  # what an earlier sweep has done says nothing about the rate
+                bar.total, bar.initial, bar.n = runs, done, done
+            total = runs
             bar.update(done - bar.n)
 
         table = sweep(

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
+import shlex
+import subprocess
+import sys
+import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from math import nan
 from threading import Lock
 from typing import Any
@@ -37,6 +41,8 @@ except ImportError as missing:
     ) from missing
 
 PATIENCE = 5.0  # s for a scheduler to answer
+START_TIME = 60.0  # s for the first worker to start
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 NO_WORKER = 60.0  # s after which nobody hopes for another
 BATCH_TIME = 0.25  # s, of one task
 MAX_BATCH = 256
@@ -46,14 +52,8 @@ CONFIG = {
     "distributed.admin.log-length": 100,
     "distributed.admin.low-level-log-length": 100,
     "distributed.scheduler.allowed-failures": 1,
-    "distributed.worker.preload": ["twodof.sweeps.cluster"],
     "distributed.comm.timeouts.connect": PATIENCE,
 }
-
-
-def dask_setup(worker: Worker) -> None:
-    """The terminal's Ctrl-C is for the sweep, not for a local worker, which preloads this."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class JobPlugin(WorkerPlugin):  # type: ignore[misc]
@@ -113,8 +113,8 @@ class Cluster:
 
     def __enter__(self) -> Cluster:
         with ExitStack() as stack:
-            client = _local(self._workers) if self._scheduler is None else _remote(self._scheduler)
-            self._client = stack.enter_context(client)
+            workers = _local(self._workers) if self._scheduler is None else _remote(self._scheduler)
+            self._client, self._mend = stack.enter_context(workers)
             self._name = stack.enter_context(_registered(self._client, self._job))
             self._exit = stack.pop_all()
         return self
@@ -140,9 +140,11 @@ class Cluster:
         seen = time.monotonic()
         while not stop():
             workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
-            seen = time.monotonic() if workers else seen
-            if time.monotonic() - seen > NO_WORKER:
+            now = time.monotonic()
+            seen = now if workers else seen
+            if now - seen > NO_WORKER:
                 raise SweepError("no worker is left; go on with --resume")
+            self._mend()
             width = IN_HAND * max(1, workers)
             while len(tasks) < width and (batch := batches.next(alone=not tasks)):
                 tasks[self._client.submit(run_batch, self._name, batch, pure=False)] = batch
@@ -213,19 +215,54 @@ def _crashed(number: int, values: tuple[float, ...]) -> Row:
 
 
 @contextmanager
-def _local(workers: int) -> Iterator[Client]:
-    """Processes of this machine; those that die are replaced."""
+def _local(count: int) -> Iterator[tuple[Client, Callable[[], object]]]:
+    """Processes of this machine, and what replaces those that have died.
+
+    They are started by hand: Dask's nannies give up on workers that die as they start, and import
+    the program's main module. In a session of their own, the terminal's Ctrl-C is not for them.
+    """
     with ExitStack() as stack:
         stack.enter_context(_silent(logging.getLogger("distributed")))
         stack.enter_context(dask.config.set(CONFIG))
+        cluster = stack.enter_context(
+            LocalCluster(
+                n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
+            )
+        )
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="twodof_"))
+        command = [
+            sys.executable, "-m", "distributed.cli.dask_worker", cluster.scheduler_address,
+            "--no-nanny", "--nthreads", "1", "--no-dashboard", "--memory-limit", "0",
+            "--death-timeout", f"{START_TIME:g}", "--local-directory", folder,
+        ]  # fmt: skip
+        path = os.pathsep.join(entry for entry in sys.path if entry)
+        environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": path, "TMPDIR": folder}
+        start = partial(
+            subprocess.Popen, command, env=environment, start_new_session=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        workers: list[subprocess.Popen[Any]] = []
+        stack.callback(_end, workers)
+
+        def mend() -> None:
+            workers[:] = [worker for worker in workers if worker.poll() is None]
+            while len(workers) < count:
+                workers.append(start())
+
+        mend()
+        client = stack.enter_context(Client(cluster))
         try:
-            cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True,
-                dashboard_address="127.0.0.1:0", memory_limit=None, silence_logs=logging.CRITICAL,
-            )  # fmt: skip
-        except RuntimeError as error:
-            raise SweepError(f"cannot start {workers} workers: {error}") from error
-        yield stack.enter_context(Client(stack.enter_context(cluster)))
+            client.wait_for_workers(1, timeout=START_TIME)
+        except TimeoutError:
+            raise SweepError(f"no worker has started: try {shlex.join(command)}") from None
+        yield client, mend
+
+
+def _end(workers: Sequence[subprocess.Popen[Any]]) -> None:
+    for worker in workers:
+        worker.kill()  # what they have, they have told; their folder goes with this process
+    for worker in workers:
+        worker.wait()
 
 
 @contextmanager
@@ -240,8 +277,8 @@ def _silent(logger: logging.Logger) -> Iterator[None]:
 
 
 @contextmanager
-def _remote(address: str) -> Iterator[Client]:
-    """The workers of a cluster that runs already."""
+def _remote(address: str) -> Iterator[tuple[Client, Callable[[], object]]]:
+    """The workers of a cluster that runs already, which mends itself."""
     try:
         client = Client(address, timeout=PATIENCE)
     except (OSError, ValueError, TypeError) as error:
@@ -251,7 +288,7 @@ def _remote(address: str) -> Iterator[Client]:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError:
             raise SweepError(f"the scheduler '{address}' has no workers") from None
-        yield client
+        yield client, lambda: None
 
 
 @contextmanager

@@ -46,9 +46,7 @@ def sweep(
     """Run every point of a design; the table, one row a run.
 
     The columns are ``run``, the variables that are varied, the metrics (``METRICS``), ``end_time``
-    in s, ``outcome`` (finished, discarded, diverged, failed or crashed) and ``message``. A local
-    worker is a new Python process that imports the program's main module: keep the call under
-    ``if __name__ == "__main__":``.
+    in s, ``outcome`` (finished, discarded, diverged, failed or crashed) and ``message``.
 
     Args:
         fmu: the FMU or its path.
