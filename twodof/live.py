@@ -384,7 +384,7 @@ class Controls:
                 self._add_gain(group, unit, change)
         if fmu.vector("tau_ext"):
             self._add_disturbance(robot, change)
-        units = "rad or m" if any(robot.prismatic) else "rad"
+        units = " or ".join(dict.fromkeys("m" if p else "rad" for p in robot.prismatic))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
         joints, error = f"position, {units}", "distance from the target, mm"
         self._plots = (
