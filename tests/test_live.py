@@ -84,10 +84,10 @@ def time_of(found: dict[str, str]) -> float:
     return numbers(found["time"])[0]
 
 
-def watch(page: Page, until_time: float) -> list[dict[str, str]]:
-    """The readout at some moments."""
+def watch(page: Page, until_time: float, *, least: int = 1) -> list[dict[str, str]]:
+    """The readout at some moments, so many at least."""
     seen = [rows(page)]
-    while time_of(seen[-1]) < until_time:
+    while time_of(seen[-1]) < until_time or len(seen) < least:
         page.wait_for_timeout(30)
         seen.append(rows(page))
     return seen
@@ -96,9 +96,8 @@ def watch(page: Page, until_time: float) -> list[dict[str, str]]:
 def play(page: Page, until_time: float) -> list[dict[str, str]]:
     """The readout at some moments of a run from the start, each after a step."""
     press(page, "Play")
-    seen = [found for found in watch(page, until_time) if time_of(found) > 0.0]
+    seen = [found for found in watch(page, until_time, least=20) if time_of(found) > 0.0]
     pause(page)
-    assert len(seen) > 10
     return seen
 
 
@@ -120,10 +119,41 @@ def test_arm_follows_the_target_as_the_closed_form_says(page: Page) -> None:
     type_into(page, "x", target[0])
     type_into(page, "y", target[1])
     before = picture(page)
-    assert_follows(play(page, 3.0), target)
+    seen = play(page, 3.0)
+    assert_follows(seen, target)
     after = picture(page)
     assert min(colours(before), colours(after)) > 100
     assert (before != after).any(axis=-1).mean() > 0.01
+
+
+def test_readout_tells_how_well_time_is_kept(page: Page) -> None:
+    seen = play(page, 2.5)
+    factors = [float(found["real-time factor"]) for found in seen if time_of(found) > 1.5]
+    assert np.median(factors) == pytest.approx(1.0, abs=0.1)
+    counts = [numbers(found["deadlines missed"]) for found in seen]
+    for found, (missed, steps, worst) in zip(seen, counts):
+        assert steps - counts[0][1] == round(100 * (time_of(found) - time_of(seen[0])))
+        assert 0 <= missed <= steps and worst >= 0.0
+
+
+def test_plots_are_those_of_what_was_shown(page: Page) -> None:
+    """Up to the last step."""
+    type_into(page, "x", 0.2)
+    type_into(page, "y", 0.05)
+    seen = play(page, 1.0)
+    found = rows(page)
+    count = round(100 * time_of(found)) + 1
+    drawn = f"() => ({browser.PLOTS})().every(([_, [age]]) => age.length === {count})"
+    page.wait_for_function(drawn, timeout=5000)
+    (title, (age, q1, q2)), (_, (_, error)) = page.evaluate(browser.PLOTS)
+    assert title == "position, rad"
+    assert np.diff(age) == pytest.approx(0.01) and age[-1] == 0.0
+    for moment in (*seen, found):
+        k = round(100 * time_of(moment))
+        assert [q1[k], q2[k]] == pytest.approx(
+            numbers(moment["joint1"] + moment["joint2"]), abs=ROUNDED
+        )
+        assert error[k] == pytest.approx(numbers(moment["error"])[0], rel=1e-3)
 
 
 def test_gains_are_those_of_the_sliders(page: Page) -> None:
@@ -163,7 +193,7 @@ def test_target_is_dragged_in_the_scene(
     press(page, "Reset")
     until(page, lambda found: found["time"] == "0.00 s")
     box = page.locator("canvas").first.bounding_box()
-    x, y = pixels(shots[1], colour).mean(axis=0) + (box["x"], box["y"])
+    x, y = np.add(pixels(shots[1], colour).mean(axis=0), (box["x"], box["y"]))
     page.mouse.move(x, y)
     page.wait_for_timeout(300)  # until the page knows what the mouse is on
     page.mouse.down()
@@ -222,9 +252,9 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
     press(page, "Record")
     page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
     start = time_of(rows(page))
-    seen = watch(page, start + 0.5)
+    seen = watch(page, start + 0.5, least=6)
     type_into(page, "x", 0.15)
-    seen += watch(page, start + 1.5)
+    seen += watch(page, start + 1.5, least=6)
     press(page, "Stop recording")
     page.get_by_role("button", name="Record", exact=True).wait_for()
     pause(page)
@@ -235,6 +265,7 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
     first = made["start_time"]
     assert before <= first <= start
     assert made["steps"] == len(states) - 1
+    page.get_by_text(f"recorded, {len(states)} samples").wait_for()
     steps = np.diff([state.log_time for state in states])
     assert (steps == SECOND // 100).all()
     found = [found for found in seen if time_of(found) >= first]

@@ -177,16 +177,19 @@ def misfits(links: list[list[np.ndarray]], q: np.ndarray) -> float:
 
 @pytest.mark.parametrize("speed", [1.0, 0.25])
 def test_speed_is_that_of_the_wall_clock(page: Page, speed: float) -> None:
+    """Told from those of half and of twice as much, though a slow browser may show it late."""
     page.get_by_role("combobox").last.click()
     page.get_by_role("option", name=f"{speed:g} ×", exact=True).click()
     scrub(page, 0.5)
     press(page, "Play")
-    before = numbers(until(page, lambda found: numbers(found["time"])[0] > 0.5)["time"])[0]
-    begin = clock.monotonic()
-    until(page, lambda found: numbers(found["time"])[0] > before + speed)
-    elapsed = clock.monotonic() - begin
+    until(page, lambda found: numbers(found["time"])[0] > 0.5)
+    seen = []
+    while not seen or seen[-1][0] < seen[0][0] + 1.5:
+        page.wait_for_timeout(30)
+        seen.append((clock.monotonic(), *numbers(rows(page)["time"])))
     press(page, "Pause")
-    assert 0.7 < elapsed < 3.0  # s; a browser that renders in software may show it late
+    slope = np.polyfit(*np.transpose(seen), 1)[0]
+    assert 0.7 < slope / speed < 1.4
 
 
 def test_plots_hold_the_bag_and_a_mark_at_the_time(page: Page, truth: np.ndarray) -> None:
