@@ -24,6 +24,11 @@ from scipy import ndimage
 from viser import _messages
 from websockets import Subprotocol
 
+LINKS = (
+    lambda r, g, b: (r < 110) & (g < 120) & (b < 130) & (b >= r),
+    lambda r, g, b: (r > 190) & (g > 110) & (g < 180) & (b < 100),
+)
+"""What colours the default arm's two links have."""
 VIEWPORT = {"width": 900, "height": 560}
 ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -200,6 +205,12 @@ def pixels(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
     patches, count = ndimage.label(seen(*np.moveaxis(shown.astype(int), -1, 0)))
     assert count > 0
     return np.argwhere(patches == np.bincount(patches.flat)[1:].argmax() + 1)[:, ::-1]
+
+
+def direction(link: np.ndarray) -> float:
+    """That of a patch's longest extent, rad, or the opposite; y of its pixels is downwards."""
+    x, y = np.linalg.eigh(np.cov(link.T))[1][:, -1]
+    return float(np.arctan2(-y, x))
 
 
 def colours(shown: np.ndarray) -> int:

@@ -573,15 +573,15 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _own_pages() -> Iterator[None]:
-    """viser's server begins to serve: else the pages of any website could connect to it."""
+    """Where viser begins to serve: else any website's page that is open here could connect."""
     serve = websockets.asyncio.server.serve
 
-    def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
+    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             origin, host = request.headers.get("Origin"), request.headers.get("Host")
             if origin is not None and origin.partition("://")[2] != host:
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
-            return process_request(connection, request)
+            return process_request and process_request(connection, request)
 
         return serve(*arguments, process_request=answer, **options)
 
