@@ -266,7 +266,8 @@ def painted(folder: Path) -> Path:
     urdf = urdf.replace("0.95 0.49 0.09 1", "1 0 1 1")
     (folder / "painted.urdf").write_text(urdf)
     options = twodof.FmuOptions(urdf=folder / "painted.urdf", mesh_dir=folder / "packages")
-    run = twodof.experiment(twodof.build_fmu(folder / "painted.fmu", options), stop_time=0.1)
+    (folder / "made").mkdir()
+    run = twodof.experiment(twodof.build_fmu(folder / "made/painted.fmu", options), stop_time=0.1)
     bag = folder / "elsewhere/bag"
     bag.parent.mkdir()
     twodof.simulate(run, [twodof.Bag(bag, run)])
@@ -274,7 +275,7 @@ def painted(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "options", [["--fmu", "painted.fmu"], ["--urdf", "painted.urdf", "--mesh-dir", "packages"]]
+    "options", [["--fmu", "made/painted.fmu"], ["--urdf", "painted.urdf", "--mesh-dir", "packages"]]
 )
 def test_meshes_are_found_where_they_are_said_to_be(
     shown: Browser, folder: Path, painted: Path, options: list[str]
