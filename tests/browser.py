@@ -20,9 +20,15 @@ import websockets.sync.client
 from harness import needs
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
+from scipy import ndimage
 from viser import _messages
 from websockets import Subprotocol
 
+LINKS = (
+    lambda r, g, b: (r < 110) & (g < 120) & (b < 130) & (b >= r),
+    lambda r, g, b: (r > 190) & (g > 110) & (g < 180) & (b < 100),
+)
+"""What colours the default arm's two links have."""
 VIEWPORT = {"width": 900, "height": 560}
 ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -35,6 +41,10 @@ ROWS = """() => Object.fromEntries([...document.querySelectorAll("[data-value]")
 PLOTS = """() => Object.values(window.__viserTestpoints.uplots).map(({chart}) =>
     [chart.root.querySelector(".u-title").textContent, chart.data.map(line => [...line].map(
         value => Number.isFinite(value) ? value : null))])"""
+DRAWN = """async () => {
+    for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
+}"""
+NOTES = ".mantine-Notifications-root { visibility: hidden }"
 LATENCY = """([label, text, row]) => new Promise(resolve => {
     const cell = () => document.querySelector(`[data-value="${row}"]`);
     const before = cell().textContent;
@@ -124,8 +134,8 @@ def served(*arguments: str | Path, cwd: Path) -> Iterator[Served]:
         command.process.communicate()
 
 
-def connect(url: str) -> None:
-    """Connect as a browser does that has the page open, and leave at once."""
+def connect(url: str, origin: str | None = None) -> None:
+    """Connect as a browser does that has the page of that origin open, and leave at once."""
     camera = _messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, 1.0), fov=0.6, near=0.01, far=10.0,
         image_height=100, image_width=100, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 1.0, 0.0),
@@ -133,7 +143,7 @@ def connect(url: str) -> None:
     address = url.replace("http:", "ws:")
     protocol = Subprotocol(f"viser-v{viser.__version__}")
     with websockets.sync.client.connect(
-        address, subprotocols=[protocol], compression=None, max_size=None
+        address, origin=origin, subprotocols=[protocol], compression=None, max_size=None
     ) as connection:
         connection.send(msgspec.msgpack.encode(camera.as_serializable_dict()))
         connection.recv()
@@ -184,9 +194,23 @@ def latency(page: Page, label: str, value: float) -> float:
 
 
 def picture(page: Page) -> np.ndarray:
-    """What the 3D scene shows, height × width × 3."""
-    shot = page.screenshot(clip=page.locator("canvas").first.bounding_box())
+    """What the 3D scene shows now, without the notes before it, height × width × 3."""
+    page.evaluate(DRAWN)
+    shot = page.screenshot(clip=page.locator("canvas").first.bounding_box(), style=NOTES)
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
+
+
+def pixels(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
+    """The largest patch of a picture whose red, green and blue are as asked; x and y, N × 2."""
+    patches, count = ndimage.label(seen(*np.moveaxis(shown.astype(int), -1, 0)))
+    assert count > 0
+    return np.argwhere(patches == np.bincount(patches.flat)[1:].argmax() + 1)[:, ::-1]
+
+
+def direction(link: np.ndarray) -> float:
+    """That of a patch's longest extent, rad, or the opposite; y of its pixels is downwards."""
+    x, y = np.linalg.eigh(np.cov(link.T))[1][:, -1]
+    return float(np.arctan2(-y, x))
 
 
 def colours(shown: np.ndarray) -> int:

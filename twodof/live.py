@@ -317,15 +317,15 @@ class Controls:
     def show(self) -> None:
         """Show what the loop tells, until it ends."""
         trail: deque[Array] = deque(maxlen=TRAIL_POINTS)
-        shown, plotted = -1.0, 0.0
+        shown, plotted, since = -1.0, -1.0, 0.0
         while True:
             begin = time.perf_counter()
             news: News = self._ask("more", self._page.viewers > 0)
             self._news, sample = news, news.sample
             if news.again:
                 trail.clear()
-                self._rows = np.array(news.rows[:1])
-                shown = -1.0
+                self._rows = self._rows[:0]
+                shown = plotted = -1.0
             if news.rows:
                 self._rows = np.concatenate([self._rows, news.rows])[-self._most :]
             if sample.t != shown:
@@ -334,8 +334,8 @@ class Controls:
                     self._figure.pose(sample.q)
                     self._trail.show(np.array(trail))
             self._show_numbers(begin)
-            if sample.t != shown and begin - plotted > 1 / PLOT_RATE:
-                plotted = begin
+            if sample.t != plotted and begin - since > 1 / PLOT_RATE:
+                plotted, since = sample.t, begin
                 age = np.arange(1.0 - len(self._rows), 1.0) * self._step
                 self._plots[0].show(age, self._rows[:, :-1])
                 self._plots[1].show(age, self._rows[:, -1:])
@@ -384,7 +384,7 @@ class Controls:
                 self._add_gain(group, unit, change)
         if fmu.vector("tau_ext"):
             self._add_disturbance(robot, change)
-        units = "rad or m" if any(robot.prismatic) else "rad"
+        units = " or ".join(dict.fromkeys("m" if p else "rad" for p in robot.prismatic))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
         joints, error = f"position, {units}", "distance from the target, mm"
         self._plots = (

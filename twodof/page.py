@@ -14,6 +14,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
 from io import StringIO
 from itertools import cycle
 from math import ceil, floor, log10, pi, tan
@@ -29,6 +30,7 @@ from .scene import Scene, Transform, floats, origin, quaternion
 
 try:
     import viser
+    import websockets.asyncio.server
 except ImportError as missing:
     raise PageError(
         f"cannot show a page: {missing}; install the package 'viser' (the extra 'view')"
@@ -209,7 +211,11 @@ class Page:
 
 
 class _Server(viser.ViserServer):  # type: ignore[misc, unused-ignore]
-    """viser's server, which otherwise any page could ask to become public by a foreign server."""
+    """viser's server for its own pages alone, which cannot ask it to become public."""
+
+    def __init__(self, **options: Any) -> None:
+        with _own_pages():
+            super().__init__(**options)
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -563,6 +569,27 @@ def outline(t: Array, rows: Array) -> tuple[Array, Array]:
 def _quiet() -> Iterator[None]:
     with redirect_stdout(StringIO()):
         yield
+
+
+@contextmanager
+def _own_pages() -> Iterator[None]:
+    """Where viser begins to serve: else any website's page that is open here could connect."""
+    serve = websockets.asyncio.server.serve
+
+    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            origin, host = request.headers.get("Origin"), request.headers.get("Host")
+            if origin is not None and origin.partition("://")[2] != host:
+                return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
+            return process_request and process_request(connection, request)
+
+        return serve(*arguments, process_request=answer, **options)
+
+    websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
 def _check_address(host: str, port: int) -> None:

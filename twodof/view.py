@@ -74,6 +74,10 @@ class Replay:
         frame: str | None = None,
         fmu: str | Path | None = None,
     ) -> None:
+        if mesh_dir is not None and urdf is None:
+            raise PageError("--mesh-dir has the meshes of a URDF; give that with --urdf")
+        if fmu is not None and urdf is not None:
+            raise PageError("--fmu has the meshes of the bag's robot; leave it out beside --urdf")
         run = bag if isinstance(bag, Run) else read_bag(bag)
         self._page = page
         self._track = track = read_tracks([run], urdf=urdf, frame=frame)[0]
