@@ -2,9 +2,10 @@
 //
 //     node DOMAIN [--any] TOPIC...
 //
-// On standard output one JSON array a line: ["message", topic, time of arrival in ns, message], and
-// ["matched", topic, change of the number of others that match]. Lines of standard input,
-// "point TOPIC FRAME X Y Z" with "-" for an empty frame, are sent; its end ends the program.
+// On standard output one JSON array a line: ["message", topic, time in ns, fields] of what comes,
+// ["sent", topic, time in ns] of what goes, and ["matched", topic, change of the number of others].
+// Lines of standard input, "TOPIC FRAME X Y Z" with "-" for an empty frame, are sent as points; its
+// end ends the program.
 // Stays on the loopback interface unless --any.
 
 #include <chrono>
@@ -47,6 +48,11 @@ static void print(const std::string& line) {
     std::cout << line << std::endl;
 }
 
+static std::string now() {
+    auto time = std::chrono::system_clock::now().time_since_epoch();
+    return std::to_string(std::chrono::duration_cast<std::chrono::nanoseconds>(time).count());
+}
+
 static std::string json(const TransformStamped_& it);
 
 static std::string json(double value) {
@@ -76,7 +82,7 @@ static std::string json(const std::vector<T>& values) {
 
 static std::string json(const Header_& header) {
     const Time_& stamp = header.stamp_();
-    return "[" + std::to_string(stamp.sec_()) + "," + std::to_string(stamp.nanosec_()) + "," +
+    return "[[" + std::to_string(stamp.sec_()) + "," + std::to_string(stamp.nanosec_()) + "]," +
            json(header.frame_id_()) + "]";
 }
 
@@ -94,9 +100,9 @@ static std::string json(const PointStamped_& it) {
 static std::string json(const TransformStamped_& it) {
     const auto& p = it.transform_().translation_();
     const auto& r = it.transform_().rotation_();
-    return "[" + json(it.header_()) + "," + json(it.child_frame_id_()) + "," +
+    return "[" + json(it.header_()) + "," + json(it.child_frame_id_()) + ",[" +
            json(std::vector<double>{p.x_(), p.y_(), p.z_()}) + "," +
-           json(std::vector<double>{r.x_(), r.y_(), r.z_(), r.w_()}) + "]";
+           json(std::vector<double>{r.x_(), r.y_(), r.z_(), r.w_()}) + "]]";
 }
 
 static std::string json(const TFMessage_& it) { return "[" + json(it.transforms_()) + "]"; }
@@ -115,11 +121,8 @@ public:
         T message;
         SampleInfo info;
         while (reader->take_next_sample(&message, &info) == ReturnCode_t::RETCODE_OK) {
-            auto now = std::chrono::system_clock::now().time_since_epoch();
-            auto ns = std::chrono::duration_cast<std::chrono::nanoseconds>(now).count();
             if (info.valid_data)
-                print("[\"message\"," + json(topic_) + "," + std::to_string(ns) + "," +
-                      json(message) + "]");
+                print("[\"message\"," + json(topic_) + "," + now() + "," + json(message) + "]");
         }
     }
 
@@ -197,13 +200,14 @@ int main(int count, char** arguments) {
     }
     for (std::string line; std::getline(std::cin, line);) {
         std::istringstream words(line);
-        std::string order, name, frame, x, y, z;
-        words >> order >> name >> frame >> x >> y >> z;
+        std::string name, frame, x, y, z;
+        words >> name >> frame >> x >> y >> z;
         PointStamped_ point;
         point.header_().frame_id_(frame == "-" ? "" : frame);
         point.point_().x_(std::stod(x));
         point.point_().y_(std::stod(y));
         point.point_().z_(std::stod(z));
+        print("[\"sent\"," + json(name) + "," + now() + "]");
         writers.at(name)->write(&point);
     }
     for (auto& writer : writers) writer.second->wait_for_acknowledgments({2, 0});

@@ -90,11 +90,15 @@ class Stamps:
         if end * NANOSECONDS > LATEST_STAMP:
             raise BagError(f"the last stamp, {run.steps * run.step:g} s later, is out of range")
 
+    def now(self) -> int:
+        """Stamp of the first sample if it came now, ns since the epoch."""
+        # a fraction: a double of today's nanoseconds is good to 256 only
+        return time.time_ns() if self._given is None else round(Fraction(self._given) * NANOSECONDS)
+
     @cached_property
     def start(self) -> int:
         """Stamp of the first sample, ns since the epoch."""
-        # a fraction: a double of today's nanoseconds is good to 256 only
-        return time.time_ns() if self._given is None else round(Fraction(self._given) * NANOSECONDS)
+        return self.now()
 
     def of(self, sample: Sample) -> int:
         """Stamp of a sample, ns since the epoch."""

@@ -99,7 +99,8 @@ class Bag:
 
     def __enter__(self) -> Bag:
         _check_free(self.path, self._overwrite)
-        text = provenance.provenance(self._run, self.stamps.start, self._command_line)
+        start = self.stamps.now() if self._open_ended else self.stamps.start
+        text = provenance.provenance(self._run, start, self._command_line)
         try:
             if self.path.exists():
                 shutil.rmtree(self.path)

@@ -1,0 +1,400 @@
+"""A run on the wire, heard and steered by Fast DDS: another maker's DDS, with an IDL of its own.
+
+Truth is the bag that is recorded at the same time, read by the MCAP project's reader. All stays on
+the loopback interface, or in network namespaces that lead nowhere.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+from bags import SECOND, assert_consistent
+from harness import cannot_run, needs
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import twodof
+from twodof.cli import main
+from twodof.publish import LAST_DOMAIN, Network, dds_type, network
+
+HERE = Path(__file__).resolve().parent
+TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
+LATCHED = ("/robot_description", "/tf_static")
+COMMANDS = ("/target_command", "/clicked_point")
+DOMAINS = itertools.count(os.getpid())
+PATIENCE = 20.0  # s
+
+
+@pytest.fixture(scope="session")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Fast DDS node, compiled."""
+    generator, compiler = needs("fastddsgen"), needs("g++", "c++")
+    if not Path("/usr/include/fastdds/dds").is_dir():
+        cannot_run("the headers of Fast DDS are not installed (Debian: libfastrtps-dev)")
+    folder = tmp_path_factory.mktemp("fastdds")
+    for source in (HERE / "fastdds").iterdir():
+        shutil.copy(source, folder)
+    subprocess.run([generator, "-cs", "ros.idl"], cwd=folder, check=True, capture_output=True)
+    sources = [path.name for path in folder.glob("*.c[px][px]")]
+    command = [
+        compiler,
+        "-std=c++14",
+        "-w",
+        "-I.",
+        *sources,
+        "-lfastrtps",
+        "-lfastcdr",
+        "-o",
+        "node",
+    ]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "node"
+
+
+@pytest.fixture
+def number() -> int:
+    """A DDS domain that no other test uses."""
+    return 1 + next(DOMAINS) % 100
+
+
+class Node:
+    """A Fast DDS node that listens to topics, or talks on those of COMMANDS."""
+
+    def __init__(self, program: Path, number: int, *topics: str, inside: tuple[str, ...] = ()):
+        command = [*inside, str(program), str(number), *topics]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.told: list[list[Any]] = []
+        self._thread = Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.endswith("\n"):
+                self.told.append(json.loads(line))
+
+    def messages(self, topic: str) -> list[Any]:
+        """Fields of what came on a topic."""
+        return [it[3] for it in self.told if it[:2] == ["message", topic]]
+
+    def until(self, condition: Callable[[], Any], patience: float = PATIENCE) -> None:
+        end = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < end, self.told[-3:]
+            time.sleep(0.02)
+
+    def hears(self, topic: str = "/joint_states", more: int = 5) -> None:
+        """Wait for some more messages."""
+        before = len(self.messages(topic))
+        self.until(lambda: len(self.messages(topic)) >= before + more)
+
+    def point(self, topic: str, frame: str, *xyz: float) -> None:
+        """Send a point to somebody who listens."""
+        self.until(lambda: ["matched", topic, 1] in self.told)
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{topic} {frame or '-'} {' '.join(map(repr, xyz))}\n")
+        self.process.stdin.flush()
+
+    def leave(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(PATIENCE)
+        finally:
+            self.process.kill()
+            self._thread.join()
+            self.process.wait()
+
+
+@pytest.fixture
+def listen(program: Path, number: int) -> Iterator[Callable[..., Node]]:
+    nodes: list[Node] = []
+
+    def begin(*topics: str, **options: Any) -> Node:
+        nodes.append(Node(program, number, *topics, **options))
+        return nodes[-1]
+
+    yield begin
+    for node in nodes:
+        if node.process.poll() is None:
+            node.process.send_signal(signal.SIGCONT)
+            node.leave()
+
+
+def environment(number: int, **variables: str) -> dict[str, str]:
+    kept = {n: v for n, v in os.environ.items() if not n.startswith(("ROS_", "CYCLONEDDS"))}
+    return {**kept, "ROS_DOMAIN_ID": str(number), "ROS_LOCALHOST_ONLY": "1", **variables}
+
+
+@contextmanager
+def published(
+    number: int, fmu: Path, *options: str, inside: tuple[str, ...] = (), **variables: str
+) -> Iterator[subprocess.Popen[str]]:
+    """``twodof publish`` in a process of its own, when it has told that it is on the network."""
+    process = subprocess.Popen(
+        [*inside, *TWODOF, "publish", str(fmu), *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=environment(number, **variables),
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        told = iter(process.stdout.readline, "")
+        assert "  ros2 topic echo /joint_states\n" in told, process.stderr and process.stderr.read()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def ended(process: subprocess.Popen[str], status: int = 0) -> tuple[str, str]:
+    """What it said at its end."""
+    out, err = process.communicate(timeout=90.0)
+    assert process.returncode == status, err
+    return out, err
+
+
+def recorded(bag: Path) -> dict[str, list[Any]]:
+    """Fields of all messages by topic."""
+    found: dict[str, list[Any]] = {}
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            fields = listed(decoded)
+            found.setdefault(channel.topic, []).append(fields)
+            if channel.topic in STREAMS:
+                header = fields[0][0][0] if channel.topic == "/tf" else fields[0]
+                assert stamp_of(header) == message.log_time
+    return found
+
+
+def listed(message: Any) -> Any:
+    if hasattr(message, "__slots__"):
+        return [listed(getattr(message, name)) for name in message.__slots__]
+    return [listed(it) for it in message] if isinstance(message, list | tuple) else message
+
+
+def stamp_of(header: Any) -> int:
+    (seconds, nanoseconds), _frame = header
+    return int(seconds) * SECOND + int(nanoseconds)
+
+
+def test_another_makers_dds_hears_every_field_of_the_bag(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    seconds = length(60, 4)
+    node = listen(*STREAMS, *LATCHED)
+    bag = tmp_path / "bag"
+    options = ["--scene", "--effort", "--stop-time", str(seconds + 2), "-o", str(bag)]
+    with published(number, native_path, *options) as process:
+        out, err = ended(process)
+    node.until(lambda: ["matched", "/joint_states", -1] in node.told)
+    node.leave()
+    assert err == ""
+    truth = recorded(bag)
+    assert len(truth["/joint_states"]) == 100 * (seconds + 2) + 1
+    for topic in STREAMS:
+        heard = node.messages(topic)
+        assert len(heard) >= 100 * seconds + 1
+        assert heard == truth[topic][-len(heard) :], topic  # none is lost since the first
+    for topic in LATCHED:
+        assert node.messages(topic) == truth[topic]
+    state = truth["/joint_states"][0]
+    assert state[1] == ["joint1", "joint2"] and len(state[4]) == 2  # names, efforts
+    assert re.search(rf"deadlines +\d+ of {100 * (seconds + 2) + 1} missed, worst [\d.]+ ms", out)
+
+
+def test_stamps_are_the_wall_clock(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen("/joint_states")
+    bag = str(tmp_path / "bag")
+    with published(number, native_path, "--stop-time", "3", "-o", bag) as process:
+        ended(process)
+    delays = [it[2] - stamp_of(it[3][0]) for it in node.told if it[0] == "message"]
+    assert len(delays) > 100
+    assert 0 < statistics.median(delays) < 0.005 * SECOND
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_the_last_sample_before_a_signal_is_in_the_bag_and_on_the_wire(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    ending: signal.Signals,
+) -> None:  # fmt: skip
+    node = listen("/joint_states")
+    bag = tmp_path / "bag"
+    with published(number, native_path, "-o", str(bag)) as process:
+        node.hears(more=30)
+        process.send_signal(ending)
+        out, err = ended(process, 130)
+    assert err == ""
+    node.until(lambda: ["matched", "/joint_states", -1] in node.told)
+    heard, truth = node.messages("/joint_states"), recorded(bag)["/joint_states"]
+    assert heard == truth[-len(heard) :]
+    assert assert_consistent(bag, "mcap") == len(truth)
+    assert "stopped" in out and f"{len(truth)} messages" in out
+    assert json.loads((bag / "run.json").read_text())["steps"] == len(truth) - 1
+
+
+def test_who_comes_late_gets_robot_description_and_fixed_transforms(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    bag = tmp_path / "bag"
+    with published(number, native_path, "--scene", "-o", str(bag)) as process:
+        time.sleep(length(45, 1))
+        node = listen(*LATCHED, "/joint_states")
+        node.until(lambda: all(map(node.messages, LATCHED)))
+        node.hears()
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
+    truth = recorded(bag)
+    for topic in LATCHED:
+        assert node.messages(topic) == truth[topic]
+    assert '<link name="EndEffector"' in truth["/robot_description"][0][0]
+
+
+@pytest.mark.parametrize("frame", ["world", ""])
+@pytest.mark.parametrize("topic", COMMANDS)
+def test_a_point_is_the_target_within_two_steps(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    topic: str, frame: str,
+) -> None:  # fmt: skip
+    bag, step, k = tmp_path / "bag", 0.05, 0
+    node = listen("/target", topic)
+    options = ["--scene", "--rate", str(1 / step), "-o", str(bag), "--set", "Kp=80"]
+    with published(number, native_path, *options) as process:
+        node.hears("/target")
+        node.point(topic, frame, 0.125, 0.17, 0.9)
+        node.until(lambda: node.messages("/target")[-1][1] == [0.125, 0.17, 0])
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
+    ((sent,),) = [[it[2] for it in node.told if it[0] == "sent"]]
+    heard = next(m for m in node.messages("/target") if m[1][0] == 0.125)
+    assert 0 < stamp_of(heard[0]) - sent <= 2 * step * SECOND
+    ((t, values),) = json.loads((bag / "run.json").read_text())["input_changes"]
+    assert values == {"x_des[1]": 0.125, "x_des[2]": 0.17}
+    states = recorded(bag)["/joint_states"]
+    k = round(t / step)
+    assert k < len(states) - 1
+    # the FMU had it: its own trajectory with that target from that step on
+    run = twodof.samples(
+        native_path, step=step, stop_time=(len(states) - 1) * step, settings={"Kp": 80}
+    )
+    sample = next(run)
+    for state in states:
+        assert state[2:4] == [list(sample.q), list(sample.v)]
+        if sample.k < len(states) - 1:
+            sample = run.send({"x_des": (0.125, 0.17)} if sample.k == k else None)
+
+
+def test_points_that_mean_nothing_are_ignored_with_one_warning_each(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen("/target", *COMMANDS)
+    with published(number, native_path, "--scene", "-o", str(tmp_path / "bag")) as process:
+        for _ in range(3):
+            node.point("/clicked_point", "world", float("nan"), 0.1, 0.0)
+            node.point("/target_command", "", 0.1, float("inf"), 0.0)
+            node.point("/clicked_point", "odom", 0.1, 0.1, 0.0)
+            node.point("/target_command", "map", 0.1, 0.1, 0.0)
+            node.hears("/target")
+        node.point("/target_command", "world", 0.25, 0.0625, 0.0)
+        node.until(lambda: node.messages("/target")[-1][1] == [0.25, 0.0625, 0])
+        process.send_signal(signal.SIGINT)
+        _, err = ended(process, 130)
+    targets = [m[1] for m in node.messages("/target")]
+    assert [xyz for xyz, _ in itertools.groupby(targets)] == [[0.2, 0.05, 0], [0.25, 0.0625, 0]]
+    lines = sorted(err.splitlines())
+    assert len(lines) == 2
+    assert re.fullmatch(
+        r"WARNING: a point on /\S+ is in frame '(odom|map)', not in 'world': .*", lines[0]
+    )
+    assert re.fullmatch(r"WARNING: a point on /\S+ is not finite: .*", lines[1])
+
+
+def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    bag = tmp_path / "bag"
+    with published(number, native_path, "--scene", "--stop-time", "9", "-o", str(bag)) as process:
+        stalled, killed = listen(*STREAMS, *LATCHED), listen(*STREAMS)
+        stalled.hears()
+        killed.hears()
+        stalled.process.send_signal(signal.SIGSTOP)
+        killed.process.kill()
+        killed.leave()
+        time.sleep(3.0)
+        back = listen(*STREAMS)
+        back.hears()
+        stalled.process.send_signal(signal.SIGCONT)
+        stalled.hears(more=50)
+        out, err = ended(process)
+    assert err == ""
+    assert len(recorded(bag)["/joint_states"]) == 901
+    missed, worst = re.search(r"(\d+) of 901 missed, worst ([\d.]+) ms", out).groups()  # type: ignore[union-attr]
+    assert int(missed) < 450 and float(worst) < 500
+    assert float(re.search(r"simulated in ([\d.]+) s", out)[1]) < 9.5  # type: ignore[index]
+
+
+def test_two_publishers_on_one_topic_are_both_heard(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen("/joint_states")
+    bags = [tmp_path / "one", tmp_path / "two"]
+    runs = [["--stop-time", "4", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
+    with (
+        published(number, native_path, *runs[0], str(bags[0])) as one,
+        published(number, native_path, *runs[1], str(bags[1])) as two,
+    ):
+        node.hears()
+        assert ended(one)[1] == ended(two)[1] == ""
+    node.until(lambda: node.told.count(["matched", "/joint_states", -1]) == 2)
+    heard = node.messages("/joint_states")
+    for bag in bags:
+        truth = recorded(bag)["/joint_states"]
+        mine = [message for message in heard if message in truth]
+        assert len(mine) > 200 and mine == truth[-len(mine) :]
+
+
+ISOLATED = ("unshare", "--net", "sh", "-c")
+
+
+def isolated(script: str) -> tuple[str, ...]:
+    """A command's beginning that runs it in a network of its own, after a script."""
+    needs("unshare")
+    needs("ip")
+    if subprocess.run([*ISOLATED, "ip link"], capture_output=True, check=False).returncode != 0:
+        cannot_run("networks of one's own cannot be made here")
+    return (*ISOLATED, f'{script}\nexec "$@"', "sh")
+
+
+def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, number: int) -> None:
+    bag = tmp_path / "bag"
+    options = ["--stop-time", "0.5", "-o", str(bag)]
+    inside = isolated("true")
+    with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="0") as process:
+        _, err = ended(process)
+    assert err.splitlines() == [
+        "WARNING: there is no network interface: nobody can hear what is published"
+    ]
+    assert len(recorded(bag)["/joint_states"]) == 51
