@@ -157,8 +157,10 @@ def published(
     )  # fmt: skip
     try:
         assert process.stdout is not None
-        told = iter(process.stdout.readline, "")
-        assert "  ros2 topic echo /joint_states\n" in told, process.stderr and process.stderr.read()
+        process.told = []  # type: ignore[attr-defined]
+        while not process.told or "ros2 topic echo" not in process.told[-1]:  # type: ignore[attr-defined]
+            process.told.append(process.stdout.readline())  # type: ignore[attr-defined]
+            assert process.told[-1], process.communicate()  # type: ignore[attr-defined]
         yield process
     finally:
         process.kill()
@@ -207,10 +209,9 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
     options = ["--scene", "--effort", "--stop-time", str(seconds + 2), "-o", str(bag)]
     with published(number, native_path, *options) as process:
         out, err = ended(process)
-    node.until(lambda: ["matched", "/joint_states", -1] in node.told)
-    node.leave()
     assert err == ""
     truth = recorded(bag)
+    node.until(lambda: all(node.messages(topic)[-1:] == truth[topic][-1:] for topic in STREAMS))
     assert len(truth["/joint_states"]) == 100 * (seconds + 2) + 1
     for topic in STREAMS:
         heard = node.messages(topic)
@@ -247,8 +248,9 @@ def test_the_last_sample_before_a_signal_is_in_the_bag_and_on_the_wire(
         process.send_signal(ending)
         out, err = ended(process, 130)
     assert err == ""
-    node.until(lambda: ["matched", "/joint_states", -1] in node.told)
-    heard, truth = node.messages("/joint_states"), recorded(bag)["/joint_states"]
+    truth = recorded(bag)["/joint_states"]
+    node.until(lambda: node.messages("/joint_states")[-1] == truth[-1])
+    heard = node.messages("/joint_states")
     assert heard == truth[-len(heard) :]
     assert assert_consistent(bag, "mcap") == len(truth)
     assert "stopped" in out and f"{len(truth)} messages" in out
@@ -368,11 +370,10 @@ def test_two_publishers_on_one_topic_are_both_heard(
     ):
         node.hears()
         assert ended(one)[1] == ended(two)[1] == ""
-    node.until(lambda: node.told.count(["matched", "/joint_states", -1]) == 2)
-    heard = node.messages("/joint_states")
     for bag in bags:
         truth = recorded(bag)["/joint_states"]
-        mine = [message for message in heard if message in truth]
+        node.until(lambda last=truth[-1]: last in node.messages("/joint_states"))
+        mine = [message for message in node.messages("/joint_states") if message in truth]
         assert len(mine) > 200 and mine == truth[-len(mine) :]
 
 
@@ -392,9 +393,225 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
     bag = tmp_path / "bag"
     options = ["--stop-time", "0.5", "-o", str(bag)]
     inside = isolated("true")
-    with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="0") as process:
+    with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
         _, err = ended(process)
     assert err.splitlines() == [
         "WARNING: there is no network interface: nobody can hear what is published"
     ]
     assert len(recorded(bag)["/joint_states"]) == 51
+
+
+# a network of two interfaces that are each other's cable
+CABLE = """
+ip link set lo up
+sysctl -qw net.ipv6.conf.all.disable_ipv6=1 net.ipv6.conf.default.disable_ipv6=1
+ip link add cable0 type veth peer name cable1
+ip address add 10.200.0.1/24 dev cable0
+ip link set cable0 up
+ip link set cable1 up
+"""
+
+
+def packets(process: subprocess.Popen[str]) -> int:
+    """How many left the cable's end in the network of a process."""
+    command = ["nsenter", "--net", "--target", str(process.pid), "ip", "-j", "-s", "link"]
+    links = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    (link,) = [link for link in links if link["ifname"] == "cable0"]
+    return int(link["stats64"]["tx"]["packets"])
+
+
+@pytest.mark.parametrize(
+    ("options", "variables", "reach", "local", "outside"),
+    [
+        ([], {}, "lo, cable0, range LOCALHOST (this host alone; --subnet opens it)", True, False),
+        ([], {"ROS_LOCALHOST_ONLY": "1"}, "lo, loopback alone (ROS_LOCALHOST_ONLY)", True, False),
+        ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "cable0, range OFF (nobody)", False, False),
+        (["--subnet"], {}, "cable0, range SUBNET (other hosts too)", True, True),
+        (
+            [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
+            "cable0, range SUBNET (other hosts too)", True, True,
+        ),
+        (
+            [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"},
+            "cable0, range SYSTEM_DEFAULT (other hosts too)", True, True,
+        ),
+    ],
+)  # fmt: skip
+def test_range(
+    native_path: Path, number: int, listen: Callable[..., Node],
+    options: list[str], variables: dict[str, str], reach: str, local: bool, outside: bool,
+) -> None:  # fmt: skip
+    """A node of ROS 2's default range hears the run, and packets leave the host, or not."""
+    variables = {"ROS_LOCALHOST_ONLY": "", **variables}
+    inside = isolated(CABLE)
+    with published(number, native_path, *options, inside=inside, **variables) as process:
+        assert f"on {reach}\n" in process.told[1], process.told
+        time.sleep(2.5)
+        assert (packets(process) > 0) == outside
+        node = listen(
+            "--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid))
+        )
+        if local:
+            node.hears()
+        else:
+            time.sleep(4.0)
+            assert not node.messages("/joint_states")
+        process.send_signal(signal.SIGINT)
+        assert ended(process, 130)[1] == ""
+
+
+def test_an_interface_that_goes_and_comes_back(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    bag = tmp_path / "bag"
+    options, inside = ["--stop-time", "8", "-o", str(bag)], isolated(CABLE)
+    with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
+        enter = ("nsenter", "--net", "--target", str(process.pid))
+        node = listen("--any", "/joint_states", inside=enter)
+        node.hears()
+        for state in ("down", "up"):
+            subprocess.run([*enter, "ip", "link", "set", "cable0", state], check=True)
+            time.sleep(1.0)
+        node.hears()
+        ended(process)
+    assert len(recorded(bag)["/joint_states"]) == 801
+
+
+MEMORY = """
+import resource, sys
+from pathlib import Path
+import twodof
+from twodof.master import RealTime
+from twodof.publish import Publisher
+
+class Memory:
+    first = most = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        pass
+
+    def write(self, sample):
+        if sample.k == steps // 10:
+            self.first = self.resident()
+        elif sample.k % 1000 == 0:
+            self.most = max(self.most, self.resident())
+
+    def resident(self):
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize()
+
+steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
+run = twodof.experiment(sys.argv[1], stop_time=steps / 100)
+wire, memory = Publisher(run, scene=True), Memory()
+pace = RealTime() if paced else None
+summary = twodof.simulate(run, [wire, memory], pace=pace, steer=wire.command)
+assert summary.last.k == steps
+print(memory.most - memory.first)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_an_hour_has_flat_memory(
+    native_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
+) -> None:
+    """Half a minute without pace; in full, an hour in real time."""
+    steps = length(360_000, 40_000)
+    listen("/joint_states", "/tf", "/robot_description")
+    command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
+    done = subprocess.run(
+        [*command, "paced" if steps == 360_000 else ""],
+        env=environment(number), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    print(f"{steps} samples: memory grew by {int(done.stdout) / 2**20:.1f} MiB")
+    assert int(done.stdout) <= 10e6
+
+
+@pytest.mark.parametrize(
+    ("variables", "place"),
+    [
+        ({}, Network()),
+        ({"ROS_DOMAIN_ID": "", "ROS_LOCALHOST_ONLY": "0"}, Network()),
+        ({"ROS_DOMAIN_ID": str(LAST_DOMAIN)}, Network(LAST_DOMAIN)),
+        ({"ROS_STATIC_PEERS": "10.0.0.5;localhost;"}, Network(peers=("10.0.0.5", "localhost"))),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, Network(range="OFF")),
+        (
+            {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
+            Network(loopback=True),
+        ),
+    ],
+)
+def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> None:
+    assert network(variables) == place
+
+
+@pytest.mark.parametrize(
+    ("variables", "culprit"),
+    [
+        ({"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233', not a number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "-1"}, "ROS_DOMAIN_ID is '-1'"),
+        ({"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
+        ({"ROS_DOMAIN_ID": "²"}, "ROS_DOMAIN_ID is '²'"),
+        ({"ROS_LOCALHOST_ONLY": "yes"}, "ROS_LOCALHOST_ONLY is 'yes', not 0 or 1"),
+        (
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"},
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is 'localhost', not one of LOCALHOST, SUBNET, OFF",
+        ),
+        (
+            {
+                "CYCLONEDDS_URI": "<CycloneDDS><Domain><General><Interfaces>"
+                '<NetworkInterface name="nope0"/></Interfaces></General></Domain></CycloneDDS>'
+            },
+            r"nope0: does not match an available interface.*CYCLONEDDS_URI .*: lo",
+        ),
+        ({"CYCLONEDDS_URI": "<CycloneDDS></Domain>"}, "parser error.*correct CYCLONEDDS_URI"),
+        ({"CYCLONEDDS_URI": "file:///nowhere.xml"}, "nowhere.xml.*correct CYCLONEDDS_URI"),
+        ({"CYCLONEDDS_URI": "<Größe/>"}, "cannot be opened.*correct CYCLONEDDS_URI"),
+        ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
+    ],
+)
+def test_a_network_that_cannot_be(
+    native_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    variables: dict[str, str], culprit: str,
+) -> None:  # fmt: skip
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert main(["publish", str(native_path), "--stop-time", "0.1"]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert re.match(f"twodof: error: .*{culprit}", line), line
+
+
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--rate", "0"], "--rate 0"),
+        (["--rate", "nan"], "--rate nan"),
+        (["--rate", "inf"], "--rate inf"),
+        (["--overwrite"], "name it with -o"),
+        (["--stop-time", "0.005"], "no whole number of steps"),
+    ],
+)
+def test_options_that_cannot_be(
+    native_path: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
+) -> None:
+    assert main(["publish", str(native_path), *options]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("twodof: error: ") and culprit in line
+
+
+def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
+    code = "import sys; sys.modules['cyclonedds'] = None; " + TWODOF[2]
+    command = [sys.executable, "-c", code, "publish", str(native_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert "install the package 'cyclonedds' (the extra 'ros')" in line
+
+
+def test_types_are_those_of_ros_2() -> None:
+    made = dds_type("sensor_msgs/msg/JointState")
+    assert made.__idl_typename__ == "sensor_msgs.msg.dds_.JointState_"
+    assert list(made.__annotations__) == ["header_", "name_", "position_", "velocity_", "effort_"]

@@ -40,6 +40,9 @@ RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
 LAST_DOMAIN = 232  # the ports of later ones are beyond 65535
 LOOPBACK = "lo"
 MOST_PARTICIPANTS = 32  # of one host, that are looked for; as rmw_cyclonedds
+NO_NETWORK = (
+    "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
+)
 ANNOUNCED = 1  # s between two announcements to participants of this host
 
 
@@ -68,23 +71,27 @@ class Network(NamedTuple):
         words = {"LOCALHOST": "this host alone; --subnet opens it", "OFF": "nobody"}
         return f"range {self.range} ({words.get(self.range, 'other hosts too')})"
 
-    def configuration(self, trace: str, *, transport: str = "default") -> str:
+    def configuration(self, trace: str) -> str:
         """What Cyclone DDS is told, as rmw_cyclonedds of Jazzy does.
 
         LOCALHOST looks for others by messages to this host's own address, and so is heard by
         nobody else. Unlike there it keeps doing so each second: a participant that starts later,
         and announces itself by multicast alone, else would find us after half a minute or never.
+        And it uses the loopback interface beside the one that Cyclone DDS chooses: Fast DDS
+        answers there, and Cyclone DDS drops what comes by an interface that it does not use.
 
         Args:
             trace: file for the account of what was configured.
-            transport: "none" where there is no network.
         """
         off, localhost = self.range == "OFF", self.range == "LOCALHOST"
-        general = f"<Transport>{transport}</Transport>"
-        if self.loopback:  # nothing leaves it, so multicast is as good, which older nodes need
-            general += f'<Interfaces><NetworkInterface name="{LOOPBACK}"/></Interfaces>'
-        elif off or localhost:
-            general += "<AllowMulticast>false</AllowMulticast>"
+        general = ""
+        interfaces = [f'<NetworkInterface name="{LOOPBACK}"/>']
+        if not self.loopback:  # which nothing leaves, so multicast is as good; older nodes need it
+            interfaces.insert(0, '<NetworkInterface autodetermine="true"/>')
+            if off or localhost:
+                general = "<AllowMulticast>false</AllowMulticast>"
+        if self.loopback or (localhost and not self.custom):
+            general += f"<Interfaces>{''.join(interfaces)}</Interfaces>"
         discovery = ""
         if off:
             discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>twodof_{os.getpid()}</Tag>"
@@ -137,7 +144,13 @@ def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) 
 
 
 def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")))
+    peers = tuple(filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")))
+    for peer in peers:
+        try:
+            socket.getaddrinfo(peer, None)  # Cyclone DDS would end the process
+        except (OSError, UnicodeError) as error:
+            raise PublishError(f"ROS_STATIC_PEERS: '{peer}' is not found: {error}") from error
+    return peers
 
 
 class Carrier:
@@ -205,44 +218,48 @@ def open_domain(place: Network) -> tuple[Any, str]:
     Raises:
         PublishError: saying what Cyclone DDS says.
     """
-    domain_, interfaces, said = _try_to_open(place)
-    if domain_ is None and "failed to find interfaces" in said:
-        domain_, _, said = _try_to_open(place, transport="none")
-        interfaces = "no interface"
+    with tempfile.TemporaryDirectory() as folder:
+        trace = Path(folder, "trace")
+        opened, said = _try_to_open(place.domain, place.configuration(str(trace)))
+        if opened is None and "selected twice" in said:  # there is no other than the loopback
+            place = place._replace(loopback=True)
+            opened, said = _try_to_open(place.domain, place.configuration(str(trace)))
+        account = trace.read_text("utf-8", "replace") if trace.exists() else ""
+    chosen = re.findall("selected interfaces: (.*)", account)
+    interfaces = ", ".join(re.findall(r"(\S+) \(index", chosen[-1])) if chosen else "?"
+    if opened is None and "failed to find interfaces" in said:
         LOG.warning("there is no network interface: nobody can hear what is published")
-    if domain_ is None:
+        interfaces = "no interface"
+        opened, said = _try_to_open(place.domain, NO_NETWORK)
+    if opened is None:
         names = ", ".join(name for _, name in socket.if_nameindex())
         blame = f"; correct CYCLONEDDS_URI (interfaces here: {names})" if place.custom else ""
         raise PublishError(f"DDS domain {place.domain} cannot be opened: {said}{blame}")
     if said:
         LOG.warning("Cyclone DDS: %s", said)
-    return domain_, interfaces
+    return opened, interfaces
 
 
-def _try_to_open(place: Network, **options: str) -> tuple[Any, str, str]:
-    """A domain or None, its interfaces, and what was said on the standard error meanwhile.
+def _try_to_open(number: int, configuration: str) -> tuple[Any, str]:
+    """A domain or None, and what was said on the standard error meanwhile.
 
-    Cyclone DDS tells interfaces to its trace, and reasons of failure to the standard error alone.
+    Reasons of a failure are told by Cyclone DDS there alone.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        trace, errors = Path(folder, "trace"), Path(folder, "errors")
-        configuration = place.configuration(str(trace), **options)
+    with tempfile.TemporaryFile() as file:
         sys.stderr.flush()
         kept = os.dup(2)
         try:
-            with errors.open("wb") as file:
-                os.dup2(file.fileno(), 2)
-            opened = domain.Domain(place.domain, configuration)
+            os.dup2(file.fileno(), 2)
+            opened = domain.Domain(number, configuration)
         except (core.DDSException, UnicodeEncodeError):
             opened = None
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-        lines = errors.read_text("utf-8", "replace").splitlines()
-        account = trace.read_text("utf-8", "replace") if trace.exists() else ""
-    chosen = re.search("selected interfaces: (.*)", account)
-    names = ", ".join(re.findall(r"(\S+) \(index", chosen[1])) if chosen else "CYCLONEDDS_URI's"
-    return opened, names, "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
+        file.seek(0)
+        lines = file.read().decode("utf-8", "replace").splitlines()
+    # each begins with time, domain and program
+    return opened, "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
 
 
 class Publisher:
