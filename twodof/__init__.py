@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .fmu import Fmu, load_fmu
     from .master import Sample, Summary, experiment, samples, simulate
     from .plot import plot_bags
+    from .publish import Publisher
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOME = {
@@ -30,6 +31,7 @@ _HOME = {
     "Summary": "master",
     "experiment": "master",
     "plot_bags": "plot",
+    "Publisher": "publish",
     "samples": "master",
     "simulate": "master",
 }
@@ -37,6 +39,7 @@ __all__ = [
     "Bag",
     "Fmu",
     "FmuOptions",
+    "Publisher",
     "Run",
     "Sample",
     "Summary",
