@@ -30,7 +30,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 import twodof
 from twodof.cli import main
-from twodof.publish import LAST_DOMAIN, Network, dds_type, network
+from twodof.publish import LAST_DOMAIN, Network, network
 
 HERE = Path(__file__).resolve().parent
 TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
@@ -222,6 +222,42 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
     state = truth["/joint_states"][0]
     assert state[1] == ["joint1", "joint2"] and len(state[4]) == 2  # names, efforts
     assert re.search(rf"deadlines +\d+ of {100 * (seconds + 2) + 1} missed, worst [\d.]+ ms", out)
+
+
+TYPES = {  # as 'ros2 topic info --verbose' tells them
+    "rt/joint_states": (
+        "sensor_msgs::msg::dds_::JointState_",
+        "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    ),
+    "rt/robot_description": (
+        "std_msgs::msg::dds_::String_",
+        "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    ),
+    **dict.fromkeys(
+        ("rt/tf", "rt/tf_static"),
+        (
+            "tf2_msgs::msg::dds_::TFMessage_",
+            "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+        ),
+    ),
+    **dict.fromkeys(
+        ("rt/target", "rt/end_effector"),
+        (
+            "geometry_msgs::msg::dds_::PointStamped_",
+            "4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
+        ),
+    ),
+}
+
+
+def test_names_types_and_type_hashes_are_those_of_ros_2(
+    native_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen()
+    with published(number, native_path, "--scene"):
+        node.until(lambda: len(node.told) >= len(TYPES))
+    found = {topic: rest for event, topic, *rest in node.told}
+    assert found == {t: [name, f"typehash=RIHS01_{it};"] for t, (name, it) in TYPES.items()}
 
 
 def test_stamps_are_the_wall_clock(
@@ -460,6 +496,18 @@ def test_range(
         assert ended(process, 130)[1] == ""
 
 
+def test_an_interface_can_be_chosen(native_path: Path, number: int) -> None:
+    chosen = (
+        "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='cable0'/></Interfaces>"
+        "</General></Domain></CycloneDDS>"
+    )
+    variables = {"ROS_LOCALHOST_ONLY": "", "CYCLONEDDS_URI": chosen}
+    with published(number, native_path, inside=isolated(CABLE), **variables) as process:
+        assert "on cable0, range LOCALHOST" in process.told[1]
+        process.send_signal(signal.SIGINT)
+        assert ended(process, 130)[1] == ""
+
+
 def test_an_interface_that_goes_and_comes_back(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
 ) -> None:
@@ -609,9 +657,3 @@ def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
     assert done.returncode == 1 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert "install the package 'cyclonedds' (the extra 'ros')" in line
-
-
-def test_types_are_those_of_ros_2() -> None:
-    made = dds_type("sensor_msgs/msg/JointState")
-    assert made.__idl_typename__ == "sensor_msgs.msg.dds_.JointState_"
-    assert list(made.__annotations__) == ["header_", "name_", "position_", "velocity_", "effort_"]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from .build import FmuOptions, build_fmu
     from .errors import TwoDofError
     from .fmu import Fmu, load_fmu
-    from .master import Sample, Summary, experiment, samples, simulate
+    from .master import RealTime, Sample, Summary, experiment, samples, simulate
     from .plot import plot_bags
     from .publish import Publisher
 
@@ -27,6 +27,7 @@ _HOME = {
     "TwoDofError": "errors",
     "Fmu": "fmu",
     "load_fmu": "fmu",
+    "RealTime": "master",
     "Sample": "master",
     "Summary": "master",
     "experiment": "master",
@@ -40,6 +41,7 @@ __all__ = [
     "Fmu",
     "FmuOptions",
     "Publisher",
+    "RealTime",
     "Run",
     "Sample",
     "Summary",

@@ -38,7 +38,7 @@ POINT = SCENE_TOPICS["/target"].type
 COMMANDS = ("/target_command", "/clicked_point")
 RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
 LAST_DOMAIN = 232  # the ports of later ones are beyond 65535
-LOOPBACK = "lo"
+LOOPBACK = {"lo": "127.0.0.1"}
 MOST_PARTICIPANTS = 32  # of one host, that are looked for; as rmw_cyclonedds
 NO_NETWORK = (
     "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
@@ -71,28 +71,26 @@ class Network(NamedTuple):
         words = {"LOCALHOST": "this host alone; --subnet opens it", "OFF": "nobody"}
         return f"range {self.range} ({words.get(self.range, 'other hosts too')})"
 
-    def configuration(self, trace: str) -> str:
+    def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
         """What Cyclone DDS is told, as rmw_cyclonedds of Jazzy does.
 
-        LOCALHOST looks for others by messages to this host's own address, and so is heard by
+        LOCALHOST looks for others by messages to this host's own addresses, and so is heard by
         nobody else. Unlike there it keeps doing so each second: a participant that starts later,
         and announces itself by multicast alone, else would find us after half a minute or never.
-        And it uses the loopback interface beside the one that Cyclone DDS chooses: Fast DDS
-        answers there, and Cyclone DDS drops what comes by an interface that it does not use.
+        And it uses the loopback interface too: Fast DDS speaks to its own host there, and Cyclone
+        DDS drops what comes by an interface that it does not use.
 
         Args:
             trace: file for the account of what was configured.
+            own: addresses by interface, those to use; None: what Cyclone DDS chooses.
         """
         off, localhost = self.range == "OFF", self.range == "LOCALHOST"
-        general = ""
-        interfaces = [f'<NetworkInterface name="{LOOPBACK}"/>']
-        if not self.loopback:  # which nothing leaves, so multicast is as good; older nodes need it
-            interfaces.insert(0, '<NetworkInterface autodetermine="true"/>')
-            if off or localhost:
-                general = "<AllowMulticast>false</AllowMulticast>"
-        if self.loopback or (localhost and not self.custom):
-            general += f"<Interfaces>{''.join(interfaces)}</Interfaces>"
-        discovery = ""
+        general, discovery = "", ""
+        if (off or localhost) and not self.loopback:  # which nothing leaves; older nodes need it
+            general += "<AllowMulticast>false</AllowMulticast>"
+        if own:
+            named = "".join(f"<NetworkInterface name={quoteattr(name)}/>" for name in own)
+            general += f"<Interfaces>{named}</Interfaces>"
         if off:
             discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>twodof_{os.getpid()}</Tag>"
         elif self.range != "SYSTEM_DEFAULT":
@@ -102,8 +100,9 @@ class Network(NamedTuple):
             )
             peers = "".join(f"<Peer Address={quoteattr(peer)}/>" for peer in self.peers)
             if localhost:
-                peers += '<Peer Address="localhost" PruneDelay="inf"/>'
                 discovery += f"<SPDPInterval>{ANNOUNCED} s</SPDPInterval>"
+                for address in (own or {"": "localhost"}).values():
+                    peers += f'<Peer Address="{address}" PruneDelay="inf"/>'
             discovery += f"<Peers>{peers}</Peers>"
         tracing = f"<Category>config</Category><OutputFile>{trace}</OutputFile>"
         return (
@@ -218,48 +217,57 @@ def open_domain(place: Network) -> tuple[Any, str]:
     Raises:
         PublishError: saying what Cyclone DDS says.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        trace = Path(folder, "trace")
-        opened, said = _try_to_open(place.domain, place.configuration(str(trace)))
-        if opened is None and "selected twice" in said:  # there is no other than the loopback
-            place = place._replace(loopback=True)
-            opened, said = _try_to_open(place.domain, place.configuration(str(trace)))
-        account = trace.read_text("utf-8", "replace") if trace.exists() else ""
-    chosen = re.findall("selected interfaces: (.*)", account)
-    interfaces = ", ".join(re.findall(r"(\S+) \(index", chosen[-1])) if chosen else "?"
+    own = LOOPBACK if place.loopback else None
+    opened, used, said = _try_to_open(place, own)
+    if opened and place.range == "LOCALHOST" and not used.keys() & LOOPBACK:
+        del opened
+        opened, both, said = _try_to_open(place, {**used, **LOOPBACK})
+        if opened:
+            used = both
+        else:  # CYCLONEDDS_URI names interfaces, and none may be named twice
+            opened, used, said = _try_to_open(place, own)
+    interfaces = ", ".join(used) or "an interface of CYCLONEDDS_URI"
     if opened is None and "failed to find interfaces" in said:
         LOG.warning("there is no network interface: nobody can hear what is published")
         interfaces = "no interface"
-        opened, said = _try_to_open(place.domain, NO_NETWORK)
-    if opened is None:
+        opened = domain.Domain(place.domain, NO_NETWORK)
+    elif opened is None:
         names = ", ".join(name for _, name in socket.if_nameindex())
         blame = f"; correct CYCLONEDDS_URI (interfaces here: {names})" if place.custom else ""
         raise PublishError(f"DDS domain {place.domain} cannot be opened: {said}{blame}")
-    if said:
+    elif said:
         LOG.warning("Cyclone DDS: %s", said)
     return opened, interfaces
 
 
-def _try_to_open(number: int, configuration: str) -> tuple[Any, str]:
-    """A domain or None, and what was said on the standard error meanwhile.
+def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
+    """A domain or None, the addresses of the interfaces in use by name, and what went wrong.
 
-    Reasons of a failure are told by Cyclone DDS there alone.
+    Cyclone DDS tells interfaces in its trace, and reasons of a failure on the standard error alone.
     """
-    with tempfile.TemporaryFile() as file:
+    with tempfile.TemporaryDirectory() as folder:
+        trace, errors = Path(folder, "trace"), Path(folder, "errors")
+        trace.touch()
         sys.stderr.flush()
         kept = os.dup(2)
         try:
-            os.dup2(file.fileno(), 2)
-            opened = domain.Domain(number, configuration)
+            with errors.open("wb") as file:
+                os.dup2(file.fileno(), 2)
+            opened = domain.Domain(place.domain, place.configuration(str(trace), own))
         except (core.DDSException, UnicodeEncodeError):
             opened = None
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-        file.seek(0)
-        lines = file.read().decode("utf-8", "replace").splitlines()
-    # each begins with time, domain and program
-    return opened, "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
+        account = trace.read_text("utf-8", "replace")
+        lines = errors.read_text("utf-8", "replace").splitlines()
+    present = dict(
+        re.findall(r"(\S+) udp/([\d.]+)", "".join(re.findall(": interfaces: .*", account)))
+    )
+    chosen = re.findall(r"(\S+) \(index", "".join(re.findall("selected interfaces: .*", account)))
+    # each line of an error begins with time, domain and program
+    said = "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
+    return opened, {name: present.get(name, "localhost") for name in chosen}, said
 
 
 class Publisher:

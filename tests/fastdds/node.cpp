@@ -3,8 +3,8 @@
 //     node DOMAIN [--any] TOPIC...
 //
 // On standard output one JSON array a line: ["message", topic, time in ns, fields] of what comes,
-// ["sent", topic, time in ns] of what goes, and ["matched", topic, change of the number of others].
-// Lines of standard input, "TOPIC FRAME X Y Z" with "-" for an empty frame, are sent as points; its
+// ["sent", topic, time in ns] of what goes, ["matched", topic, change of the number of others], and
+// ["writer", DDS topic, DDS type, user data] of the writers of others. Lines of standard input, "TOPIC FRAME X Y Z" with "-" for an empty frame, are sent as points; its
 // end ends the program.
 // Stays on the loopback interface unless --any.
 
@@ -146,6 +146,17 @@ private:
     std::string topic_;
 };
 
+class Discovery : public DomainParticipantListener {
+public:
+    void on_publisher_discovery(DomainParticipant*, WriterDiscoveryInfo&& found) override {
+        if (found.status != WriterDiscoveryInfo::DISCOVERED_WRITER) return;
+        const auto& data = found.info.m_qos.m_userData;
+        print("[\"writer\"," + json(found.info.topicName().to_string()) + "," +
+              json(found.info.typeName().to_string()) + "," +
+              json(std::string(data.begin(), data.end())) + "]");
+    }
+};
+
 static DomainParticipant* participant;
 
 static Topic* topic(const std::string& name, TypeSupport type) {
@@ -182,7 +193,9 @@ int main(int count, char** arguments) {
         qos.transport().user_transports.push_back(loopback);
     }
     auto* factory = DomainParticipantFactory::get_instance();
-    participant = factory->create_participant(std::stoi(arguments[1]), qos);
+    Discovery discovery;
+    participant = factory->create_participant(std::stoi(arguments[1]), qos, &discovery,
+                                              StatusMask::none());
     std::map<std::string, DataWriter*> writers;
     for (const std::string& name : topics) {
         using namespace geometry_msgs::msg::dds_;
