@@ -20,6 +20,7 @@
 
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
+#include <fastdds/dds/domain/DomainParticipantListener.hpp>
 #include <fastdds/dds/publisher/DataWriter.hpp>
 #include <fastdds/dds/publisher/DataWriterListener.hpp>
 #include <fastdds/dds/publisher/Publisher.hpp>
@@ -33,6 +34,7 @@
 
 using namespace eprosima::fastdds::dds;
 using namespace eprosima::fastdds::rtps;
+using eprosima::fastrtps::rtps::WriterDiscoveryInfo;
 using builtin_interfaces::msg::dds_::Time_;
 using geometry_msgs::msg::dds_::PointStamped_;
 using geometry_msgs::msg::dds_::TransformStamped_;
