@@ -80,8 +80,9 @@ class Node:
     def __init__(self, program: Path, number: int, *topics: str, inside: tuple[str, ...] = ()):
         command = [*inside, str(program), str(number), *topics]
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            errors="surrogateescape",
+        )  # fmt: skip
         self.told: list[list[Any]] = []
         self._thread = Thread(target=self._read)
         self._thread.start()
@@ -269,7 +270,7 @@ def test_stamps_are_the_wall_clock(
         ended(process)
     delays = [it[2] - stamp_of(it[3][0]) for it in node.told if it[0] == "message"]
     assert len(delays) > 100
-    assert 0 < statistics.median(delays) < 0.005 * SECOND
+    assert 0 < statistics.median(delays) < 0.02 * SECOND
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
@@ -355,6 +356,7 @@ def test_points_that_mean_nothing_are_ignored_with_one_warning_each(
             node.point("/target_command", "", 0.1, float("inf"), 0.0)
             node.point("/clicked_point", "odom", 0.1, 0.1, 0.0)
             node.point("/target_command", "map", 0.1, 0.1, 0.0)
+            node.point("/target_command", "\udcff", 0.1, 0.1, 0.0)  # no UTF-8
             node.hears("/target")
         node.point("/target_command", "world", 0.25, 0.0625, 0.0)
         node.until(lambda: node.messages("/target")[-1][1] == [0.25, 0.0625, 0])
@@ -363,7 +365,8 @@ def test_points_that_mean_nothing_are_ignored_with_one_warning_each(
     targets = [m[1] for m in node.messages("/target")]
     assert [xyz for xyz, _ in itertools.groupby(targets)] == [[0.2, 0.05, 0], [0.25, 0.0625, 0]]
     lines = sorted(err.splitlines())
-    assert len(lines) == 2
+    assert len(lines) == 3
+    assert re.fullmatch(r"WARNING: a point on /target_command cannot be read .*", lines.pop(0))
     assert re.fullmatch(
         r"WARNING: a point on /\S+ is in frame '(odom|map)', not in 'world': .*", lines[0]
     )
@@ -440,7 +443,7 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
 # a network of two interfaces that are each other's cable
 CABLE = """
 ip link set lo up
-sysctl -qw net.ipv6.conf.all.disable_ipv6=1 net.ipv6.conf.default.disable_ipv6=1
+for which in all default; do echo 1 > /proc/sys/net/ipv6/conf/$which/disable_ipv6; done 2> /dev/null
 ip link add cable0 type veth peer name cable1
 ip address add 10.200.0.1/24 dev cable0
 ip link set cable0 up
@@ -496,6 +499,48 @@ def test_range(
         assert ended(process, 130)[1] == ""
 
 
+LISTENER = """
+import sys, time
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from twodof.bag.messages import STREAM
+from twodof.publish import dds_qos, dds_type
+
+number, configuration = int(sys.argv[1]), sys.argv[2]
+domain = Domain(number, f"<CycloneDDS><Domain>{configuration}</Domain></CycloneDDS>")
+participant = DomainParticipant(number)
+name = "sensor_msgs/msg/JointState"
+topic = Topic(participant, "rt/joint_states", dds_type(name))
+reader = DataReader(participant, topic, dds_qos(STREAM, name))
+end, heard = time.monotonic() + 20.0, 0
+while heard < 50 and time.monotonic() < end:
+    heard += len(reader.take(10))
+    time.sleep(0.01)
+print(heard)
+"""
+JAZZY = """<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>{}</Discovery>"""
+SHELLS = {
+    "LOCALHOST": "<General><AllowMulticast>false</AllowMulticast></General>"
+    + JAZZY.format('<Peers><Peer address="localhost"/></Peers>'),
+    "SUBNET": JAZZY.format(""),
+}
+
+
+@pytest.mark.parametrize("variables", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}])
+@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
+def test_cyclone_dds_as_jazzy_configures_it_hears(
+    native_path: Path, number: int, shell: str, variables: dict[str, str]
+) -> None:
+    variables = {"ROS_LOCALHOST_ONLY": "", **variables}
+    with published(number, native_path, inside=isolated(CABLE), **variables) as process:
+        enter = ["nsenter", "--net", "--target", str(process.pid)]
+        command = [*enter, sys.executable, "-c", LISTENER, str(number), shell]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert int(done.stdout) >= 50
+
+
 def test_an_interface_can_be_chosen(native_path: Path, number: int) -> None:
     chosen = (
         "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='cable0'/></Interfaces>"
@@ -521,7 +566,7 @@ def test_an_interface_that_goes_and_comes_back(
             subprocess.run([*enter, "ip", "link", "set", "cable0", state], check=True)
             time.sleep(1.0)
         node.hears()
-        ended(process)
+        assert ended(process)[1] == ""
     assert len(recorded(bag)["/joint_states"]) == 801
 
 

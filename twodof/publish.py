@@ -39,6 +39,7 @@ COMMANDS = ("/target_command", "/clicked_point")
 RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
 LAST_DOMAIN = 232  # the ports of later ones are beyond 65535
 LOOPBACK = {"lo": "127.0.0.1"}
+LONGEST_NAME = 80  # of a frame, that is told
 MOST_PARTICIPANTS = 32  # of one host, that are looked for; as rmw_cyclonedds
 NO_NETWORK = (
     "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
@@ -92,7 +93,7 @@ class Network(NamedTuple):
             named = "".join(f"<NetworkInterface name={quoteattr(name)}/>" for name in own)
             general += f"<Interfaces>{named}</Interfaces>"
         if off:
-            discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>twodof_{os.getpid()}</Tag>"
+            discovery = "<ParticipantIndex>none</ParticipantIndex>"  # ports that nobody guesses
         elif self.range != "SYSTEM_DEFAULT":
             discovery = (
                 "<ParticipantIndex>auto</ParticipantIndex>"
@@ -366,12 +367,15 @@ class Publisher:
         return None if target is None else {"x_des": target}
 
     def _target(self, name: str, cdr: Serialised) -> tuple[float, ...] | None:
-        message: Any = STORE.deserialize_cdr(cdr, POINT)
+        try:
+            message: Any = STORE.deserialize_cdr(cdr, POINT)
+        except Exception as error:  # the bytes are anybody's
+            self._warn_once("bytes", f"a point on {name} cannot be read ({error}): ignored")
+            return None
         frame, point = message.header.frame_id, message.point
         if frame not in ("", self._root):
-            self._warn_once(
-                "frame", f"a point on {name} is in frame '{frame}', not in '{self._root}': ignored"
-            )
+            told = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
+            self._warn_once("frame", f"a point on {name} is in frame {told}: ignored")
             return None
         if not all(map(isfinite, (point.x, point.y, point.z))):
             self._warn_once("finite", f"a point on {name} is not finite: ignored")
