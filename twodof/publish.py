@@ -125,7 +125,7 @@ def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) 
         PublishError: naming the variable that is at fault.
     """
     number = variables.get("ROS_DOMAIN_ID") or "0"
-    if not (number.isascii() and number.isdigit() and int(number) <= LAST_DOMAIN):
+    if not re.fullmatch("[0-9]{1,9}", number) or int(number) > LAST_DOMAIN:
         raise PublishError(f"ROS_DOMAIN_ID is '{number}', not a number from 0 to {LAST_DOMAIN}")
     custom = variables.get("CYCLONEDDS_URI", "")
     if subnet:
@@ -221,7 +221,7 @@ def open_domain(place: Network) -> tuple[Any, str]:
     own = LOOPBACK if place.loopback else None
     opened, used, said = _try_to_open(place, own)
     if opened and place.range == "LOCALHOST" and not used.keys() & LOOPBACK:
-        del opened
+        del opened  # which closes it
         opened, both, said = _try_to_open(place, {**used, **LOOPBACK})
         if opened:
             used = both
