@@ -59,12 +59,13 @@ def main() -> None:
         return browse(sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, build_fmu
-    from twodof.live import Loop, long_run, page_of
+    from twodof.live import Loop, page_of
+    from twodof.master import endless
 
     with tempfile.TemporaryDirectory() as folder:
         native = sys.argv[2:3] != ["python"]
         fmu = build_fmu(Path(folder) / "TwoDof.fmu", FmuOptions(native=native))
-        run = long_run(fmu, step=STEP)
+        run = endless(fmu, step=STEP)
         loop = Loop(run)
         with page_of(loop, run, "127.0.0.1", 0) as (url, page):
             ended = threading.Event()

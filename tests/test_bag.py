@@ -373,6 +373,28 @@ def test_provenance_is_complete(fmu_path: Path, tmp_path: Path, storage: str) ->
     }
 
 
+@both_storages
+def test_provenance_of_an_open_ended_run_is_completed_at_its_end(
+    native_path: Path, tmp_path: Path, storage: str
+) -> None:
+    run = twodof.experiment(native_path, stop_time=1e6)
+    answers = {2: {"x_des": (0.1, 0.2)}, 4: {"Kp[2]": 80.0}, 5: {"Kp[2]": 80.0}}
+    steps = twodof.samples(run)
+    with twodof.Bag(tmp_path / "bag", run, storage=storage, open_ended=True) as bag:
+        sample = next(steps)
+        while sample.k < 8:
+            bag.write(sample)
+            sample = steps.send(answers.get(sample.k))
+    told = twodof.read_bag(tmp_path / "bag")
+    for found in (told.provenance, json.loads(metadata(tmp_path / "bag")["custom_data"]["twodof"])):
+        assert found["steps"] == 7
+        assert found["stamp_start_ns"] == told.stamps[0]
+        assert found["input_changes"] == [
+            [0.02, {"x_des[1]": 0.1, "x_des[2]": 0.2}],
+            [0.04, {"Kp[2]": 80.0}],
+        ]
+
+
 def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(
     run: Experiment, tmp_path: Path
 ) -> None:

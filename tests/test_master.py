@@ -166,6 +166,32 @@ def test_realtime_paces_to_the_wall_clock_and_counts_missed_deadlines(fmu_path):
     assert slow.worst >= 0.05
 
 
+def test_time_that_sinks_take_to_open_is_not_the_runs(fmu_path):
+    pace = RealTime()
+
+    class Slow(Recorder):
+        def __enter__(self):
+            time.sleep(0.3)
+            return self
+
+    summary = twodof.simulate(fmu_path, [Slow()], pace=pace, stop_time=0.5, step=0.05)
+    assert pace.worst < 0.2
+    assert 0.5 <= summary.wall_time < 0.7
+
+
+def test_steering_holds_from_the_sample_on_that_it_answers(native_path):
+    answers = {3: {"x_des": (0.1, 0.2)}, 7: {"Kp[2]": 80.0}, 20: {"Kp": 1.0}}
+    recorder = Recorder()
+    twodof.simulate(
+        native_path, [recorder], stop_time=0.2, steer=lambda: answers.get(recorder.samples[-1].k)
+    )
+    run = twodof.samples(native_path, stop_time=0.2)
+    expected = [next(run)]
+    expected += [run.send(answers.get(k)) for k in range(20)]
+    assert recorder.samples == expected
+    assert [s.inputs["x_des[1]"] for s in expected[3:5]] == [0.2, 0.1]
+
+
 def test_messages_of_the_fmu_go_to_logging(fmu_path, caplog):
     with caplog.at_level(logging.INFO, "twodof.fmu"):
         twodof.simulate(fmu_path, stop_time=0.01, settings={"q_start": (4.0, 0.35)})

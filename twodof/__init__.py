@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from .build import FmuOptions, build_fmu
     from .errors import TwoDofError
     from .fmu import Fmu, load_fmu
-    from .master import Sample, Summary, experiment, samples, simulate
+    from .master import RealTime, Sample, Summary, experiment, samples, simulate
     from .plot import plot_bags
+    from .publish import Publisher
     from .sweeps import read_sweep, sweep
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
@@ -28,10 +29,12 @@ _HOME = {
     "TwoDofError": "errors",
     "Fmu": "fmu",
     "load_fmu": "fmu",
+    "RealTime": "master",
     "Sample": "master",
     "Summary": "master",
     "experiment": "master",
     "plot_bags": "plot",
+    "Publisher": "publish",
     "samples": "master",
     "simulate": "master",
     "sweep": "sweeps",
@@ -40,6 +43,8 @@ __all__ = [
     "Bag",
     "Fmu",
     "FmuOptions",
+    "Publisher",
+    "RealTime",
     "Run",
     "Sample",
     "Summary",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import os
 import shlex
 import signal
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from . import __version__
 from .errors import BuildError, InputError, TwoDofError
@@ -23,10 +24,11 @@ from .errors import BuildError, InputError, TwoDofError
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from .bag import Run
+    from .bag import Bag, Run
     from .figure import Drawing
     from .fmu import Fmu
-    from .master import Experiment, RealTime, Summary
+    from .master import Experiment, RealTime, Sink, Summary
+    from .publish import Publisher
 
 INTERRUPTED = 130
 LONGEST_LINE = 2000
@@ -118,28 +120,28 @@ def _parser() -> argparse.ArgumentParser:
         description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
     )  # fmt: skip
     run.set_defaults(verb=_run)
-    run.add_argument("fmu", nargs="?", metavar="FMU", help="default: TwoDof.fmu, built if need be")
-    run.add_argument(
-        "--native", action="store_true", help="build and run the native default FMU instead"
-    )
     run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
-    _add_run_options(run)
-    run.add_argument(
-        "--input", metavar="CSV", help="inputs over time: a column 'time' and one for each input"
-    )
-    run.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
-    run.add_argument(
-        "--scene", action="store_true", help="add robot description, tf, target and end effector"
-    )
-    run.add_argument("--effort", action="store_true", help="put the control effort into the bag")
-    run.add_argument(
-        "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
-    )
-    run.add_argument("--overwrite", action="store_true", help="replace an existing bag")
-    run.add_argument(
-        "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
-    )
+    _add_time_options(run)
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
+    _add_run_options(run)
+
+    publish = verbs.add_parser(
+        "publish", help="step an FMU in real time on a ROS 2 network",
+        description="Step an FMU in real time and publish each step as sensor_msgs/JointState over"
+        " DDS, until Ctrl-C. Points on /target_command and /clicked_point move the target. Honours"
+        " ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and"
+        " CYCLONEDDS_URI.",
+    )  # fmt: skip
+    publish.set_defaults(verb=_publish)
+    publish.add_argument("-o", dest="output", metavar="BAG", help="record a bag too")
+    publish.add_argument("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
+    publish.add_argument(
+        "--rate", type=float, default=100.0, metavar="HZ", help="steps a second (%(default)g)"
+    )
+    publish.add_argument(
+        "--subnet", action="store_true", help="for other hosts too, not for this one alone"
+    )
+    _add_run_options(publish)
 
     info = verbs.add_parser("info", help="show what is in an FMU or a bag")
     info.set_defaults(verb=_info)
@@ -178,7 +180,8 @@ def _parser() -> argparse.ArgumentParser:
     live.set_defaults(verb=_live)
     live.add_argument("fmu", nargs="?", metavar="FMU", help="default: the default arm's")
     live.add_argument("-o", dest="output", metavar="BAG", help="name of recordings")
-    _add_model_options(live)
+    _add_step_option(live)
+    _add_set_option(live)
     _add_page_options(live)
 
     sweep = verbs.add_parser(
@@ -200,7 +203,8 @@ def _parser() -> argparse.ArgumentParser:
         "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH",
         help="values drawn uniformly",
     )  # fmt: skip
-    _add_run_options(sweep)
+    _add_time_options(sweep)
+    _add_set_option(sweep)
     sweep.add_argument("-o", dest="output", metavar="OUT", help="default: sweep_<date and time>")
     sweep.add_argument(
         "--resume", action="store_true", help="go on with OUT; what is done is not repeated"
@@ -219,14 +223,42 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "fmu", nargs="?", metavar="FMU", help="default: TwoDof.fmu, built if need be"
+    )
+    parser.add_argument(
+        "--native", action="store_true", help="build and run the native default FMU instead"
+    )
+    _add_set_option(parser)
+    parser.add_argument(
+        "--input", metavar="CSV", help="inputs over time: a column 'time' and one for each input"
+    )
+    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
+    parser.add_argument(
+        "--scene", action="store_true", help="add robot description, tf, target and end effector"
+    )
+    parser.add_argument("--effort", action="store_true", help="add the control effort")
+    parser.add_argument(
+        "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
+    parser.add_argument(
+        "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
+    )
+
+
+def _add_time_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
-    _add_model_options(parser)
+    _add_step_option(parser)
 
 
-def _add_model_options(parser: argparse.ArgumentParser) -> None:
+def _add_step_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
     )
+
+
+def _add_set_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
@@ -282,20 +314,41 @@ def _platforms(chosen: Sequence[str]) -> tuple[str, ...]:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from .bag import Bag
+    from .master import RealTime, simulate
+
+    run = _experiment(options, options.stop_time, options.step)
+    bag = _bag(options, run, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
+    pace = RealTime() if options.realtime else None
+    with _asked_to_stop() as asked:
+        summary = simulate(run, [bag, _Progress(run)], pace=pace, stop=asked)
+    _print_summary(run, bag, options.storage, summary, pace)
+    file = bag.path / f"{bag.path.name}.{'mcap' if options.storage == 'mcap' else 'db3'}"
+    viewer = "Foxglove: open" if options.storage == "mcap" else "RViz: play"
+    _print_next(
+        f"twodof info {_quote(bag.path)}",
+        f"ros2 bag play {_quote(bag.path)}",
+        f"{viewer} {_quote(file)}",
+    )
+    return INTERRUPTED if summary.stopped else 0
+
+
+def _experiment(options: argparse.Namespace, stop_time: float | None, step: float) -> Experiment:
     from .inputs import parse_settings
-    from .master import RealTime, experiment, simulate
+    from .master import endless, experiment
 
     settings = parse_settings(options.settings)
-    run = experiment(
-        _chosen_fmu(options),
-        stop_time=options.stop_time,
-        step=options.step,
-        settings=settings,
-        input_file=options.input,
+    made: dict[str, Any] = {"step": step, "settings": settings, "input_file": options.input}
+    fmu = _chosen_fmu(options)
+    return (
+        endless(fmu, **made) if stop_time is None else experiment(fmu, stop_time=stop_time, **made)
     )
-    bag = Bag(
-        options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"),
+
+
+def _bag(options: argparse.Namespace, run: Experiment, path: str, **more: bool) -> Bag:
+    from .bag import Bag
+
+    return Bag(
+        path,
         run,
         storage=options.storage,
         scene=options.scene,
@@ -304,11 +357,34 @@ def _run(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         fsync=options.fsync,
         command_line=options.command_line,
+        **more,
     )
-    pace = RealTime() if options.realtime else None
+
+
+def _publish(options: argparse.Namespace) -> int:
+    from .bag.messages import Stamps
+    from .master import RealTime, simulate
+    from .publish import Publisher, network
+
+    if not 0.0 < options.rate < math.inf:
+        raise InputError(f"--rate {options.rate:g}: not a number of steps a second")
+    if options.output is None and (options.overwrite or options.fsync):
+        raise InputError("--overwrite and --fsync are for a bag; name it with -o")
+    place = network(subnet=options.subnet)
+    run = _experiment(options, options.stop_time, 1.0 / options.rate)
+    bag = _bag(options, run, options.output, open_ended=True) if options.output else None
+    stamps = bag.stamps if bag else Stamps(run, options.stamp_start)
+    wire = Publisher(
+        run, place, stamps=stamps, scene=options.scene, effort=options.effort,
+        opened=_print_network,
+    )  # fmt: skip
+    sinks: list[Sink] = [wire] if bag is None else [wire, bag]
+    pace = RealTime()
     with _asked_to_stop() as asked:
-        summary = simulate(run, [bag, _Progress(run)], pace=pace, stop=asked)
-    _print_summary(run, bag.path, options.storage, summary, pace)
+        summary = simulate(run, sinks, pace=pace, stop=asked, steer=wire.command)
+    _print_summary(run, bag, options.storage, summary, pace)
+    if bag is not None:
+        _print_next(f"twodof plot {_quote(bag.path)}", f"ros2 bag play {_quote(bag.path)}")
     return INTERRUPTED if summary.stopped else 0
 
 
@@ -323,6 +399,18 @@ def _fast_fmu(options: argparse.Namespace) -> Path:
     except BuildError as error:
         print(f"{error}; running the Python flavour, which is slower", file=sys.stderr)
         return build_fmu(None, FmuOptions())
+
+
+def _print_network(wire: Publisher) -> None:
+    place = wire.place
+    _print_table(
+        ("topics", ", ".join(wire.topics)),
+        ("network", f"DDS domain {place.domain} on {wire.interface}, {place.reach}"),
+        ("targets", f"from {', '.join(wire.commands)}" if wire.commands else "fixed"),
+        ("end", "Ctrl-C"),
+    )
+    _print_next("ros2 topic echo /joint_states")
+    sys.stdout.flush()
 
 
 def _chosen_fmu(options: argparse.Namespace) -> Path:
@@ -389,14 +477,13 @@ class _Progress:
 
 
 def _print_summary(
-    run: Experiment, bag: Path, storage: str, summary: Summary, pace: RealTime | None
+    run: Experiment, bag: Bag | None, storage: str, summary: Summary, pace: RealTime | None
 ) -> None:
     last = summary.last
     simulated = last.k * run.step
-    rows = [
-        ("FMU", f"{run.fmu.path}"),
-        ("bag", f"{bag} ({last.k + 1} messages on /joint_states, {storage})"),
-    ]
+    rows = [("FMU", f"{run.fmu.path}")]
+    if bag is not None:
+        rows.append(("bag", f"{bag.path} ({last.k + 1} messages on /joint_states, {storage})"))
     if summary.error is not None:
         target = ", ".join(f"{last.inputs[f'x_des[{k + 1}]']:g}" for k in range(len(last.x)))
         rows.append(("end effector", f"{_length(summary.error)} from its target ({target}) m"))
@@ -409,13 +496,9 @@ def _print_summary(
             ("deadlines", f"{pace.missed} of {last.k + 1} missed, worst {pace.worst * 1e3:.1f} ms")
         )
     if summary.stopped:
-        rows.append(("stopped", f"on request at {last.t:g} s; the bag is complete up to there"))
+        complete = "" if bag is None else "; the bag is complete up to there"
+        rows.append(("stopped", f"on request at {last.t:g} s{complete}"))
     _print_table(*rows)
-    file = bag / f"{bag.name}.{'mcap' if storage == 'mcap' else 'db3'}"
-    viewer = "Foxglove: open" if storage == "mcap" else "RViz: play"
-    _print_next(
-        f"twodof info {_quote(bag)}", f"ros2 bag play {_quote(bag)}", f"{viewer} {_quote(file)}"
-    )
 
 
 def _length(metres: float) -> str:

@@ -52,3 +52,7 @@ class PlotError(TwoDofError):
 
 class PageError(TwoDofError):
     """A page cannot be shown: viser, its port, the robot or the output file is at fault."""
+
+
+class PublishError(TwoDofError):
+    """A run cannot be published: Cyclone DDS, the network or a variable of ROS 2 is at fault."""

@@ -30,7 +30,7 @@ from .bag import Bag
 from .errors import BagError, PageError, SimulationError, TwoDofError
 from .fmu import Fmu, load_fmu, read_resource, read_urdf
 from .inputs import Setting, Value, resolve
-from .master import Experiment, RealTime, Sample, experiment, samples
+from .master import Experiment, RealTime, Sample, endless, samples
 from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Figure, Page, Plot, Readout
 from .plant import Robot, RobotError, load_robot
 
@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 Change = Callable[[dict[str, Setting]], None]
 """Asks for inputs by name."""
 
-LONGEST = 1e7  # s: no run that anybody watches is longer
 PLOTTED = 10.0  # s
 TRAIL_POINTS = 45
 MOST_ROWS = 10_000  # that wait for a page to ask
@@ -65,31 +64,25 @@ class Recording:
             run, start_time=first.t, steps=run.steps - first.k, start_values=starts,
             given={**run.given, **first.inputs, **state}, changes=[],
         )  # fmt: skip
-        self.path, self._run = path, run
-        self._first = self._last = first
-        self._changes: list[tuple[float, dict[str, Value]]] = []
-        self._bag = Bag(path, run, scene=True, effort=bool(first.tau), command_line=command_line)
+        self.path, self._first = path, first.k
+        self._bag = Bag(
+            path, run, scene=True, effort=bool(first.tau), open_ended=True,
+            command_line=command_line,
+        )  # fmt: skip
         self._bag.__enter__()
         self.write(first)
 
     def write(self, sample: Sample) -> None:
         """Write one sample."""
-        before = self._last
-        if sample.inputs is not before.inputs:
-            changed = {n: v for n, v in sample.inputs.items() if v != before.inputs[n]}
-            if changed:  # since the sample before, to which they were the answer
-                self._changes.append((before.t, changed))
-        self._last = sample
-        self._bag.write(sample._replace(k=sample.k - self._first.k))
+        self._bag.write(sample._replace(k=sample.k - self._first))
 
     @property
     def count(self) -> int:
         """Number of samples so far."""
-        return self._last.k - self._first.k + 1
+        return self._bag.count
 
     def close(self) -> None:
         """Close the bag, and complete its provenance."""
-        self._bag.amend(replace(self._run, steps=self.count - 1, changes=self._changes))
         self._bag.__exit__(None, None, None)
 
 
@@ -563,15 +556,9 @@ def live(
         bag: name of the first recording; None: rosbag2_<date and time>.
         command_line: for the provenance of recordings.
     """
-    run = long_run(fmu, step=step, settings=settings)
+    run = endless(fmu, step=step, settings=settings)
     loop = Loop(run, bag=bag, command_line=command_line)
     with page_of(loop, run, host, port) as (url, page):
         opened(url)
         loop.play(page, stop)
     return loop.recorded
-
-
-def long_run(fmu: Fmu | str | Path, *, step: float, **options: Any) -> Experiment:
-    """An experiment without end; arguments and errors as of ``experiment``."""
-    run = experiment(fmu, step=step, stop_time=step, **options)
-    return replace(run, steps=round(LONGEST / step))

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from math import dist, isfinite
 from pathlib import Path
@@ -23,6 +23,7 @@ from .fmu import Fmu, Instance, instantiate, load_fmu
 from .inputs import Changes, Setting, Value, read_changes, resolve
 
 TIME_TOLERANCE = 1e-9
+LONGEST = 1e7  # s: no run that anybody watches is longer
 OUTPUTS = ("q", "v", "x", "tau")
 
 
@@ -118,6 +119,12 @@ def experiment(
         given=given,
         changes=changes,
     )
+
+
+def endless(fmu: Fmu | str | Path, *, step: float, **options: Any) -> Experiment:
+    """An experiment without end; arguments and errors as of ``experiment``."""
+    run = experiment(fmu, step=step, stop_time=step, **options)
+    return replace(run, steps=round(LONGEST / step))
 
 
 def _steps(start: float, stop: float, h: float) -> int:
@@ -271,19 +278,32 @@ def simulate(
     pace: RealTime | None = None,
     stop: Callable[[], bool] | None = None,
     instance: Instance | None = None,
+    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
     **options: Any,
 ) -> Summary:
-    """Run an FMU and hand every sample to every sink. Arguments and errors as in ``samples``."""
+    """Run an FMU and hand every sample to every sink.
+
+    Other arguments and errors as in ``samples``.
+
+    Args:
+        steer: asked after each sample for new inputs, which hold from that sample's time on.
+    """
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
     with ExitStack() as stack:
         source = stack.enter_context(closing(samples(run, pace=pace, stop=stop, instance=instance)))
         sample = next(source)
         writes = [stack.enter_context(sink).write for sink in sinks]
+        if pace is not None:  # what the sinks took to open is not the run's
+            pace.restart()
+            pace.wait(0.0)
         begin = time.perf_counter()
-        for write in writes:
-            write(sample)
-        for sample in source:
+        while True:
             for write in writes:
                 write(sample)
+            answer = steer()
+            try:
+                sample = source.send(answer)
+            except StopIteration:
+                break
         return Summary(sample, time.perf_counter() - begin, sample.k < run.steps)

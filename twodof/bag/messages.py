@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import struct
+import time
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +31,7 @@ Array = NDArray[np.float64]
 JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 NANOSECONDS = 1_000_000_000
+LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 FOREVER = QosTime(9223372036, 854775807)
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -65,6 +69,40 @@ SCENE_TOPICS = {
     "/target": Topic("geometry_msgs/msg/PointStamped", STREAM),
     "/end_effector": Topic("geometry_msgs/msg/PointStamped", STREAM),
 }
+
+
+class Stamps:
+    """Stamps of a run's samples, start + k·h: what keeps the samples keeps the stamps.
+
+    Args:
+        run: the experiment.
+        start: s since the epoch; None: the wall clock when it is first asked for.
+
+    Raises:
+        BagError: a stamp is out of range.
+    """
+
+    def __init__(self, run: Experiment, start: float | None = None) -> None:
+        if start is not None and not 0 <= start * NANOSECONDS <= LATEST_STAMP:
+            raise BagError(f"the first stamp, {start:g} s, is out of range")
+        self._given, self._step = start, run.step
+        end = (time.time() if start is None else start) + run.steps * run.step
+        if end * NANOSECONDS > LATEST_STAMP:
+            raise BagError(f"the last stamp, {run.steps * run.step:g} s later, is out of range")
+
+    def now(self) -> int:
+        """Stamp of the first sample if it came now, ns since the epoch."""
+        # a fraction: a double of today's nanoseconds is good to 256 only
+        return time.time_ns() if self._given is None else round(Fraction(self._given) * NANOSECONDS)
+
+    @cached_property
+    def start(self) -> int:
+        """Stamp of the first sample, ns since the epoch."""
+        return self.now()
+
+    def of(self, sample: Sample) -> int:
+        """Stamp of a sample, ns since the epoch."""
+        return self.start + round(sample.k * self._step * NANOSECONDS)
 
 
 class JointStateLayout:

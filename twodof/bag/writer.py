@@ -6,11 +6,10 @@ import errno
 import os
 import shutil
 import sqlite3
-import time
 from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
-from fractions import Fraction
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 
@@ -19,17 +18,18 @@ from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
 from ..files import read_file
+from ..inputs import Changes
 from ..master import Experiment, Sample
 from . import provenance
-from .messages import JOINT_STATES, NANOSECONDS, STORE, Messages, Serialised
+from .messages import JOINT_STATES, STORE, Messages, Serialised, Stamps
 from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, is_being_written, lock, sync
 
 MAX_METADATA = 64 * 1024**2  # bytes
 PROVENANCE_KEY = "twodof"
+MOST_CHANGES = 100_000  # of inputs, that the provenance of an open-ended run has room for
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
-LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 
 
 class Bag:
@@ -51,7 +51,14 @@ class Bag:
         stamp_start: time of the first stamp, s since the epoch; None: the wall clock.
         overwrite: replace an existing bag.
         fsync: wait for the disk at each flush, so that the machine may lose its power too.
+        open_ended: how long the run will be and what will change its inputs is not known before;
+            the provenance is completed at the end.
         command_line: for the provenance.
+
+    Attributes:
+        path: the folder.
+        stamps: of the messages.
+        count: number of samples so far.
 
     Raises:
         BagError: the folder exists or cannot be written; in ``write`` and at the end where the
@@ -69,6 +76,7 @@ class Bag:
         stamp_start: float | None = None,
         overwrite: bool = False,
         fsync: bool = False,
+        open_ended: bool = False,
         command_line: str = "",
     ) -> None:
         self.path = Path(path)
@@ -80,20 +88,19 @@ class Bag:
         self._storage = storage
         self._overwrite = overwrite
         self._fsync = fsync
+        self._open_ended = open_ended
         self._command_line = command_line
-        if stamp_start is not None and not 0 <= stamp_start * NANOSECONDS <= LATEST_STAMP:
-            raise BagError(f"the first stamp, {stamp_start:g} s, is out of range")
-        # a fraction: a double of today's nanoseconds is good to 256 only
-        exact = None if stamp_start is None else Fraction(stamp_start) * NANOSECONDS
-        self._start = time.time_ns() if exact is None else round(exact)
-        if self._start + run.steps * run.step * NANOSECONDS > LATEST_STAMP:
-            raise BagError(f"the last stamp, {run.steps * run.step:g} s later, is out of range")
+        self.count = 0
+        self._inputs, self._latest = run.start_values, run.start_time
+        self._changes: Changes = []
+        self.stamps = Stamps(run, stamp_start)
         self._messages = Messages(run, scene=scene, effort=effort)
         _check_free(self.path, overwrite)
 
     def __enter__(self) -> Bag:
         _check_free(self.path, self._overwrite)
-        text = provenance.provenance(self._run, self._start, self._command_line)
+        start = self.stamps.now() if self._open_ended else self.stamps.start
+        text = provenance.provenance(self._run, start, self._command_line)
         try:
             if self.path.exists():
                 shutil.rmtree(self.path)
@@ -116,18 +123,29 @@ class Bag:
         if self._failure is not None:
             self._ended.wait()
             raise self._error(self._failure) from self._failure
-        stamp = self._start + round(sample.k * self._run.step * NANOSECONDS)
+        stamp = self.stamps.of(sample)
         if first := not self._given:
             self._give(self._messages.latched(stamp), stamp)
         self._give(self._messages.of(sample, stamp), stamp)
+        self._note(sample)
         if first or self._given - self._taken > BATCH_SIZE:
             self._stored.clear()
             self._due.set()
             self._stored.wait()
 
-    def amend(self, run: Experiment) -> None:
-        """Put another account of the run into the provenance, of what was not known before it."""
-        text = provenance.provenance(run, self._start, self._command_line)
+    def _note(self, sample: Sample) -> None:
+        """Remember what changed inputs since the sample before, to which it was the answer."""
+        if sample.inputs is not self._inputs and len(self._changes) < MOST_CHANGES:
+            changed = {n: v for n, v in sample.inputs.items() if v != self._inputs.get(n)}
+            if changed:
+                self._changes.append((self._latest, changed))
+        self._inputs, self._latest = sample.inputs, sample.t
+        self.count += 1
+
+    def _complete(self) -> None:
+        """Put into the provenance what was not known before the run."""
+        run = replace(self._run, steps=self.count - 1, changes=self._changes)
+        text = provenance.provenance(run, self.stamps.start, self._command_line)
         self._writer.set_custom_data(PROVENANCE_KEY, text)
         file = self.path / provenance.FILE
         try:
@@ -137,9 +155,13 @@ class Bag:
             raise BagError(f"cannot write '{file}': {_reason(error)}") from error
 
     def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
-        self._closing = True
-        self._due.set()
-        self._ended.wait()  # interrupted or not, the thread ends its work; Thread.join would not
+        try:
+            if self._open_ended and self.count and self._failure is None:
+                self._complete()
+        finally:
+            self._closing = True
+            self._due.set()
+            self._ended.wait()  # interrupted or not, the thread ends its work; not so Thread.join
         if self._failure is not None and not isinstance(exception, BagError):
             raise self._error(self._failure) from self._failure
 

@@ -1,0 +1,704 @@
+"""A run on the wire, heard and steered by Fast DDS: another maker's DDS, with an IDL of its own.
+
+Truth is the bag that is recorded at the same time, read by the MCAP project's reader. All stays on
+the loopback interface, or in network namespaces that lead nowhere.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+from bags import SECOND, assert_consistent
+from harness import cannot_run, needs
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import twodof
+from twodof.cli import main
+from twodof.publish import LAST_DOMAIN, Network, network
+
+HERE = Path(__file__).resolve().parent
+TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
+LATCHED = ("/robot_description", "/tf_static")
+COMMANDS = ("/target_command", "/clicked_point")
+DOMAINS = itertools.count(os.getpid())
+PATIENCE = 20.0  # s
+
+
+@pytest.fixture(scope="session")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Fast DDS node, compiled."""
+    generator, compiler = needs("fastddsgen"), needs("g++", "c++")
+    if not Path("/usr/include/fastdds/dds").is_dir():
+        cannot_run("the headers of Fast DDS are not installed (Debian: libfastrtps-dev)")
+    folder = tmp_path_factory.mktemp("fastdds")
+    for source in (HERE / "fastdds").iterdir():
+        shutil.copy(source, folder)
+    subprocess.run([generator, "-cs", "ros.idl"], cwd=folder, check=True, capture_output=True)
+    sources = [path.name for path in folder.glob("*.c[px][px]")]
+    command = [
+        compiler,
+        "-std=c++14",
+        "-w",
+        "-I.",
+        *sources,
+        "-lfastrtps",
+        "-lfastcdr",
+        "-o",
+        "node",
+    ]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "node"
+
+
+@pytest.fixture
+def number() -> int:
+    """A DDS domain that no other test uses."""
+    return 1 + next(DOMAINS) % 100
+
+
+class Node:
+    """A Fast DDS node that listens to topics, or talks on those of COMMANDS."""
+
+    def __init__(self, program: Path, number: int, *topics: str, inside: tuple[str, ...] = ()):
+        command = [*inside, str(program), str(number), *topics]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            errors="surrogateescape",
+        )  # fmt: skip
+        self.told: list[list[Any]] = []
+        self._thread = Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.endswith("\n"):
+                self.told.append(json.loads(line))
+
+    def messages(self, topic: str) -> list[Any]:
+        """Fields of what came on a topic."""
+        return [it[3] for it in self.told if it[:2] == ["message", topic]]
+
+    def until(self, condition: Callable[[], Any], patience: float = PATIENCE) -> None:
+        end = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < end, self.told[-3:]
+            time.sleep(0.02)
+
+    def hears(self, topic: str = "/joint_states", more: int = 5) -> None:
+        """Wait for some more messages."""
+        before = len(self.messages(topic))
+        self.until(lambda: len(self.messages(topic)) >= before + more)
+
+    def point(self, topic: str, frame: str, *xyz: float) -> None:
+        """Send a point to somebody who listens."""
+        self.until(lambda: ["matched", topic, 1] in self.told)
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{topic} {frame or '-'} {' '.join(map(repr, xyz))}\n")
+        self.process.stdin.flush()
+
+    def leave(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(PATIENCE)
+        finally:
+            self.process.kill()
+            self._thread.join()
+            self.process.wait()
+
+
+@pytest.fixture
+def listen(program: Path, number: int) -> Iterator[Callable[..., Node]]:
+    nodes: list[Node] = []
+
+    def begin(*topics: str, **options: Any) -> Node:
+        nodes.append(Node(program, number, *topics, **options))
+        return nodes[-1]
+
+    yield begin
+    for node in nodes:
+        if node.process.poll() is None:
+            node.process.send_signal(signal.SIGCONT)
+            node.leave()
+
+
+def environment(number: int, **variables: str) -> dict[str, str]:
+    kept = {n: v for n, v in os.environ.items() if not n.startswith(("ROS_", "CYCLONEDDS"))}
+    return {**kept, "ROS_DOMAIN_ID": str(number), "ROS_LOCALHOST_ONLY": "1", **variables}
+
+
+@contextmanager
+def published(
+    number: int, fmu: Path, *options: str, inside: tuple[str, ...] = (), **variables: str
+) -> Iterator[subprocess.Popen[str]]:
+    """``twodof publish`` in a process of its own, when it has told that it is on the network."""
+    process = subprocess.Popen(
+        [*inside, *TWODOF, "publish", str(fmu), *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=environment(number, **variables),
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        process.told = []  # type: ignore[attr-defined]
+        while not process.told or "ros2 topic echo" not in process.told[-1]:  # type: ignore[attr-defined]
+            process.told.append(process.stdout.readline())  # type: ignore[attr-defined]
+            assert process.told[-1], process.communicate()  # type: ignore[attr-defined]
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def ended(process: subprocess.Popen[str], status: int = 0) -> tuple[str, str]:
+    """What it said at its end."""
+    out, err = process.communicate(timeout=90.0)
+    assert process.returncode == status, err
+    return out, err
+
+
+def recorded(bag: Path) -> dict[str, list[Any]]:
+    """Fields of all messages by topic."""
+    found: dict[str, list[Any]] = {}
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            fields = listed(decoded)
+            found.setdefault(channel.topic, []).append(fields)
+            if channel.topic in STREAMS:
+                header = fields[0][0][0] if channel.topic == "/tf" else fields[0]
+                assert stamp_of(header) == message.log_time
+    return found
+
+
+def listed(message: Any) -> Any:
+    if hasattr(message, "__slots__"):
+        return [listed(getattr(message, name)) for name in message.__slots__]
+    return [listed(it) for it in message] if isinstance(message, list | tuple) else message
+
+
+def stamp_of(header: Any) -> int:
+    (seconds, nanoseconds), _frame = header
+    return int(seconds) * SECOND + int(nanoseconds)
+
+
+def test_another_makers_dds_hears_every_field_of_the_bag(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    seconds = length(60, 4)
+    node = listen(*STREAMS, *LATCHED)
+    bag = tmp_path / "bag"
+    options = ["--scene", "--effort", "--stop-time", str(seconds + 2), "-o", str(bag)]
+    with published(number, native_path, *options) as process:
+        out, err = ended(process)
+    assert err == ""
+    truth = recorded(bag)
+    node.until(lambda: all(node.messages(topic)[-1:] == truth[topic][-1:] for topic in STREAMS))
+    assert len(truth["/joint_states"]) == 100 * (seconds + 2) + 1
+    for topic in STREAMS:
+        heard = node.messages(topic)
+        assert len(heard) >= 100 * seconds + 1
+        assert heard == truth[topic][-len(heard) :], topic  # none is lost since the first
+    for topic in LATCHED:
+        assert node.messages(topic) == truth[topic]
+    state = truth["/joint_states"][0]
+    assert state[1] == ["joint1", "joint2"] and len(state[4]) == 2  # names, efforts
+    assert re.search(rf"deadlines +\d+ of {100 * (seconds + 2) + 1} missed, worst [\d.]+ ms", out)
+
+
+TYPES = {  # as 'ros2 topic info --verbose' tells them
+    "rt/joint_states": (
+        "sensor_msgs::msg::dds_::JointState_",
+        "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    ),
+    "rt/robot_description": (
+        "std_msgs::msg::dds_::String_",
+        "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    ),
+    **dict.fromkeys(
+        ("rt/tf", "rt/tf_static"),
+        (
+            "tf2_msgs::msg::dds_::TFMessage_",
+            "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+        ),
+    ),
+    **dict.fromkeys(
+        ("rt/target", "rt/end_effector"),
+        (
+            "geometry_msgs::msg::dds_::PointStamped_",
+            "4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
+        ),
+    ),
+}
+
+
+def test_names_types_and_type_hashes_are_those_of_ros_2(
+    native_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen()
+    with published(number, native_path, "--scene"):
+        node.until(lambda: len(node.told) >= len(TYPES))
+    found = {topic: rest for event, topic, *rest in node.told}
+    assert found == {t: [name, f"typehash=RIHS01_{it};"] for t, (name, it) in TYPES.items()}
+
+
+def test_stamps_are_the_wall_clock(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen("/joint_states")
+    bag = str(tmp_path / "bag")
+    with published(number, native_path, "--stop-time", "3", "-o", bag) as process:
+        ended(process)
+    delays = [it[2] - stamp_of(it[3][0]) for it in node.told if it[0] == "message"]
+    assert len(delays) > 100
+    assert 0 < statistics.median(delays) < 0.02 * SECOND
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_the_last_sample_before_a_signal_is_in_the_bag_and_on_the_wire(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    ending: signal.Signals,
+) -> None:  # fmt: skip
+    node = listen("/joint_states")
+    bag = tmp_path / "bag"
+    with published(number, native_path, "-o", str(bag)) as process:
+        node.hears(more=30)
+        process.send_signal(ending)
+        out, err = ended(process, 130)
+    assert err == ""
+    truth = recorded(bag)["/joint_states"]
+    node.until(lambda: node.messages("/joint_states")[-1] == truth[-1])
+    heard = node.messages("/joint_states")
+    assert heard == truth[-len(heard) :]
+    assert assert_consistent(bag, "mcap") == len(truth)
+    assert "stopped" in out and f"{len(truth)} messages" in out
+    assert json.loads((bag / "run.json").read_text())["steps"] == len(truth) - 1
+
+
+def test_who_comes_late_gets_robot_description_and_fixed_transforms(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    bag = tmp_path / "bag"
+    with published(number, native_path, "--scene", "-o", str(bag)) as process:
+        time.sleep(length(45, 1))
+        node = listen(*LATCHED, "/joint_states")
+        node.until(lambda: all(map(node.messages, LATCHED)))
+        node.hears()
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
+    truth = recorded(bag)
+    for topic in LATCHED:
+        assert node.messages(topic) == truth[topic]
+    assert '<link name="EndEffector"' in truth["/robot_description"][0][0]
+
+
+@pytest.mark.parametrize("frame", ["world", ""])
+@pytest.mark.parametrize("topic", COMMANDS)
+def test_a_point_is_the_target_within_two_steps(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
+    topic: str, frame: str,
+) -> None:  # fmt: skip
+    bag, step, k = tmp_path / "bag", 0.05, 0
+    node = listen("/target", topic)
+    options = ["--scene", "--rate", str(1 / step), "-o", str(bag), "--set", "Kp=80"]
+    with published(number, native_path, *options) as process:
+        node.hears("/target")
+        node.point(topic, frame, 0.125, 0.17, 0.9)
+        node.until(lambda: node.messages("/target")[-1][1] == [0.125, 0.17, 0])
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
+    ((sent,),) = [[it[2] for it in node.told if it[0] == "sent"]]
+    heard = next(m for m in node.messages("/target") if m[1][0] == 0.125)
+    assert 0 < stamp_of(heard[0]) - sent <= 2 * step * SECOND
+    ((t, values),) = json.loads((bag / "run.json").read_text())["input_changes"]
+    assert values == {"x_des[1]": 0.125, "x_des[2]": 0.17}
+    states = recorded(bag)["/joint_states"]
+    k = round(t / step)
+    assert k < len(states) - 1
+    # the FMU had it: its own trajectory with that target from that step on
+    run = twodof.samples(
+        native_path, step=step, stop_time=(len(states) - 1) * step, settings={"Kp": 80}
+    )
+    sample = next(run)
+    for state in states:
+        assert state[2:4] == [list(sample.q), list(sample.v)]
+        if sample.k < len(states) - 1:
+            sample = run.send({"x_des": (0.125, 0.17)} if sample.k == k else None)
+
+
+def test_points_that_mean_nothing_are_ignored_with_one_warning_each(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen("/target", *COMMANDS)
+    with published(number, native_path, "--scene", "-o", str(tmp_path / "bag")) as process:
+        for _ in range(3):
+            node.point("/clicked_point", "world", float("nan"), 0.1, 0.0)
+            node.point("/target_command", "", 0.1, float("inf"), 0.0)
+            node.point("/clicked_point", "odom", 0.1, 0.1, 0.0)
+            node.point("/target_command", "map", 0.1, 0.1, 0.0)
+            node.point("/target_command", "\udcff", 0.1, 0.1, 0.0)  # no UTF-8
+            node.hears("/target")
+        node.point("/target_command", "world", 0.25, 0.0625, 0.0)
+        node.until(lambda: node.messages("/target")[-1][1] == [0.25, 0.0625, 0])
+        process.send_signal(signal.SIGINT)
+        _, err = ended(process, 130)
+    targets = [m[1] for m in node.messages("/target")]
+    assert [xyz for xyz, _ in itertools.groupby(targets)] == [[0.2, 0.05, 0], [0.25, 0.0625, 0]]
+    lines = sorted(err.splitlines())
+    assert len(lines) == 3
+    assert re.fullmatch(r"WARNING: a point on /target_command cannot be read .*", lines.pop(0))
+    assert re.fullmatch(
+        r"WARNING: a point on /\S+ is in frame '(odom|map)', not in 'world': .*", lines[0]
+    )
+    assert re.fullmatch(r"WARNING: a point on /\S+ is not finite: .*", lines[1])
+
+
+def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    bag = tmp_path / "bag"
+    with published(number, native_path, "--scene", "--stop-time", "9", "-o", str(bag)) as process:
+        stalled, killed = listen(*STREAMS, *LATCHED), listen(*STREAMS)
+        stalled.hears()
+        killed.hears()
+        stalled.process.send_signal(signal.SIGSTOP)
+        killed.process.kill()
+        killed.leave()
+        time.sleep(3.0)
+        back = listen(*STREAMS)
+        back.hears()
+        stalled.process.send_signal(signal.SIGCONT)
+        stalled.hears(more=50)
+        out, err = ended(process)
+    assert err == ""
+    assert len(recorded(bag)["/joint_states"]) == 901
+    missed, worst = re.search(r"(\d+) of 901 missed, worst ([\d.]+) ms", out).groups()  # type: ignore[union-attr]
+    assert int(missed) < 450 and float(worst) < 500
+    assert float(re.search(r"simulated in ([\d.]+) s", out)[1]) < 9.5  # type: ignore[index]
+
+
+def test_two_publishers_on_one_topic_are_both_heard(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    node = listen("/joint_states")
+    bags = [tmp_path / "one", tmp_path / "two"]
+    runs = [["--stop-time", "4", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
+    with (
+        published(number, native_path, *runs[0], str(bags[0])) as one,
+        published(number, native_path, *runs[1], str(bags[1])) as two,
+    ):
+        node.hears()
+        assert ended(one)[1] == ended(two)[1] == ""
+    for bag in bags:
+        truth = recorded(bag)["/joint_states"]
+        node.until(lambda last=truth[-1]: last in node.messages("/joint_states"))
+        mine = [message for message in node.messages("/joint_states") if message in truth]
+        assert len(mine) > 200 and mine == truth[-len(mine) :]
+
+
+ISOLATED = ("unshare", "--net", "sh", "-c")
+
+
+def isolated(script: str) -> tuple[str, ...]:
+    """A command's beginning that runs it in a network of its own, after a script."""
+    needs("unshare")
+    needs("ip")
+    if subprocess.run([*ISOLATED, "ip link"], capture_output=True, check=False).returncode != 0:
+        cannot_run("networks of one's own cannot be made here")
+    return (*ISOLATED, f'{script}\nexec "$@"', "sh")
+
+
+def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, number: int) -> None:
+    bag = tmp_path / "bag"
+    options = ["--stop-time", "0.5", "-o", str(bag)]
+    inside = isolated("true")
+    with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
+        _, err = ended(process)
+    assert err.splitlines() == [
+        "WARNING: there is no network interface: nobody can hear what is published"
+    ]
+    assert len(recorded(bag)["/joint_states"]) == 51
+
+
+# a network of two interfaces that are each other's cable
+CABLE = """
+ip link set lo up
+for which in all default; do echo 1 > /proc/sys/net/ipv6/conf/$which/disable_ipv6; done 2> /dev/null
+ip link add cable0 type veth peer name cable1
+ip address add 10.200.0.1/24 dev cable0
+ip link set cable0 up
+ip link set cable1 up
+"""
+
+
+def packets(process: subprocess.Popen[str]) -> int:
+    """How many left the cable's end in the network of a process."""
+    command = ["nsenter", "--net", "--target", str(process.pid), "ip", "-j", "-s", "link"]
+    links = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    (link,) = [link for link in links if link["ifname"] == "cable0"]
+    return int(link["stats64"]["tx"]["packets"])
+
+
+@pytest.mark.parametrize(
+    ("options", "variables", "reach", "local", "outside"),
+    [
+        ([], {}, "lo, cable0, range LOCALHOST (this host alone; --subnet opens it)", True, False),
+        ([], {"ROS_LOCALHOST_ONLY": "1"}, "lo, loopback alone (ROS_LOCALHOST_ONLY)", True, False),
+        ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "cable0, range OFF (nobody)", False, False),
+        (["--subnet"], {}, "cable0, range SUBNET (other hosts too)", True, True),
+        (
+            [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
+            "cable0, range SUBNET (other hosts too)", True, True,
+        ),
+        (
+            [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"},
+            "cable0, range SYSTEM_DEFAULT (other hosts too)", True, True,
+        ),
+    ],
+)  # fmt: skip
+def test_range(
+    native_path: Path, number: int, listen: Callable[..., Node],
+    options: list[str], variables: dict[str, str], reach: str, local: bool, outside: bool,
+) -> None:  # fmt: skip
+    """A node of ROS 2's default range hears the run, and packets leave the host, or not."""
+    variables = {"ROS_LOCALHOST_ONLY": "", **variables}
+    inside = isolated(CABLE)
+    with published(number, native_path, *options, inside=inside, **variables) as process:
+        assert f"on {reach}\n" in process.told[1], process.told
+        time.sleep(2.5)
+        assert (packets(process) > 0) == outside
+        node = listen(
+            "--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid))
+        )
+        if local:
+            node.hears()
+        else:
+            time.sleep(4.0)
+            assert not node.messages("/joint_states")
+        process.send_signal(signal.SIGINT)
+        assert ended(process, 130)[1] == ""
+
+
+LISTENER = """
+import sys, time
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from twodof.bag.messages import STREAM
+from twodof.publish import dds_qos, dds_type
+
+number, configuration = int(sys.argv[1]), sys.argv[2]
+domain = Domain(number, f"<CycloneDDS><Domain>{configuration}</Domain></CycloneDDS>")
+participant = DomainParticipant(number)
+name = "sensor_msgs/msg/JointState"
+topic = Topic(participant, "rt/joint_states", dds_type(name))
+reader = DataReader(participant, topic, dds_qos(STREAM, name))
+end, heard = time.monotonic() + 20.0, 0
+while heard < 50 and time.monotonic() < end:
+    heard += len(reader.take(10))
+    time.sleep(0.01)
+print(heard)
+"""
+JAZZY = """<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>{}</Discovery>"""
+SHELLS = {
+    "LOCALHOST": "<General><AllowMulticast>false</AllowMulticast></General>"
+    + JAZZY.format('<Peers><Peer address="localhost"/></Peers>'),
+    "SUBNET": JAZZY.format(""),
+}
+
+
+@pytest.mark.parametrize("variables", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}])
+@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
+def test_cyclone_dds_as_jazzy_configures_it_hears(
+    native_path: Path, number: int, shell: str, variables: dict[str, str]
+) -> None:
+    variables = {"ROS_LOCALHOST_ONLY": "", **variables}
+    with published(number, native_path, inside=isolated(CABLE), **variables) as process:
+        enter = ["nsenter", "--net", "--target", str(process.pid)]
+        command = [*enter, sys.executable, "-c", LISTENER, str(number), shell]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert int(done.stdout) >= 50
+
+
+def test_an_interface_can_be_chosen(native_path: Path, number: int) -> None:
+    chosen = (
+        "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='cable0'/></Interfaces>"
+        "</General></Domain></CycloneDDS>"
+    )
+    variables = {"ROS_LOCALHOST_ONLY": "", "CYCLONEDDS_URI": chosen}
+    with published(number, native_path, inside=isolated(CABLE), **variables) as process:
+        assert "on cable0, range LOCALHOST" in process.told[1]
+        process.send_signal(signal.SIGINT)
+        assert ended(process, 130)[1] == ""
+
+
+def test_an_interface_that_goes_and_comes_back(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    bag = tmp_path / "bag"
+    options, inside = ["--stop-time", "8", "-o", str(bag)], isolated(CABLE)
+    with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
+        enter = ("nsenter", "--net", "--target", str(process.pid))
+        node = listen("--any", "/joint_states", inside=enter)
+        node.hears()
+        for state in ("down", "up"):
+            subprocess.run([*enter, "ip", "link", "set", "cable0", state], check=True)
+            time.sleep(1.0)
+        node.hears()
+        assert ended(process)[1] == ""
+    assert len(recorded(bag)["/joint_states"]) == 801
+
+
+MEMORY = """
+import resource, sys
+from pathlib import Path
+import twodof
+from twodof.master import RealTime
+from twodof.publish import Publisher
+
+class Memory:
+    first = most = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        pass
+
+    def write(self, sample):
+        if sample.k == steps // 10:
+            self.first = self.resident()
+        elif sample.k % 1000 == 0:
+            self.most = max(self.most, self.resident())
+
+    def resident(self):
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize()
+
+steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
+run = twodof.experiment(sys.argv[1], stop_time=steps / 100)
+wire, memory = Publisher(run, scene=True), Memory()
+pace = RealTime() if paced else None
+summary = twodof.simulate(run, [wire, memory], pace=pace, steer=wire.command)
+assert summary.last.k == steps
+print(memory.most - memory.first)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_an_hour_has_flat_memory(
+    native_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
+) -> None:
+    """Half a minute without pace; in full, an hour in real time."""
+    steps = length(360_000, 40_000)
+    listen("/joint_states", "/tf", "/robot_description")
+    command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
+    done = subprocess.run(
+        [*command, "paced" if steps == 360_000 else ""],
+        env=environment(number), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    print(f"{steps} samples: memory grew by {int(done.stdout) / 2**20:.1f} MiB")
+    assert int(done.stdout) <= 10e6
+
+
+@pytest.mark.parametrize(
+    ("variables", "place"),
+    [
+        ({}, Network()),
+        ({"ROS_DOMAIN_ID": "", "ROS_LOCALHOST_ONLY": "0"}, Network()),
+        ({"ROS_DOMAIN_ID": str(LAST_DOMAIN)}, Network(LAST_DOMAIN)),
+        ({"ROS_STATIC_PEERS": "10.0.0.5;localhost;"}, Network(peers=("10.0.0.5", "localhost"))),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, Network(range="OFF")),
+        (
+            {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
+            Network(loopback=True),
+        ),
+    ],
+)
+def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> None:
+    assert network(variables) == place
+
+
+@pytest.mark.parametrize(
+    ("variables", "culprit"),
+    [
+        ({"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233', not a number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "-1"}, "ROS_DOMAIN_ID is '-1'"),
+        ({"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
+        ({"ROS_DOMAIN_ID": "²"}, "ROS_DOMAIN_ID is '²'"),
+        ({"ROS_LOCALHOST_ONLY": "yes"}, "ROS_LOCALHOST_ONLY is 'yes', not 0 or 1"),
+        (
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"},
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is 'localhost', not one of LOCALHOST, SUBNET, OFF",
+        ),
+        (
+            {
+                "CYCLONEDDS_URI": "<CycloneDDS><Domain><General><Interfaces>"
+                '<NetworkInterface name="nope0"/></Interfaces></General></Domain></CycloneDDS>'
+            },
+            r"nope0: does not match an available interface.*CYCLONEDDS_URI .*: lo",
+        ),
+        ({"CYCLONEDDS_URI": "<CycloneDDS></Domain>"}, "parser error.*correct CYCLONEDDS_URI"),
+        ({"CYCLONEDDS_URI": "file:///nowhere.xml"}, "nowhere.xml.*correct CYCLONEDDS_URI"),
+        ({"CYCLONEDDS_URI": "<Größe/>"}, "cannot be opened.*correct CYCLONEDDS_URI"),
+        ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
+    ],
+)
+def test_a_network_that_cannot_be(
+    native_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    variables: dict[str, str], culprit: str,
+) -> None:  # fmt: skip
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert main(["publish", str(native_path), "--stop-time", "0.1"]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert re.match(f"twodof: error: .*{culprit}", line), line
+
+
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--rate", "0"], "--rate 0"),
+        (["--rate", "nan"], "--rate nan"),
+        (["--rate", "inf"], "--rate inf"),
+        (["--overwrite"], "name it with -o"),
+        (["--stop-time", "0.005"], "no whole number of steps"),
+    ],
+)
+def test_options_that_cannot_be(
+    native_path: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
+) -> None:
+    assert main(["publish", str(native_path), *options]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("twodof: error: ") and culprit in line
+
+
+def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
+    code = "import sys; sys.modules['cyclonedds'] = None; " + TWODOF[2]
+    command = [sys.executable, "-c", code, "publish", str(native_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert "install the package 'cyclonedds' (the extra 'ros')" in line
