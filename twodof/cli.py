@@ -723,7 +723,7 @@ def _live(options: argparse.Namespace) -> int:
     fmu = _fast_fmu(options)
     with _asked_to_stop() as asked:
         bags = live(
-            fmu, asked, lambda url: _open(options, url),
+            fmu, asked, lambda url: _open(options, url, fmu=fmu),
             host=options.host, port=options.port, step=options.step,
             settings=parse_settings(options.settings), bag=options.output,
             command_line=options.command_line,
@@ -735,10 +735,14 @@ def _live(options: argparse.Namespace) -> int:
     return INTERRUPTED
 
 
-def _open(options: argparse.Namespace, url: str, remarks: Sequence[str] = ()) -> None:
+def _open(
+    options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None
+) -> None:
     for remark in remarks:
         print(f"WARNING: {remark}", file=sys.stderr)
     print(f"open  {url} (Ctrl-C ends)", flush=True)
+    if fmu is not None:
+        print(f"FMU   {fmu}", flush=True)
     if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
         import webbrowser
 

@@ -175,6 +175,7 @@ def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
     return axes.pcolormesh(
         _edges(cells.columns.to_numpy()), _edges(cells.index.to_numpy()), values,
         norm=_norm(values.compressed()), cmap="viridis", rasterized=values.size > 2500,
+        edgecolors="face", linewidth=0.3,  # else readers of SVG and PDF show seams
     )  # fmt: skip
 
 
