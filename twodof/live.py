@@ -31,7 +31,7 @@ from .errors import BagError, PageError, SimulationError, TwoDofError
 from .fmu import Fmu, load_fmu, read_resource, read_urdf
 from .inputs import Setting, Value, resolve
 from .master import Experiment, RealTime, Sample, endless, samples
-from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Figure, Page, Plot, Readout
+from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Figure, Page, Plot, Readout, Switch
 from .plant import Robot, RobotError, load_robot
 
 Array = NDArray[np.float64]
@@ -356,17 +356,14 @@ class Controls:
 
     def _add_controls(self, robot: Robot) -> None:
         page, gui, fmu = self._page, self._page.gui, self._fmu
-        self._play_button = gui.add_button("Pause")
-        self._play_button.on_click(
-            lambda event: self._tell("play", self._play_button.label == "Play")
-        )
+        tell = self._tell
+        self._play = Switch(page, "Play", "Pause", partial(tell, "play"), True)
         others = gui.add_button_group("", ("Single step", "Reset"))
         others.on_click(
             lambda event: self._tell("step" if others.value == "Single step" else "reset")
         )
-        self._record_button = gui.add_button("Record", color="red")
-        self._record_button.on_click(
-            lambda event: self._tell("record", self._record_button.label == "Record")
+        self._record = Switch(
+            page, "Record", "Stop recording", partial(tell, "record"), False, color="red"
         )
         self._readout = Readout(page, fmu.joints)
 
@@ -455,10 +452,9 @@ class Controls:
 
     def _show_numbers(self, now: float) -> None:
         news, sample = self._news, self._news.sample
-        self._play_button.label = "Pause" if news.playing else "Play"
-        self._record_button.label = (
-            f"Stop recording ({news.recorded} samples)" if news.recorded else "Record"
-        )
+        self._play.show(news.playing)
+        samples = f" ({news.recorded} samples)" if news.recorded else ""
+        self._record.show(news.recorded > 0, f"Stop recording{samples}")
         if not news.playing or (self._past and sample.t < self._past[-1][1]):
             self._past.clear()
         self._past.append((now, sample.t))

@@ -221,6 +221,37 @@ class _Server(viser.ViserServer):  # type: ignore[misc, unused-ignore]
         return None
 
 
+class Switch:
+    """Two buttons in one place, of which one is shown; a click means what its button said.
+
+    A single button with two labels would mean the other one while the label is on its way.
+
+    Args:
+        page: the page.
+        on, off: labels, of what turns it on and off.
+        change: told what was asked for.
+        state: which it is at first.
+        options: of viser's buttons.
+    """
+
+    def __init__(
+        self, page: Page, on: str, off: str, change: Callable[[bool], None], state: bool,
+        **options: Any,
+    ) -> None:  # fmt: skip
+        self._buttons = (page.gui.add_button(on, **options), page.gui.add_button(off, **options))
+        self._buttons[0].on_click(lambda event: change(True))
+        self._buttons[1].on_click(lambda event: change(False))
+        self.show(state)
+
+    def show(self, state: bool, off: str | None = None) -> None:
+        """Show the state that it is in, and another label of what turns it off."""
+        for button, visible in zip(self._buttons, (not state, state)):
+            if button.visible != visible:
+                button.visible = visible
+        if off is not None:
+            self._buttons[1].label = off
+
+
 class Line:
     """A line in the scene."""
 

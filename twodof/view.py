@@ -31,6 +31,7 @@ from .page import (
     Plot,
     ReadMesh,
     Readout,
+    Switch,
 )
 from .track import read_tracks
 
@@ -160,8 +161,14 @@ class Replay:
         self._sent: deque[float] = deque(maxlen=SENT)  # to the slider
         self._jump: float | None = 0.0
         step = 0.001 if self._duration >= 1.0 else max(self._duration / 1000, 1e-9)
+
+        def pressed(playing: bool) -> None:
+            if playing and self._time >= self._duration:
+                self._jump = 0.0
+            self._playing = playing
+
         self._slider = gui.add_slider("time, s", 0.0, max(self._duration, step), step, 0.0)
-        self._button = gui.add_button("Pause")
+        self._switch = Switch(page, "Play", "Pause", pressed, True)
         speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
 
         def scrubbed(event: Any) -> None:
@@ -173,16 +180,10 @@ class Replay:
                 return
             self._jump, self._playing = time, False
 
-        def pressed(event: Any) -> None:
-            self._playing = self._button.label == "Play"
-            if self._playing and self._time >= self._duration:
-                self._jump = 0.0
-
         def sped(event: Any) -> None:
             self._speed = SPEEDS[speed.value]
 
         self._slider.on_update(scrubbed)
-        self._button.on_click(pressed)
         speed.on_update(sped)
         names = [joint.name for joint in track.joints]
         self._readout = Readout(page, names)
@@ -231,7 +232,7 @@ class Replay:
     def play(self, stop: Callable[[], bool]) -> None:
         """Replay, as the page's controls say, until ``stop`` is true."""
         marked = before = time.perf_counter()
-        labelled, settled = True, inf
+        settled = inf
         while not stop():
             now = time.perf_counter()
             if self._jump is not None:
@@ -249,9 +250,7 @@ class Replay:
                 self._time = min(self._time + (now - before) * self._speed, self._duration)
                 self._playing = self._time < self._duration
             before = now
-            if self._playing != labelled:
-                labelled = self._playing
-                self._button.label = "Pause" if labelled else "Play"
+            self._switch.show(self._playing)
             if self._time != self._shown:
                 k = nearest(self._t, self._time)
                 if self._playing or self._time == self._duration:
