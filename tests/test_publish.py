@@ -323,11 +323,14 @@ def test_a_point_is_the_target_within_two_steps(
     options = ["--scene", "--rate", str(1 / step), "-o", str(bag), "--set", "Kp=80"]
     with published(number, native_path, *options) as process:
         node.hears("/target")
-        node.point(topic, frame, 0.125, 0.17, 0.9)
-        node.until(lambda: node.messages("/target")[-1][1] == [0.125, 0.17, 0])
+        for _ in range(8):  # one that comes before the run has discovered its sender is lost
+            node.point(topic, frame, 0.125, 0.17, 0.9)
+            node.hears("/target", 40)
+            if node.messages("/target")[-1][1] == [0.125, 0.17, 0]:
+                break
         process.send_signal(signal.SIGINT)
         ended(process, 130)
-    ((sent,),) = [[it[2] for it in node.told if it[0] == "sent"]]
+    sent = [it[2] for it in node.told if it[0] == "sent"][-1]
     heard = next(m for m in node.messages("/target") if m[1][0] == 0.125)
     assert 0 < stamp_of(heard[0]) - sent <= 2 * step * SECOND
     ((t, values),) = json.loads((bag / "run.json").read_text())["input_changes"]

@@ -452,7 +452,7 @@ def look(done, runs):
 if __name__ == "__main__":
     fmu, output, runs = sys.argv[1], sys.argv[2], int(sys.argv[3])
     seen = []
-    twodof.sweep(fmu, ranges={"Kp": (10, 90)}, random=runs, stop_time=0.2, output=output,
+    twodof.sweep(fmu, ranges={"Kp": (10, 90)}, random=runs, stop_time=0.5, output=output,
                  progress=look)
     late = [row for row in seen if row[0] >= 2]
     print(late[0][1], max(row[2] for row in late) - late[0][2], seen[-1][2] - seen[1][2])
@@ -464,7 +464,7 @@ if __name__ == "__main__":
     )  # fmt: skip
     first, growth, all_growth = map(float, done.stdout.split())
     print(f"coordinator: {growth:.1f} MiB from run {first:.0f} to {runs}; {all_growth:.1f} in all")
-    assert first < 0.7 * runs
+    assert first < 0.9 * runs
     assert growth < 8.0  # it goes up and down by 5
 
 
