@@ -59,9 +59,7 @@ def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: b
         for k in range(n):
             bag.write(sample(run, k))
             if k % BATCH == 0:
-                bag._stored.clear()
-                bag._due.set()
-                bag._stored.wait()
+                bag._flush()
         shutil.copytree(living, folder / "bag")
     shutil.rmtree(living.parent)
     return folder / "bag"

@@ -740,9 +740,8 @@ def _open(
 ) -> None:
     for remark in remarks:
         print(f"WARNING: {remark}", file=sys.stderr)
-    print(f"open  {url} (Ctrl-C ends)", flush=True)
-    if fmu is not None:
-        print(f"FMU   {fmu}", flush=True)
+    what = f"{fmu}; " if fmu is not None else ""
+    print(f"open  {url} ({what}Ctrl-C ends)", flush=True)
     if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
         import webbrowser
 

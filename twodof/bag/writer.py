@@ -6,12 +6,14 @@ import errno
 import os
 import shutil
 import sqlite3
+import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Thread
+from queue import Empty, SimpleQueue
+from threading import Thread
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
@@ -30,6 +32,7 @@ MOST_CHANGES = 100_000  # of inputs, that the provenance of an open-ended run ha
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
+PAUSE = 0.0005  # s between two looks at how far the thread is
 
 
 class Bag:
@@ -112,8 +115,9 @@ class Bag:
             raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
         self._queue: deque[tuple[Connection, int, Serialised]] = deque()
         self._given = self._taken = 0  # bytes, counted by one thread each
-        self._due, self._stored, self._ended = Event(), Event(), Event()
-        self._closing = self._closed = False
+        self._due: SimpleQueue[None] = SimpleQueue()
+        self._stores = 0
+        self._closing = self._closed = self._ended = False
         self._failure: Exception | None = None
         Thread(target=self._keep_storing, name="bag writer").start()
         return self
@@ -121,7 +125,7 @@ class Bag:
     def write(self, sample: Sample) -> None:
         """Write one sample: one JointState, and the scene's messages."""
         if self._failure is not None:
-            self._ended.wait()
+            self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
         stamp = self.stamps.of(sample)
         if first := not self._given:
@@ -129,9 +133,22 @@ class Bag:
         self._give(self._messages.of(sample, stamp), stamp)
         self._note(sample)
         if first or self._given - self._taken > BATCH_SIZE:
-            self._stored.clear()
-            self._due.set()
-            self._stored.wait()
+            self._flush()
+
+    def _flush(self) -> None:
+        """Have the thread store what is queued."""
+        before = self._stores
+        self._due.put(None)
+        self._wait(lambda: self._stores > before)
+
+    def _wait(self, done: Callable[[], bool]) -> None:
+        """Wait until something is done, or the thread has ended.
+
+        Without a lock, an event or a join: Ctrl-C, which Python raises between any two instructions
+        of this thread, would leave a lock taken for ever if it came when that had just been.
+        """
+        while not (done() or self._ended):
+            time.sleep(PAUSE)
 
     def _note(self, sample: Sample) -> None:
         """Remember what changed inputs since the sample before, to which it was the answer."""
@@ -160,8 +177,8 @@ class Bag:
                 self._complete()
         finally:
             self._closing = True
-            self._due.set()
-            self._ended.wait()  # interrupted or not, the thread ends its work; not so Thread.join
+            self._due.put(None)
+            self._wait(lambda: False)  # if this is interrupted, the thread still ends its work
         if self._failure is not None and not isinstance(exception, BagError):
             raise self._error(self._failure) from self._failure
 
@@ -204,12 +221,12 @@ class Bag:
         try:
             closing = False
             while not closing:
-                self._due.wait(FLUSH_PERIOD)
-                self._due.clear()
+                with suppress(Empty):
+                    self._due.get(timeout=FLUSH_PERIOD)
                 if closing := self._closing:
                     (self.path / RESERVE).unlink(missing_ok=True)
                 self._store()
-                self._stored.set()
+                self._stores += 1
         except Exception as error:  # raised in the main thread
             self._failure = error
         try:
@@ -218,8 +235,7 @@ class Bag:
             self._failure = error
         finally:
             os.close(self._lock)
-            self._stored.set()
-            self._ended.set()
+            self._ended = True
 
     def _store(self) -> None:
         while self._queue:
