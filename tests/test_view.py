@@ -122,7 +122,11 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     scrub(page, 0.5)
     press(page, "Play")
     until(page, lambda found: numbers(found["time"])[0] > 0.8)
-    page.get_by_role("slider").first.press("Home")
+    for _ in range(5):  # a slow browser may lose what is done to a slider that moves
+        page.get_by_role("slider").first.press("Home")
+        page.wait_for_timeout(500)
+        if rows(page)["time"] == "0.000 s":
+            break
     held = until(page, lambda found: found["time"] == "0.000 s")
     page.get_by_role("button", name="Play").wait_for()
     page.wait_for_timeout(300)

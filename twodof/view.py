@@ -39,7 +39,8 @@ Array = NDArray[np.float64]
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}
 SETTLING = 0.3  # s after which scrubbing is over
-SENT = 30  # times that a browser may still send back, those of a second
+SLIDER_RATE = 4.0  # Hz: what the user does with the slider is lost where a browser is sent too much
+SENT = 8  # times that a browser may still send back, those of two seconds
 TRAIL_TIME = 1.5  # s
 TRAIL_POINTS, PATH_POINTS = 60, 1500
 MOST_FRAMES = 2000
@@ -166,6 +167,7 @@ class Replay:
             if playing and self._time >= self._duration:
                 self._jump = 0.0
             self._playing = playing
+            self._echoed = True  # the slider is a little behind
 
         self._slider = gui.add_slider("time, s", 0.0, max(self._duration, step), step, 0.0)
         self._switch = Switch(page, "Play", "Pause", pressed, True)
@@ -231,7 +233,7 @@ class Replay:
 
     def play(self, stop: Callable[[], bool]) -> None:
         """Replay, as the page's controls say, until ``stop`` is true."""
-        marked = before = time.perf_counter()
+        marked = slid = before = time.perf_counter()
         settled = inf
         while not stop():
             now = time.perf_counter()
@@ -253,7 +255,9 @@ class Replay:
             self._switch.show(self._playing)
             if self._time != self._shown:
                 k = nearest(self._t, self._time)
-                if self._playing or self._time == self._duration:
+                late = self._playing and now - slid > 1 / SLIDER_RATE
+                if late or self._time == self._duration:
+                    slid = now
                     self._sent.append(self._time)
                     self._slider.value = self._time
                 self.show(k)
