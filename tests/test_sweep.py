@@ -215,6 +215,19 @@ def test_bad_input_gets_one_line(
     assert [path.name for path in tmp_path.iterdir()] in (["taken"], [])
 
 
+@pytest.mark.parametrize("package", ["pandas", "pyarrow", "distributed"])
+def test_a_missing_extra_is_named(package: str, native_path: Path, tmp_path: Path) -> None:
+    code = f"import sys; sys.modules[{package!r}] = None; {COMMAND[2]}"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "sweep", str(native_path), "--grid", "Kp=1:2:2"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert package in line and "install the extra 'sweep'" in line
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- one instance, any outcome ---
 
 

@@ -7,10 +7,9 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas
 
 from ..bag.provenance import versions
 from ..fmu import Fmu, load_fmu
@@ -20,6 +19,9 @@ from .cluster import Cluster
 from .design import make_design
 from .results import Results, read_sweep
 from .runner import Job, Point
+
+if TYPE_CHECKING:
+    import pandas
 
 PACKAGES = ("numpy", "fmpy", "distributed", "pandas", "pyarrow")
 

@@ -11,10 +11,9 @@ from functools import partial
 from itertools import combinations
 from math import ceil
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas
 from numpy.typing import NDArray
 
 from ..errors import PlotError
@@ -28,6 +27,9 @@ from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 
