@@ -177,7 +177,9 @@ def press(page: Page, name: str) -> None:
 def type_into(page: Page, label: str, value: float) -> None:
     """Type a number into the field or the slider's field of that label."""
     field = field_of(page, label)
-    field.fill(f"{value:g}")  # "0.0" is taken for a number that is yet to be ended
+    field.press("Control+a")
+    # as by pasting: what Playwright's fill does is lost by a field that was changed since it did so
+    page.keyboard.insert_text(f"{value:g}")  # "0.0" is taken for a number that is yet to be ended
     field.press("Enter")
     page.wait_for_timeout(150)  # the page sends the latest of what changes faster than 50 ms
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import inf, nextafter
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -39,8 +39,7 @@ Array = NDArray[np.float64]
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}
 SETTLING = 0.3  # s after which scrubbing is over
-SLIDER_RATE = 4.0  # Hz: what the user does with the slider is lost where a browser is sent too much
-SENT = 8  # times that a browser may still send back, those of two seconds
+SLIDER_RATE = 4.0  # Hz: a slider that moves more often is hard to use in a slow browser
 TRAIL_TIME = 1.5  # s
 TRAIL_POINTS, PATH_POINTS = 60, 1500
 MOST_FRAMES = 2000
@@ -157,30 +156,18 @@ class Replay:
         """The control panel: time line, play, speed, readout and plots."""
         page, gui, track = self._page, self._page.gui, self._track
         self._duration = float(self._t[-1])
-        self._time = self._shown = -1.0
-        self._playing, self._speed, self._echoed = True, 1.0, False
-        self._sent: deque[float] = deque(maxlen=SENT)  # to the slider
-        self._jump: float | None = 0.0
+        self._time, self._playing, self._speed = 0.0, True, 1.0
+        self._slid, self._due = 0.0, inf  # when the slider was moved, and is to be
+        self._asked: SimpleQueue[bool | float] = SimpleQueue()
+        """By the user: to play, to pause, or a time, s."""
         step = 0.001 if self._duration >= 1.0 else max(self._duration / 1000, 1e-9)
-
-        def pressed(playing: bool) -> None:
-            if playing and self._time >= self._duration:
-                self._jump = 0.0
-            self._playing = playing
-            self._echoed = True  # the slider is a little behind
-
         self._slider = gui.add_slider("time, s", 0.0, max(self._duration, step), step, 0.0)
-        self._switch = Switch(page, "Play", "Pause", pressed, True)
+        self._switch = Switch(page, "Play", "Pause", self._asked.put, True)
         speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1 ×")
 
-        def scrubbed(event: Any) -> None:
-            time = float(self._slider.value)
-            if event.client is None:  # moved by the replay itself
-                return
-            if any(abs(time - sent) < step for sent in tuple(self._sent)):
-                self._echoed = True  # a field that has the focus sends back what it was sent
-                return
-            self._jump, self._playing = time, False
+        async def scrubbed(event: Any) -> None:  # at once: the value is still the user's
+            if event.client is not None:  # else moved by the replay itself
+                self._asked.put(float(self._slider.value))
 
         def sped(event: Any) -> None:
             self._speed = SPEEDS[speed.value]
@@ -233,41 +220,50 @@ class Replay:
 
     def play(self, stop: Callable[[], bool]) -> None:
         """Replay, as the page's controls say, until ``stop`` is true."""
-        marked = slid = before = time.perf_counter()
-        settled = inf
+        before = drawn = time.perf_counter()
+        shown = marked = None
         while not stop():
             now = time.perf_counter()
-            if self._jump is not None:
-                self._time, self._jump = self._jump, None
-                settled = now + SETTLING
-            elif self._echoed:
-                self._echoed, settled = False, now + SETTLING
-            elif now > settled:
-                settled = inf
-                self._sent.clear()
-                if not self._playing:
-                    # what was sent while the user moved it may have come after; equal is not sent
-                    self._slider.value = nextafter(self._time, self._duration / 2)
-            elif self._playing and self._page.viewers:
-                self._time = min(self._time + (now - before) * self._speed, self._duration)
-                self._playing = self._time < self._duration
+            self._advance(now, now - before)
             before = now
             self._switch.show(self._playing)
-            if self._time != self._shown:
-                k = nearest(self._t, self._time)
-                late = self._playing and now - slid > 1 / SLIDER_RATE
-                if late or self._time == self._duration:
-                    slid = now
-                    self._sent.append(self._time)
-                    self._slider.value = self._time
+            if self._time != shown:
+                shown = self._time
+                k = nearest(self._t, shown)
                 self.show(k)
                 self._tell(k)
-                if now - marked > 1 / PLOT_RATE or not self._playing:
-                    marked = now
-                    for plot in self._plots:
-                        plot.mark(self._time)
-                self._shown = self._time
+            if self._time != marked and (now - drawn > 1 / PLOT_RATE or not self._playing):
+                marked, drawn = self._time, now
+                for plot in self._plots:
+                    plot.mark(marked)
+            if now >= self._due:
+                self._slid, self._due = now, inf
+                # equal to what the user set is not sent
+                same = self._slider.value == self._time
+                self._slider.value = (
+                    nextafter(self._time, self._duration / 2) if same else self._time
+                )
             time.sleep(1 / RATE)
+
+    def _advance(self, now: float, passed: float) -> None:
+        """Do what the user has asked for, else go on by a time that has passed, s."""
+        while not self._asked.empty():
+            asked = self._asked.get()
+            if isinstance(asked, bool):
+                self._playing = asked
+                if asked and self._time >= self._duration:
+                    self._time = 0.0
+                if not asked:
+                    self._due = now
+            else:
+                if self._playing or self._due < inf:
+                    self._due = now + SETTLING  # what was sent before may arrive after
+                self._time, self._playing = asked, False
+            passed = 0.0
+        if passed and self._playing and self._page.viewers:
+            self._time = min(self._time + passed * self._speed, self._duration)
+            self._playing = self._time < self._duration
+            self._due = min(self._due, self._slid + 1 / SLIDER_RATE) if self._playing else now
 
     # --- a file ---
 
