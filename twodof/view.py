@@ -253,8 +253,6 @@ class Replay:
                 self._playing = asked
                 if asked and self._time >= self._duration:
                     self._time = 0.0
-                if not asked:
-                    self._due = now
             else:
                 if self._playing or self._due < inf:
                     self._due = now + SETTLING  # what was sent before may arrive after
@@ -263,7 +261,7 @@ class Replay:
         if passed and self._playing and self._page.viewers:
             self._time = min(self._time + passed * self._speed, self._duration)
             self._playing = self._time < self._duration
-            self._due = min(self._due, self._slid + 1 / SLIDER_RATE) if self._playing else now
+            self._due = min(self._due, self._slid + 1 / SLIDER_RATE)
 
     # --- a file ---
 
