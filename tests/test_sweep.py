@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 
 import duckdb
 import numpy as np
@@ -501,32 +501,23 @@ def workers_of(process: int) -> list[int]:
 def test_workers_that_are_killed_cost_no_run(
     native_path: Path, length: Callable[[int, int], int]
 ) -> None:
-    runs, pause, stop_time = length(2000, 100), length(5, 2.5), length(20, 60)
+    runs, pause, part = length(2000, 100), length(5, 0), length(1, 30)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
-    expected = sweep(native_path, grid=grid, stop_time=stop_time)
-    begun, ended, killed = Event(), Event(), []
+    expected = sweep(native_path, grid=grid, stop_time=20)
+    killed = [(time.monotonic(), 0)]
     rng = random.Random(1)
 
-    def kill() -> None:
-        begun.wait()
-        while not ended.wait(pause):
-            if workers := workers_of(os.getpid()):
-                killed.append(rng.choice(workers))
-                os.kill(killed[-1], signal.SIGKILL)
+    def kill(done: int, runs: int) -> None:
+        """Each so many seconds, and runs that are done."""
+        now = time.monotonic()
+        workers = workers_of(os.getpid())
+        if workers and now >= killed[-1][0] + pause and done >= killed[-1][1] + part:
+            os.kill(rng.choice(workers), signal.SIGKILL)
+            killed.append((now, done))
 
-    thread = Thread(target=kill)
-    thread.start()
-    try:
-        found = sweep(
-            native_path, grid=grid, stop_time=stop_time,
-            progress=lambda done, runs: begun.set() if done else None,
-        )  # fmt: skip
-    finally:
-        ended.set()
-        begun.set()
-        thread.join()
-    print(f"{len(killed)} workers killed during {runs} runs")
-    assert len(killed) >= 2
+    found = sweep(native_path, grid=grid, stop_time=20, progress=kill)
+    print(f"{len(killed) - 1} workers killed during {runs} runs")
+    assert len(killed) > 2
     assert list(found["run"]) == list(range(runs))
     same(found, expected)
 
