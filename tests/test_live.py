@@ -143,10 +143,13 @@ def test_readout_tells_how_well_time_is_kept(page: Page) -> None:
 
 
 def test_plots_are_those_of_what_was_shown(page: Page) -> None:
-    """Up to the last step."""
+    """Up to the last step, and while it plays each fourth, back from some step."""
     type_into(page, "x", 0.2)
     type_into(page, "y", 0.05)
-    seen = play(page, 1.0)
+    press(page, "Play")
+    seen = [found for found in watch(page, 1.0, least=20) if time_of(found) > 0.0]
+    (_, moving), _ = page.evaluate(browser.PLOTS)
+    pause(page)
     found = rows(page)
     count = round(100 * time_of(found)) + 1
     drawn = f"() => ({browser.PLOTS})().every(([_, [age]]) => age.length === {count})"
@@ -160,6 +163,10 @@ def test_plots_are_those_of_what_was_shown(page: Page) -> None:
             numbers(moment["joint1"] + moment["joint2"]), abs=ROUNDED
         )
         assert error[k] == pytest.approx(numbers(moment["error"])[0], rel=1e-3)
+    back = range(0, -4 * len(moving[0]), -4)
+    assert moving[0] == pytest.approx(0.01 * np.array(back[::-1]))
+    ends = [k for k, value in enumerate(q1) if value == moving[1][-1]]
+    assert [q2[k + offset] for k in ends for offset in back[::-1]] == moving[2]
 
 
 def test_gains_are_those_of_the_sliders(page: Page) -> None:

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import chain, count
-from math import dist, isfinite
+from math import dist, inf, isfinite
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -40,6 +40,9 @@ Change = Callable[[dict[str, Setting]], None]
 """Asks for inputs by name."""
 
 PLOTTED = 10.0  # s
+PLOT_POINTS = 250  # while it plays: drawing holds a browser up
+AWAITED = 0.3  # s after a change for which the arm comes first,
+LONGEST = 1.0  # s, and the plots wait at most
 TRAIL_POINTS = 45
 MOST_ROWS = 10_000  # that wait for a page to ask
 WINDOW = 1.0  # s over which the real-time factor is taken
@@ -291,6 +294,7 @@ class Controls:
             raise PageError(f"'{fmu.path}': {error}") from error
         self._page, self._fmu, self._starts, self._loop = page, fmu, start_values, loop
         self._sending = Lock()
+        self._changed = -inf
         self._news: News = self._ask("more", False)
         self._past: deque[tuple[float, float]] = deque()  # wall clock and time, s
         self._step, self._most = step, max(2, round(PLOTTED / step))
@@ -300,6 +304,8 @@ class Controls:
         self._add_controls(robot)
 
     def _tell(self, order: str, value: Any = None) -> None:
+        if order == "change":
+            self._changed = time.perf_counter()
         with self._sending:
             self._loop.send((order, value))
 
@@ -310,7 +316,8 @@ class Controls:
     def show(self) -> None:
         """Show what the loop tells, until it ends."""
         trail: deque[Array] = deque(maxlen=TRAIL_POINTS)
-        shown, plotted, since = -1.0, -1.0, 0.0
+        shown, since = -1.0, 0.0
+        plotted: tuple[float, bool] | None = None
         while True:
             begin = time.perf_counter()
             news: News = self._ask("more", self._page.viewers > 0)
@@ -318,7 +325,7 @@ class Controls:
             if news.again:
                 trail.clear()
                 self._rows = self._rows[:0]
-                shown = plotted = -1.0
+                shown, plotted = -1.0, None
             if news.rows:
                 self._rows = np.concatenate([self._rows, news.rows])[-self._most :]
             if sample.t != shown:
@@ -327,11 +334,14 @@ class Controls:
                     self._figure.pose(sample.q)
                     self._trail.show(np.array(trail))
             self._show_numbers(begin)
-            if sample.t != plotted and begin - since > 1 / PLOT_RATE:
-                plotted, since = sample.t, begin
-                age = np.arange(1.0 - len(self._rows), 1.0) * self._step
-                self._plots[0].show(age, self._rows[:, :-1])
-                self._plots[1].show(age, self._rows[:, -1:])
+            pause = 1 / PLOT_RATE if begin - self._changed > AWAITED else LONGEST
+            if (sample.t, news.playing) != plotted and begin - since > pause:
+                plotted, since = (sample.t, news.playing), begin
+                thin = max(1, self._most // PLOT_POINTS) if news.playing else 1
+                rows = self._rows[::-1][::thin][::-1]
+                age = np.arange(1.0 - len(rows), 1.0) * self._step * thin
+                self._plots[0].show(age, rows[:, :-1])
+                self._plots[1].show(age, rows[:, -1:])
             shown = sample.t
             for title, text in news.notes:
                 self._page.notify(title, text)

@@ -42,7 +42,7 @@ ReadMesh = Callable[[str], bytes | None]
 
 HOST, PORT = "127.0.0.1", 8080
 RATE = 30.0  # Hz, of what moves
-PLOT_RATE = 8.0  # Hz, of what is drawn anew
+PLOT_RATE = 4.0  # Hz, of what is drawn anew
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of Okabe & Ito, "Color universal design", 2008, as in the plots."""
 NO_MATERIAL = (0.62, 0.66, 0.70)
