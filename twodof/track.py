@@ -306,23 +306,33 @@ def _in_robot_order(run: Run, robot: Robot, names: Sequence[str], values: Array)
 
 
 def _motion(robot: Robot, q: Array) -> Motion:
-    model, frame = robot.model, robot.frame_id
-    data = model.createData()
-    placement = data.oMf[frame]
-    path = np.empty((len(q), 3))
-    for row, configuration in zip(path, q):
-        pin.forwardKinematics(model, data, configuration)
-        pin.updateFramePlacement(model, data, frame)
-        row[:] = placement.translation
     return Motion(
         robot=robot.name,
         frame=robot.frame,
         root=robot.root,
-        path=path,
+        path=_path(robot, q),
         start=_skeleton(robot, q[0]),
         end=_skeleton(robot, q[-1]),
         reach=_reach(robot),
     )
+
+
+def _path(robot: Robot, q: Array) -> Array:
+    """Positions of the frame in the root frame, N × 3, m; q is N × joints.
+
+    For all samples at once, as a call of Pinocchio for each takes ten times as long. A joint turns
+    a point p about its axis a by Rodrigues' formula, p + sin(q) a × p + (1 - cos(q)) a × (a × p).
+    """
+    model = robot.model
+    path = np.tile(model.frames[robot.frame_id].placement.translation, (len(q), 1))
+    for i in reversed(_chain(robot)[1:]):
+        joint, placement = model.joints[i], model.jointPlacements[i]
+        slide, axis = np.reshape(joint.createData().S, (2, 3))
+        across, moved = pin.skew(axis).T, q[:, joint.idx_q, None]
+        turned = path @ across
+        path += np.sin(moved) * turned + (1.0 - np.cos(moved)) * (turned @ across) + moved * slide
+        path = path @ placement.rotation.T + placement.translation
+    return path
 
 
 def _chain(robot: Robot) -> list[int]:
