@@ -31,7 +31,8 @@ from .errors import BagError, PageError, SimulationError, TwoDofError
 from .fmu import Fmu, load_fmu, read_resource, read_urdf
 from .inputs import Setting, Value, resolve
 from .master import Experiment, RealTime, Sample, endless, samples
-from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Figure, Page, Plot, Readout, Switch
+from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Page, Plot, Readout, Switch
+from .page_robot import PageRobot
 from .plant import Robot, RobotError, load_robot
 
 Array = NDArray[np.float64]
@@ -299,7 +300,7 @@ class Controls:
         self._past: deque[tuple[float, float]] = deque()  # wall clock and time, s
         self._step, self._most = step, max(2, round(PLOTTED / step))
         self._rows = np.array(self._news.rows[-1:])
-        self._figure = Figure(page, urdf, fmu.joints, fmu.frame, partial(read_resource, fmu))
+        self._robot = PageRobot(page, urdf, fmu.joints, fmu.frame, partial(read_resource, fmu))
         self._set_scene()
         self._add_controls(robot)
 
@@ -329,9 +330,9 @@ class Controls:
             if news.rows:
                 self._rows = np.concatenate([self._rows, news.rows])[-self._most :]
             if sample.t != shown:
-                trail.append(self._figure.end_effector(sample.q))
+                trail.append(self._robot.end_effector(sample.q))
                 with self._page.atomic():
-                    self._figure.pose(sample.q)
+                    self._robot.pose(sample.q)
                     self._trail.show(np.array(trail))
             self._show_numbers(begin)
             pause = 1 / PLOT_RATE if begin - self._changed > AWAITED else LONGEST
@@ -350,11 +351,11 @@ class Controls:
     def _set_scene(self) -> None:
         fmu, sample = self._fmu, self._news.sample
         starts = self._starts
-        end = self._figure.end_effector(sample.q)
+        end = self._robot.end_effector(sample.q)
         self._target_place = end.copy()
         for axis, value in zip(fmu.axes, _target(sample)):
             self._target_place["xyz".index(axis)] = value
-        shown = np.vstack([self._figure.points(sample.q), end, self._target_place])
+        shown = np.vstack([self._robot.points(sample.q), end, self._target_place])
         gravity = [-float(starts.get(f"gravity[{i}]", 0.0)) for i in (1, 2, 3)]
         middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
         around = middle + 1.35 * (shown - middle)  # room to drag the target
@@ -362,7 +363,7 @@ class Controls:
         self._target = self._page.add_target(size, fmu.axes, draggable=True)
         self._target.position = self._target_place
         self._trail = self._page.add_line("/trail", TRAIL, 4.0)
-        self._figure.pose(sample.q)
+        self._robot.pose(sample.q)
 
     def _add_controls(self, robot: Robot) -> None:
         page, gui, fmu = self._page, self._page.gui, self._fmu

@@ -26,13 +26,12 @@ from .page import (
     PORT,
     RATE,
     TRAIL,
-    Figure,
     Page,
     Plot,
-    ReadMesh,
     Readout,
     Switch,
 )
+from .page_robot import PageRobot, ReadMesh
 from .track import read_tracks
 
 Array = NDArray[np.float64]
@@ -84,13 +83,13 @@ class Replay:
         self._track = track = read_tracks([run], urdf=urdf, frame=frame)[0]
         self._t = track.t
         self.remarks: list[str] = []
-        self._figure: Figure | None = None
+        self._figure: PageRobot | None = None
         if track.motion is None:
             self.remarks.append(f"'{run.path}' carries no robot; give one with --urdf")
         else:
             text, read = self._robot(run, urdf, mesh_dir, fmu)
             names = [joint.name for joint in track.joints]
-            self._figure = Figure(page, text, names, track.motion.frame, read)
+            self._figure = PageRobot(page, text, names, track.motion.frame, read)
             if self._figure.missing:
                 missing = ", ".join(self._figure.missing[:3])
                 self.remarks.append(f"without the meshes {missing}; give them with --fmu or --urdf")
