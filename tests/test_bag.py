@@ -44,6 +44,7 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from ruamel.yaml import YAML
+from sinks import Collector
 
 import twodof
 from twodof.errors import BagError
@@ -66,17 +67,6 @@ TYPE_HASHES = {
         "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"
     ),
 }
-
-
-class Collector(list[Sample]):
-    """The sink that keeps what it is given."""
-
-    write = list.append
-
-    def __enter__(self) -> Collector:
-        return self
-
-    def __exit__(self, *exception: object) -> None: ...
 
 
 class Recording(NamedTuple):
@@ -753,26 +743,21 @@ def stream(file: Path) -> Iterator[int]:
 
 
 MEMORY = """
-import resource, sys
-from pathlib import Path
+import sys
 import twodof
+from sinks import Memory
 from twodof.master import Sample
-
-def resident():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu)
 inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
-most = 0
+memory = Memory(1000)
 with twodof.Bag(path, run, storage=storage) as bag:
     for k in range(20_000):
-        bag.write(Sample(k, run.time(k), (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs))
-        if k == 1000:
-            first = resident()
-        elif k % 500 == 0:
-            most = max(most, resident())
-print(most - first)
+        sample = Sample(k, run.time(k), (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs)
+        bag.write(sample)
+        memory.write(sample)
+print(memory.growth)
 """
 
 
@@ -780,6 +765,8 @@ print(most - first)
 @both_storages
 def test_memory_does_not_grow_with_the_run(fmu_path: Path, tmp_path: Path, storage: str) -> None:
     command = [sys.executable, "-c", MEMORY, str(fmu_path), str(tmp_path / "bag"), storage]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+    )
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000

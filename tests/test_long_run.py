@@ -17,35 +17,16 @@ import twodof
 DAY = 8_640_000  # steps of 10 ms
 MIB = 1024**2
 RUN = """
-import resource, sys
-from pathlib import Path
+import sys
 import twodof
-
-class Memory:
-    first = most = 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
-        pass
-
-    def write(self, sample):
-        if sample.k == 4000:
-            self.first = self.resident()
-        elif sample.k % 4000 == 0:
-            self.most = max(self.most, self.resident())
-
-    def resident(self):
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * resource.getpagesize()
+from sinks import Memory
 
 fmu, path, storage, steps, start = sys.argv[1:]
 run = twodof.experiment(fmu, stop_time=int(steps) / 100)
-memory = Memory()
+memory = Memory(4000)
 bag = twodof.Bag(path, run, storage=storage, stamp_start=int(start))
 summary = twodof.simulate(run, [bag, memory])
-print(memory.most - memory.first, summary.wall_time)
+print(memory.growth, summary.wall_time)
 """
 
 
@@ -58,7 +39,10 @@ def test_a_day_has_flat_memory_and_exact_stamps(
     steps = length(DAY, 60_000)
     bag = tmp_path / "bag"
     command = [sys.executable, "-c", RUN, str(native_path), str(bag), storage, str(steps)]
-    done = subprocess.run([*command, str(START)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [*command, str(START)], cwd=Path(__file__).parent, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
     growth, wall_time = map(float, done.stdout.split())
     size = sum(file.stat().st_size for file in bag.iterdir())
     print(

@@ -10,6 +10,7 @@ import pytest
 from harness import changed_plant, in_child_process
 from oracles import position, task_error
 from pythonfmu import FmuBuilder
+from sinks import Memory
 
 import twodof
 from twodof.errors import FmuError, InputError, SimulationError
@@ -282,16 +283,7 @@ def test_an_fmu_for_another_platform_says_which(fmu_path, tmp_path):
 @in_child_process
 def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
     """100,000 steps of 1 ms (that each takes seven right-hand sides only) into a bag."""
-
-    def resident():
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
-
-    class Memory(Recorder):
-        def write(self, sample):
-            if sample.k == 1000:
-                self.early = resident()
-
     run = twodof.experiment(fmu_path, stop_time=100.0, step=1e-3)
-    memory = Memory()
+    memory = Memory(1000)
     twodof.simulate(run, [twodof.Bag(tmp_path / "bag", run), memory])
-    assert resident() - memory.early <= 5 * 1024**2
+    assert memory.growth <= 5 * 1024**2

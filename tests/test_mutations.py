@@ -34,6 +34,7 @@ from bags import assert_consistent
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.typesys import Stores, get_typestore
+from sinks import resident
 
 import twodof
 from twodof.cli import main
@@ -133,12 +134,12 @@ def serve() -> None:
             for number, file in enumerate(files, start=1):
                 os.dup2(file, number)
             run(json.loads(line))
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        before = resident()
         _, status, usage = os.wait4(child, 0)
         texts = [Path(f"/proc/self/fd/{file}").read_text("utf-8", "replace") for file in files]
         for file in files:
             os.close(file)
-        memory = usage.ru_maxrss * 1024 - pages * resource.getpagesize()
+        memory = usage.ru_maxrss * 1024 - before
         answers.write(json.dumps((os.waitstatus_to_exitcode(status), memory, *texts)) + "\n")
         answers.flush()
 

@@ -31,6 +31,7 @@ from matplotlib.text import Text
 from PIL import Image
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
+from sinks import Collector
 
 import twodof
 from twodof.cli import main
@@ -50,17 +51,6 @@ UR5_JOINTS = [
 
 
 # --- bags ---
-
-
-class Collector(list[Sample]):
-    """The sink that keeps what it is given."""
-
-    write = list.append
-
-    def __enter__(self) -> Collector:
-        return self
-
-    def __exit__(self, *exception: object) -> None: ...
 
 
 class Recording(NamedTuple):

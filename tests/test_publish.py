@@ -574,38 +574,19 @@ def test_an_interface_that_goes_and_comes_back(
 
 
 MEMORY = """
-import resource, sys
-from pathlib import Path
+import sys
 import twodof
+from sinks import Memory
 from twodof.master import RealTime
 from twodof.publish import Publisher
 
-class Memory:
-    first = most = 0
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
-        pass
-
-    def write(self, sample):
-        if sample.k == steps // 10:
-            self.first = self.resident()
-        elif sample.k % 1000 == 0:
-            self.most = max(self.most, self.resident())
-
-    def resident(self):
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * resource.getpagesize()
-
 steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
 run = twodof.experiment(sys.argv[1], stop_time=steps / 100)
-wire, memory = Publisher(run, scene=True), Memory()
+wire, memory = Publisher(run, scene=True), Memory(steps // 10)
 pace = RealTime() if paced else None
 summary = twodof.simulate(run, [wire, memory], pace=pace, steer=wire.command)
 assert summary.last.k == steps
-print(memory.most - memory.first)
+print(memory.growth)
 """
 
 
@@ -620,7 +601,8 @@ def test_an_hour_has_flat_memory(
     command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
     done = subprocess.run(
         [*command, "paced" if steps == 360_000 else ""],
-        env=environment(number), capture_output=True, text=True, check=True,
+        cwd=Path(__file__).parent, env=environment(number),
+        capture_output=True, text=True, check=True,
     )  # fmt: skip
     print(f"{steps} samples: memory grew by {int(done.stdout) / 2**20:.1f} MiB")
     assert int(done.stdout) <= 10e6

@@ -459,9 +459,9 @@ def test_memory_of_the_coordinator_is_flat(
     code = """
 import sys, twodof
 from pathlib import Path
+from sinks import resident
 def look(done, runs):
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    seen.append((len(list(Path(output).glob("part-*"))), done, pages * 4096 / 2**20))
+    seen.append((len(list(Path(output).glob("part-*"))), done, resident() / 2**20))
 if __name__ == "__main__":
     fmu, output, runs = sys.argv[1], sys.argv[2], int(sys.argv[3])
     seen = []
@@ -473,7 +473,7 @@ if __name__ == "__main__":
     runs = length(10_000, 3_000)
     done = subprocess.run(
         [sys.executable, "-c", code, str(native_path), str(tmp_path / "s"), str(runs)],
-        capture_output=True, text=True, check=True, timeout=500,
+        cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=500,
     )  # fmt: skip
     first, growth, all_growth = map(float, done.stdout.split())
     print(f"coordinator: {growth:.1f} MiB from run {first:.0f} to {runs}; {all_growth:.1f} in all")
