@@ -374,6 +374,7 @@ def test_joint_that_slides_has_its_own_units(shown: Browser, tmp_path: Path) -> 
         status, _, errors = command.interrupt()
     assert (status, errors) == (130, "")
     assert titles[0] == "position, m or rad"
+    assert (found["slide"][-2:], found["swing"][-4:]) == (" m", " rad")
     s, q = numbers(found["slide"] + found["swing"])
     x = np.array(numbers(found["end effector"]))
     assert x == pytest.approx([s + 0.3 * np.cos(q), 0.3 * np.sin(q)], abs=2 * ROUNDED)

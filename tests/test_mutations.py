@@ -915,6 +915,12 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
         lambda: mcap_of(SCHEMA, CHANNEL, record(5, struct.pack("<HIQQ", 1, 0, 1, 1),
                                                 b"\0\1\0\0", bytes(8), b"\xff" * 400))
     ),
+    "no topic in CDR": with_sql(
+        "UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"
+    ),
+    "stamps before 1970": with_sql(
+        "UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"
+    ),
     "a view of endless messages": with_sql(
         f"DROP TABLE messages; CREATE VIEW messages AS {ENDLESS}"
         " SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM r"

@@ -558,7 +558,7 @@ def _recover(options: argparse.Namespace) -> int:
     _print_table(
         ("bag", f"{done.path} ({sum(done.counts.values())} messages)"),
         *((topic, f"{count}") for topic, count in sorted(done.counts.items())),
-        *([("saved up to", done.damage)] if done.damage else []),
+        *([("damage", done.damage)] if done.damage else []),
         ("original", f"{done.original}, as it was; delete it when you are content"),
     )
     _print_next(f"twodof info {_quote(done.path)}", f"ros2 bag play {_quote(done.path)}")

@@ -385,7 +385,8 @@ class Controls:
                 self._add_gain(group, unit, change)
         if fmu.vector("tau_ext"):
             self._add_disturbance(robot, change)
-        units = " or ".join(dict.fromkeys("m" if p else "rad" for p in robot.prismatic))
+        self._units = ["m" if prismatic else "rad" for prismatic in robot.prismatic]
+        units = " or ".join(dict.fromkeys(self._units))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
         joints, error = f"position, {units}", "distance from the target, mm"
         self._plots = (
@@ -481,7 +482,10 @@ class Controls:
             "end effector": f"({', '.join(f'{value:+.5f}' for value in x)}) m",
             "target": f"({', '.join(f'{value:+.5f}' for value in target)}) m",
             "error": f"{1e3 * dist(x, target):.4g} mm",
-            **{name: f"{q:+.5f}" for name, q in zip(self._fmu.joints, sample.q)},
+            **{
+                name: f"{q:+.5f} {unit}"
+                for name, q, unit in zip(self._fmu.joints, sample.q, self._units)
+            },
         }
         self._readout.show(rows)
 

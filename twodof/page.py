@@ -324,7 +324,7 @@ class Plot:
         self._handle = page.gui.add_uplot(
             self._data(0.0), tuple(series), title=title, height=150,
             scales={"x": {"time": False}, "y": y},
-            legend={"show": False}, cursor={"show": False},
+            legend={"show": False}, cursor={"show": False}, padding=(8, 24, 0, 0),
         )  # fmt: skip
 
     def show(self, t: Array, rows: Array) -> None:

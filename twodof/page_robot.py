@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import pi
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import coal
 import numpy as np
 from numpy.typing import NDArray
 
 from .page import COLOURS, Page
-from .scene import Scene, Transform, floats, origin, quaternion
+from .scene import Scene, Transform, floats, origin, quaternion, triangles
 
 Array = NDArray[np.float64]
 ReadMesh = Callable[[str], bytes | None]
@@ -201,16 +198,10 @@ def _colour(tree: ET.Element, visual: ET.Element) -> tuple[float, float, float]:
 def _mesh(name: str, content: bytes | None, scale: Array) -> _Shape | None:
     if content is None:
         return None
-    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
-        file = Path(folder, Path(name).name)
-        file.write_bytes(content)
-        try:
-            mesh = coal.MeshLoader().load(str(file), scale)
-        except ValueError:
-            return None
-    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
-    triangles = [(corner[0], corner[1], corner[2]) for corner in corners]
-    return _Shape(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32))
+    try:
+        return _Shape(*triangles(name, content, scale))
+    except ValueError:
+        return None
 
 
 def _box(size: Array) -> _Shape:

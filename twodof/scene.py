@@ -232,23 +232,34 @@ def _principal_axes(vertices: Array) -> Array:
 
 def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Array | None:
     content = read(uri.removeprefix("package://"))
-    if content is not None:
-        with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
-            file = Path(folder, Path(uri).name)
-            file.write_bytes(content)
-            try:
-                mesh = coal.MeshLoader().load(str(file), scale)
-                vertices = np.asarray(mesh.vertices(), dtype=np.float64)
-            except ValueError as error:
-                reason = " ".join(str(error).split())  # coal's has many lines
-                logger.warning("mesh '%s' is left out of the scene: %s", uri, reason)
-                return None
+    if content is None:
+        reason = "the FMU does not carry it"
+    else:
+        try:
+            vertices, _ = triangles(uri, content, scale)
             if np.abs(vertices).max(initial=0.0) < LARGEST:  # false where one is not a number
                 return vertices
-            logger.warning("mesh '%s' is left out of the scene: it has no sound size", uri)
-            return None
-    logger.warning("mesh '%s' is left out of the scene: the FMU does not carry it", uri)
+            reason = "it has no sound size"
+        except ValueError as error:
+            reason = " ".join(str(error).split())  # coal's has many lines
+    logger.warning("mesh '%s' is left out of the scene: %s", uri, reason)
     return None
+
+
+def triangles(name: str, content: bytes, scale: Array) -> tuple[Array, NDArray[np.uint32]]:
+    """Vertices of a mesh file, V × 3 in m, and its triangles' indices, T × 3.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+        file = Path(folder, Path(name).name)
+        file.write_bytes(content)
+        # boxes along the axes: others take longer, and complain on stderr of odd triangles
+        mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
+    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
+    indices = [(corner[0], corner[1], corner[2]) for corner in corners]
+    return np.array(mesh.vertices(), dtype=np.float64), np.array(indices, dtype=np.uint32)
 
 
 def _place(part: ET.Element, pose: Array) -> None:

@@ -27,9 +27,10 @@ else:
     from backports import zstd
 
 MAX_TOPICS = 1000
-MAX_CHUNK = 256 * 1024**2  # bytes; writers cut chunks at 1 to 4 MiB
+MAX_CHUNK = 256 * 1024**2  # bytes, of a message too; writers cut chunks at 1 to 4 MiB
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, FOOTER = 3, 4, 5, 6, 2  # opcodes of the MCAP specification
+READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
 HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # with the record's head: channel, sequence, two times
 COLUMNS = "topic_id, timestamp, data"
@@ -82,7 +83,7 @@ def _mcap_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
             while position < len(chunk):
                 opcode, length = HEAD.unpack_from(chunk, position)
                 end = position + HEAD.size + length
-                if end > len(chunk):
+                if end > len(chunk) or not opcode:
                     raise DamageError(f"'{path.name}' has a damaged chunk")
                 if opcode == MESSAGE:
                     _, _, channel, _, stamp, _ = MESSAGE_HEAD.unpack_from(chunk, position)
@@ -103,15 +104,18 @@ def _mcap_records(path: Path, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
     Of a chunk, the content alone.
     """
-    size = path.stat().st_size
+    size, position = path.stat().st_size, len(MAGIC)
     while True:
-        start = file.tell()
+        start = position
         head = file.read(HEAD.size)
         if len(head) < HEAD.size:
             raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
         opcode, length = HEAD.unpack(head)
-        if opcode == 0 or length > size - file.tell():
+        position += HEAD.size + length
+        if opcode == 0 or position > size:
             raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
+        if opcode in READ and length > MAX_CHUNK:
+            raise DamageError(f"'{path.name}' has a record of {length} bytes")
         if opcode == FOOTER:
             file.seek(length, 1)
             if file.read(len(MAGIC)) != MAGIC:
@@ -119,9 +123,9 @@ def _mcap_records(path: Path, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             return
         if opcode == CHUNK:
             yield opcode, file.read(length)
-        elif opcode in (SCHEMA, CHANNEL, MESSAGE):
+        elif opcode in READ:
             yield opcode, head + file.read(length)
-        else:
+        elif length:
             file.seek(length, 1)
 
 
@@ -192,7 +196,7 @@ def _sqlite3_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
                 read += len(data) + 1
                 if read > size:  # pages that are read in a circle
                     raise DamageError(f"'{path.name}' is damaged")
-                if not isinstance(stamp, int) or not isinstance(data, bytes):
+                if not isinstance(stamp, int) or stamp < 0 or not isinstance(data, bytes):
                     raise DamageError(f"'{path.name}' is damaged")
                 yield channels[topic], stamp, data
     except sqlite3.Error as error:

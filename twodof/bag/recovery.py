@@ -38,7 +38,7 @@ class Recovered:
         path: its folder.
         original: where the folder is now that was found; None if it was whole already.
         counts: messages by topic.
-        damage: why nothing behind was saved; "" where the file merely lacks its end.
+        damage: why not all was saved; "" where the file merely lacks its end.
     """
 
     path: Path
@@ -119,6 +119,7 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
     """Write what can be read into a new bag; messages by topic, and what ended the reading."""
     damage = []
     told = folder / provenance.FILE
+    others = set()
     writer = BagWriter(new, KINDS[files[0].suffix])
     with suppress(BagError):  # damaged: the messages are worth saving without it
         if provenance.read_provenance(folder):
@@ -128,9 +129,14 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
         for file in files:
             try:
                 for channel, stamp, data in read_messages(file):
+                    if channel.serialization != "cdr":
+                        others.add(channel.topic)
+                        continue
                     writer.write(topics.connection(channel), stamp, data)
             except DamageError as error:
                 damage.append(str(error))
+    if others:
+        damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
     if told.is_file():
         shutil.copyfile(told, new / told.name)
     with Reader(new) as reader:  # whole is what another reader opens
