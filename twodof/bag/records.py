@@ -28,6 +28,8 @@ else:
 
 MAX_TOPICS = 1000
 MAX_CHUNK = 256 * 1024**2  # bytes, of a message too; writers cut chunks at 1 to 4 MiB
+LARGE_CHUNK = 32 * 1024**2  # bytes, beyond which compression is not believed that is better than
+MAX_RATIO = 100
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, FOOTER = 3, 4, 5, 6, 2  # opcodes of the MCAP specification
 READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
@@ -134,7 +136,7 @@ def _unpack(path: Path, content: bytes) -> bytes:
     _, _, size, crc, compression = _fields("QQQIs", content, 0)
     start = 28 + 4 + len(compression.encode()) + 8
     packed = content[start : start + struct.unpack_from("<Q", content, start - 8)[0]]
-    if size > MAX_CHUNK:
+    if size > min(MAX_CHUNK, LARGE_CHUNK + MAX_RATIO * len(packed)):
         raise DamageError(f"'{path.name}' has a chunk of {size} bytes")
     try:
         if compression == "zstd":
