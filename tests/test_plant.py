@@ -1,5 +1,6 @@
 """The plant against closed forms, finite differences and MuJoCo."""
 
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -331,3 +332,15 @@ def test_gravity_is_a_parameter():
     plant.prepare()
     weight = TwoLinkArm(URDF, 9.81).nonlinear_effects(np.array([0.3, 0.6]), np.zeros(2))
     assert plant.tau == pytest.approx(weight, abs=1e-14)
+
+
+def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone() -> None:
+    """A joint at its limit, while the arm comes to a singularity with gains that are too large."""
+    plant = default_arm()
+    plant.q_max = [0.239, 2.109]
+    plant.q, plant.v = start = [-1.3188557156881935, 2.109], [-17.807560432487726, 0.0]
+    plant.Kp, plant.Kd, plant.x_des = [8000.0] * 2, [5.0] * 2, [0.043, 0.15]
+    with warnings.catch_warnings(), pytest.raises(FloatingPointError, match="not finite"):
+        warnings.simplefilter("error")
+        plant.step(0.043)
+    assert (plant.q, plant.v) == start

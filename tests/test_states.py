@@ -30,6 +30,7 @@ from twodof.data import data_file
 from twodof.plant import Robot, load_robot
 
 OK, DISCARD, ERROR = 0, 2, 3
+ESCAPED = "gave a value that is not finite"
 OUTPUTS = ("q", "v", "x", "tau")
 INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "Kn")
 PARAMETERS = (
@@ -57,15 +58,15 @@ class Master:
         self.time, self.saved = 0.0, {}
 
     def answer(self, operation):
-        """The statuses of the operation's calls, whether the FMU complained, what was read."""
+        """The statuses of the operation's calls, the FMU's complaints, what was read."""
         self.statuses = []
         self.driver.log.clear()
         name, *arguments = operation
         values = getattr(self, name)(*arguments)
-        return self.statuses, self.complained(), values
+        return self.statuses, self.complaints(), values
 
-    def complained(self):
-        return any(status >= DISCARD for status, _ in self.driver.log)
+    def complaints(self):
+        return [text for status, text in self.driver.log if status >= DISCARD]
 
     def call(self, name, *arguments, **named):
         value = self.driver.call(name, *arguments, **named)
@@ -74,7 +75,7 @@ class Master:
 
     def enter(self, start):
         self.call("setupExperiment", startTime=start)
-        if not self.complained():
+        if not self.complaints():
             self.call("enterInitializationMode")
             self.time = start
 
@@ -91,7 +92,7 @@ class Master:
         truth = references.pop("limit_effort", [])
         values = self.call("getReal", [*chain.from_iterable(references.values())])
         truths = self.call("getBoolean", truth)
-        if self.complained():
+        if self.complaints():
             return None
         rest = iter(values)
         found = {group: [next(rest) for _ in vrs] for group, vrs in references.items()}
@@ -241,8 +242,8 @@ def is_right(flavour, operation, expected, answer):
     The native flavour refuses by fmi2Error. The Python one cannot: it logs, and discards the next
     step, which is then taken at the second attempt.
     """
-    statuses, complained, _ = answer
-    refused = expected.refused
+    statuses, complaints, _ = answer
+    complained, refused = bool(complaints), expected.refused
     if operation[0] == "wreck":
         return statuses[-1] == OK  # of restoring; what was before may fail or not
     if flavour == "native":
@@ -254,14 +255,26 @@ def is_right(flavour, operation, expected, answer):
     return not complained and statuses == [OK]
 
 
+class EscapeError(Exception):
+    """A joint at a limit and an arm near a singularity: the others' speeds grow beyond all bounds.
+
+    q̈ is quadratic in q̇ there, and rounding says whether the arm passes.
+    """
+
+
 def run(fresh, flavour, program):
     """What is read after the operations of a program: (index, history, values by group).
 
     ``fresh`` gives the answers of a fresh instance to a program.
+
+    Raises:
+        EscapeError: the speeds of a step grow beyond all bounds.
     """
     readings = []
     answers = fresh(program)
     for i, (operation, expected) in enumerate(zip(program, expectations(program))):
+        if operation[0] == "step" and any(ESCAPED in text for text in answers[i][1]):
+            raise EscapeError
         assert is_right(flavour, operation, expected, answers[i]), (
             f"{flavour} flavour, operation {i}, {operation}: {answers[i][0]}, {expected}"
         )
@@ -291,8 +304,18 @@ def states(fresh, flavour, program):
     return alone
 
 
-def compared(arm, python, native):
-    """The histories that were compared, and agree; the others go near a singularity."""
+def far(theirs, ours, group):
+    """Largest difference of a group's values, relative to those above 1."""
+    scale = np.maximum(1.0, np.abs(ours[group]))
+    return (np.abs(np.subtract(theirs[group], ours[group])) / scale).max()
+
+
+def compared(arm, python, native, again):
+    """The histories that were compared, and agree; the others go near a singularity.
+
+    To 1e-9, or where the motion is that sensitive, as well as with a start that is one unit in the
+    last place away. ``again`` gives the native flavour's answers to a program.
+    """
     found = {()}
     for history in sorted(python, key=len):
         ours, theirs, before = python[history], native[history], history[:-1]
@@ -301,10 +324,15 @@ def compared(arm, python, native):
         elif before in found and arm.keeps_away(history, python[before], ours):
             found.add(history)
             for group in OUTPUTS:
-                scale = np.maximum(1.0, np.abs(ours[group]))
-                difference = np.abs(np.subtract(theirs[group], ours[group])) / scale
-                assert difference.max() <= 1e-9, (
-                    f"the flavours' {group} differ by {difference.max():g} after {Program(history)}"
+                difference = far(theirs, ours, group)
+                sensitivity = 0.0
+                if difference > 1e-9:
+                    i = history.index(("exit",))
+                    moved = ("set", "q_start", tuple(np.nextafter(ours["q_start"], np.inf)))
+                    moved = again([*history[:i], moved, *history[i:], ("read",)])[-1][2]
+                    sensitivity = far(moved, theirs, group)
+                assert difference <= max(1e-9, sensitivity), (
+                    f"the flavours' {group} differ by {difference:g} after {Program(history)}"
                 )
     return found
 
@@ -580,12 +608,17 @@ def test_every_state_is_that_of_its_history_alone(arm, worker, request):
     @given(programs(arm))
     def holds(program):
         note(program)
-        python, native = (
-            states(partial(worker, carry_out, *fmu), flavour, program)
-            for flavour, fmu in arm.fmus.items()
-        )
+        try:
+            python, native = (
+                states(partial(worker, carry_out, *fmu), flavour, program)
+                for flavour, fmu in arm.fmus.items()
+            )
+        except EscapeError:
+            seen.update(["programs", "escapes"])
+            return
         found = features(arm, program, python)
-        if compared(arm, python, native) == python.keys():
+        again = partial(worker, carry_out, *arm.fmus["native"])
+        if compared(arm, python, native, again) == python.keys():
             found.add("all histories compared")
         seen.update(found | {"programs"})
 
@@ -593,4 +626,5 @@ def test_every_state_is_that_of_its_history_alone(arm, worker, request):
     print(*seen.most_common(), sep="\n")  # pytest -rP shows it
     rare = [what for what in CONTAINED if seen[what] < seen["programs"] // 50]
     assert not rare, seen
+    assert seen["escapes"] <= seen["programs"] / 100
     assert seen["all histories compared"] > 0.5 * seen["programs"], seen

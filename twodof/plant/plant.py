@@ -111,10 +111,11 @@ class Plant:
         """
         self._hold_inputs()
         limits = list(zip(self.q_min, self.q_max))
-        self.q, self.v = advance(
-            self._equations_of_motion(), self.q, self.v, h, limits,
-            self.rtol, self.atol, self.max_step,
-        )  # fmt: skip
+        with np.errstate(over="ignore", invalid="ignore"):  # an exception tells it
+            self.q, self.v = advance(
+                self._equations_of_motion(), self.q, self.v, h, limits,
+                self.rtol, self.atol, self.max_step,
+            )  # fmt: skip
 
     @property
     def x(self) -> list[float]:
