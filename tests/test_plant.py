@@ -334,13 +334,12 @@ def test_gravity_is_a_parameter():
     assert plant.tau == pytest.approx(weight, abs=1e-14)
 
 
-def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone() -> None:
-    """A joint at its limit, while the arm comes to a singularity with gains that are too large."""
+@pytest.mark.parametrize("gain", [1e150, 1e200, 1e308])
+def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -> None:
     plant = default_arm()
-    plant.q_max = [0.239, 2.109]
-    plant.q, plant.v = start = [-1.3188557156881935, 2.109], [-17.807560432487726, 0.0]
-    plant.Kp, plant.Kd, plant.x_des = [8000.0] * 2, [5.0] * 2, [0.043, 0.15]
+    plant.Kp = [gain] * 2
+    before = plant.q, plant.v
     with warnings.catch_warnings(), pytest.raises(FloatingPointError, match="not finite"):
         warnings.simplefilter("error")
-        plant.step(0.043)
-    assert (plant.q, plant.v) == start
+        plant.step(0.01)
+    assert (plant.q, plant.v) == before
