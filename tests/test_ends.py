@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from bags import START, assert_consistent, both_storages, read_with_rosbags
 
+from twodof import cli
 from twodof.cli import main
 
 TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
@@ -189,3 +190,25 @@ def test_reader_of_the_summary_that_leaves_costs_no_sample(
     os.close(writing)
     assert done.stderr == "" and done.returncode == 1
     assert assert_consistent(tmp_path / "bag", storage) == 501
+
+
+def test_interrupt_while_a_file_is_closed_is_an_interrupt(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in ``shutil.rmtree``, which closes a folder once more if it does not know that it has."""
+
+    def verb(_options: object) -> int:
+        descriptor = os.open(os.devnull, os.O_RDONLY)
+        try:
+            os.close(descriptor)
+            raise KeyboardInterrupt
+        finally:
+            os.close(descriptor)
+
+    monkeypatch.setitem(cli.VERBS, "info", verb)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert main(["info", "."]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err == "twodof: error: interrupted\n"

@@ -6,6 +6,7 @@ Imports are inside the verbs, so that ``twodof --help`` is instant.
 from __future__ import annotations
 
 import argparse
+import errno
 import logging
 import math
 import os
@@ -59,9 +60,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _silence()
         return 1
     except OSError as error:
+        if _is_interrupt(error):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            return _fail("interrupted", INTERRUPTED)
         _silence()
         culprit = "" if error.filename is None else f"'{error.filename}': "
         return _fail(f"{culprit}{error.strerror or error}")
+
+
+def _is_interrupt(error: OSError) -> bool:
+    """Whether Ctrl-C came while a file was closed, which then is closed again and fails.
+
+    So does ``shutil.rmtree``, which removes the folder that an FMU was unzipped to.
+    """
+    return error.errno == errno.EBADF and isinstance(error.__context__, KeyboardInterrupt)
 
 
 def _fail(message: str, status: int = 1) -> int:
