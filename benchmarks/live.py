@@ -30,6 +30,7 @@ def bare_loop(seconds: float) -> None:
     """Print how many deadlines a loop missed that does nothing else, and the worst in s."""
     from twodof.master import RealTime
 
+    print("begins", flush=True)
     pace = RealTime()
     for k in range(round(seconds / STEP)):
         pace.wait(k * STEP)
@@ -80,13 +81,14 @@ def main() -> None:
 
             def watch() -> None:
                 viewer = begin_browser(seconds + 2, 19)
+                command = [sys.executable, __file__, "--bare", f"{seconds}"]
+                alone = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+                assert alone.stdout is not None and alone.stdout.readline() == "begins\n"
+                # only now: to start a process holds the loop up that starts it
                 loop.pace.missed, loop.pace.worst, loop.steps = 0, 0.0, 0
-                alone = subprocess.run(
-                    [sys.executable, __file__, "--bare", f"{seconds}"],
-                    capture_output=True, text=True, check=True,
-                )  # fmt: skip
+                out, _ = alone.communicate()
                 live.extend([loop.pace.missed, loop.pace.worst, loop.steps])
-                bare.extend(map(float, alone.stdout.split()))
+                bare.extend(map(float, out.split()))
                 viewer.communicate()
                 out, _ = begin_browser(seconds / 2, 0).communicate()
                 delays.extend(map(float, out.split()))
