@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .page import COLOURS, Page
-from .scene import Scene, Transform, floats, origin, quaternion, triangles
+from .scene import Scene, Transform, floats, load_mesh, origin, quaternion
 
 Array = NDArray[np.float64]
 ReadMesh = Callable[[str], bytes | None]
@@ -199,9 +199,12 @@ def _mesh(name: str, content: bytes | None, scale: Array) -> _Shape | None:
     if content is None:
         return None
     try:
-        return _Shape(*triangles(name, content, scale))
+        mesh = load_mesh(name, content, scale)
     except ValueError:
         return None
+    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
+    triangles = [(corner[0], corner[1], corner[2]) for corner in corners]
+    return _Shape(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32))
 
 
 def _box(size: Array) -> _Shape:

@@ -11,7 +11,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
@@ -236,7 +236,8 @@ def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Ar
         reason = "the FMU does not carry it"
     else:
         try:
-            vertices, _ = triangles(uri, content, scale)
+            mesh = load_mesh(uri, content, scale)
+            vertices = np.array(mesh.vertices(), dtype=np.float64)
             if np.abs(vertices).max(initial=0.0) < LARGEST:  # false where one is not a number
                 return vertices
             reason = "it has no sound size"
@@ -246,8 +247,8 @@ def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Ar
     return None
 
 
-def triangles(name: str, content: bytes, scale: Array) -> tuple[Array, NDArray[np.uint32]]:
-    """Vertices of a mesh file, V × 3 in m, and its triangles' indices, T × 3.
+def load_mesh(name: str, content: bytes, scale: Array) -> Any:
+    """A mesh file as coal's model, its vertices in m.
 
     Raises:
         ValueError: it cannot be read.
@@ -256,10 +257,7 @@ def triangles(name: str, content: bytes, scale: Array) -> tuple[Array, NDArray[n
         file = Path(folder, Path(name).name)
         file.write_bytes(content)
         # boxes along the axes: others take longer, and complain on stderr of odd triangles
-        mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
-    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
-    indices = [(corner[0], corner[1], corner[2]) for corner in corners]
-    return np.array(mesh.vertices(), dtype=np.float64), np.array(indices, dtype=np.uint32)
+        return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
 
 
 def _place(part: ET.Element, pose: Array) -> None:
