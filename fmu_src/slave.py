@@ -115,7 +115,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             return self._discard(f"fmi2DoStep: the step {step_size!r} s must be finite and > 0")
         try:
             self._plant.step(step_size)
-        except FloatingPointError as error:
+        except self._plant_module.DiscardError as error:
             return self._discard(f"fmi2DoStep at {current_time!r} s: {error}")
         except KeyboardInterrupt:  # SIGINT of the process; raised on, it would be fatal
             return self._discard(f"fmi2DoStep at {current_time!r} s: interrupted")

@@ -141,6 +141,12 @@ class Engine:
         self.call("acceleration_of_effort", q, tau, a)
         return a
 
+    def obstacle(self) -> tuple[int, int, float]:
+        """Why the last step was refused: the reason, the fastest joint, its rate in 1/s."""
+        row = np.empty(3)
+        self.call("obstacle", row)
+        return int(row[0]), int(row[1]), float(row[2])
+
     def values(self, plant: Plant) -> np.ndarray:
         """All variables of a Python plant by value reference; x and tau are 0."""
         row = []

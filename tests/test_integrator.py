@@ -5,9 +5,14 @@ import pytest
 from scipy.integrate import RK45
 
 from twodof.plant import integrator
-from twodof.plant.integrator import advance
+from twodof.plant.integrator import StepError, advance
 
 FREE = [(-np.inf, np.inf)]
+
+
+def smooth(acceleration):
+    """Equations of motion whose J⁺ drops nothing anywhere."""
+    return lambda q, v: (acceleration(q, v), 1)
 
 
 def test_coefficients_are_those_of_scipy():
@@ -32,7 +37,7 @@ def test_steps_and_states_are_those_of_scipy(rtol, atol):
         return acceleration(q, v)
 
     h, max_step = 0.7, 0.2
-    q, v = advance(counted, [1.2], [0.0], h, FREE, rtol, atol, max_step)
+    q, v = advance(smooth(counted), [1.2], [0.0], h, FREE, rtol, atol, max_step)
     scipy = RK45(
         lambda t, y: np.concatenate((y[1:], acceleration(y[:1], y[1:]))),
         0.0, [1.2, 0.0], h, max_step=max_step, rtol=rtol, atol=atol, first_step=max_step,
@@ -53,7 +58,7 @@ def test_constant_acceleration_stops_at_the_instant_of_contact(h):
     q, v, t = [0.0], [1.0], 0.0
     contact = (-1.0 + np.sqrt(1.0 + 2 * 3.0 * 0.05)) / 3.0  # q(t) = t + 1.5 t² = 0.05
     while t < 0.7 - 1e-9:
-        q, v = advance(acceleration, q, v, h, [(-1.0, 0.05)], 1e-3, 1e-6, 1e-3)
+        q, v = advance(smooth(acceleration), q, v, h, [(-1.0, 0.05)], 1e-3, 1e-6, 1e-3)
         t += h
         if t < contact:
             assert q[0] == pytest.approx(t + 1.5 * t**2, abs=1e-13)
@@ -67,7 +72,7 @@ def test_a_stop_leaves_the_other_joint_alone():
         return [5.0, -2.0]
 
     q, v = advance(
-        acceleration, [0.0, 0.0], [1.0, 1.0], 0.5, [(-1, 0.2), (-9, 9)], 1e-3, 1e-6, 1e-3
+        smooth(acceleration), [0.0, 0.0], [1.0, 1.0], 0.5, [(-1, 0.2), (-9, 9)], 1e-3, 1e-6, 1e-3
     )
     assert q[0] == 0.2
     assert v[0] == 0.0
@@ -86,7 +91,7 @@ def test_a_held_joint_is_released_where_its_acceleration_turns(side, h):
     limits = [(-0.1, 0.1), (-9.0, 9.0)]
     q, v = [side * 0.1, 0.0], [0.0, 1.0]
     for _ in range(round(1.0 / h)):
-        q, v = advance(acceleration, q, v, h, limits, 1e-3, 1e-6, 1e-2)
+        q, v = advance(smooth(acceleration), q, v, h, limits, 1e-3, 1e-6, 1e-2)
     # released at 0.3 with v = 0: v = −(t − 0.3)²/2, q = 0.1 − (t − 0.3)³/6
     assert v[0] == pytest.approx(-side * 0.7**2 / 2, abs=1e-10)
     assert q[0] == pytest.approx(side * (0.1 - 0.7**3 / 6), abs=1e-10)
@@ -99,7 +104,7 @@ def test_an_excursion_within_one_step_is_found():
         return [-200.0]
 
     top = 1.0 / (2 * 200.0)
-    q, v = advance(acceleration, [0.0], [1.0], 0.01, [(-1.0, top / 2)], 1e-3, 1e-6, 0.01)
+    q, v = advance(smooth(acceleration), [0.0], [1.0], 0.01, [(-1.0, top / 2)], 1e-3, 1e-6, 0.01)
     contact = (1.0 - np.sqrt(1.0 - 2 * 200.0 * top / 2)) / 200.0
     assert v[0] == pytest.approx(-200.0 * (0.01 - contact), abs=1e-12)
     assert q[0] == pytest.approx(top / 2 - 100.0 * (0.01 - contact) ** 2, abs=1e-12)
@@ -109,29 +114,74 @@ def test_two_joints_may_reach_their_limits_in_one_step():
     def acceleration(q, v):
         return [1.0, 1.0]
 
-    q, v = advance(acceleration, [0.0, 0.0], [1.0, 1.0], 0.1, [(-1, 0.02), (-1, 0.04)], 1, 1, 0.1)
+    q, v = advance(
+        smooth(acceleration), [0.0, 0.0], [1.0, 1.0], 0.1, [(-1, 0.02), (-1, 0.04)], 1, 1, 0.1
+    )
     assert (q, v) == ([0.02, 0.04], [0.0, 0.0])
 
 
 def test_a_joint_without_room_stays():
-    q, v = advance(lambda q, v: [-7.0], [0.5], [0.0], 0.1, [(0.5, 0.5)], 1e-3, 1e-6, 1e-3)
+    q, v = advance(smooth(lambda q, v: [-7.0]), [0.5], [0.0], 0.1, [(0.5, 0.5)], 1e-3, 1e-6, 1e-3)
     assert (q, v) == ([0.5], [0.0])
 
 
 def test_a_jump_of_the_acceleration_neither_hangs_nor_fails():
-    """Sliding along the jump: no step satisfies the error test there."""
+    """Sliding along the jump of J⁺: no step satisfies the error test there."""
 
     def acceleration(q, v):
-        return [-1e4 if q[0] + 0.01 * v[0] > 0.0 else 1e4]
+        above = q[0] + 0.01 * v[0] > 0.0
+        return [-1e4 if above else 1e4], 2 - above
 
     q, v = advance(acceleration, [1e-3], [0.0], 0.02, FREE, 1e-6, 1e-9, 1e-3)
     assert abs(q[0]) < 1e-3
     assert abs(v[0]) < 0.2
 
 
+def test_a_jump_that_no_rank_explains_is_refused():
+    """The same with one rank on both sides: what fails the error test is not taken."""
+
+    def acceleration(q, v):
+        return [-1e4 if q[0] + 0.01 * v[0] > 0.0 else 1e4]
+
+    with pytest.raises(StepError) as refused:
+        advance(smooth(acceleration), [1e-3], [0.0], 0.02, FREE, 1e-6, 1e-9, 1e-3)
+    assert refused.value.joint == 0
+
+
+@pytest.mark.parametrize("rate", [1e2, 1e4, 1e6])
+def test_a_stiff_motion_is_that_of_its_closed_form(rate):
+    """v̇ = −rate·(v − cos t): the step falls far below what a jump would be given."""
+    clock = []
+
+    def acceleration(q, v):  # joint 2 is a clock of constant speed
+        clock.append(q[1])
+        return [-rate * (v[0] - np.cos(q[1])), 0.0]
+
+    start = rate**2 / (1 + rate**2)  # on the slow solution
+    q, v = advance(smooth(acceleration), [0.0, 0.0], [start, 1.0], 0.02, FREE * 2, 1e-6, 1e-9, 1e-3)
+    exact = (rate**2 * np.cos(0.02) + rate * np.sin(0.02)) / (1 + rate**2)
+    assert v[0] == pytest.approx(exact, abs=1e-6)
+    assert np.diff(clock).max() <= 1e-3 + 1e-15
+
+
+def test_a_motion_beyond_the_budget_is_refused_with_its_rate():
+    calls = 0
+
+    def acceleration(q, v):
+        nonlocal calls
+        calls += 1
+        return [-v[0], -1e10 * v[1]]
+
+    with pytest.raises(StepError) as refused:
+        advance(smooth(acceleration), [0.0] * 2, [0.0, 1.0], 0.01, FREE * 2, 1e-3, 1e-6, 1e-3)
+    assert (refused.value.joint, refused.value.too_fine) == (1, False)
+    assert refused.value.rate == pytest.approx(1e10, rel=1e-6)
+    assert calls <= integrator.BUDGET + 20
+
+
 def test_a_value_that_is_not_finite_is_an_error():
     with pytest.raises(FloatingPointError, match="not finite"):
-        advance(lambda q, v: [float("nan")], [0.0], [0.0], 0.01, FREE, 1e-3, 1e-6, 1e-3)
+        advance(smooth(lambda q, v: [float("nan")]), [0.0], [0.0], 0.01, FREE, 1e-3, 1e-6, 1e-3)
 
 
 @pytest.mark.parametrize("h", [0.003552920638135623, 0.0095405843, 0.0133802664])
@@ -143,7 +193,7 @@ def test_a_smallest_step_stretched_to_the_end_is_still_taken_as_it_is(h):
         nonlocal calls
         calls += 1
         assert calls < 10_000, "it does not end"
-        return [1e9 * (-1) ** calls]
+        return [1e9 * (-1) ** calls], calls % 2
 
     for k in range(20):
         calls = 0

@@ -1,5 +1,6 @@
 /* FMI 2.0 co-simulation: the life of an instance and its steps. */
 #include <math.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -142,6 +143,26 @@ fmi2Status fmi2Reset(fmi2Component component)
     return fmi2OK;
 }
 
+/* Say why a step cannot be done, and what would help. */
+static fmi2Status discard(Instance *instance, double point, double h, const Obstacle *obstacle)
+{
+    const double *value = instance->state.plant.value;
+    if (obstacle->reason == NOT_FINITE)
+        return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: the equations of motion gave"
+                      " a value that is not finite", point);
+    if (obstacle->reason == MANY_STEPS)
+        return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: max_step = %g s divides a step"
+                      " of %g s into more than %d integration steps; enlarge max_step or shorten"
+                      " the step", point, value[MAX_STEP], h, BUDGET / STAGES);
+    char need[80] = "integration steps below the resolution of time";
+    if (obstacle->reason == MANY_EVALUATIONS)
+        snprintf(need, sizeof need, "more than %d evaluations for the step of %g s", BUDGET, h);
+    return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: rtol = %g and atol = %g need %s:"
+                  " joint '%s' changes at a rate of %.3g 1/s; shorten the step, lessen damping or"
+                  " gains, or enlarge rtol and atol", point, value[RTOL], value[ATOL], need,
+                  JOINT_NAME[obstacle->joint], obstacle->rate);
+}
+
 fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
                       fmi2Boolean no_set_state_prior)
 {
@@ -159,10 +180,10 @@ fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
     if (point + h > state->stop_time && is_far(point + h, state->stop_time))
         return report(instance, fmi2Error, "fmi2DoStep: the step of %.12g s from %.12g s ends after"
                       " the stop time, %.12g s", h, point, state->stop_time);
-    if (!advance_plant(&state->plant, h)) {
+    Obstacle obstacle;
+    if (!advance_plant(&state->plant, h, &obstacle)) {
         state->phase = STEP_FAILED;
-        return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: the equations of motion gave"
-                      " a value that is not finite", point);
+        return discard(instance, point, h, &obstacle);
     }
     state->time = point + h;
     state->has_x = state->has_tau = 0;

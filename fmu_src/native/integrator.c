@@ -12,10 +12,10 @@
 #include <math.h>
 #include <string.h>
 
-enum { STAGES = 7, N_STATES = 2 * N_JOINTS }; /* y = (q, v) */
+enum { N_STATES = 2 * N_JOINTS }; /* y = (q, v) */
 
 /* Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution. */
-static const double A[STAGES - 1][STAGES - 1] = {
+static const double A[STAGES][STAGES] = {
     {1.0 / 5, 0, 0, 0, 0, 0},
     {3.0 / 40, 9.0 / 40, 0, 0, 0, 0},
     {44.0 / 45, -56.0 / 15, 32.0 / 9, 0, 0, 0},
@@ -23,9 +23,9 @@ static const double A[STAGES - 1][STAGES - 1] = {
     {9017.0 / 3168, -355.0 / 33, 46732.0 / 5247, 49.0 / 176, -5103.0 / 18656, 0},
     {35.0 / 384, 0, 500.0 / 1113, 125.0 / 192, -2187.0 / 6784, 11.0 / 84},
 };
-static const double E[STAGES] = {
+static const double E[STAGES + 1] = {
     -71.0 / 57600, 0, 71.0 / 16695, -71.0 / 1920, 17253.0 / 339200, -22.0 / 525, 1.0 / 40};
-static const double P[STAGES][4] = {
+static const double P[STAGES + 1][4] = {
     {1, -8048581381.0 / 2820520608, 8663915743.0 / 2820520608, -12715105075.0 / 11282082432},
     {0, 0, 0, 0},
     {0, 131558114200.0 / 32700410799, -68118460800.0 / 10900136933, 87487479700.0 / 32700410799},
@@ -36,28 +36,39 @@ static const double P[STAGES][4] = {
     {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
 };
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
-/* Smallest step, as a part of the first one, 2⁻⁸. Across a singularity of the Jacobian the
-   right-hand side jumps and no step satisfies the error test; a step of this size is taken as it
-   is. */
-static const double STEP_FLOOR = 1.0 / 256.0;
+/* As a part of the first step, 2⁻⁸: where J⁺ drops a singular value the right-hand side jumps, and no
+   step across that passes the error test. One of this size, whose stages had different ranks, is
+   taken. */
+static const double JUMP_STEP = 1.0 / 256.0;
 /* As a part of the largest step: a joint that is back at its limit sooner than this after leaving
    it is kept there for as long. Where its acceleration only grazes zero, as it may at a
    singularity, it would else leave and return without end. */
 static const double PATIENCE = 0.25;
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
+/* rad, m and per s: of the difference quotients that tell how fast a joint is. */
+static const double NUDGE = 1e-6;
 
 /* One integration step, from y to y_new. */
 typedef struct {
     const Plant *plant;
     double size;                /* s */
     double y[N_STATES], y_new[N_STATES];
-    double K[STAGES][N_STATES]; /* derivatives at the stages */
+    double K[STAGES + 1][N_STATES]; /* derivatives at the stages, */
+    int rank[STAGES + 1];       /* of J⁺ there */
+    long evaluations;           /* of the equations of motion so far */
     double Q[N_STATES][4];      /* coefficients of the dense output */
     int held[N_JOINTS];         /* joints that rest at a limit */
     int watched[N_JOINTS];      /* those of them that may leave it when they are drawn */
     int any_watched;
     int stopped[N_JOINTS];      /* joints that reached a limit at the end of the step */
 } Step;
+
+/* q̈ at a state, and its rank. */
+static int evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS])
+{
+    step->evaluations++;
+    return acceleration(step->plant, y, y + N_JOINTS, a);
+}
 
 /* Set out at y: take the velocity that points into a limit, find the joints that rest there. */
 static void hold(Step *step, const int kept[N_JOINTS])
@@ -67,7 +78,7 @@ static void hold(Step *step, const int kept[N_JOINTS])
     for (int i = 0; i < N_JOINTS; i++)
         if ((q[i] >= high[i] && v[i] > 0.0) || (q[i] <= low[i] && v[i] < 0.0))
             v[i] = 0.0;
-    acceleration(step->plant, q, v, a);
+    step->rank[0] = evaluate(step, step->y, a);
     step->any_watched = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         const int into = (q[i] >= high[i] && a[i] >= 0.0) || (q[i] <= low[i] && a[i] <= 0.0);
@@ -85,8 +96,8 @@ static double dormand_prince(Step *step)
 {
     const double rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
     double *y_new = step->y_new, sum = 0.0;
-    for (int stage = 1; stage < STAGES; stage++) {
-        double weight[STAGES - 1], *a = step->K[stage] + N_JOINTS;
+    for (int stage = 1; stage <= STAGES; stage++) {
+        double weight[STAGES], *a = step->K[stage] + N_JOINTS;
         for (int s = 0; s < stage; s++)
             weight[s] = step->size * A[stage - 1][s];
         for (int i = 0; i < N_STATES; i++) {
@@ -96,14 +107,14 @@ static double dormand_prince(Step *step)
             y_new[i] = step->y[i] + change;
         }
         memcpy(step->K[stage], y_new + N_JOINTS, N_JOINTS * sizeof *y_new);
-        acceleration(step->plant, y_new, y_new + N_JOINTS, a);
+        step->rank[stage] = evaluate(step, y_new, a);
         for (int i = 0; i < N_JOINTS; i++)
             if (step->held[i])
                 a[i] = 0.0;
     }
     for (int i = 0; i < N_STATES; i++) {
         double error = 0.0;
-        for (int s = 0; s < STAGES; s++)
+        for (int s = 0; s <= STAGES; s++)
             error += E[s] * step->K[s][i];
         const double size = fabs(step->y[i]), size_new = fabs(y_new[i]);
         const double ratio =
@@ -126,14 +137,14 @@ static void dense_output(const Step *step, double passed, double y[N_STATES])
 
 /* Mark the free joints that are past a limit and the watched joints that leave theirs, at y;
    whether there are any. */
-static int events(const Step *step, const double y[N_STATES], int found[N_JOINTS])
+static int events(Step *step, const double y[N_STATES], int found[N_JOINTS])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
     const double *q = y, *v = y + N_JOINTS;
     double a[N_JOINTS];
     int any = 0;
     if (step->any_watched)
-        acceleration(step->plant, q, v, a);
+        evaluate(step, y, a);
     for (int i = 0; i < N_JOINTS; i++) {
         found[i] = (q[i] >= high[i] && (q[i] > high[i] || v[i] > 0.0))
                    || (q[i] <= low[i] && (q[i] < low[i] || v[i] < 0.0));
@@ -145,9 +156,9 @@ static int events(const Step *step, const double y[N_STATES], int found[N_JOINTS
 }
 
 /* What may happen within a step: an event, or a joint's turning back. */
-typedef int Happened(const Step *step, double passed, int joint);
+typedef int Happened(Step *step, double passed, int joint);
 
-static int event_happened(const Step *step, double passed, int joint)
+static int event_happened(Step *step, double passed, int joint)
 {
     double y[N_STATES];
     int found[N_JOINTS];
@@ -156,7 +167,7 @@ static int event_happened(const Step *step, double passed, int joint)
     return events(step, y, found);
 }
 
-static int joint_turned(const Step *step, double passed, int joint)
+static int joint_turned(Step *step, double passed, int joint)
 {
     double y[N_STATES];
     dense_output(step, passed, y);
@@ -164,7 +175,7 @@ static int joint_turned(const Step *step, double passed, int joint)
 }
 
 /* First time in (0, latest] at which it has happened, to the last bits of the step. */
-static double bisect(const Step *step, Happened *happened, int joint, double latest)
+static double bisect(Step *step, Happened *happened, int joint, double latest)
 {
     double before = 0.0;
     while (latest - before > TIME_RESOLUTION * step->size) {
@@ -181,7 +192,7 @@ static double bisect(const Step *step, Happened *happened, int joint, double lat
 
 /* When a joint is furthest past a limit, where it is so within the step and back at its end; the
    earliest such time, 0 where there is none. */
-static double excursion(const Step *step)
+static double excursion(Step *step)
 {
     double earliest = 0.0;
     for (int i = 0; i < N_JOINTS; i++) {
@@ -213,7 +224,7 @@ static double first_event(Step *step)
     for (int i = 0; i < N_STATES; i++)
         for (int k = 0; k < 4; k++) {
             step->Q[i][k] = 0.0;
-            for (int s = 0; s < STAGES; s++)
+            for (int s = 0; s <= STAGES; s++)
                 step->Q[i][k] += step->K[s][i] * P[s][k];
         }
     double latest = at_the_end ? step->size : excursion(step);
@@ -234,21 +245,61 @@ static double first_event(Step *step)
     return latest;
 }
 
+/* Whether the stages of a step had different ranks: it straddles a jump of J⁺. */
+static int ranks_differ(const Step *step)
+{
+    for (int stage = 1; stage <= STAGES; stage++)
+        if (step->rank[stage] != step->rank[0])
+            return 1;
+    return 0;
+}
+
+static int is_finite(const Step *step)
+{
+    for (int stage = 0; stage <= STAGES; stage++)
+        for (int i = 0; i < N_STATES; i++)
+            if (!isfinite(step->K[stage][i]))
+                return 0;
+    return 1;
+}
+
+/* Name the joint whose own acceleration answers most to its position or velocity at y: the rate is
+   the largest of |∂q̈ᵢ/∂vᵢ| and |∂q̈ᵢ/∂qᵢ|½. */
+static void find_fastest(Step *step, Obstacle *obstacle)
+{
+    double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS];
+    evaluate(step, step->y, a);
+    obstacle->joint = 0;
+    obstacle->rate = -1.0;
+    for (int i = 0; i < N_STATES; i++) {
+        const int joint = i % N_JOINTS;
+        memcpy(nudged, step->y, sizeof nudged);
+        nudged[i] += NUDGE;
+        evaluate(step, nudged, answer);
+        double rate = fabs(answer[joint] - a[joint]) / NUDGE;
+        rate = !isfinite(rate) ? HUGE_VAL : i < N_JOINTS ? sqrt(rate) : rate;
+        if (rate > obstacle->rate) {
+            obstacle->joint = joint;
+            obstacle->rate = rate;
+        }
+    }
+}
+
 /* Integrate from the time t, at y, until a joint reaches or leaves a limit, or until the end: the
-   time reached, y being the state there; NaN where a value is not finite. */
-static double until_event(Step *step, double t, double end)
+   time reached, y being the state there; NaN where that cannot be done. */
+static double until_event(Step *step, double t, double end, Obstacle *obstacle)
 {
     const double max_step = step->plant->value[MAX_STEP];
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
-    const double smallest = STEP_FLOOR * next;
+    const double jump_step = JUMP_STEP * next;
     memset(step->stopped, 0, sizeof step->stopped);
-    for (;;) {
+    while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
-        const int is_smallest = next <= smallest; /* also where stretched to the end */
+        const int small = next <= jump_step; /* also where stretched to the end */
         step->size = last ? end - t : next;
         const double norm = dormand_prince(step);
         double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
-        if (norm < 1.0 || (is_smallest && isfinite(norm))) {
+        if (norm < 1.0 || (small && isfinite(norm) && ranks_differ(step))) {
             const double passed = first_event(step);
             memcpy(step->y, step->y_new, sizeof step->y);
             if (last && (passed == 0.0 || passed == step->size))
@@ -256,21 +307,29 @@ static double until_event(Step *step, double t, double end)
             if (passed > 0.0)
                 return t + passed;
             t += step->size;
-            memcpy(step->K[0], step->K[STAGES - 1], sizeof step->K[0]);
+            memcpy(step->K[0], step->K[STAGES], sizeof step->K[0]);
+            step->rank[0] = step->rank[STAGES];
             factor = fmax(MIN_FACTOR, fmin(growth, factor));
-            next = fmax(smallest, fmin(max_step, step->size * factor));
+            if (norm < 1.0) /* else the error says nothing about the next step */
+                next = fmin(max_step, step->size * factor);
             growth = MAX_FACTOR;
-        } else if (is_smallest) {
-            return NAN;
         } else {
-            factor = isfinite(norm) ? factor : MIN_FACTOR;
-            next = fmax(smallest, step->size * fmax(MIN_FACTOR, factor));
+            factor = isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR;
+            next = small ? step->size * factor : fmax(jump_step, step->size * factor);
             growth = 1.0; /* no growth right after a rejection */
+            if (next < 10.0 * (nextafter(t, HUGE_VAL) - t)) {
+                obstacle->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
+                find_fastest(step, obstacle);
+                return NAN;
+            }
         }
     }
+    obstacle->reason = MANY_EVALUATIONS;
+    find_fastest(step, obstacle);
+    return NAN;
 }
 
-int advance_plant(Plant *plant, double h)
+int advance_plant(Plant *plant, double h, Obstacle *obstacle)
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
@@ -278,7 +337,12 @@ int advance_plant(Plant *plant, double h)
     double until[N_JOINTS] = {0}; /* until when each joint is kept at its limit */
     Step step;
     double t = 0.0;
+    if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
+        obstacle->reason = MANY_STEPS;
+        return 0;
+    }
     step.plant = plant;
+    step.evaluations = 0;
     memcpy(step.y, &plant->value[Q], N_JOINTS * sizeof *step.y);
     memcpy(step.y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *step.y);
     for (int i = 0; i < N_JOINTS; i++)
@@ -295,7 +359,7 @@ int advance_plant(Plant *plant, double h)
         for (int i = 0; i < N_JOINTS; i++)
             if (!step.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
                 left[i] = t;
-        t = until_event(&step, t, end);
+        t = until_event(&step, t, end, obstacle);
         for (int i = 0; i < N_JOINTS; i++)
             if (step.stopped[i] && t - left[i] < patience)
                 until[i] = t + patience;

@@ -5,9 +5,22 @@
 #include "internal.h"
 #include "plant.h"
 
+enum { BUDGET = 1000000, /* evaluations of the equations of motion in one communication step */
+       STAGES = 6 };     /* evaluations that an integration step costs */
+
+/* Why a communication step cannot be done. */
+typedef struct {
+    enum { NOT_FINITE,      /* the equations of motion gave a value that is not */
+           MANY_STEPS,      /* max_step alone asks for more than the budget */
+           MANY_EVALUATIONS,
+           SMALL_STEPS      /* below the resolution of time */
+    } reason;
+    int joint;   /* where too fast: the joint that changes fastest */
+    double rate; /* of its change, 1/s */
+} Obstacle;
+
 /* Advance the plant's state by h seconds, inputs held: Dormand–Prince 5(4) with located
-   joint-limit stops. False, and the plant unchanged, where the equations of motion gave a value
-   that is not finite. */
-INTERNAL int advance_plant(Plant *plant, double h);
+   joint-limit stops. False, and the plant unchanged, where that cannot be done. */
+INTERNAL int advance_plant(Plant *plant, double h, Obstacle *obstacle);
 
 #endif

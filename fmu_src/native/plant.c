@@ -14,8 +14,8 @@
 #include "kinematics.h"
 #include "pseudo_inverse.h"
 
-static void commanded_acceleration(const double value[N_VARIABLES], Placement joint[N_JOINTS],
-                                   const double v[N_JOINTS], double a[N_JOINTS])
+static int commanded_acceleration(const double value[N_VARIABLES], Placement joint[N_JOINTS],
+                                  const double v[N_JOINTS], double a[N_JOINTS])
 {
     TaskFrame task;
     double command[N_AXES];
@@ -28,9 +28,10 @@ static void commanded_acceleration(const double value[N_VARIABLES], Placement jo
         command[k] = value[XDD_DES + k] + value[KD + k] * (value[XD_DES + k] - xd)
                      + value[KP + k] * (value[X_DES + k] - task.x[k]) - task.drift[k] + Kn * xd;
     }
-    apply_pseudo_inverse(task.J, command, value[RCOND], a);
+    const int rank = apply_pseudo_inverse(task.J, command, value[RCOND], a);
     for (int i = 0; i < N_JOINTS; i++)
         a[i] -= Kn * v[i];
+    return rank;
 }
 
 static double saturated(double tau, double limit)
@@ -38,15 +39,15 @@ static double saturated(double tau, double limit)
     return tau > limit ? limit : tau < -limit ? -limit : tau;
 }
 
-void acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                  double a[N_JOINTS])
+int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                 double a[N_JOINTS])
 {
     const double *value = plant->value;
     Placement joint[N_JOINTS];
     double excess[N_JOINTS]; /* sat(τ) − τ + tau_ext − D v */
     int acts = 0;
     place_joints(q, joint);
-    commanded_acceleration(value, joint, v, a);
+    const int rank = commanded_acceleration(value, joint, v, a);
     for (int i = 0; i < N_JOINTS; i++)
         excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
     if (value[LIMIT_EFFORT] != 0.0) {
@@ -63,6 +64,7 @@ void acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
+    return rank;
 }
 
 void compute_position(Plant *plant)

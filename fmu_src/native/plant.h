@@ -11,9 +11,10 @@ typedef struct {
     double value[N_VARIABLES];
 } Plant;
 
-/* q̈ of the equations of motion at a state, joint limits left out. */
-INTERNAL void acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                           double a[N_JOINTS]);
+/* q̈ of the equations of motion at a state, joint limits left out; the rank that J⁺ was given, the
+   number of its singular values that were not dropped. */
+INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                          double a[N_JOINTS]);
 
 /* The output x at the plant's state. */
 INTERNAL void compute_position(Plant *plant);

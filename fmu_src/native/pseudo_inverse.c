@@ -80,10 +80,11 @@ static void orthogonalise(double J[N_AXES][N_JOINTS], double b[N_AXES])
     }
 }
 
-void apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
-                          double result[N_JOINTS])
+int apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
+                         double result[N_JOINTS])
 {
     double y[N_AXES]; /* J⁺ b = Jᵀ y */
+    int rank = N_AXES;
     if (!solve_normal_equations(J, b, fmax(rcond * rcond, WELL_CONDITIONED), y)) {
         double square[N_AXES], largest = 0.0;
         orthogonalise(J, b);
@@ -91,11 +92,15 @@ void apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double r
             square[k] = dot(J[k], J[k]);
             largest = fmax(largest, square[k]);
         }
-        for (int k = 0; k < N_AXES; k++)
-            y[k] = square[k] > rcond * rcond * largest ? b[k] / square[k] : 0.0;
+        for (int k = 0; k < N_AXES; k++) {
+            const int kept = square[k] > rcond * rcond * largest;
+            y[k] = kept ? b[k] / square[k] : 0.0;
+            rank -= !kept;
+        }
     }
     memset(result, 0, N_JOINTS * sizeof *result);
     for (int k = 0; k < N_AXES; k++)
         for (int i = 0; i < N_JOINTS; i++)
             result[i] += y[k] * J[k][i];
+    return rank;
 }

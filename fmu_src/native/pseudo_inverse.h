@@ -6,8 +6,8 @@
 #include "model.h"
 
 /* result = J⁺ b, singular values σ ≤ rcond·σ_max dropped: the least-squares solution of smallest
-   norm. J and b are used as working memory. */
-INTERNAL void apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
-                                   double result[N_JOINTS]);
+   norm. The rank: how many were not dropped. J and b are used as working memory. */
+INTERNAL int apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
+                                  double result[N_JOINTS]);
 
 #endif

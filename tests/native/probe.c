@@ -45,9 +45,18 @@ FMI2_Export void probe_acceleration(const double value[], double a[])
     acceleration(&plant, &plant.value[Q], &plant.value[V], a);
 }
 
+static Obstacle obstacle;
+
 FMI2_Export int probe_advance(double value[], double h)
 {
-    return advance_plant((Plant *)value, h);
+    return advance_plant((Plant *)value, h, &obstacle);
+}
+
+FMI2_Export void probe_obstacle(double result[])
+{
+    result[0] = obstacle.reason;
+    result[1] = obstacle.joint;
+    result[2] = obstacle.rate;
 }
 
 FMI2_Export void probe_outputs(double value[])

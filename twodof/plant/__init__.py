@@ -1,11 +1,12 @@
 """The plant: what runs inside the FMU. Imports numpy and pinocchio, and nothing of the package."""
 
-from .plant import ParameterError, Plant
+from .plant import DiscardError, ParameterError, Plant
 from .robot import UNBOUNDED, Robot, RobotError, load_robot
 from .variables import Variable, variable_table
 
 __all__ = [
     "UNBOUNDED",
+    "DiscardError",
     "ParameterError",
     "Plant",
     "Robot",

@@ -24,8 +24,10 @@ MAX_SWEEPS = 12
 PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 
 
-def apply_pseudo_inverse(rows: list[list[float]], b: list[float], rcond: float) -> list[float]:
-    """J⁺b, singular values σ ≤ rcond·σ_max dropped (the rule of ``numpy.linalg.pinv``).
+def apply_pseudo_inverse(
+    rows: list[list[float]], b: list[float], rcond: float
+) -> tuple[list[float], int]:
+    """J⁺b and the rank of J⁺: singular values σ ≤ rcond·σ_max dropped (the rule of ``numpy.linalg.pinv``).
 
     Args:
         rows: J, m ≤ 3 rows of n.
@@ -33,7 +35,8 @@ def apply_pseudo_inverse(rows: list[list[float]], b: list[float], rcond: float) 
         rcond: in [0, 1).
 
     Returns:
-        n values; the least-squares solution of smallest norm.
+        n values, the least-squares solution of smallest norm; and how many singular values of the
+        m were not dropped.
     """
     smallest = max(rcond * rcond, WELL_CONDITIONED)
     if len(rows) == 2:
@@ -44,7 +47,7 @@ def apply_pseudo_inverse(rows: list[list[float]], b: list[float], rcond: float) 
         if determinant > smallest * trace * trace:  # ≤ σ_min²/σ_max²: nothing is dropped
             y0 = (g11 * b[0] - g01 * b[1]) / determinant
             y1 = (g00 * b[1] - g01 * b[0]) / determinant
-            return [y0 * x0 + y1 * x1 for x0, x1 in zip(r0, r1)]
+            return [y0 * x0 + y1 * x1 for x0, x1 in zip(r0, r1)], 2
     elif len(rows) == 3:
         r0, r1, r2 = rows
         g00, g01, g02 = _dot(r0, r0), _dot(r0, r1), _dot(r0, r2)
@@ -57,12 +60,14 @@ def apply_pseudo_inverse(rows: list[list[float]], b: list[float], rcond: float) 
             y0 = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant
             y1 = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant
             y2 = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / determinant
-            return [y0 * x0 + y1 * x1 + y2 * x2 for x0, x1, x2 in zip(r0, r1, r2)]
+            return [y0 * x0 + y1 * x1 + y2 * x2 for x0, x1, x2 in zip(r0, r1, r2)], 3
     return _by_singular_values(list(rows), list(b), rcond)
 
 
-def _by_singular_values(rows: list[list[float]], b: list[float], rcond: float) -> list[float]:
-    """J⁺b by one-sided Jacobi rotations (Hestenes, J. SIAM 6(1), 1958); changes its arguments.
+def _by_singular_values(
+    rows: list[list[float]], b: list[float], rcond: float
+) -> tuple[list[float], int]:
+    """J⁺b and its rank by one-sided Jacobi rotations (Hestenes, J. SIAM 6(1), 1958); changes its arguments.
 
     Rotations from the left make the rows orthogonal: row k becomes σ_k v_kᵀ and b_k becomes
     u_kᵀb, so J⁺b = Σ_k row_k b_k / |row_k|² over the singular values that are kept.
@@ -85,11 +90,12 @@ def _by_singular_values(rows: list[list[float]], b: list[float], rcond: float) -
             break
     squares = [_dot(row, row) for row in rows]
     smallest = rcond * rcond * max(squares)
-    result = [0.0] * len(rows[0])
+    result, rank = [0.0] * len(rows[0]), 0
     for row, bk, square in zip(rows, b, squares):
         if square > smallest:
+            rank += 1
             result = [r + bk / square * x for r, x in zip(result, row)]
-    return result
+    return result, rank
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:

@@ -14,14 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from itertools import product
+from math import inf, isfinite, sqrt, ulp
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Acceleration = Callable[[Array, Array], Sequence[float]]
-"""q̈ of the equations of motion at (q, v), n values, joint limits left out."""
+Acceleration = Callable[[Array, Array], tuple[Sequence[float], int]]
+"""At (q, v), joint limits left out: q̈ of the equations of motion, n values, and the rank that J⁺
+was given, the number of its singular values that were not dropped."""
 Limits = Sequence[tuple[float, float]]
 """Per joint (q_min, q_max)."""
 
@@ -49,14 +51,45 @@ P = np.array(
     ]
 )
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
-STEP_FLOOR = 2.0**-8
-"""Smallest step, as a part of the first one. Across a singularity of the Jacobian the right-hand
-side jumps and no step satisfies the error test; a step of this size is taken as it is."""
+JUMP_STEP = 2.0**-8
+"""As a part of the first step: where J⁺ drops a singular value the right-hand side jumps, and no step
+across that passes the error test. One of this size, whose stages had different ranks, is taken."""
+BUDGET = 1_000_000
+"""Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
+STAGES = 6
+"""Evaluations that an integration step costs."""
 PATIENCE = 0.25
 """As a part of the largest step: a joint that is back at its limit sooner than this after leaving
 it is kept there for as long. Where its acceleration only grazes zero, as it may at a singularity,
 it would else leave and return without end."""
 TIME_RESOLUTION = 2.0**-52
+NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
+
+
+class StepError(ArithmeticError):
+    """A communication step that cannot be done within the tolerances and the budget.
+
+    Attributes:
+        too_fine: no integration step was small enough, so that a larger budget would not help.
+        joint: index of the joint that changes fastest.
+        rate: of its change, 1/s.
+    """
+
+    def __init__(self, *, too_fine: bool, joint: int, rate: float) -> None:
+        super().__init__(f"joint {joint} changes at a rate of {rate:g} 1/s")
+        self.too_fine, self.joint, self.rate = too_fine, joint, rate
+
+
+@dataclass
+class _Equations:
+    """The equations of motion, and how often they were evaluated."""
+
+    acceleration: Acceleration
+    evaluations: int = 0
+
+    def __call__(self, q: Array, v: Array) -> tuple[Sequence[float], int]:
+        self.evaluations += 1
+        return self.acceleration(q, v)
 
 
 @dataclass
@@ -93,7 +126,9 @@ def advance(
 
     Raises:
         FloatingPointError: the equations gave a value that is not finite.
+        StepError: they change too fast.
     """
+    equations = _Equations(acceleration)
     y = np.array([*q, *v])
     t = 0.0
     patience = PATIENCE * min(max_step, h)
@@ -101,12 +136,12 @@ def advance(
     kept = [0.0] * len(limits)  # until when each joint is kept at its limit
     while t < h:
         end = min((until for until in kept if until > t), default=h)
-        stops, y, f = _hold(acceleration, y, limits, [until > t for until in kept])
+        stops, y, f, rank = _hold(equations, y, limits, [until > t for until in kept])
         for i, (low, high) in enumerate(limits):
             if i not in stops.held and not low < y[i] < high:
                 left[i] = t
         t, y, stopped = _until_event(
-            acceleration, y, f, t, min(end, h), stops, rtol, atol, max_step
+            equations, y, f, rank, t, min(end, h), stops, rtol, atol, max_step
         )
         for i in stopped:
             if t - left[i] < patience:
@@ -116,9 +151,10 @@ def advance(
 
 
 def _until_event(
-    acceleration: Acceleration,
+    equations: _Equations,
     y: Array,
     f: list[float],
+    rank: int,
     t: float,
     end: float,
     stops: _Stops,
@@ -128,80 +164,112 @@ def _until_event(
 ) -> tuple[float, Array, list[int]]:
     """Integrate from t until a joint reaches or leaves a limit, or until the end.
 
-    Returns the time, the state there, and the joints that reached a limit. f is q̈ at y.
+    Returns the time, the state there, and the joints that reached a limit. f is q̈ at y, of this
+    rank.
     """
     n = len(f)
     first = min(max_step, end - t)
-    floor = STEP_FLOOR * first
-    K = np.empty((7, 2 * n))
+    jump_step = JUMP_STEP * first
+    K = np.empty((STAGES + 1, 2 * n))
     K[0, :n] = y[n:]
     K[0, n:] = f
+    ranks = [rank] * (STAGES + 1)
     step, growth = first, MAX_FACTOR
     while True:
         last = t + step * (1 + 1e-9) >= end
-        smallest = step <= floor  # also where it is stretched to the end
+        small = step <= jump_step  # also where it is stretched to the end
         if last:
             step = end - t
-        y_new, error = _dormand_prince(acceleration, y, step, stops.held, K)
+        y_new, error = _dormand_prince(equations, y, step, stops.held, K, ranks)
         ratio = error / (atol + rtol * np.maximum(np.abs(y), np.abs(y_new)))
         norm = sqrt(ratio.dot(ratio) / (2 * n))
-        if norm < 1.0 or (smallest and isfinite(norm)):
-            event = _first_event(acceleration, y, y_new, step, stops, K)
+        factor = MIN_FACTOR
+        if isfinite(norm):
+            factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
+        at_jump = small and isfinite(norm) and min(ranks) < max(ranks)
+        if norm < 1.0 or at_jump:
+            event = _first_event(equations, y, y_new, step, stops, K)
             if event is not None:
                 passed, y, stopped = event
                 return (end if last and passed == step else t + passed), y, stopped
             if last:
                 return end, y_new, []
             t, y = t + step, y_new
-            K[0] = K[6]
-            factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
-            step = max(floor, min(max_step, step * max(MIN_FACTOR, min(growth, factor))))
+            K[0], ranks[0] = K[-1], ranks[-1]
+            if norm < 1.0:  # else the error says nothing about the next step
+                step = min(max_step, step * max(MIN_FACTOR, min(growth, factor)))
             growth = MAX_FACTOR
-        elif smallest:
-            raise FloatingPointError("the equations of motion gave a value that is not finite")
         else:
-            factor = SAFETY * norm**-0.2 if isfinite(norm) else MIN_FACTOR
-            step = max(floor, step * max(MIN_FACTOR, factor))
+            shorter = step * max(MIN_FACTOR, factor)
+            step = shorter if small else max(jump_step, shorter)
             growth = 1.0  # SciPy's rule: no growth right after a rejection
+            if step < 10 * ulp(t):
+                if not np.isfinite(K).all():
+                    raise FloatingPointError(
+                        "the equations of motion gave a value that is not finite"
+                    )
+                raise _too_fast(equations, y, too_fine=True)
+        if equations.evaluations > BUDGET:
+            raise _too_fast(equations, y, too_fine=False)
 
 
 def _dormand_prince(
-    acceleration: Acceleration, y: Array, step: float, held: list[int], K: Array
+    equations: _Equations, y: Array, step: float, held: list[int], K: Array, ranks: list[int]
 ) -> tuple[Array, Array]:
-    """One step from y, whose derivative is K[0]: (y_new, error); fills K[1:]."""
+    """One step from y, whose derivative is K[0]: (y_new, error); fills K[1:] and ranks[1:]."""
     n = len(y) // 2
+    acceleration = equations.acceleration
+    equations.evaluations += STAGES
     weights = step * A
-    for stage in range(1, 7):
+    for stage in range(1, STAGES + 1):
         y_new = y + weights[stage - 1, :stage].dot(K[:stage])
         v = y_new[n:]
         K[stage, :n] = v
-        K[stage, n:] = acceleration(y_new[:n], v)
+        K[stage, n:], ranks[stage] = acceleration(y_new[:n], v)
         for i in held:
             K[stage, n + i] = 0.0
     return y_new, step * E.dot(K)
 
 
+def _too_fast(equations: _Equations, y: Array, *, too_fine: bool) -> StepError:
+    """Names the joint whose own acceleration answers most to its position or velocity at y."""
+    n = len(y) // 2
+    a = equations(y[:n], y[n:])[0]
+    rates = []
+    for i, order in product(range(n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
+        nudged = y.copy()
+        nudged[i + n * (order == 1)] += NUDGE
+        change = abs(equations(nudged[:n], nudged[n:])[0][i] - a[i]) / NUDGE
+        rates.append((change ** (1 / order) if isfinite(change) else inf, i))
+    rate, joint = max(rates)
+    return StepError(too_fine=too_fine, joint=joint, rate=rate)
+
+
 def _hold(
-    acceleration: Acceleration, y: Array, limits: Limits, kept: list[bool]
-) -> tuple[_Stops, Array, list[float]]:
-    """Joints that rest at a limit; y with the velocity into it taken; the accelerations left."""
+    equations: _Equations, y: Array, limits: Limits, kept: list[bool]
+) -> tuple[_Stops, Array, list[float], int]:
+    """Joints that rest at a limit; y with the velocity into it taken; what acceleration is left.
+
+    That is of the rank that is the last value.
+    """
     n = len(limits)
     y = y.copy()
     for i, (low, high) in enumerate(limits):
         if (y[i] >= high and y[n + i] > 0.0) or (y[i] <= low and y[n + i] < 0.0):
             y[n + i] = 0.0
-    a = list(acceleration(y[:n], y[n:]))
+    f, rank = equations(y[:n], y[n:])
+    a = list(f)
     held = []
     for i, (low, high) in enumerate(limits):
         into = (y[i] >= high and a[i] >= 0.0) or (y[i] <= low and a[i] <= 0.0)
         if (into or kept[i]) and y[n + i] == 0.0:
             held.append(i)
             a[i] = 0.0
-    return _Stops(limits, held, [i for i in held if not kept[i]]), y, a
+    return _Stops(limits, held, [i for i in held if not kept[i]]), y, a, rank
 
 
 def _first_event(
-    acceleration: Acceleration, y: Array, y_new: Array, step: float, stops: _Stops, K: Array
+    equations: _Equations, y: Array, y_new: Array, step: float, stops: _Stops, K: Array
 ) -> tuple[float, Array, list[int]] | None:
     """First time in (0, step] at which a limit is reached or left.
 
@@ -214,14 +282,14 @@ def _first_event(
         return y_new if passed == step else _dense_output(y, Q, passed / step, step)
 
     latest = step
-    if not _events(acceleration, y_new, stops):
+    if not _events(equations, y_new, stops):
         excursion = _excursion(y, y_new, state, step, stops.limits)
         if excursion is None:
             return None
         latest = excursion
-    latest = _bisect(lambda passed: bool(_events(acceleration, state(passed), stops)), latest, step)
+    latest = _bisect(lambda passed: bool(_events(equations, state(passed), stops)), latest, step)
     y = state(latest).copy()
-    stopped = [i for i in _events(acceleration, y, stops) if i not in stops.held]
+    stopped = [i for i in _events(equations, y, stops) if i not in stops.held]
     for i in stopped:
         low, high = stops.limits[i]
         y[i] = min(max(y[i], low), high)
@@ -229,7 +297,7 @@ def _first_event(
     return latest, y, stopped
 
 
-def _events(acceleration: Acceleration, y: Array, stops: _Stops) -> list[int]:
+def _events(equations: _Equations, y: Array, stops: _Stops) -> list[int]:
     """Free joints that are past a limit and watched joints that leave theirs, at y."""
     n = len(stops.limits)
     values = y.tolist()
@@ -239,7 +307,7 @@ def _events(acceleration: Acceleration, y: Array, stops: _Stops) -> list[int]:
         if (q >= high and (q > high or v > 0.0)) or (q <= low and (q < low or v < 0.0)):
             found.append(i)
     if stops.watched:
-        a = acceleration(y[:n], y[n:])
+        a, _ = equations(y[:n], y[n:])
         for i in stops.watched:
             low, high = stops.limits[i]
             leaves = a[i] < 0.0 if values[i] >= high else a[i] > 0.0

@@ -8,14 +8,14 @@ Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import mul
 
 import numpy as np
 import pinocchio as pin
 
 from .controller import apply_pseudo_inverse
-from .integrator import Array, advance
+from .integrator import BUDGET, STAGES, Acceleration, Array, StepError, advance
 from .robot import Robot
 from .variables import Variable
 
@@ -28,6 +28,10 @@ WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 class ParameterError(ValueError):
     """A parameter or input with a value that makes no sense; the message names it."""
+
+
+class DiscardError(ArithmeticError):
+    """A communication step that cannot be done; the message names the culprit and the remedy."""
 
 
 class Plant:
@@ -107,15 +111,33 @@ class Plant:
         """Advance the state by one communication step of h seconds, inputs held.
 
         Raises:
-            FloatingPointError: the state would no longer be finite; it is left as it was.
+            DiscardError: the motion is too fast for the integrator, or its values would no longer
+                be finite; the state is left as it was.
         """
+        if STAGES * h > BUDGET * self.max_step:
+            raise DiscardError(
+                f"max_step = {self.max_step:g} s divides a step of {h:g} s into more than"
+                f" {BUDGET // STAGES} integration steps; enlarge max_step or shorten the step"
+            )
         self._hold_inputs()
         limits = list(zip(self.q_min, self.q_max))
-        with np.errstate(over="ignore", invalid="ignore"):  # an exception tells it
-            self.q, self.v = advance(
-                self._equations_of_motion(), self.q, self.v, h, limits,
-                self.rtol, self.atol, self.max_step,
-            )  # fmt: skip
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # an exception tells it
+                self.q, self.v = advance(
+                    self._equations_of_motion(), self.q, self.v, h, limits,
+                    self.rtol, self.atol, self.max_step,
+                )  # fmt: skip
+        except FloatingPointError as error:
+            raise DiscardError(str(error)) from error
+        except StepError as error:
+            need = f"more than {BUDGET} evaluations for the step of {h:g} s"
+            if error.too_fine:
+                need = "integration steps below the resolution of time"
+            raise DiscardError(
+                f"rtol = {self.rtol:g} and atol = {self.atol:g} need {need}: joint"
+                f" '{self.robot.joints[error.joint]}' changes at a rate of {error.rate:.3g} 1/s;"
+                " shorten the step, lessen damping or gains, or enlarge rtol and atol"
+            ) from error
 
     @property
     def x(self) -> list[float]:
@@ -129,14 +151,14 @@ class Plant:
     def tau(self) -> list[float]:
         """Control effort applied at the current state and inputs, N·m or N."""
         self._hold_inputs()
-        tau: list[float] = self._control_effort(np.array(self.q), np.array(self.v)).tolist()
+        tau: list[float] = self._control_effort(np.array(self.q), np.array(self.v))[0].tolist()
         return tau
 
     def _hold_inputs(self) -> None:
         self._task = list(zip(self._axes, self.x_des, self.xd_des, self.xdd_des, self.Kp, self.Kd))
 
-    def _commanded_acceleration(self, q: Array, v: Array) -> list[float]:
-        """q̈_cmd of the controller at a state, n values."""
+    def _commanded_acceleration(self, q: Array, v: Array) -> tuple[list[float], int]:
+        """q̈_cmd of the controller at a state, n values, and the rank of its J⁺."""
         model, data, frame = self._model, self._data, self.robot.frame_id
         forward_kinematics(model, data, q, v, self._still)
         jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).reshape(6, -1).tolist()
@@ -153,26 +175,26 @@ class Plant:
             command.append(
                 xdd_des + Kd * (xd_des - xd) + Kp * (x_des - x[axis]) - drift[axis] + Kn * xd
             )
-        qdd = apply_pseudo_inverse(rows, command, self.rcond)
-        return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd
+        qdd, rank = apply_pseudo_inverse(rows, command, self.rcond)
+        return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd, rank
 
-    def _control_effort(self, q: Array, v: Array) -> Array:
-        command = np.array(self._commanded_acceleration(q, v))
-        tau: Array = pin.rnea(self._model, self._data, q, v, command)
+    def _control_effort(self, q: Array, v: Array) -> tuple[Array, int]:
+        command, rank = self._commanded_acceleration(q, v)
+        tau: Array = pin.rnea(self._model, self._data, q, v, np.array(command))
         if self.limit_effort:
             tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
-        return tau
+        return tau, rank
 
-    def _equations_of_motion(self) -> Callable[[Array, Array], Sequence[float]]:
+    def _equations_of_motion(self) -> Acceleration:
         damping = np.array(self.robot.damping)
         external = np.array(self.tau_ext)
         if not (self.limit_effort or damping.any() or external.any()):
             return self._commanded_acceleration  # M⁻¹(M q̈_cmd + h − h)
 
-        def acceleration(q: Array, v: Array) -> Sequence[float]:
-            effort = self._control_effort(q, v) + external - damping * v
-            a: list[float] = pin.aba(self._model, self._data, q, v, effort).tolist()
-            return a
+        def acceleration(q: Array, v: Array) -> tuple[list[float], int]:
+            tau, rank = self._control_effort(q, v)
+            effort = tau + external - damping * v
+            return pin.aba(self._model, self._data, q, v, effort).tolist(), rank
 
         return acceleration
 

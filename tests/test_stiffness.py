@@ -1,0 +1,155 @@
+"""Motions that are too fast for an explicit integrator: right or refused, never silently wrong.
+
+The oracle is SciPy's implicit Radau on equations of motion written here.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from native_models import ROOT, Engine, from_urdf, robots_folder
+from scipy.integrate import solve_ivp
+
+from twodof.plant import DiscardError, Plant
+
+STEP = 0.01
+TIGHT, DEFAULT = (1e-9, 1e-12), (1e-3, 1e-6)
+WITHIN = {TIGHT: 1e-6, DEFAULT: 1e-3}  # rad
+NOT_FINITE, MANY_STEPS, MANY_EVALUATIONS, SMALL_STEPS = range(4)
+
+
+def damped_arm(damping: float) -> Engine:
+    urdf = (ROOT / "urdf" / "2dof.urdf").read_text()
+    text = urdf.replace("<limit", f'<dynamics damping="{damping!r}"/><limit')
+    return Engine(from_urdf(text, "EndEffector", "xy"))
+
+
+def shipped(of: Engine, **changes: object) -> Plant:
+    plant = of.model.plant()
+    start = {"q_start": [0.5, 0.35], "x_des": [0.2, 0.05], "gravity": [0.0, -9.81, 0.0]}
+    for name, value in {**start, **changes}.items():
+        setattr(plant, name, value)
+    plant.initialise()
+    return plant
+
+
+def radau(plant: Plant, seconds: float) -> np.ndarray:
+    """q after some time, by an implicit method."""
+    robot = plant.robot
+    model, n = robot.model.copy(), len(robot.joints)
+    model.gravity.linear = np.array(plant.gravity)
+    data, axes = model.createData(), ["xyz".index(axis) for axis in robot.axes]
+    x_des, Kp, Kd, D = map(np.array, (plant.x_des, plant.Kp, plant.Kd, robot.damping))
+
+    def rates(_t: float, y: np.ndarray) -> np.ndarray:
+        q, v = y[:n], y[n:]
+        pin.forwardKinematics(model, data, q, v, np.zeros(n))
+        J = pin.computeFrameJacobian(model, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED)[axes]
+        drift = pin.getFrameClassicalAcceleration(
+            model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
+        ).linear[axes]
+        command = Kp * (x_des - data.oMf[robot.frame_id].translation[axes]) - Kd * (J @ v)
+        commanded = np.linalg.pinv(J, plant.rcond) @ (command - drift + plant.Kn * J @ v)
+        M = pin.crba(model, data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        return np.concatenate([v, commanded - plant.Kn * v - np.linalg.solve(M, D * v)])
+
+    start = [*plant.q, *plant.v]
+    solved = solve_ivp(rates, (0.0, seconds), start, "Radau", rtol=1e-10, atol=1e-13)
+    assert solved.success
+    return solved.y[:n, -1]
+
+
+def advanced(of: Engine, plant: Plant, steps: int) -> np.ndarray:
+    """q of the native engine after some communication steps."""
+    values = of.values(plant)
+    for _ in range(steps):
+        assert of.call("advance", values, STEP) == 1
+    return of.group(values, "q")
+
+
+@pytest.mark.parametrize("tolerances", [TIGHT, DEFAULT], ids=["tight", "default"])
+@pytest.mark.parametrize("gains", [(50.0, 40.0), (4000.0, 100.0)], ids=["soft", "hard"])
+@pytest.mark.parametrize("damping", [0.1, 1.0, 10.0, 100.0, 600.0, 3000.0, 10_000.0])
+def test_damped_arms_move_as_an_implicit_solver_says(damping, gains, tolerances, length):
+    of = damped_arm(damping)
+    changes = {"Kp": [gains[0]] * 2, "Kd": [gains[1]] * 2}
+    rtol, atol = tolerances
+    plant = shipped(of, rtol=rtol, atol=atol, **changes)
+    expected = radau(plant, 5 * STEP)
+    assert np.abs(advanced(of, plant, 5) - expected).max() <= WITHIN[tolerances]
+    if damping <= length(10_000, 600):  # Python needs a millisecond for each of D
+        expected = radau(plant, STEP)
+        plant.step(STEP)
+        assert np.abs(plant.q - expected).max() <= WITHIN[tolerances]
+
+
+def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
+    of = damped_arm(1e6)
+    plant = shipped(of)
+    values = of.values(plant)
+    before = values.copy()
+    assert of.call("advance", values, STEP) == 0
+    assert (values == before).all()
+    # D/M of joint 2 alone: its inertia about its axis is that of link 2, as M₂₂ does not depend on q
+    inertia = pin.crba(plant.robot.model, plant.robot.model.createData(), np.array(plant.q))
+    rate = 1e6 * np.linalg.inv(np.triu(inertia) + np.triu(inertia, 1).T)[1, 1]
+    assert of.obstacle() == (MANY_EVALUATIONS, 1, pytest.approx(rate, rel=1e-3))
+    if length(1, 0):  # a million evaluations in Python
+        with pytest.raises(DiscardError, match="joint 'joint2' changes at a rate of 1.82e") as told:
+            plant.step(STEP)
+        assert float(re.search(r"rate of (\S+)", str(told.value))[1]) == pytest.approx(
+            rate, rel=0.01
+        )
+        assert plant.q == [0.5, 0.35]
+
+
+@pytest.mark.parametrize("max_step", [1e-12, 1e-300, 5e-324, 5.9e-8])
+def test_a_largest_step_beyond_the_budget_is_refused_at_once(max_step):
+    of = damped_arm(0.0)
+    plant = shipped(of, max_step=max_step)
+    values = of.values(plant)
+    before = values.copy()
+    assert of.call("advance", values, STEP) == 0
+    assert (values == before).all()
+    assert of.obstacle()[0] == MANY_STEPS
+    with pytest.raises(
+        DiscardError, match=f"max_step = {max_step:g} s divides .*; enlarge max_step"
+    ):
+        plant.step(STEP)
+    assert plant.q == [0.5, 0.35]
+
+
+@pytest.mark.parametrize("tolerance", [1e-300, 1e-25])
+def test_tolerances_that_nothing_satisfies_are_named(tolerance, length):
+    of = damped_arm(0.0)
+    plant = shipped(of, rtol=tolerance, atol=tolerance)
+    values = of.values(plant)
+    assert of.call("advance", values, STEP) == 0
+    assert of.obstacle()[0] in (MANY_EVALUATIONS, SMALL_STEPS)
+    if length(1, 0):
+        with pytest.raises(DiscardError, match=f"^rtol = {tolerance:g} and atol = .* enlarge rtol"):
+            plant.step(STEP)
+
+
+def test_a_hand_of_small_inertias_and_strong_damping_moves_as_an_implicit_solver_says():
+    """The allegro hand, D/M up to 8e5 1/s; inertias that no body has are made those of a cube."""
+    urdf = robots_folder() / "allegro_hand_description" / "urdf" / "allegro_left_hand.urdf"
+    tree = ET.fromstring(urdf.read_text())
+    for inertia in tree.iter("inertia"):
+        moments = sorted(float(inertia.get(key)) for key in ("ixx", "iyy", "izz"))
+        for key in ("ixx", "iyy", "izz"):
+            inertia.set(key, repr(moments[2]))
+        for key in ("ixy", "ixz", "iyz"):
+            inertia.set(key, "0")
+    of = Engine(from_urdf(ET.tostring(tree, encoding="unicode"), "link_3.0_tip", "xyz"))
+    plant = of.model.plant()
+    plant.x_des = (np.array(plant.x) + [0.0, 0.01, -0.01]).tolist()
+    expected = radau(plant, 3 * STEP)
+    found = advanced(of, plant, 3)
+    assert np.abs(found - plant.q).max() > 1e-7  # it moves
+    assert np.abs(found - expected).max() <= 1e-6
