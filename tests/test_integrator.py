@@ -158,7 +158,7 @@ def test_a_stiff_motion_is_that_of_its_closed_form(rate):
         return [-rate * (v[0] - np.cos(q[1])), 0.0]
 
     start = rate**2 / (1 + rate**2)  # on the slow solution
-    q, v = advance(smooth(acceleration), [0.0, 0.0], [start, 1.0], 0.02, FREE * 2, 1e-6, 1e-9, 1e-3)
+    _, v = advance(smooth(acceleration), [0.0, 0.0], [start, 1.0], 0.02, FREE * 2, 1e-6, 1e-9, 1e-3)
     exact = (rate**2 * np.cos(0.02) + rate * np.sin(0.02)) / (1 + rate**2)
     assert v[0] == pytest.approx(exact, abs=1e-6)
     assert np.diff(clock).max() <= 1e-3 + 1e-15

@@ -95,16 +95,15 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
     before = values.copy()
     assert of.call("advance", values, STEP) == 0
     assert (values == before).all()
-    # D/M of joint 2 alone: its inertia about its axis is that of link 2, as M₂₂ does not depend on q
+    # D (M⁻¹)₂₂, what joint 2 answers to its own speed with
     inertia = pin.crba(plant.robot.model, plant.robot.model.createData(), np.array(plant.q))
     rate = 1e6 * np.linalg.inv(np.triu(inertia) + np.triu(inertia, 1).T)[1, 1]
     assert of.obstacle() == (MANY_EVALUATIONS, 1, pytest.approx(rate, rel=1e-3))
     if length(1, 0):  # a million evaluations in Python
-        with pytest.raises(DiscardError, match="joint 'joint2' changes at a rate of 1.82e") as told:
+        with pytest.raises(DiscardError, match="joint 'joint2' changes at a rate") as told:
             plant.step(STEP)
-        assert float(re.search(r"rate of (\S+)", str(told.value))[1]) == pytest.approx(
-            rate, rel=0.01
-        )
+        named = float(re.search(r"rate of (\S+)", str(told.value))[1])
+        assert named == pytest.approx(rate, rel=0.01)
         assert plant.q == [0.5, 0.35]
 
 
@@ -148,7 +147,7 @@ def test_a_hand_of_small_inertias_and_strong_damping_moves_as_an_implicit_solver
             inertia.set(key, "0")
     of = Engine(from_urdf(ET.tostring(tree, encoding="unicode"), "link_3.0_tip", "xyz"))
     plant = of.model.plant()
-    plant.x_des = (np.array(plant.x) + [0.0, 0.01, -0.01]).tolist()
+    plant.x_des = np.add(plant.x, [0.0, 0.01, -0.01]).tolist()
     expected = radau(plant, 3 * STEP)
     found = advanced(of, plant, 3)
     assert np.abs(found - plant.q).max() > 1e-7  # it moves

@@ -27,7 +27,9 @@ PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 def apply_pseudo_inverse(
     rows: list[list[float]], b: list[float], rcond: float
 ) -> tuple[list[float], int]:
-    """J⁺b and the rank of J⁺: singular values σ ≤ rcond·σ_max dropped (the rule of ``numpy.linalg.pinv``).
+    """J⁺b and the rank of J⁺, singular values σ ≤ rcond·σ_max dropped.
+
+    The rule is that of ``numpy.linalg.pinv``.
 
     Args:
         rows: J, m ≤ 3 rows of n.
@@ -67,7 +69,7 @@ def apply_pseudo_inverse(
 def _by_singular_values(
     rows: list[list[float]], b: list[float], rcond: float
 ) -> tuple[list[float], int]:
-    """J⁺b and its rank by one-sided Jacobi rotations (Hestenes, J. SIAM 6(1), 1958); changes its arguments.
+    """The same by one-sided Jacobi rotations (Hestenes, J. SIAM 6(1), 1958); changes its arguments.
 
     Rotations from the left make the rows orthogonal: row k becomes σ_k v_kᵀ and b_k becomes
     u_kᵀb, so J⁺b = Σ_k row_k b_k / |row_k|² over the singular values that are kept.

@@ -52,8 +52,9 @@ P = np.array(
 )
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 JUMP_STEP = 2.0**-8
-"""As a part of the first step: where J⁺ drops a singular value the right-hand side jumps, and no step
-across that passes the error test. One of this size, whose stages had different ranks, is taken."""
+"""As a part of the first step: where J⁺ drops a singular value the right-hand side jumps, and no
+step across that passes the error test. One of this size, whose stages had different ranks, is
+taken."""
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
 STAGES = 6
