@@ -11,6 +11,7 @@ and 'playwright'.
 
 from __future__ import annotations
 
+import math
 import os
 import statistics
 import subprocess
@@ -61,12 +62,12 @@ def main() -> None:
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, build_fmu
     from twodof.live import Loop, page_of
-    from twodof.master import endless
+    from twodof.master import experiment
 
     with tempfile.TemporaryDirectory() as folder:
         native = sys.argv[2:3] != ["python"]
         fmu = build_fmu(Path(folder) / "TwoDof.fmu", FmuOptions(native=native))
-        run = endless(fmu, step=STEP)
+        run = experiment(fmu, step=STEP, stop_time=math.inf)
         loop = Loop(run)
         with page_of(loop, run, "127.0.0.1", 0) as (url, page):
             ended = threading.Event()

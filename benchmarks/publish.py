@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from twodof import Sink
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
@@ -73,17 +75,11 @@ def receive() -> None:
     account("received", stamps)
 
 
-class Clock:
+class Clock(Sink):
     """A sink that notes when samples come, after the start has settled."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
-
-    def __enter__(self) -> Clock:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
 
     def write(self, sample: object) -> None:
         self.times.append(time.perf_counter())
@@ -107,10 +103,12 @@ def main() -> None:
         me = [sys.executable, __file__]
         receiver = subprocess.Popen([*me, "--receive"], stdout=subprocess.PIPE, text=True)
         assert receiver.stdout is not None and receiver.stdout.readline() == "ready\n"
-        bare = subprocess.Popen([*me, "--bare", f"{run.steps}"], stdout=subprocess.PIPE, text=True)
+        bare = subprocess.Popen(
+            [*me, "--bare", f"{run.steps:.0f}"], stdout=subprocess.PIPE, text=True
+        )
         pace, clock = RealTime(), Clock()
-        wire = Publisher(run, Network(DOMAIN, loopback=True), scene=True)
-        summary = simulate(run, [clock, wire], pace=pace, steer=wire.command)
+        wire = Publisher(Network(DOMAIN, loopback=True), scene=True)
+        summary = simulate(run, clock, wire, pace=pace, steer=wire.command)
     print(bare.communicate()[0], end="")
     account("published", clock.times)
     print(

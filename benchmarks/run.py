@@ -439,9 +439,9 @@ def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
     time of all threads: this package's bag stores in one of its own.
     """
     run = twodof.experiment(fmu)
-    first = twodof.Sample(0, 0.0, (0.5, 0.35), (0.1, 0.2), (0.2, 0.1), (1.0, 0.3), {})
-    samples = [first._replace(k=k, t=k * STEP) for k in range(LOG_TURN)]
-    stamps = [1_700_000_000_000_000_000 + round(s.t * 1e9) for s in samples]
+    first = twodof.Sample(0, 0.0, (0.5, 0.35), (0.1, 0.2), (0.2, 0.1), (1.0, 0.3), {}, 0.0, 0)
+    stamps = [1_700_000_000_000_000_000 + round(k * STEP * 1e9) for k in range(LOG_TURN)]
+    samples = [first._replace(k=k, t=k * STEP, stamp=stamp) for k, stamp in enumerate(stamps)]
     found = {}
     for storage in ("mcap", "sqlite3"):
         walls: tuple[list[float], list[float]] = ([], [])
@@ -451,7 +451,7 @@ def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
                 walls[0].append(log_time(stack, write, stamps))
             with ExitStack() as stack:
                 path = folder / f"bag-{storage}-{turn}"
-                bag = twodof.Bag(path, run, storage=storage, stamp_start=1.7e9)
+                bag = twodof.Bag(path, storage=storage).begin(run)
                 write = stack.enter_context(bag).write
                 walls[1].append(log_time(stack, write, samples))
         found[storage] = (statistics.median(walls[0]), statistics.median(walls[1]))
@@ -504,7 +504,7 @@ def run_time(folder: Path, fmu: Path) -> float:
     """What ``twodof run`` does once it is loaded: the default run from the FMU to a bag, s."""
     begin = time.perf_counter()
     run = twodof.experiment(fmu)
-    twodof.simulate(run, [twodof.Bag(folder / "whole", run)])
+    twodof.simulate(run, twodof.Bag(folder / "whole"))
     return time.perf_counter() - begin
 
 

@@ -205,7 +205,7 @@ def draw_plot(fmu: Path, path: Path) -> None:
     bags = [fmu.parent / f"Kp{gain}" for gain in GAINS]
     for gain, bag in zip(GAINS, bags, strict=True):
         run = twodof.experiment(fmu, settings={"Kp": gain})
-        twodof.simulate(run, [twodof.Bag(bag, run)])
+        twodof.simulate(run, twodof.Bag(bag))
     figure = plot_bags(*bags)
     figure.savefig(path, dpi=135, pil_kwargs={"optimize": True}, metadata={"Software": None})
 

@@ -32,7 +32,7 @@ def main() -> None:
         fmu = twodof.build_fmu(folder / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
         (folder / "targets.csv").write_text(INPUTS)
         run = twodof.experiment(fmu, stop_time=6, input_file=folder / "targets.csv")
-        twodof.simulate(run, [twodof.Bag(folder / "my_bag", run)])
+        twodof.simulate(run, twodof.Bag(folder / "my_bag"))
         view(chromium, folder)
         live(chromium, folder, fmu)
 

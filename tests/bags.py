@@ -46,7 +46,8 @@ def sample(run: Experiment, k: int) -> Sample:
     inputs = {
         n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"
     }
-    return Sample(k, run.time(k), (k / 7, -k / 3), (k / 11, -k), (k, k), (k / 13, k / 17), inputs)
+    numbers = (k / 7, -k / 3), (k / 11, -k), (k, k), (k / 13, k / 17)
+    return Sample(k, run.time(k), *numbers, inputs, 0.0, START * SECOND + k * PERIOD)
 
 
 def joint_state(k: int, sample: Sample, effort: bool = False) -> JointState:

@@ -5,21 +5,16 @@ from __future__ import annotations
 import resource
 from pathlib import Path
 
-from twodof.master import Sample
+from twodof.master import Sample, Sink
 
 
-class Collector(list[Sample]):
+class Collector(list[Sample], Sink):
     """The sink that keeps what it is given."""
 
     write = list.append
 
-    def __enter__(self) -> Collector:
-        return self
 
-    def __exit__(self, *exception: object) -> None: ...
-
-
-class Memory:
+class Memory(Sink):
     """The sink that looks at this process's memory each so many samples.
 
     Attributes:
@@ -28,11 +23,6 @@ class Memory:
 
     def __init__(self, every: int) -> None:
         self._every, self._first, self.growth = every, 0, 0
-
-    def __enter__(self) -> Memory:
-        return self
-
-    def __exit__(self, *exception: object) -> None: ...
 
     def write(self, sample: Sample) -> None:
         if sample.k == self._every:

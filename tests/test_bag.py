@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -47,7 +49,7 @@ from ruamel.yaml import YAML
 from sinks import Collector
 
 import twodof
-from twodof.errors import BagError
+from twodof.errors import BagError, InputError
 from twodof.master import Experiment, Sample
 
 KIB, MIB = 1024, 1024**2
@@ -88,14 +90,14 @@ KINDS: dict[str, dict[str, Any]] = {
 @pytest.fixture(scope="module")
 def recording(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The default run, written to all kinds of bags at once."""
-    run = twodof.experiment(fmu_path)
+    run = twodof.experiment(fmu_path, stamp_start=START)
     recording = Recording(run, Collector(), tmp_path_factory.mktemp("bags"))
     bags = [
-        twodof.Bag(recording.bag(storage, kind), run, storage=storage, stamp_start=START, **options)
+        twodof.Bag(recording.bag(storage, kind), storage=storage, **options)
         for storage in STORAGES
         for kind, options in KINDS.items()
     ]
-    twodof.simulate(run, [recording.samples, *bags])
+    twodof.simulate(run, recording.samples, *bags)
     return recording
 
 
@@ -137,33 +139,38 @@ def test_end_effector_follows_the_closed_form(
     np.testing.assert_allclose(oracles.position(q), target - error, rtol=0.0, atol=1e-9)
 
 
-def test_first_stamp_is_the_wall_clock_by_default(run: Experiment, tmp_path: Path) -> None:
+def test_first_stamp_is_the_wall_clock_by_default(native_path: Path, tmp_path: Path) -> None:
     before = time.time_ns()
-    with twodof.Bag(tmp_path / "bag", run) as bag:
-        bag.write(sample(run, 0))
-        bag.write(sample(run, 1))
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.01)
     first, second = (state.stamp for state in read_with_rosbags(tmp_path / "bag"))
     assert before <= first <= time.time_ns()
     assert second - first == PERIOD
 
 
-def test_start_of_the_stamps_is_exact(run: Experiment, tmp_path: Path) -> None:
-    with twodof.Bag(tmp_path / "bag", run, stamp_start=START + 0.25) as bag:
-        bag.write(sample(run, 0))
+def test_start_of_the_stamps_is_exact(native_path: Path, tmp_path: Path) -> None:
+    bag = twodof.Bag(tmp_path / "bag")
+    twodof.simulate(native_path, bag, stop_time=0.01, stamp_start=START + 0.25)
     assert read_with_rosbags(tmp_path / "bag")[0].stamp == START * SECOND + SECOND // 4
 
 
 @pytest.mark.parametrize("start", [-1.0, 2.0**31, float("nan"), float("inf")])
-def test_stamp_out_of_the_range_of_ros_is_refused(
-    run: Experiment, tmp_path: Path, start: float
+def test_stamp_out_of_the_range_of_ros_is_refused(native_path: Path, start: float) -> None:
+    with pytest.raises(InputError, match="stamp"):
+        twodof.experiment(native_path, stamp_start=start)
+
+
+def test_run_whose_last_stamp_is_out_of_range_is_refused(native_path: Path) -> None:
+    with pytest.raises(InputError, match="stamp"):
+        twodof.experiment(native_path, stop_time=5.0, stamp_start=2**31 - 3)
+
+
+@pytest.mark.parametrize("now", [-1, (2**31) * SECOND, 2**63, 2**70])
+def test_wall_clock_out_of_the_range_of_ros_is_refused(
+    native_path: Path, now: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(BagError, match="stamp"):
-        twodof.Bag(tmp_path / "bag", run, stamp_start=start)
-
-
-def test_run_whose_last_stamp_is_out_of_range_is_refused(run: Experiment, tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="stamp"):
-        twodof.Bag(tmp_path / "bag", run, stamp_start=2**31 - 3)  # the run takes 5 s
+    monkeypatch.setattr(time, "time_ns", lambda: now)
+    with pytest.raises(InputError, match="from the wall clock on are not those of 1970 to 2038"):
+        twodof.experiment(native_path)
 
 
 # --- metadata and storages ---
@@ -319,10 +326,8 @@ def test_provenance_is_complete(fmu_path: Path, tmp_path: Path, storage: str) ->
         fmu_path, stop_time=0.1, step=0.005, settings={"Kp": 80.0}, input_file=inputs
     )
     command_line = "twodof run --set Kp=80 --input inputs.csv"
-    bag = twodof.Bag(
-        tmp_path / "bag", run, storage=storage, stamp_start=START, command_line=command_line
-    )
-    twodof.simulate(run, [bag])
+    bag = twodof.Bag(tmp_path / "bag", storage=storage, command_line=command_line)
+    twodof.simulate(run, bag)
 
     with zipfile.ZipFile(fmu_path) as fmu:
         description = ET.fromstring(fmu.read("modelDescription.xml"))
@@ -351,8 +356,6 @@ def test_provenance_is_complete(fmu_path: Path, tmp_path: Path, storage: str) ->
         "joints": ["joint1", "joint2"],
         "start_time": 0.0,
         "step": 0.005,
-        "steps": 20,
-        "stamp_start_ns": START * SECOND,
         "start_values": {**starts, "Kp[1]": 80.0, "Kp[2]": 80.0},
         "input_changes": [
             [0.02, {"x_des[1]": 0.25, "x_des[2]": 0.1}],
@@ -363,26 +366,75 @@ def test_provenance_is_complete(fmu_path: Path, tmp_path: Path, storage: str) ->
     }
 
 
+ANSWERS = {2: {"x_des": (0.1, 0.2)}, 4: {"Kp[2]": 80.0}, 5: {"Kp[2]": 80.0}}
+CHANGES = [[0.02, {"x_des[1]": 0.1, "x_des[2]": 0.2}], [0.04, {"Kp[2]": 80.0}]]
+
+
 @both_storages
-def test_provenance_of_an_open_ended_run_is_completed_at_its_end(
-    native_path: Path, tmp_path: Path, storage: str
+@pytest.mark.parametrize("every", [1, 3], ids=["every sample", "every third"])
+def test_provenance_has_each_change_of_an_input_that_a_loop_sends(
+    native_path: Path, tmp_path: Path, storage: str, every: int
 ) -> None:
-    run = twodof.experiment(native_path, stop_time=1e6)
-    answers = {2: {"x_des": (0.1, 0.2)}, 4: {"Kp[2]": 80.0}, 5: {"Kp[2]": 80.0}}
+    run = twodof.experiment(native_path, stop_time=math.inf)
     steps = twodof.samples(run)
-    with twodof.Bag(tmp_path / "bag", run, storage=storage, open_ended=True) as bag:
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         sample = next(steps)
-        while sample.k < 8:
+        while sample.k < 9:
+            if sample.k % every == 0:
+                bag.write(sample)
+            sample = steps.send(ANSWERS.get(sample.k))
+    provenance = twodof.read_bag(tmp_path / "bag").provenance
+    assert provenance == json.loads(metadata(tmp_path / "bag")["custom_data"]["twodof"])
+    assert provenance["input_changes"] == CHANGES
+
+
+def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(
+    native_path: Path, tmp_path: Path
+) -> None:
+    """At each flush, so that they survive the death of the process."""
+    run = twodof.experiment(native_path, stop_time=math.inf)
+    steps = twodof.samples(run)
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        sample = next(steps)
+        for k in range(9):
             bag.write(sample)
-            sample = steps.send(answers.get(sample.k))
-    told = twodof.read_bag(tmp_path / "bag")
-    for found in (told.provenance, json.loads(metadata(tmp_path / "bag")["custom_data"]["twodof"])):
-        assert found["steps"] == 7
-        assert found["stamp_start_ns"] == told.stamps[0]
-        assert found["input_changes"] == [
-            [0.02, {"x_des[1]": 0.1, "x_des[2]": 0.2}],
-            [0.04, {"Kp[2]": 80.0}],
-        ]
+            sample = steps.send(ANSWERS.get(k))
+        shutil.copytree(bag.path, tmp_path / "early")
+        while json.loads((bag.path / "run.json").read_text())["input_changes"] != CHANGES:
+            time.sleep(0.05)
+    assert json.loads((tmp_path / "early" / "run.json").read_text())["input_changes"] in (
+        CHANGES[:0], CHANGES[:1], CHANGES,
+    )  # fmt: skip
+
+
+def test_provenance_says_where_it_was_full(
+    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twodof.bag.provenance.MAX_SIZE", 20_000)
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        for k in range(1000):
+            inputs = {"x_des[1]": k / 7}
+            bag.write(sample(run, k)._replace(inputs=inputs, since=(k - 1) / 100))
+            if k % 100 == 0:
+                time.sleep(0.6)  # a flush
+    text = (tmp_path / "bag" / "run.json").read_text()
+    provenance = json.loads(text)
+    changes = provenance["input_changes"]
+    assert len(text) <= 20_000
+    assert 0 < len(changes) < 999
+    assert provenance["inputs_known_until"] == round(changes[-1][0] * 100 + 1) / 100
+
+
+def test_custom_data_leaves_out_changes_that_take_yaml_minutes(
+    run: Experiment, tmp_path: Path
+) -> None:
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        for k in range(20_000):
+            inputs = {"x_des[1]": k / 7}
+            bag.write(sample(run, k)._replace(inputs=inputs, since=(k - 1) / 100))
+    custom = json.loads(metadata(tmp_path / "bag")["custom_data"]["twodof"])
+    assert (custom["input_changes"], custom["inputs_known_until"]) == ([], 0.0)
+    assert len(twodof.read_bag(tmp_path / "bag").provenance["input_changes"]) == 20_000
 
 
 def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(
@@ -391,7 +443,7 @@ def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(
     damaged = []
     for n in range(0, 80, 3):
         path = tmp_path / f"bag{n}"
-        with twodof.Bag(path, run, command_line=f"{'x' * n} --set 'Kp=80'") as bag:
+        with twodof.Bag(path, command_line=f"{'x' * n} --set 'Kp=80'").begin(run) as bag:
             bag.write(sample(run, 0))
         custom = metadata(path)["custom_data"]["twodof"]
         try:
@@ -408,7 +460,7 @@ def test_provenance_is_there_before_the_first_message(
     run: Experiment, tmp_path: Path, storage: str
 ) -> None:
     file = tmp_path / "bag" / "run.json"
-    with twodof.Bag(tmp_path / "bag", run, storage=storage) as bag:
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         before = file.read_bytes()
         bag.write(sample(run, 0))
     assert json.loads(before)["fmu"]["guid"] == run.fmu.guid
@@ -511,7 +563,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, content: str | None) -> None:
 
 @both_storages
 def test_damaged_bag_is_read_or_refused(run: Experiment, tmp_path: Path, storage: str) -> None:
-    with twodof.Bag(tmp_path / "bag", run, storage=storage) as bag:
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         for k in range(200):
             bag.write(sample(run, k))
     (file,) = [*(tmp_path / "bag").glob("*.mcap"), *(tmp_path / "bag").glob("*.db3")]
@@ -543,12 +595,12 @@ def test_existing_bag_is_kept_unless_told_otherwise(
     run: Experiment, tmp_path: Path, storage: str
 ) -> None:
     path = tmp_path / "bag"
-    with twodof.Bag(path, run, storage=storage) as bag:
+    with twodof.Bag(path, storage=storage).begin(run) as bag:
         bag.write(sample(run, 0))
     with pytest.raises(BagError, match="exists already"):
-        twodof.Bag(path, run, storage=storage)
+        twodof.Bag(path, storage=storage)
     assert len(read_with_rosbags(path)) == 1
-    with twodof.Bag(path, run, storage=storage, overwrite=True) as bag:
+    with twodof.Bag(path, storage=storage, overwrite=True).begin(run) as bag:
         for k in range(3):
             bag.write(sample(run, k))
     assert len(read_with_rosbags(path)) == 3
@@ -573,7 +625,7 @@ def test_folder_that_is_no_bag_is_never_overwritten(
         (path / name).write_text(text)
     with (
         pytest.raises(BagError, match="not a bag"),
-        twodof.Bag(path, run, overwrite=True) as bag,
+        twodof.Bag(path, overwrite=True).begin(run) as bag,
     ):
         bag.write(sample(run, 0))
     assert {file.name: file.read_text() for file in path.iterdir()} == files
@@ -583,7 +635,7 @@ def test_file_is_never_overwritten(run: Experiment, tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("precious")
     with pytest.raises(BagError, match="not a bag"):
-        twodof.Bag(path, run, overwrite=True)
+        twodof.Bag(path, overwrite=True)
     assert path.read_text() == "precious"
 
 
@@ -592,7 +644,7 @@ def test_folder_that_appears_before_the_first_sample_is_kept(
     run: Experiment, tmp_path: Path, overwrite: bool
 ) -> None:
     path = tmp_path / "bag"
-    bag = twodof.Bag(path, run, overwrite=overwrite)
+    bag = twodof.Bag(path, overwrite=overwrite).begin(run)
     path.mkdir()
     (path / "notes.txt").write_text("precious")
     with pytest.raises(BagError, match="bag"), bag:
@@ -601,12 +653,12 @@ def test_folder_that_appears_before_the_first_sample_is_kept(
 
 
 def test_bag_behind_a_link_is_not_lost(run: Experiment, tmp_path: Path) -> None:
-    with twodof.Bag(tmp_path / "bag", run) as bag:
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         bag.write(sample(run, 0))
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "bag")
     try:
-        with twodof.Bag(link, run, overwrite=True) as bag:
+        with twodof.Bag(link, overwrite=True).begin(run) as bag:
             bag.write(sample(run, 0))
     except BagError:
         pass  # refused, and fine so
@@ -628,7 +680,7 @@ def test_folder_that_cannot_be_written_is_refused(
     before = sorted(tmp_path.rglob("*"))
     with (
         pytest.raises(BagError, match=re.escape(str(path))),
-        twodof.Bag(path, run, storage=storage),
+        twodof.Bag(path, storage=storage).begin(run),
     ):
         pass
     assert sorted(tmp_path.rglob("*")) == before
@@ -644,7 +696,7 @@ def test_exception_leaves_a_bag_with_every_sample_so_far(
     run: Experiment, tmp_path: Path, storage: str, error: type[BaseException], n: int
 ) -> None:
     path = tmp_path / "bag"
-    bag = twodof.Bag(path, run, storage=storage, stamp_start=START)
+    bag = twodof.Bag(path, storage=storage).begin(run)
     with pytest.raises(error, match="enough"), bag:
         for k in range(n):
             bag.write(sample(run, k))
@@ -656,7 +708,7 @@ def test_exception_leaves_a_bag_with_every_sample_so_far(
 def fill(bag: twodof.Bag, run: Experiment) -> tuple[str, int]:
     """Write until the disk is full; what the error says, and how many samples were taken."""
     taken = 0
-    with pytest.raises(BagError) as caught, bag:
+    with pytest.raises(BagError) as caught, bag.begin(run):
         for k in range(200_000):
             bag.write(sample(run, k))
             taken += 1
@@ -669,7 +721,7 @@ def test_full_disk_ends_in_a_closed_bag_with_every_sample(
     run: Experiment, disk: Callable[..., Path], storage: str, size: int
 ) -> None:
     path = disk(size) / "bag"
-    said, taken = fill(twodof.Bag(path, run, storage=storage, stamp_start=START), run)
+    said, taken = fill(twodof.Bag(path, storage=storage), run)
     assert "disk is full" in said
     kept = assert_consistent(path, storage)
     assert taken - 1 <= kept <= taken  # one may be handed over while the bag is being closed
@@ -685,7 +737,7 @@ def test_disk_too_small_to_begin_with_is_left_as_it_was(
     for size in (4, 8, 12, 16, 32, 512, *range(2048, 2128, 4)):
         path = disk(size) / "bag"
         try:
-            with twodof.Bag(path, run, storage=storage):
+            with twodof.Bag(path, storage=storage).begin(run):
                 pass
         except BagError as error:
             refused += 1
@@ -702,7 +754,7 @@ def test_reserve_is_room_to_close_a_run_that_was_never_flushed(
 ) -> None:
     monkeypatch.setattr("twodof.bag.writer.FLUSH_PERIOD", 1e6)
     path = disk(2140) / "bag"  # 92 KiB beside the reserve; the messages take 140
-    with twodof.Bag(path, run, storage=storage) as bag:
+    with twodof.Bag(path, storage=storage).begin(run) as bag:
         for k in range(1000):
             bag.write(sample(run, k))
     assert assert_consistent(path, storage) == 1000
@@ -715,8 +767,8 @@ def test_messages_reach_the_disk_while_the_run_goes_on(run: Experiment, tmp_path
     mcap, sqlite = tmp_path / "mcap", tmp_path / "sqlite3"
     begin, k = time.monotonic(), 0
     with (
-        twodof.Bag(mcap, run, stamp_start=START) as first,
-        twodof.Bag(sqlite, run, storage="sqlite3", stamp_start=START) as second,
+        twodof.Bag(mcap).begin(run) as first,
+        twodof.Bag(sqlite, storage="sqlite3").begin(run) as second,
     ):
         while time.monotonic() - begin < 1.1:
             first.write(sample(run, k))
@@ -752,9 +804,10 @@ fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu)
 inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
 memory = Memory(1000)
-with twodof.Bag(path, run, storage=storage) as bag:
+with twodof.Bag(path, storage=storage).begin(run) as bag:
     for k in range(20_000):
-        sample = Sample(k, run.time(k), (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs)
+        numbers = (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8)
+        sample = Sample(k, run.time(k), *numbers, inputs, 0.0, k * 10_000_000)
         bag.write(sample)
         memory.write(sample)
 print(memory.growth)

@@ -45,7 +45,7 @@ def listing(folder: Path) -> dict[str, tuple[int, int]]:
 def bag_path(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bag") / "bag"
     run = twodof.experiment(fmu_path, stop_time=0.05)
-    twodof.simulate(run, [twodof.Bag(path, run)])
+    twodof.simulate(run, twodof.Bag(path))
     return path
 
 

@@ -85,10 +85,11 @@ run = twodof.experiment(fmu, stop_time=1e4)
 inputs = dict(run.start_values)
 k = 0
 try:
-    with twodof.Bag(path, run, storage=storage, scene=True) as bag:
+    with twodof.Bag(path, storage=storage, scene=True).begin(run) as bag:
         print("open", flush=True)
         while True:
-            bag.write(Sample(k, run.time(k), (0.1, k), (0.3, -k), (0.5, 0.6), (0.7, 0.8), inputs))
+            numbers = (0.1, k), (0.3, -k), (0.5, 0.6), (0.7, 0.8)
+            bag.write(Sample(k, run.time(k), *numbers, inputs, 0.0, 10_000_000 * k))
             k += 1
 except KeyboardInterrupt:
     print(k)

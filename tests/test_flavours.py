@@ -38,7 +38,7 @@ def test_trajectories_of_both_flavours_agree(fmu_path, native_path, settings):
 
 def test_native_end_effector_follows_the_closed_form_into_the_bag(native_path, tmp_path):
     run = twodof.experiment(native_path)
-    twodof.simulate(run, [twodof.Bag(tmp_path / "bag", run)])
+    twodof.simulate(run, twodof.Bag(tmp_path / "bag"))
     q = twodof.read_bag(tmp_path / "bag").q
     target = np.array([0.2, 0.05])
     expected = target - task_error(target - position(q[0]), 50.0, 40.0, 0.01 * np.arange(501))

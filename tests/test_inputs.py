@@ -212,7 +212,7 @@ def test_variable_that_is_both_set_and_in_the_table_is_refused(
 ) -> None:
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0,0.1\n")
     with pytest.raises(InputError, match=r"x_des\[1\] is both set and in '.*inputs\.csv'"):
-        twodof.experiment(fmu, settings=settings, input_file=tmp_path / "inputs.csv")
+        twodof.experiment(fmu, settings=settings, input_file=tmp_path / "inputs.csv", stamp_start=0)
 
 
 # --- a run ---
@@ -241,7 +241,7 @@ def table(tmp_path: Path) -> Path:
 
 def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: object) -> list[Sample]:
     """A run whose inputs are sent at communication points; those of point 0 are set before."""
-    run = twodof.samples(fmu, stop_time=N * STEP, settings=rows.get(0), **options)
+    run = twodof.samples(fmu, stop_time=N * STEP, settings=rows.get(0), stamp_start=0, **options)
     found = [next(run)]
     while found[-1].k < N:
         found.append(run.send(rows.get(found[-1].k) if found[-1].k else None))
@@ -249,13 +249,13 @@ def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: object) -> l
 
 
 def test_run_with_a_table_is_the_run_with_its_rows_set_by_hand(fmu: Fmu, table: Path) -> None:
-    from_table = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table))
+    from_table = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0))
     assert from_table == by_hand(fmu, {k: ROWS[row][1] for k, row in SET_AT.items()})
     assert len({sample.q for sample in from_table}) == N + 1
 
 
 def test_value_holds_from_its_row_to_the_next(fmu: Fmu, table: Path) -> None:
-    found = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table))
+    found = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0))
     # a sample's inputs are those of the step that led to it
     row = [max(at for at in SET_AT if at <= max(k - 1, 0)) for k in range(N + 1)]
     for sample, at in zip(found, row):
@@ -265,21 +265,21 @@ def test_value_holds_from_its_row_to_the_next(fmu: Fmu, table: Path) -> None:
 
 
 def test_inputs_of_earlier_samples_do_not_change_later(fmu: Fmu, table: Path) -> None:
-    run = twodof.samples(fmu, stop_time=N * STEP, input_file=table)
+    run = twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0)
     seen = [(sample, dict(sample.inputs)) for sample in run]
     assert all(sample.inputs == inputs for sample, inputs in seen)
 
 
 def test_start_values_hold_before_the_first_row(fmu: Fmu, tmp_path: Path) -> None:
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0.05,0.1\n")
-    run = twodof.samples(fmu, stop_time=N * STEP, input_file=tmp_path / "inputs.csv")
+    run = twodof.samples(fmu, stop_time=N * STEP, input_file=tmp_path / "inputs.csv", stamp_start=0)
     assert [sample.inputs["x_des[1]"] for sample in run] == [0.2] * 6 + [0.1] * (N - 5)
 
 
 def test_rows_before_the_start_hold_at_the_start(fmu: Fmu, tmp_path: Path) -> None:
     (tmp_path / "inputs.csv").write_text("time,x_des[1]\n-2,0.3\n-1,0.1\n")
-    run = twodof.samples(fmu, stop_time=STEP, input_file=tmp_path / "inputs.csv")
-    plain = twodof.samples(fmu, stop_time=STEP, settings={"x_des[1]": 0.1})
+    run = twodof.samples(fmu, stop_time=STEP, input_file=tmp_path / "inputs.csv", stamp_start=0)
+    plain = twodof.samples(fmu, stop_time=STEP, settings={"x_des[1]": 0.1}, stamp_start=0)
     assert list(run) == list(plain)
 
 
@@ -301,7 +301,9 @@ def test_a_parameter_cannot_be_sent(fmu: Fmu) -> None:
 
 
 def test_a_setting_holds_throughout(fmu: Fmu) -> None:
-    run = twodof.samples(fmu, stop_time=N * STEP, settings={"Kp": 80, "q_start": (0.4, 0.6)})
+    run = twodof.samples(
+        fmu, stop_time=N * STEP, settings={"Kp": 80, "q_start": (0.4, 0.6)}, stamp_start=0
+    )
     found = list(run)
     assert found[0].q == (0.4, 0.6)
     assert {(sample.inputs["Kp[1]"], sample.inputs["Kp[2]"]) for sample in found} == {(80.0, 80.0)}

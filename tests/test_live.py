@@ -277,7 +277,6 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
     made = json.loads((bag / "run.json").read_text())
     first = made["start_time"]
     assert before <= first <= start
-    assert made["steps"] == len(states) - 1
     page.get_by_text(f"recorded, {len(states)} samples").wait_for()
     steps = np.diff([state.log_time for state in states])
     assert (steps == SECOND // 100).all()
@@ -293,7 +292,7 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
     assert values == {"x_des[1]": 0.15}
     run = twodof.experiment(
         native_path,
-        start_time=first, stop_time=first + made["steps"] * 0.01, settings=given,
+        start_time=first, stop_time=first + (len(states) - 1) * 0.01, settings=given,
     )  # fmt: skip
     again = twodof.samples(run)
     sample = next(again)

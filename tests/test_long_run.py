@@ -22,10 +22,10 @@ import twodof
 from sinks import Memory
 
 fmu, path, storage, steps, start = sys.argv[1:]
-run = twodof.experiment(fmu, stop_time=int(steps) / 100)
+run = twodof.experiment(fmu, stop_time=int(steps) / 100, stamp_start=int(start))
 memory = Memory(4000)
-bag = twodof.Bag(path, run, storage=storage, stamp_start=int(start))
-summary = twodof.simulate(run, [bag, memory])
+bag = twodof.Bag(path, storage=storage)
+summary = twodof.simulate(run, bag, memory)
 print(memory.growth, summary.wall_time)
 """
 

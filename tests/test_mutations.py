@@ -354,9 +354,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> dict[st
         storage, _, kind = name.partition(" ")
         if kind in ("", "scene"):
             run = twodof.experiment(native_path, stop_time=0.3)
-            twodof.simulate(
-                run, [twodof.Bag(folder / name, run, storage=storage, scene=bool(kind))]
-            )
+            twodof.simulate(run, twodof.Bag(folder / name, storage=storage, scene=bool(kind)))
         else:
             write_foreign_bag(
                 folder / name, StoragePlugin[storage.upper()], compressed=kind == "zstd"

@@ -62,9 +62,9 @@ class Recording(NamedTuple):
 
 
 def record(bag: Path, fmu: Path, **options: Any) -> Recording:
-    run = twodof.experiment(fmu, **options)
+    run = twodof.experiment(fmu, stamp_start=START, **options)
     samples = Collector()
-    twodof.simulate(run, [samples, twodof.Bag(bag, run, stamp_start=START)])
+    twodof.simulate(run, samples, twodof.Bag(bag))
     return Recording(bag, samples)
 
 
@@ -378,7 +378,7 @@ def test_what_does_not_change_remains(fmu_path: Path, tmp_path: Path) -> None:
     run = twodof.experiment(fmu_path, stop_time=0.4)
     changes = [(0.1, {"x_des[1]": 0.15}), (0.2, {"Kp[2]": 90.0}), (0.3, {"x_des[2]": 0.1})]
     run, samples = replace(run, changes=changes), Collector()
-    twodof.simulate(run, [samples, twodof.Bag(tmp_path / "bag", run)])
+    twodof.simulate(run, samples, twodof.Bag(tmp_path / "bag"))
     error = panels(plot_bags(tmp_path / "bag")).error
     assert error is not None
     targets = np.array([[s.inputs[f"x_des[{k}]"] for k in (1, 2)] for s in samples])

@@ -291,7 +291,6 @@ def test_the_last_sample_before_a_signal_is_in_the_bag_and_on_the_wire(
     assert heard == truth[-len(heard) :]
     assert assert_consistent(bag, "mcap") == len(truth)
     assert "stopped" in out and f"{len(truth)} messages" in out
-    assert json.loads((bag / "run.json").read_text())["steps"] == len(truth) - 1
 
 
 def test_who_comes_late_gets_robot_description_and_fixed_transforms(
@@ -582,9 +581,9 @@ from twodof.publish import Publisher
 
 steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
 run = twodof.experiment(sys.argv[1], stop_time=steps / 100)
-wire, memory = Publisher(run, scene=True), Memory(steps // 10)
+wire, memory = Publisher(scene=True), Memory(steps // 10)
 pace = RealTime() if paced else None
-summary = twodof.simulate(run, [wire, memory], pace=pace, steer=wire.command)
+summary = twodof.simulate(run, wire, memory, pace=pace, steer=wire.command)
 assert summary.last.k == steps
 print(memory.growth)
 """

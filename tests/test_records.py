@@ -256,7 +256,7 @@ PROVENANCES = {
 def test_hostile_provenance_is_refused(fmu_path: Path, tmp_path: Path, content: str) -> None:
     bag = tmp_path / "bag"
     run = twodof.experiment(fmu_path)
-    with twodof.Bag(bag, run) as sink:
+    with twodof.Bag(bag).begin(run) as sink:
         sink.write(sample(run, 0))
     (bag / "run.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     assert "run.json" in refused("info", bag, tmp_path)
@@ -265,7 +265,7 @@ def test_hostile_provenance_is_refused(fmu_path: Path, tmp_path: Path, content: 
 def test_provenance_without_end_is_refused(fmu_path: Path, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     run = twodof.experiment(fmu_path)
-    with twodof.Bag(bag, run) as sink:
+    with twodof.Bag(bag).begin(run) as sink:
         sink.write(sample(run, 0))
     (bag / "run.json").unlink()
     with (bag / "run.json").open("wb") as file:

@@ -55,7 +55,7 @@ def run(fmu_path: Path) -> Experiment:
 def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
     """A bag of n samples in the state in which a killed process leaves it."""
     living = folder / "living" / "bag"
-    with twodof.Bag(living, run, storage=storage, stamp_start=START, **options) as bag:
+    with twodof.Bag(living, storage=storage, **options).begin(run) as bag:
         for k in range(n):
             bag.write(sample(run, k))
             if k % BATCH == 0:
@@ -134,7 +134,7 @@ def test_killed_run_loses_a_second_at_most(
 def test_slow_step_holds_back_nothing_that_came_before(
     run: Experiment, tmp_path: Path, storage: str
 ) -> None:
-    with twodof.Bag(tmp_path / "bag", run, storage=storage, stamp_start=START) as bag:
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         for k in range(50):
             bag.write(sample(run, k))
         time.sleep(1.0)  # the FMU takes its time
@@ -210,9 +210,7 @@ def test_recovered_bag_is_the_one_that_closing_makes(
     run: Experiment, tmp_path: Path, storage: str
 ) -> None:
     bag = unfinished(tmp_path, run, storage, 2 * BATCH + 1, scene=True)
-    with twodof.Bag(
-        tmp_path / "closed" / "bag", run, storage=storage, stamp_start=START, scene=True
-    ) as closed:
+    with twodof.Bag(tmp_path / "closed" / "bag", storage=storage, scene=True).begin(run) as closed:
         for k in range(2 * BATCH + 1):
             closed.write(sample(run, k))
     twodof.recover(bag)
@@ -299,14 +297,14 @@ def test_unfinished_bag_is_named_with_the_command(
 def test_bag_that_is_being_written_is_left_alone(
     run: Experiment, tmp_path: Path, storage: str
 ) -> None:
-    with twodof.Bag(tmp_path / "bag", run, storage=storage) as bag:
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         bag.write(sample(run, 0))
         for refused in (twodof.recover, twodof.read_bag):
             with pytest.raises(BagError, match="still being written"):
                 refused(bag.path)
         (bag.path / "metadata.yaml").write_text("rosbag2_bagfile_information:")
         with pytest.raises(BagError, match="being written"):
-            twodof.Bag(bag.path, run, overwrite=True)
+            twodof.Bag(bag.path, overwrite=True)
     assert assert_consistent(bag.path, storage) == 1
 
 
@@ -314,7 +312,7 @@ def test_bag_that_is_being_written_is_left_alone(
 def test_complete_bag_is_left_as_it_is(
     run: Experiment, tmp_path: Path, storage: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with twodof.Bag(tmp_path / "bag", run, storage=storage) as bag:
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         bag.write(sample(run, 0))
     before = content(tmp_path)
     assert main(["recover", str(bag.path)]) == 0
@@ -324,7 +322,7 @@ def test_complete_bag_is_left_as_it_is(
 
 @pytest.mark.parametrize("damage", ["metadata.yaml", "short metadata", "mcap"])
 def test_damaged_bag_is_made_anew(run: Experiment, tmp_path: Path, damage: str) -> None:
-    with twodof.Bag(tmp_path / "bag", run, stamp_start=START) as bag:
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(20):
             bag.write(sample(run, k))
     file = bag.path / ("bag.mcap" if damage == "mcap" else "metadata.yaml")
@@ -438,8 +436,8 @@ from twodof.master import Sample
 fmu, path, storage, fsync = sys.argv[1:]
 run = twodof.experiment(fmu)
 inputs = dict(run.start_values)
-with twodof.Bag(path, run, storage=storage, fsync=fsync == "True") as bag:
-    bag.write(Sample(0, 0.0, (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs))
+with twodof.Bag(path, storage=storage, fsync=fsync == "True").begin(run) as bag:
+    bag.write(Sample(0, 0.0, (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs, 0.0, 0))
     open(path + "-stored", "w").close()
 """
     trace = needs("strace")

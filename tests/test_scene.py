@@ -201,8 +201,8 @@ def messages(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Messag
     folder = tmp_path_factory.mktemp("scene")
     inputs = folder / "inputs.csv"
     inputs.write_text("time,x_des[1],x_des[2]\n0,0.2,0.05\n0.5,0.1,0.2\n")
-    run = twodof.experiment(fmu_path, stop_time=1.0, input_file=inputs)
-    twodof.simulate(run, [twodof.Bag(folder / "bag", run, scene=True, stamp_start=START)])
+    run = twodof.experiment(fmu_path, stop_time=1.0, input_file=inputs, stamp_start=START)
+    twodof.simulate(run, twodof.Bag(folder / "bag", scene=True))
     return read(folder / "bag")
 
 
@@ -261,8 +261,8 @@ def test_target_follows_the_end_effector_along_axes_that_are_not_controlled(
     run = twodof.experiment(fmu)
     q = (0.1, -0.9, 1.2, 0.4, 0.5, 0.6)
     inputs = {"x_des[1]": 0.7, "x_des[2]": -0.3}
-    with twodof.Bag(tmp_path / "bag", run, scene=True) as bag:
-        bag.write(Sample(0, 0.0, q, q, (0.0, 0.0), q, inputs))
+    with twodof.Bag(tmp_path / "bag", scene=True).begin(run) as bag:
+        bag.write(Sample(0, 0.0, q, q, (0.0, 0.0), q, inputs, 0.0, 0))
     found = read(tmp_path / "bag")
     ((_, end_effector),) = found["/end_effector"]
     ((_, target),) = found["/target"]

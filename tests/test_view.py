@@ -60,7 +60,7 @@ def folder(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     inputs = folder / "inputs.csv"
     inputs.write_text("time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n")
     run = twodof.experiment(fmu, stop_time=4, input_file=inputs)
-    twodof.simulate(run, [twodof.Bag(folder / "bag", run)])
+    twodof.simulate(run, twodof.Bag(folder / "bag"))
     return folder
 
 
@@ -287,7 +287,7 @@ def painted(folder: Path) -> Path:
     run = twodof.experiment(twodof.build_fmu(folder / "made/painted.fmu", options), stop_time=0.1)
     bag = folder / "elsewhere/bag"
     bag.parent.mkdir()
-    twodof.simulate(run, [twodof.Bag(bag, run)])
+    twodof.simulate(run, twodof.Bag(bag))
     return bag.parent
 
 

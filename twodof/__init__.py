@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from .build import FmuOptions, build_fmu
     from .errors import TwoDofError
     from .fmu import Fmu, load_fmu
-    from .master import RealTime, Sample, Summary, experiment, samples, simulate
+    from .master import RealTime, Sample, Sink, Summary, experiment, samples, simulate
     from .plot import plot_bags
     from .publish import Publisher
     from .sweeps import read_sweep, sweep
@@ -31,6 +31,7 @@ _HOME = {
     "load_fmu": "fmu",
     "RealTime": "master",
     "Sample": "master",
+    "Sink": "master",
     "Summary": "master",
     "experiment": "master",
     "plot_bags": "plot",
@@ -47,6 +48,7 @@ __all__ = [
     "RealTime",
     "Run",
     "Sample",
+    "Sink",
     "Summary",
     "TwoDofError",
     "build_fmu",

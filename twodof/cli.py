@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from .errors import BuildError, InputError, TwoDofError
+from .errors import BuildError, InputError, SimulationError, TwoDofError
 from .options import parser
 
 if TYPE_CHECKING:
@@ -28,12 +28,14 @@ if TYPE_CHECKING:
     from .bag import Bag, Run
     from .figure import Drawing
     from .fmu import Fmu
-    from .master import Experiment, RealTime, Sink, Summary
+    from .master import Experiment, RealTime, Sample, Sink, Summary
     from .publish import Publisher
 
 INTERRUPTED = 130
 LONGEST_LINE = 2000
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM")
+SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
+PATIENCE = 5.0  # s for what is under way to end when it was asked to
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,6 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has left: nothing more to say
         _silence()
         return 1
+    except MemoryError:
+        return _fail("there is not enough memory")
+    except ImportError as error:  # of a broken environment, or where memory does not do
+        return _fail(f"cannot load what it needs: {error}")
     except OSError as error:
         if _is_interrupt(error):
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -129,10 +135,10 @@ def _run(options: argparse.Namespace) -> int:
     from .master import RealTime, simulate
 
     run = _experiment(options, options.stop_time, options.step)
-    bag = _bag(options, run, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
+    bag = _bag(options, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
     pace = RealTime() if options.realtime else None
     with _asked_to_stop() as asked:
-        summary = simulate(run, [bag, _Progress(run)], pace=pace, stop=asked)
+        summary = simulate(run, bag, progress(), pace=pace, stop=asked)
     _print_summary(run, bag, options.storage, summary, pace)
     file = bag.path / f"{bag.path.name}.{'mcap' if options.storage == 'mcap' else 'db3'}"
     viewer = "Foxglove: open" if options.storage == "mcap" else "RViz: play"
@@ -144,37 +150,32 @@ def _run(options: argparse.Namespace) -> int:
     return INTERRUPTED if summary.stopped else 0
 
 
-def _experiment(options: argparse.Namespace, stop_time: float | None, step: float) -> Experiment:
+def _experiment(options: argparse.Namespace, stop_time: float, step: float) -> Experiment:
     from .inputs import parse_settings
-    from .master import endless, experiment
+    from .master import experiment
 
-    settings = parse_settings(options.settings)
-    made: dict[str, Any] = {"step": step, "settings": settings, "input_file": options.input}
-    fmu = _chosen_fmu(options)
-    return (
-        endless(fmu, **made) if stop_time is None else experiment(fmu, stop_time=stop_time, **made)
-    )
+    return experiment(
+        _chosen_fmu(options), stop_time=stop_time, step=step,
+        settings=parse_settings(options.settings), input_file=options.input,
+        stamp_start=options.stamp_start,
+    )  # fmt: skip
 
 
-def _bag(options: argparse.Namespace, run: Experiment, path: str, **more: bool) -> Bag:
+def _bag(options: argparse.Namespace, path: str) -> Bag:
     from .bag import Bag
 
     return Bag(
         path,
-        run,
         storage=options.storage,
         scene=options.scene,
         effort=options.effort,
-        stamp_start=options.stamp_start,
         overwrite=options.overwrite,
         fsync=options.fsync,
         command_line=options.command_line,
-        **more,
     )
 
 
 def _publish(options: argparse.Namespace) -> int:
-    from .bag.messages import Stamps
     from .master import RealTime, simulate
     from .publish import Publisher, network
 
@@ -183,17 +184,16 @@ def _publish(options: argparse.Namespace) -> int:
     if options.output is None and (options.overwrite or options.fsync):
         raise InputError("--overwrite and --fsync are for a bag; name it with -o")
     place = network(subnet=options.subnet)
-    run = _experiment(options, options.stop_time, 1.0 / options.rate)
-    bag = _bag(options, run, options.output, open_ended=True) if options.output else None
-    stamps = bag.stamps if bag else Stamps(run, options.stamp_start)
-    wire = Publisher(
-        run, place, stamps=stamps, scene=options.scene, effort=options.effort,
-        opened=_print_network,
-    )  # fmt: skip
+    endless = options.stop_time is None
+    run = _experiment(options, math.inf if endless else options.stop_time, 1.0 / options.rate)
+    bag = _bag(options, options.output) if options.output else None
+    wire = Publisher(place, scene=options.scene, effort=options.effort, opened=_print_network)
     sinks: list[Sink] = [wire] if bag is None else [wire, bag]
     pace = RealTime()
     with _asked_to_stop() as asked:
-        summary = simulate(run, sinks, pace=pace, stop=asked, steer=wire.command)
+        summary = simulate(
+            run, *sinks, pace=pace, stop=asked, steer=wire.command, resume=wire.resume
+        )
     _print_summary(run, bag, options.storage, summary, pace)
     if bag is not None:
         _print_next(f"twodof plot {_quote(bag.path)}", f"ros2 bag play {_quote(bag.path)}")
@@ -244,8 +244,9 @@ def _chosen_fmu(options: argparse.Namespace) -> Path:
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Whether a signal asked the run to end; read between steps, so that a step is never cut.
 
-    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once;
-    more are ignored, as all that is left is closing the bag.
+    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once, and
+    so does the clock where the first has no effect; more are ignored, as all that is left is
+    closing the bag.
     """
     asked = False
 
@@ -256,36 +257,50 @@ def _asked_to_stop() -> Iterator[Callable[[], bool]]:
                 signal.signal(number, signal.SIG_IGN)
             raise KeyboardInterrupt
         asked = True
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, PATIENCE)
 
     before = {number: signal.signal(number, ask) for number in SIGNALS}
     try:
         yield lambda: asked
+    except SimulationError as error:
+        if asked:  # the Python flavour discards a step that is interrupted
+            raise KeyboardInterrupt from error
+        raise
     finally:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-class _Progress:
+def progress() -> Sink:
     """A sink that shows a bar on a terminal and nothing in a pipe."""
+    from tqdm import tqdm
 
-    def __init__(self, run: Experiment) -> None:
-        self._run = run
+    from .master import Sink
 
-    def __enter__(self) -> _Progress:
-        from tqdm import tqdm
+    class Progress(Sink):
+        def begin(self, run: Experiment) -> Progress:
+            self._run = run
+            return self
 
-        seconds = self._run.steps * self._run.step
-        self._bar = tqdm(
-            total=seconds, unit="s", disable=None, leave=False, desc="simulating",
-            bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left",
-        )  # fmt: skip
-        return self
+        def __enter__(self) -> Progress:
+            run = self._run
+            self._bar = tqdm(
+                total=run.steps * run.step, unit="s", disable=None, leave=False, desc="simulating",
+                bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s,"
+                " {remaining} left",
+            )  # fmt: skip
+            return self
 
-    def write(self, sample: object) -> None:
-        self._bar.update(self._run.step if sample.k else 0.0)  # type: ignore[attr-defined]
+        def write(self, sample: Sample) -> None:
+            self._bar.update(self._run.step if sample.k else 0.0)
 
-    def __exit__(self, *exception: object) -> None:
-        self._bar.close()
+        def __exit__(self, *exception: object) -> None:
+            self._bar.close()
+
+    return Progress()
 
 
 def _print_summary(
@@ -297,7 +312,7 @@ def _print_summary(
     if bag is not None:
         rows.append(("bag", f"{bag.path} ({last.k + 1} messages on /joint_states, {storage})"))
     if summary.error is not None:
-        target = ", ".join(f"{last.inputs[f'x_des[{k + 1}]']:g}" for k in range(len(last.x)))
+        target = ", ".join(f"{value:g}" for value in last.target or ())
         rows.append(("end effector", f"{_length(summary.error)} from its target ({target}) m"))
     speed = simulated / summary.wall_time if summary.wall_time else 0.0
     rows.append(

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from ctypes import byref, c_double, c_uint
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path, PurePosixPath
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -168,9 +169,10 @@ class Instance:
     def initialise(
         self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
     ) -> None:
-        """Set start values and go through initialisation mode."""
+        """Set start values and go through initialisation mode; the stop time may be infinite."""
         self.set(values)
-        self._accept(self._slave.setupExperiment, startTime=start_time, stopTime=stop_time)
+        stop = stop_time if stop_time < inf else None
+        self._accept(self._slave.setupExperiment, startTime=start_time, stopTime=stop)
         self._accept(self._slave.enterInitializationMode)
         self._accept(self._slave.exitInitializationMode)
 

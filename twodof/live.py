@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import chain, count
-from math import dist, inf, isfinite
+from math import inf, isfinite
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -30,7 +30,7 @@ from .bag import Bag
 from .errors import BagError, PageError, SimulationError, TwoDofError
 from .fmu import Fmu, load_fmu, read_resource, read_urdf
 from .inputs import Setting, Value, resolve
-from .master import Experiment, RealTime, Sample, endless, samples
+from .master import Experiment, RealTime, Sample, at_rest, experiment, samples
 from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Page, Plot, Readout, Switch
 from .page_robot import PageRobot
 from .plant import Robot, RobotError, load_robot
@@ -54,7 +54,7 @@ class Recording:
     """A bag that begins in the midst of a run, with the sample that is at hand.
 
     Its provenance is that of a run which starts there: from the joint positions and velocities and
-    with the inputs of its first sample; what was changed later is added when it is closed.
+    with the inputs of its first sample. Its stamps start at the wall clock's time.
     """
 
     def __init__(self, path: Path, run: Experiment, first: Sample, command_line: str) -> None:
@@ -64,21 +64,16 @@ class Recording:
             for name, value in zip(run.fmu.vector(group), values)
         }
         starts = {**run.start_values, **first.inputs, **state}
-        run = replace(
-            run, start_time=first.t, steps=run.steps - first.k, start_values=starts,
-            given={**run.given, **first.inputs, **state}, changes=[],
-        )  # fmt: skip
-        self.path, self._first = path, first.k
-        self._bag = Bag(
-            path, run, scene=True, effort=bool(first.tau), open_ended=True,
-            command_line=command_line,
-        )  # fmt: skip
-        self._bag.__enter__()
+        run = replace(run, start_time=first.t, start_values=starts, changes=[])
+        self._later = run.first_stamp() - first.stamp
+        bag = Bag(path, scene=True, effort=bool(first.tau), command_line=command_line)
+        self._bag = bag.begin(run).__enter__()
+        self.path = path
         self.write(first)
 
     def write(self, sample: Sample) -> None:
         """Write one sample."""
-        self._bag.write(sample._replace(k=sample.k - self._first))
+        self._bag.write(sample._replace(stamp=sample.stamp + self._later))
 
     @property
     def count(self) -> int:
@@ -86,7 +81,7 @@ class Recording:
         return self._bag.count
 
     def close(self) -> None:
-        """Close the bag, and complete its provenance."""
+        """Close the bag."""
         self._bag.__exit__(None, None, None)
 
 
@@ -148,7 +143,7 @@ class Loop:
 
     def _begin(self) -> None:
         """Instantiate the FMU and take its first sample."""
-        self._source = samples(self._run, pace=self.pace)
+        self._source = samples(self._run, pace=self.pace, resume=self._resume)
         self.pace.restart()
         self._rows: list[tuple[float, ...]] = []
         self._again, self._broken = True, False
@@ -217,9 +212,15 @@ class Loop:
             self._notes.append(("The simulation has ended", f"{error or 'its time is over'}"))
             self._end_recording()
 
+    def _resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
+        rest = at_rest(self._run.fmu, sample)
+        if rest is not None:
+            self._notes.append(("The robot is stopped where it is", str(error)))
+        return rest
+
     def _take(self, sample: Sample) -> None:
         self._sample = sample
-        self._rows.append((*sample.q, 1e3 * dist(sample.x, _target(sample))))
+        self._rows.append((*sample.q, 1e3 * (sample.error or 0.0)))
         del self._rows[:-MOST_ROWS]  # while no page asks
         if self._recording is not None:
             try:
@@ -265,10 +266,6 @@ class Loop:
         name = self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
         names = chain([name], (f"{name}-{i}" for i in count(2)))
         return next(path for path in map(Path, names) if not path.exists())
-
-
-def _target(sample: Sample) -> list[float]:
-    return [float(sample.inputs[f"x_des[{k + 1}]"]) for k in range(len(sample.x))]
 
 
 class Controls:
@@ -353,7 +350,7 @@ class Controls:
         starts = self._starts
         end = self._robot.end_effector(sample.q)
         self._target_place = end.copy()
-        for axis, value in zip(fmu.axes, _target(sample)):
+        for axis, value in zip(fmu.axes, sample.target or ()):
             self._target_place["xyz".index(axis)] = value
         shown = np.vstack([self._robot.points(sample.q), end, self._target_place])
         gravity = [-float(starts.get(f"gravity[{i}]", 0.0)) for i in (1, 2, 3)]
@@ -474,14 +471,13 @@ class Controls:
             self._past.popleft()
         elapsed = now - self._past[0][0]
         factor = (sample.t - self._past[0][1]) / elapsed if elapsed > 0.5 * WINDOW else None
-        x, target = sample.x, _target(sample)
         rows = {
             "time": f"{sample.t:.2f} s",
             "real-time factor": "-" if factor is None else f"{factor:.2f}",
             "deadlines missed": f"{news.missed} of {news.steps}, worst {1e3 * news.worst:.1f} ms",
-            "end effector": f"({', '.join(f'{value:+.5f}' for value in x)}) m",
-            "target": f"({', '.join(f'{value:+.5f}' for value in target)}) m",
-            "error": f"{1e3 * dist(x, target):.4g} mm",
+            "end effector": f"({', '.join(f'{value:+.5f}' for value in sample.x)}) m",
+            "target": f"({', '.join(f'{value:+.5f}' for value in sample.target or ())}) m",
+            "error": f"{1e3 * (sample.error or 0.0):.4g} mm",
             **{
                 name: f"{q:+.5f} {unit}"
                 for name, q, unit in zip(self._fmu.joints, sample.q, self._units)
@@ -567,7 +563,7 @@ def live(
         bag: name of the first recording; None: rosbag2_<date and time>.
         command_line: for the provenance of recordings.
     """
-    run = endless(fmu, step=step, settings=settings)
+    run = experiment(fmu, step=step, stop_time=inf, settings=settings)
     loop = Loop(run, bag=bag, command_line=command_line)
     with page_of(loop, run, host, port) as (url, page):
         opened(url)

@@ -10,20 +10,26 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import dataclass, replace
-from itertools import accumulate
-from math import dist, isfinite
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import accumulate, count
+from math import dist, inf, isfinite
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .errors import InputError, SimulationError
 from .fmu import Fmu, Instance, instantiate, load_fmu
 from .inputs import Changes, Setting, Value, read_changes, resolve
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 TIME_TOLERANCE = 1e-9
-LONGEST = 1e7  # s: no run that anybody watches is longer
+NANOSECONDS = 1_000_000_000
+LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
+LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
 OUTPUTS = ("q", "v", "x", "tau")
 
 
@@ -37,6 +43,8 @@ class Sample(NamedTuple):
         x: position of the end effector along the task axes, m; empty if the FMU has none.
         tau: control effort applied, N·m or N; empty if the FMU has none.
         inputs: values of all inputs by name, as they are at t.
+        since: the communication point from which on the inputs have had these values, s.
+        stamp: of the messages that tell of it, ns since the epoch.
     """
 
     k: int
@@ -46,15 +54,49 @@ class Sample(NamedTuple):
     x: tuple[float, ...]
     tau: tuple[float, ...]
     inputs: Mapping[str, Value]
+    since: float
+    stamp: int
+
+    @property
+    def target(self) -> tuple[float, ...] | None:
+        """x_des, m, one value for each of x; None where the FMU has no such inputs."""
+        values = [self.inputs.get(f"x_des[{k + 1}]") for k in range(len(self.x))]
+        return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
+
+    @property
+    def error(self) -> float | None:
+        """Distance of the end effector from its target, m; None where there is no target."""
+        return None if self.target is None else dist(self.x, self.target)
 
 
-class Sink(Protocol):
-    """Consumer of samples: a context manager with ``write``."""
+class Sink:
+    """Consumer of samples: a context that is given the experiment and then each sample.
 
-    def __enter__(self) -> Any: ...
-    def __exit__(self, *exception: Any) -> Any: ...
+    One of one's own needs ``write`` alone; the rest does nothing here.
+
+    ::
+
+        with sink.begin(run):
+            for sample in samples(run):
+                sink.write(sample)
+    """
+
+    def begin(self, run: Experiment) -> Self:
+        """Take the experiment whose samples come; itself, to be entered."""
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        pass
+
     def write(self, sample: Sample) -> None:
         """Take one sample."""
+
+
+Resume = Callable[[Sample, SimulationError], Mapping[str, Setting] | None]
+"""What a run goes on with after a step that was discarded: the sample before it, and the reason."""
 
 
 @dataclass(frozen=True)
@@ -64,23 +106,40 @@ class Experiment:
     Attributes:
         fmu: the FMU.
         start_time, step: s.
-        steps: N, the number of communication steps.
+        steps: N, the number of communication steps; infinite for a run without end.
         start_values: all inputs and parameters with the values they start with.
         given: those of them that differ from the model description on purpose.
         changes: inputs over time.
+        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
     """
 
     fmu: Fmu
     start_time: float
     step: float
-    steps: int
+    steps: float
     start_values: Mapping[str, Value]
     given: Mapping[str, Value]
     changes: Changes
+    stamp_start: float | None
 
-    def time(self, k: int) -> float:
+    def time(self, k: float) -> float:
         """Time after k steps, s; never accumulated."""
         return self.start_time + k * self.step
+
+    def first_stamp(self) -> int:
+        """Stamp of the first sample if the run began now, ns since the epoch.
+
+        Raises:
+            InputError: ROS 2 has no such time.
+        """
+        start = self.stamp_start
+        # a fraction: a double of today's nanoseconds is good to 256 only
+        first = time.time_ns() if start is None else round(Fraction(start) * NANOSECONDS)
+        last = first + (self.steps * self.step * NANOSECONDS if self.steps < inf else 0)
+        if not 0 <= first <= last <= LATEST_STAMP:
+            whose = "the wall clock" if start is None else f"stamp_start = {start:g} s"
+            raise InputError(f"the stamps of a run from {whose} on are not those of 1970 to 2038")
+        return first
 
 
 def experiment(
@@ -91,15 +150,18 @@ def experiment(
     step: float = 0.01,
     settings: Mapping[str, Setting] | None = None,
     input_file: str | Path | None = None,
+    stamp_start: float | None = None,
 ) -> Experiment:
     """Check what a run is asked to do.
 
     Args:
         fmu: the FMU or its path.
-        start_time, stop_time, step: s; the stop a whole number of steps after the start.
+        start_time, stop_time, step: s; the stop a whole number of steps after the start, or
+            infinite.
         settings: start values of inputs and parameters by name; a vector's name takes one value
             for all elements or a sequence.
         input_file: CSV of inputs over time (``inputs.read_changes``).
+        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
 
     Raises:
         InputError, FmuError: naming what is wrong.
@@ -110,7 +172,9 @@ def experiment(
     for name in changes[0][1] if changes else ():
         if name in given:
             raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
-    return Experiment(
+    if stamp_start is not None and not isfinite(stamp_start):
+        raise InputError(f"stamp_start = {stamp_start} is not finite")
+    run = Experiment(
         fmu=fmu,
         start_time=start_time,
         step=step,
@@ -118,18 +182,17 @@ def experiment(
         start_values={**_declared_starts(fmu), **given},
         given=given,
         changes=changes,
+        stamp_start=stamp_start,
     )
+    run.first_stamp()  # which refuses what has none
+    return run
 
 
-def endless(fmu: Fmu | str | Path, *, step: float, **options: Any) -> Experiment:
-    """An experiment without end; arguments and errors as of ``experiment``."""
-    run = experiment(fmu, step=step, stop_time=step, **options)
-    return replace(run, steps=round(LONGEST / step))
-
-
-def _steps(start: float, stop: float, h: float) -> int:
+def _steps(start: float, stop: float, h: float) -> float:
     if not (h > 0.0 and isfinite(h)):
         raise InputError(f"step {h:g} s must be > 0")
+    if stop == inf and isfinite(start):
+        return inf
     if not (isfinite(start) and isfinite(stop) and stop > start):
         raise InputError(f"stop time {stop:g} s must be after the start time {start:g} s")
     if not isfinite((stop - start) / h):
@@ -168,24 +231,28 @@ class RealTime:
         """The next sample is due at once, and those after it by that."""
         self._start = None
 
-    def wait(self, elapsed: float) -> None:
-        """Wait until the wall clock is ``elapsed`` s after the first call."""
+    def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
+        """Wait until the wall clock is ``elapsed`` s after the first call, or ``stop`` is true."""
         now = time.perf_counter()
         if self._start is None:
             self._start = now - elapsed
-        left = self._start + elapsed - now
-        if left > 0.0:
-            time.sleep(left)
-        elif left < 0.0:
+        due = self._start + elapsed
+        left = due - now
+        while left > 0.0 and not stop():
+            time.sleep(min(left, LONGEST_SLEEP))
+            left = due - time.perf_counter()
+        if due < now:
             self.missed += 1
-            self.worst = max(self.worst, -left)
+            self.worst = max(self.worst, now - due)
 
 
 def samples(
     run: Experiment | Fmu | str | Path,
     *,
     pace: RealTime | None = None,
-    stop: Callable[[], bool] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    ready: Callable[[], object] = lambda: None,
+    resume: Resume = lambda sample, error: None,
     instance: Instance | None = None,
     **options: Any,
 ) -> Generator[Sample, Mapping[str, Setting] | None, None]:
@@ -197,7 +264,11 @@ def samples(
     Args:
         run: the experiment, or an FMU with the options of ``experiment`` beside it.
         pace: waits before each sample until its time has come.
-        stop: asked between two steps; True ends the run.
+        stop: asked between two steps, and while it is waited for the next one's time; True ends the
+            run.
+        ready: called when the FMU is initialised, before time and stamps begin.
+        resume: asked where a step was discarded; start values with which the FMU is initialised
+            anew and goes on from the sample before, or None, and the run fails.
         instance: one of that FMU which is as instantiated, and stays when the run has ended;
             None: an own one.
 
@@ -225,27 +296,53 @@ def samples(
         inputs.update(first)
         instance.initialise(run.start_time, run.time(run.steps), {**run.given, **first})
         read = instance.reader(names)
-        for k in range(run.steps + 1):
+        ready()
+        first_stamp, since = run.first_stamp(), run.start_time
+        for k in count():
             t = run.time(k)
             values = read()
             if not all(map(isfinite, values)):
                 text = f"the FMU gave a value that is not finite at t = {t:g} s"
                 raise SimulationError(text, k, "diverged")
             if pace is not None:
-                pace.wait(t - run.start_time)
+                pace.wait(t - run.start_time, stop)
             q, v, x, tau = (values[part] for part in slices)
-            answer = yield Sample(k, t, q, v, x, tau, inputs)
-            if k == run.steps or (stop is not None and stop()):
+            stamp = first_stamp + round(k * run.step * NANOSECONDS)
+            sample = Sample(k, t, q, v, x, tau, inputs, since, stamp)
+            answer = yield sample
+            if k == run.steps or stop():
                 return
-            latest = {**changes_until(t), **(resolve(fmu, answer) if answer else {})}
+            asked = {**changes_until(t), **(resolve(fmu, answer) if answer else {})}
+            latest = {name: value for name, value in asked.items() if value != inputs.get(name)}
             try:
                 if latest:
                     instance.set(latest)
-                    inputs = {**inputs, **latest}
+                    inputs, since = {**inputs, **latest}, t
                 instance.step(t, run.step)
             except SimulationError as error:
                 text = f"step {k + 1} at t = {t:g} s: {error}"
-                raise SimulationError(text, k, error.outcome) from error
+                failure = SimulationError(text, k, error.outcome)
+                again = resume(sample, failure) if error.outcome == "discarded" else None
+                if again is None:
+                    raise failure from error
+                values_again = resolve(fmu, again)
+                kept = {n: v for n, v in values_again.items() if n in inputs}
+                inputs, since = {**inputs, **kept}, t
+                instance.reset()
+                end = run.time(run.steps)
+                instance.initialise(t, end, {**run.given, **inputs, **values_again})
+                instance.step(t, run.step)
+
+
+def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
+    """Start values of a robot that rests where a sample has it, and is meant to be there.
+
+    With them a run can go on after a step that was discarded: across a singularity, speeds can
+    escape to infinity in finite time after a target that is out of reach. None where the FMU has
+    not the variables.
+    """
+    values = {"q_start": sample.q, "v_start": (0.0,) * len(sample.v), "x_des": sample.x}
+    return values if all(fmu.vector(group) for group in values) else None
 
 
 @dataclass(frozen=True)
@@ -264,24 +361,21 @@ class Summary:
 
     @property
     def error(self) -> float | None:
-        """Distance of the end effector from its target, m; None where the FMU has no x_des."""
-        target = [self.last.inputs.get(f"x_des[{k + 1}]") for k in range(len(self.last.x))]
-        if not target or None in target:
-            return None
-        return dist(self.last.x, target)  # type: ignore[arg-type]
+        """Distance of the end effector from its target at the end, m; None without a target."""
+        return self.last.error
 
 
 def simulate(
     run: Experiment | Fmu | str | Path,
-    sinks: Iterable[Sink] = (),
-    *,
+    *sinks: Sink,
     pace: RealTime | None = None,
-    stop: Callable[[], bool] | None = None,
+    stop: Callable[[], bool] = lambda: False,
     instance: Instance | None = None,
     steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
+    resume: Resume = lambda sample, error: None,
     **options: Any,
 ) -> Summary:
-    """Run an FMU and hand every sample to every sink.
+    """Run an FMU and hand every sample to every sink, which is opened once the FMU is initialised.
 
     Other arguments and errors as in ``samples``.
 
@@ -291,19 +385,20 @@ def simulate(
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
     with ExitStack() as stack:
-        source = stack.enter_context(closing(samples(run, pace=pace, stop=stop, instance=instance)))
-        sample = next(source)
-        writes = [stack.enter_context(sink).write for sink in sinks]
-        if pace is not None:  # what the sinks took to open is not the run's
-            pace.restart()
-            pace.wait(0.0)
-        begin = time.perf_counter()
+
+        def begin() -> None:
+            for sink in sinks:
+                stack.enter_context(sink.begin(run))
+
+        source = samples(run, pace=pace, stop=stop, ready=begin, resume=resume, instance=instance)
+        sample = next(stack.enter_context(closing(source)))
+        started = time.perf_counter()
         while True:
-            for write in writes:
-                write(sample)
+            for sink in sinks:
+                sink.write(sample)
             answer = steer()
             try:
                 sample = source.send(answer)
             except StopIteration:
                 break
-        return Summary(sample, time.perf_counter() - begin, sample.k < run.steps)
+        return Summary(sample, time.perf_counter() - started, sample.k < run.steps)

@@ -22,9 +22,10 @@ from xml.sax.saxutils import quoteattr
 
 from rosbags.interfaces import Nodetype, Qos, QosDurability
 
-from .bag.messages import SCENE_TOPICS, STORE, STREAM, Messages, Serialised, Stamps
-from .errors import PublishError
-from .master import Experiment, Sample
+from .bag.messages import SCENE_TOPICS, STORE, STREAM, Messages, Serialised
+from .errors import PublishError, SimulationError
+from .inputs import Setting
+from .master import Experiment, Sample, Sink, at_rest
 
 try:
     from cyclonedds import core, domain, idl, pub, qos, sub, topic
@@ -271,13 +272,11 @@ def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, di
     return opened, {name: present.get(name, "localhost") for name in chosen}, said
 
 
-class Publisher:
+class Publisher(Sink):
     """A sink that publishes each sample, and hears of targets.
 
     Args:
-        run: the experiment whose samples come.
         place: the network; None: what the environment asks for.
-        stamps: of the messages; a bag's, where the same samples go there.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         opened: told when the network is open.
@@ -287,19 +286,16 @@ class Publisher:
         interface: names of the network interfaces in use, known when it is open.
         topics: what is published.
         commands: the topics on which targets are heard of; none where the FMU has no inputs
-            x_des[k], or does not say which axes of which frame they are.
+            x_des[k], or does not say which axes of which frame they are. Known when it has begun.
 
     Raises:
         PublishError: the network cannot be used as asked for.
-        BagError: the FMU has not what is asked for.
     """
 
     def __init__(
         self,
-        run: Experiment,
         place: Network | None = None,
         *,
-        stamps: Stamps | None = None,
         scene: bool = False,
         effort: bool = False,
         opened: Callable[[Publisher], None] = lambda publisher: None,
@@ -307,13 +303,21 @@ class Publisher:
         self._opened = opened
         self.place = network() if place is None else place
         self.interface = ""
-        self._axes, self._root = run.fmu.axes, run.fmu.root
-        self._messages = Messages(run, scene=scene, effort=effort)
-        self.topics = tuple(self._messages.topics)
-        self.commands = COMMANDS if self._axes and run.fmu.vector("x_des") else ()
-        self._stamps = Stamps(run) if stamps is None else stamps
+        self._scene, self._effort = scene, effort
         self._begun = False
         self._warned: set[str] = set()
+
+    def begin(self, run: Experiment) -> Publisher:
+        """Take the experiment whose samples come.
+
+        Raises:
+            BagError: the FMU has not what is asked for.
+        """
+        self._fmu, self._axes, self._root = run.fmu, run.fmu.axes, run.fmu.root
+        self._messages = Messages(run, scene=self._scene, effort=self._effort)
+        self.topics = tuple(self._messages.topics)
+        self.commands = COMMANDS if self._axes and run.fmu.vector("x_des") else ()
+        return self
 
     def __enter__(self) -> Publisher:
         self._domain, self.interface = open_domain(self.place)
@@ -339,11 +343,10 @@ class Publisher:
 
     def write(self, sample: Sample) -> None:
         """Publish one sample: one JointState, and the scene's messages."""
-        stamp = self._stamps.of(sample)
         if not self._begun:
             self._begun = True
-            self._publish(self._messages.latched(stamp))
-        self._publish(self._messages.of(sample, stamp))
+            self._publish(self._messages.latched(sample.stamp))
+        self._publish(self._messages.of(sample))
 
     def _publish(self, messages: list[tuple[str, Serialised]]) -> None:
         for name, cdr in messages:
@@ -365,6 +368,13 @@ class Publisher:
                 if message.sample_info.valid_data:
                     target = self._target(name, message.cdr) or target
         return None if target is None else {"x_des": target}
+
+    def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
+        """What a run goes on with where a step was discarded: who asks for targets ends no run."""
+        rest = at_rest(self._fmu, sample) if self.commands else None
+        if rest is not None:
+            self._warn_once("rest", f"{error}: the robot is stopped, and its target is where it is")
+        return rest
 
     def _target(self, name: str, cdr: Serialised) -> tuple[float, ...] | None:
         try:

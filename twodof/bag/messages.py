@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Iterator, Sequence
-from fractions import Fraction
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,15 +20,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from ..errors import BagError
 from ..fmu import read_resource, read_urdf
-from ..master import Experiment, Sample
+from ..master import NANOSECONDS, Experiment, Sample
 from ..plant import RobotError, load_robot
 from ..scene import Scene, Transform
 
 Array = NDArray[np.float64]
 JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
-NANOSECONDS = 1_000_000_000
-LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 FOREVER = QosTime(9223372036, 854775807)
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -69,40 +64,6 @@ SCENE_TOPICS = {
     "/target": Topic("geometry_msgs/msg/PointStamped", STREAM),
     "/end_effector": Topic("geometry_msgs/msg/PointStamped", STREAM),
 }
-
-
-class Stamps:
-    """Stamps of a run's samples, start + k·h: what keeps the samples keeps the stamps.
-
-    Args:
-        run: the experiment.
-        start: s since the epoch; None: the wall clock when it is first asked for.
-
-    Raises:
-        BagError: a stamp is out of range.
-    """
-
-    def __init__(self, run: Experiment, start: float | None = None) -> None:
-        if start is not None and not 0 <= start * NANOSECONDS <= LATEST_STAMP:
-            raise BagError(f"the first stamp, {start:g} s, is out of range")
-        self._given, self._step = start, run.step
-        end = (time.time() if start is None else start) + run.steps * run.step
-        if end * NANOSECONDS > LATEST_STAMP:
-            raise BagError(f"the last stamp, {run.steps * run.step:g} s later, is out of range")
-
-    def now(self) -> int:
-        """Stamp of the first sample if it came now, ns since the epoch."""
-        # a fraction: a double of today's nanoseconds is good to 256 only
-        return time.time_ns() if self._given is None else round(Fraction(self._given) * NANOSECONDS)
-
-    @cached_property
-    def start(self) -> int:
-        """Stamp of the first sample, ns since the epoch."""
-        return self.now()
-
-    def of(self, sample: Sample) -> int:
-        """Stamp of a sample, ns since the epoch."""
-        return self.start + round(sample.k * self._step * NANOSECONDS)
 
 
 class JointStateLayout:
@@ -182,7 +143,7 @@ class Messages:
 
     def __init__(self, run: Experiment, *, scene: bool, effort: bool) -> None:
         if effort and not run.fmu.vector("tau"):
-            raise BagError(f"'{run.fmu.path}' has no outputs tau[i] for --effort")
+            raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
         self._effort = effort
         self._scene = _load_scene(run) if scene else None
         self._axes = run.fmu.axes
@@ -191,29 +152,33 @@ class Messages:
         self._joint_state = JointStateLayout(run.fmu.joints, "", (n, n, n if effort else 0))
         self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM), **(SCENE_TOPICS if scene else {})}
 
-    def of(self, sample: Sample, stamp: int) -> list[tuple[str, Serialised]]:
-        """Topics and messages of one sample at a time stamp in ns."""
+    def of(self, sample: Sample) -> list[tuple[str, Serialised]]:
+        """Topics and messages of one sample."""
         effort = sample.tau if self._effort else ()
-        state = self._joint_state.pack(stamp, sample.q, sample.v, effort)
+        state = self._joint_state.pack(sample.stamp, sample.q, sample.v, effort)
         found: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
         if self._scene is not None:
-            found += map(_serialise, self._of_scene(self._scene, sample, stamp))
+            found += map(_serialise, self._of_scene(self._scene, sample))
         return found
 
     def latched(self, stamp: int) -> list[tuple[str, Serialised]]:
-        """Topics and messages that hold for the whole run: robot description, fixed transforms."""
+        """Topics and messages that hold for the whole run: robot description, fixed transforms.
+
+        Their stamp is given in ns since the epoch.
+        """
         if self._scene is None:
             return []
         description = Message["std_msgs/msg/String"](data=self._scene.description)
         fixed = _tf_message(stamp, self._scene.fixed)
         return [_serialise(("/robot_description", description)), _serialise(("/tf_static", fixed))]
 
-    def _of_scene(self, scene: Scene, sample: Sample, stamp: int) -> Iterator[tuple[str, Any]]:
+    def _of_scene(self, scene: Scene, sample: Sample) -> Iterator[tuple[str, Any]]:
+        stamp = sample.stamp
         yield "/tf", _tf_message(stamp, scene.moving(sample.q))
         end_effector = scene.end_effector(sample.q)
         target = list(end_effector)  # the target leaves an axis that is not controlled as it is
-        for k, axis in enumerate(self._axes):
-            target["xyz".index(axis)] = float(sample.inputs[f"x_des[{k + 1}]"])
+        for axis, value in zip(self._axes, sample.target or ()):
+            target["xyz".index(axis)] = value
         yield "/target", _point(stamp, self._root, target)
         yield "/end_effector", _point(stamp, self._root, end_effector)
 
@@ -221,7 +186,7 @@ class Messages:
 def _load_scene(run: Experiment) -> Scene:
     urdf = read_urdf(run.fmu)
     if urdf is None or not run.fmu.axes:
-        raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which --scene needs")
+        raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which a scene shows")
     try:
         load_robot(urdf, run.fmu.frame, run.fmu.axes)  # a scene takes the URDF to be sound
     except RobotError as error:

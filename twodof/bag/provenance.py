@@ -1,4 +1,4 @@
-"""Where a run came from: run.json, written beside the messages before the first of them."""
+"""Where a run came from: run.json, written beside the messages, and never behind them."""
 
 from __future__ import annotations
 
@@ -11,21 +11,69 @@ from .. import __version__
 from ..errors import BagError
 from ..files import read_file
 from ..fmu import read_urdf
+from ..inputs import Changes
 from ..master import Experiment
 
 FILE = "run.json"
 FORMAT = 1
+MAX_YAML = 256 * 1024  # bytes of changes: a writer of YAML takes 2 s for a MiB
+TAIL = b"]}\n"
+KNOWN_UNTIL = "inputs_known_until"
+"""Key of the time, s, from which on more inputs changed than the file has room for."""
 MAX_SIZE = 64 * 1024**2
 PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
 
 
-def provenance(run: Experiment, stamp_start: int, command_line: str) -> str:
-    """What plots, replay and recovery need to know, as JSON without a single space.
+class ProvenanceFile:
+    """run.json of a bag that is being written: whole at any moment, with the changes so far.
 
-    Writers of YAML, which holds it too, fold at spaces, and not all do it right.
+    The changes of inputs stand at its end, so that adding some writes no other byte anew.
+
+    Args:
+        folder: of the bag.
+        run: the experiment.
+        command_line: that made the bag; "" where none did.
+
+    Raises:
+        OSError: it cannot be written; so does ``add``, which can be called again then.
     """
+
+    def __init__(self, folder: Path, run: Experiment, command_line: str) -> None:
+        self.path = folder / FILE
+        self._head = _as_json(_provenance(run, command_line))[:-1] + b',"input_changes":['
+        self.path.write_bytes(self._head + TAIL)
+        self._start, self._end = run.start_time, len(self._head)
+        self._separator, self._full = b"", False
+
+    def add(self, changes: Changes) -> None:
+        """Add times and the inputs that changed there, as many as a reader is ready for."""
+        if self._full or not changes:
+            return
+        text, tail = self._separator + b",".join(_as_json([t, v]) for t, v in changes), TAIL
+        if self._end + len(text) > MAX_SIZE - 100:
+            text, tail = b"", self._until(changes[0][0])
+            self._full = True
+        with self.path.open("r+b") as file:
+            file.seek(self._end)
+            file.write(text + tail)
+        self._end += len(text)
+        self._separator = b","
+
+    def text(self) -> str:
+        """What the bag's own metadata holds: the whole, or where that is long no changes."""
+        content = self.path.read_bytes()
+        if len(content) > len(self._head) + MAX_YAML:
+            content = self._head + self._until(self._start)
+        return content.decode().strip()
+
+    def _until(self, time: float) -> bytes:
+        return b'],"%s":%r}\n' % (KNOWN_UNTIL.encode(), time)
+
+
+def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
+    """All but the changes of inputs."""
     fmu = run.fmu
-    content = {
+    return {
         "format": FORMAT,
         "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
         "robot": fmu.robot,
@@ -35,15 +83,16 @@ def provenance(run: Experiment, stamp_start: int, command_line: str) -> str:
         "joints": list(fmu.joints),
         "start_time": run.start_time,
         "step": run.step,
-        "steps": run.steps,
-        "stamp_start_ns": stamp_start,
         "start_values": dict(run.start_values),
-        "input_changes": [[t, values] for t, values in run.changes],
         "versions": versions(*PACKAGES),
         "command_line": command_line,
         "urdf": read_urdf(fmu),
     }
-    return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020")
+
+
+def _as_json(content: Any) -> bytes:
+    """Without a single space: writers of YAML, which holds it too, fold there, not all rightly."""
+    return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
 
 
 def versions(*packages: str) -> dict[str, str]:
@@ -78,7 +127,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
 
 def _is_sound(found: dict[str, Any]) -> bool:
     texts = [found.get(key) for key in ("robot", "frame", "root", "axes", "command_line")]
-    numbers = [found.get(key) for key in ("start_time", "step", "steps", "stamp_start_ns")]
+    numbers = [found.get(key) for key in ("start_time", "step")]
     fmu, joints = found["fmu"], found.get("joints")
     starts, changes = found.get("start_values"), found.get("input_changes")
     return (

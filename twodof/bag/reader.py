@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
-from .messages import JOINT_STATE, JOINT_STATES, NANOSECONDS, STORE, Array, JointStateLayout
+from ..master import NANOSECONDS
+from .messages import JOINT_STATE, JOINT_STATES, STORE, Array, JointStateLayout
 from .provenance import read_provenance
 from .records import Channel, DamageError, read_messages, storage_files
 from .storage import is_being_written

@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
@@ -20,22 +19,21 @@ from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
 from ..files import read_file
-from ..inputs import Changes
-from ..master import Experiment, Sample
-from . import provenance
-from .messages import JOINT_STATES, STORE, Messages, Serialised, Stamps
+from ..inputs import Value
+from ..master import Experiment, Sample, Sink
+from .messages import JOINT_STATES, STORE, Messages, Serialised
+from .provenance import ProvenanceFile, read_provenance
 from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, is_being_written, lock, sync
 
 MAX_METADATA = 64 * 1024**2  # bytes
 PROVENANCE_KEY = "twodof"
-MOST_CHANGES = 100_000  # of inputs, that the provenance of an open-ended run has room for
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
 PAUSE = 0.0005  # s between two looks at how far the thread is
 
 
-class Bag:
+class Bag(Sink):
     """A sink that writes a rosbag2 folder.
 
     Left in whatever way, the bag is closed and readable with every sample written so far; while
@@ -47,20 +45,15 @@ class Bag:
 
     Args:
         path: folder of the bag; must not exist, unless ``overwrite`` and it is a bag.
-        run: the experiment whose samples come; goes into the provenance.
         storage: "mcap" or "sqlite3".
         scene: add the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        stamp_start: time of the first stamp, s since the epoch; None: the wall clock.
         overwrite: replace an existing bag.
         fsync: wait for the disk at each flush, so that the machine may lose its power too.
-        open_ended: how long the run will be and what will change its inputs is not known before;
-            the provenance is completed at the end.
         command_line: for the provenance.
 
     Attributes:
         path: the folder.
-        stamps: of the messages.
         count: number of samples so far.
 
     Raises:
@@ -71,19 +64,15 @@ class Bag:
     def __init__(
         self,
         path: str | Path,
-        run: Experiment,
         *,
         storage: str = "mcap",
         scene: bool = False,
         effort: bool = False,
-        stamp_start: float | None = None,
         overwrite: bool = False,
         fsync: bool = False,
-        open_ended: bool = False,
         command_line: str = "",
     ) -> None:
         self.path = Path(path)
-        self._run = run
         if storage not in STORAGES:
             raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
         if storage == "sqlite3" and any(c in str(self.path) for c in "?#%"):
@@ -91,29 +80,38 @@ class Bag:
         self._storage = storage
         self._overwrite = overwrite
         self._fsync = fsync
-        self._open_ended = open_ended
+        self._scene, self._effort = scene, effort
         self._command_line = command_line
+        self._run: Experiment | None = None
         self.count = 0
-        self._inputs, self._latest = run.start_values, run.start_time
-        self._changes: Changes = []
-        self.stamps = Stamps(run, stamp_start)
-        self._messages = Messages(run, scene=scene, effort=effort)
         _check_free(self.path, overwrite)
 
+    def begin(self, run: Experiment) -> Bag:
+        """Take the experiment whose samples come.
+
+        Raises:
+            BagError: the FMU has not what is asked for.
+        """
+        self._run = run
+        self._inputs = run.start_values
+        self._messages = Messages(run, scene=self._scene, effort=self._effort)
+        return self
+
     def __enter__(self) -> Bag:
+        if self._run is None:
+            raise BagError("a bag is given its experiment first: 'with bag.begin(experiment):'")
         _check_free(self.path, self._overwrite)
-        start = self.stamps.now() if self._open_ended else self.stamps.start
-        text = provenance.provenance(self._run, start, self._command_line)
         try:
             if self.path.exists():
                 shutil.rmtree(self.path)
             self._writer = BagWriter(self.path, self._storage, fsync=self._fsync)
-            self._open(text)
+            self._open(self._run)
         except WriterError as error:  # the folder appeared meanwhile and is not ours
             raise BagError(f"cannot write the bag '{self.path}': {error}") from error
         except (OSError, sqlite3.Error) as error:
             raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
         self._queue: deque[tuple[Connection, int, Serialised]] = deque()
+        self._changes: deque[tuple[float, dict[str, Value]]] = deque()
         self._given = self._taken = 0  # bytes, counted by one thread each
         self._due: SimpleQueue[None] = SimpleQueue()
         self._stores = 0
@@ -127,11 +125,10 @@ class Bag:
         if self._failure is not None:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
-        stamp = self.stamps.of(sample)
-        if first := not self._given:
-            self._give(self._messages.latched(stamp), stamp)
-        self._give(self._messages.of(sample, stamp), stamp)
         self._note(sample)
+        if first := not self._given:
+            self._give(self._messages.latched(sample.stamp), sample.stamp)
+        self._give(self._messages.of(sample), sample.stamp)
         if first or self._given - self._taken > BATCH_SIZE:
             self._flush()
 
@@ -151,43 +148,26 @@ class Bag:
             time.sleep(PAUSE)
 
     def _note(self, sample: Sample) -> None:
-        """Remember what changed inputs since the sample before, to which it was the answer."""
-        if sample.inputs is not self._inputs and len(self._changes) < MOST_CHANGES:
+        """Queue what changed of the inputs since the sample before."""
+        if sample.inputs is not self._inputs:
             changed = {n: v for n, v in sample.inputs.items() if v != self._inputs.get(n)}
             if changed:
-                self._changes.append((self._latest, changed))
-        self._inputs, self._latest = sample.inputs, sample.t
+                self._changes.append((sample.since, changed))
+        self._inputs = sample.inputs
         self.count += 1
 
-    def _complete(self) -> None:
-        """Put into the provenance what was not known before the run."""
-        run = replace(self._run, steps=self.count - 1, changes=self._changes)
-        text = provenance.provenance(run, self.stamps.start, self._command_line)
-        self._writer.set_custom_data(PROVENANCE_KEY, text)
-        file = self.path / provenance.FILE
-        try:
-            file.with_suffix(".new").write_text(text + "\n", "utf-8")
-            file.with_suffix(".new").replace(file)
-        except OSError as error:
-            raise BagError(f"cannot write '{file}': {_reason(error)}") from error
-
     def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
-        try:
-            if self._open_ended and self.count and self._failure is None:
-                self._complete()
-        finally:
-            self._closing = True
-            self._due.put(None)
-            self._wait(lambda: False)  # if this is interrupted, the thread still ends its work
+        self._closing = True
+        self._due.put(None)
+        self._wait(lambda: False)  # if this is interrupted, the thread still ends its work
         if self._failure is not None and not isinstance(exception, BagError):
             raise self._error(self._failure) from self._failure
 
-    def _open(self, text: str) -> None:
+    def _open(self, run: Experiment) -> None:
         """Create the bag's folder, or leave nothing of it."""
         try:
-            self._writer.set_custom_data(PROVENANCE_KEY, text)
             self._writer.open()
-            (self.path / provenance.FILE).write_text(text + "\n", "utf-8")
+            self._provenance = ProvenanceFile(self.path, run, self._command_line)
             with (self.path / RESERVE).open("wb") as reserve:
                 reserve.write(b"\0" * RESERVE_SIZE)
                 reserve.flush()
@@ -200,7 +180,7 @@ class Bag:
             }
             self._writer.flush()
             if self._fsync:
-                sync(self.path / provenance.FILE, self.path, self.path.absolute().parent)
+                sync(self._provenance.path, self.path, self.path.absolute().parent)
             self._lock = lock(self.path)
         except WriterError:
             raise
@@ -238,7 +218,14 @@ class Bag:
             self._ended = True
 
     def _store(self) -> None:
-        while self._queue:
+        """Changes of inputs before the messages that show what they did."""
+        count, changes = len(self._queue), list(self._changes)
+        self._provenance.add(changes)
+        for _ in changes:
+            self._changes.popleft()
+        if self._fsync and changes:
+            sync(self._provenance.path)
+        for _ in range(count):
             connection, stamp, data = self._queue.popleft()
             self._writer.write(connection, stamp, data)
             self._taken += len(data)
@@ -255,6 +242,8 @@ class Bag:
             (self.path / RESERVE).unlink(missing_ok=True)
             storage.salvage()
             self._store()
+        with suppress(OSError):  # it was removed: the messages are worth closing without it
+            self._writer.set_custom_data(PROVENANCE_KEY, self._provenance.text())
         self._writer.close()
         if self._fsync:
             sync(storage.path, self.path / "metadata.yaml", self.path)
@@ -302,4 +291,4 @@ def _is_bag(path: Path) -> bool:
         metadata = read_file(path / "metadata.yaml", MAX_METADATA)
         return metadata.startswith(b"rosbag2_bagfile_information:")
     except OSError:
-        return bool(provenance.read_provenance(path))
+        return bool(read_provenance(path))

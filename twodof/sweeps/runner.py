@@ -18,7 +18,7 @@ from ..bag import Bag
 from ..errors import SimulationError
 from ..fmu import Instance, instantiate
 from ..inputs import Value, resolve
-from ..master import OUTPUTS, Experiment, Sample, experiment, simulate
+from ..master import OUTPUTS, Experiment, Sample, Sink, experiment, simulate
 from .metrics import METRICS, measure
 
 Point = tuple[int, tuple[float, ...]]
@@ -82,12 +82,12 @@ class Runner:
         settings = resolve(self._base.fmu, dict(zip(self._job.names, values)))
         given = {**self._base.given, **settings}
         run = replace(self._base, start_values={**self._base.start_values, **given}, given=given)
-        trace = _Trace(run)
-        sinks: list[Any] = [trace]
+        trace = _Trace()
+        sinks: list[Sink] = [trace]
         if self._job.bags is not None:
-            sinks.append(Bag(Path(self._job.bags) / f"{number:06d}", run, overwrite=True))
+            sinks.append(Bag(Path(self._job.bags) / f"{number:06d}", overwrite=True))
         try:
-            simulate(run, sinks, instance=self._fresh())
+            simulate(run, *sinks, instance=self._fresh())
         except SimulationError as error:
             self._drop()  # whatever state it is in
             nothing = [nan] * len(METRICS)
@@ -109,18 +109,16 @@ class Runner:
         self._used.close()
 
 
-class _Trace:
+class _Trace(Sink):
     """A sink that keeps all samples as numbers."""
 
-    def __init__(self, run: Experiment) -> None:
-        self._run = run
+    def __init__(self) -> None:
         self._values = array("d")
 
-    def __enter__(self) -> _Trace:
+    def begin(self, run: Experiment) -> _Trace:
+        """Take the experiment."""
+        self._run = run
         return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
 
     def write(self, sample: Sample) -> None:
         """Keep one sample."""

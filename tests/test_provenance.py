@@ -1,0 +1,182 @@
+"""However a run is driven, its bag tells what drove it: distances and closed form by the bag alone."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing import Pipe
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from sinks import Collector
+
+import twodof
+from twodof.live import Loop
+from twodof.track import read_tracks
+
+TARGETS = {0: (0.2, 0.05), 20: (0.15, 0.1), 45: (0.1, 0.2)}  # by the step that they hold from
+STEPS = 80
+
+
+def by_settings(fmu: Path, bag: Path, samples: Collector) -> None:
+    settings = {"x_des": (0.15, 0.1), "Kp": 80.0, "Kd": (20.0, 30.0)}
+    twodof.simulate(fmu, samples, twodof.Bag(bag), stop_time=STEPS / 100, settings=settings)
+
+
+def by_csv(fmu: Path, bag: Path, samples: Collector) -> None:
+    table = bag.with_suffix(".csv")
+    rows = (f"{k / 100 - 0.004},{x},{y}\n" for k, (x, y) in TARGETS.items())  # between two steps
+    table.write_text("time,x_des[1],x_des[2]\n" + "".join(rows))
+    twodof.simulate(fmu, samples, twodof.Bag(bag), stop_time=STEPS / 100, input_file=table)
+
+
+def by_steering(fmu: Path, bag: Path, samples: Collector) -> None:
+    def steer() -> dict[str, tuple[float, float]] | None:
+        target = TARGETS.get(samples[-1].k)
+        return None if target is None else {"x_des": target}
+
+    twodof.simulate(fmu, samples, twodof.Bag(bag), stop_time=STEPS / 100, steer=steer)
+
+
+def by_sending(fmu: Path, bag: Path, samples: Collector) -> None:
+    run = twodof.experiment(fmu, stop_time=math.inf)
+    steps = twodof.samples(run)
+    with twodof.Bag(bag).begin(run) as sink:
+        sample = next(steps)
+        while sample.k <= STEPS:
+            samples.append(sample)
+            sink.write(sample)
+            target = TARGETS.get(sample.k)
+            sample = steps.send(None if target is None else {"x_des": target})
+
+
+def by_a_thinned_loop(fmu: Path, bag: Path, samples: Collector) -> None:
+    run = twodof.experiment(fmu, stop_time=math.inf)
+    steps = twodof.samples(run)
+    with twodof.Bag(bag).begin(run) as sink:
+        sample = next(steps)
+        while sample.k <= STEPS:
+            if sample.k % 7 == 0:
+                samples.append(sample)
+                sink.write(sample)
+            target = TARGETS.get(sample.k)
+            sample = steps.send(None if target is None else {"x_des": target})
+
+
+def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
+    """What the page's controls send, one order after each news; the recording begins midway."""
+    run = twodof.experiment(fmu, stop_time=math.inf)
+    loop = Loop(run, bag=str(bag))
+    ours, theirs = Pipe()
+    ended = False
+    thread = Thread(target=loop.play, args=(theirs, lambda: ended))
+    thread.start()
+
+    def more(until: Callable[[int], bool]) -> None:
+        while True:
+            ours.send(("more", True))
+            news = ours.recv()
+            if until(news.sample.k):
+                return
+            time.sleep(0.02)
+
+    more(lambda k: k > 5)
+    ours.send(("record", True))
+    for target in TARGETS.values():
+        more(lambda k, begin=[]: bool(begin.append(k) or k > begin[0] + 15))
+        ours.send(("change", {"x_des": target}))
+    more(lambda k, begin=[]: bool(begin.append(k) or k > begin[0] + 15))
+    ended = True
+    thread.join()
+    # the recording's own samples are not told: run again with what it says, by the master
+    stored = twodof.read_bag(bag)
+    changes = [(t, dict(values)) for t, values in stored.provenance["input_changes"]]
+    assert len(changes) == len(TARGETS)
+    start = stored.provenance["start_time"]
+    again = twodof.experiment(
+        fmu, start_time=start, stop_time=start + (len(stored.t) - 1) / 100,
+        settings=stored.provenance["start_values"],
+    )  # fmt: skip
+    due = iter(changes)
+    change = next(due)
+
+    def steer() -> dict[str, float] | None:
+        nonlocal change
+        if change is None or samples[-1].t < change[0] - 1e-9:
+            return None
+        values, change = change[1], next(due, None)
+        return values
+
+    twodof.simulate(again, samples, steer=steer)
+    np.testing.assert_array_equal([sample.q for sample in samples], stored.q)
+
+
+WAYS = [by_settings, by_csv, by_steering, by_sending, by_a_thinned_loop, by_the_page]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_distance_shown_is_that_of_the_samples(
+    way: Callable[[Path, Path, Collector], None], native_path: Path, tmp_path: Path
+) -> None:
+    samples = Collector()
+    way(native_path, tmp_path / "bag", samples)
+    (track,) = read_tracks([tmp_path / "bag"])
+    assert track.task is not None and track.task.departure is not None
+    x = np.array([sample.x for sample in samples])
+    targets = np.array([[sample.inputs[f"x_des[{k}]"] for k in (1, 2)] for sample in samples])
+    assert len(np.unique(targets, axis=0)) == (1 if way is by_settings else len(TARGETS))
+    np.testing.assert_allclose(track.task.error, np.linalg.norm(x - targets, axis=1), rtol=1e-9)
+    assert track.task.departure <= 1e-9
+
+
+LOOP = """
+import math, sys, time
+import twodof
+
+fmu, path = sys.argv[1:]
+run = twodof.experiment(fmu, stop_time=math.inf)
+pace = twodof.RealTime()
+steps = twodof.samples(run, pace=pace)
+with twodof.Bag(path).begin(run) as bag:
+    sample = next(steps)
+    print("begun", flush=True)
+    while True:
+        bag.write(sample)
+        turn = 0.05 * sample.k
+        sample = steps.send({"x_des": (0.15 + 0.05 * math.cos(turn), 0.1 + 0.05 * math.sin(turn))})
+"""
+
+
+@pytest.mark.parametrize("moment", [0.9, 1.7, 2.3])
+def test_so_it_is_after_a_kill_up_to_the_last_flush(
+    native_path: Path, tmp_path: Path, moment: float
+) -> None:
+    bag = tmp_path / "bag"
+    command = [sys.executable, "-c", LOOP, str(native_path), str(bag)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"begun\n"
+        time.sleep(moment)
+        os.kill(process.pid, signal.SIGKILL)
+    assert twodof.recover(bag).counts["/joint_states"] > 20
+    (track,) = read_tracks([bag])
+    assert track.task is not None and track.task.departure is not None
+    assert track.task.departure <= 1e-9
+    assert len(track.run.provenance["input_changes"]) >= len(track.t) - 1
+
+
+def test_what_is_not_known_is_not_shown(native_path: Path, tmp_path: Path) -> None:
+    """Where the file of the changes was full, no distance is told from its end on."""
+    bag = tmp_path / "bag"
+    by_sending(native_path, bag, Collector())
+    text = (bag / "run.json").read_text().strip()
+    assert text.endswith("]}")
+    (bag / "run.json").write_text(f'{text[:-1]},"inputs_known_until":0.6}}')
+    (track,) = read_tracks([bag])
+    assert track.motion is not None and track.task is None
