@@ -1,12 +1,15 @@
-"""Files that others made: regular ones only, and no larger than can be borne."""
+"""Files that others made, regular ones only and no larger than can be borne; files written whole;
+folders marked as being written."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import stat
 import tempfile
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 MAX_ARCHIVE = 2 * 1024**3
@@ -74,3 +77,35 @@ def write_file(path: Path, content: bytes) -> None:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
+
+
+def lock(path: Path) -> int:
+    """Mark a folder as being written until the descriptor is closed or the process dies."""
+    folder = os.open(path, os.O_RDONLY)
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return folder
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a living process writes the folder."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(folder)
+    return False
+
+
+def sync(*paths: Path) -> None:
+    """Bring files and folders, as far as they are written, to the disk itself."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

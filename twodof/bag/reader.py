@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
+from ..files import is_being_written
 from .messages import JOINT_STATE, JOINT_STATES, NANOSECONDS, STORE, Array, JointStateLayout
 from .provenance import read_provenance
 from .records import Channel, DamageError, read_messages, storage_files
-from .storage import is_being_written
 
 BATCH = 8192  # messages that are decoded at once
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
