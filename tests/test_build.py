@@ -197,6 +197,20 @@ def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("uri", ["/etc/passwd", "file:///etc/passwd", "package://etc/passwd"])
+def test_an_fmu_holds_no_file_that_is_none_of_the_robots(uri, tmp_path):
+    urdf = tmp_path / "in/arm.urdf"
+    urdf.parent.mkdir()
+    urdf.write_text(
+        SHAPES.sub(f"<mesh filename='{uri}'/>", data_file("urdf", "2dof.urdf").read_text())
+    )
+    with pytest.raises(
+        TwoDofError, match=f"mesh '{uri}' not found in '{urdf.parent}', .*--mesh-dir"
+    ):
+        build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
+    assert list(tmp_path.iterdir()) == [urdf.parent]
+
+
 def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
     urdf = tmp_path / "rough.urdf"
     text = SHAPES.sub("<sphere radius='0.01'/>", data_file("urdf", "2dof.urdf").read_text())

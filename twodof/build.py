@@ -40,7 +40,7 @@ class FmuOptions:
 
     Attributes:
         urdf: the URDF; None for the shipped planar arm.
-        mesh_dir: folder in which ``package://`` names are looked up; None: around the URDF.
+        mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
         frame: link whose origin is controlled.
         axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else

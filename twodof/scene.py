@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # m
+MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
+"""Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
 logger = logging.getLogger("twodof.scene")
 
 
@@ -251,8 +253,13 @@ def load_mesh(name: str, content: bytes, scale: Array) -> Any:
     """A mesh file as coal's model, its vertices in m.
 
     Raises:
-        ValueError: it cannot be read.
+        ValueError: it cannot be read, or is of a format that has other files read beside it.
     """
+    suffix = Path(name).suffix.lower()
+    if suffix not in MESH_FORMATS:
+        raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
+    if suffix == ".obj":
+        content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
     with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
         file = Path(folder, Path(name).name)
         file.write_bytes(content)
