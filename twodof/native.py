@@ -14,7 +14,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import BuildError
+from .files import temporary_folder
 from .plant import Robot, Variable
 
 Array = NDArray[np.float64]
@@ -136,15 +136,15 @@ def compile_library(
     """
     if platform not in TARGETS:
         raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")
-    with tempfile.TemporaryDirectory(prefix="twodof-native-") as folder:
+    with temporary_folder() as folder:
         for file, content in sources.items():
-            Path(folder, file).write_bytes(content)
+            (folder / file).write_bytes(content)
         files = sorted(file for file in sources if file.endswith(".c"))
         output = name + EXTENSIONS[platform]
         built = []
         for compiler in _compilers(platform):
             _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *files], folder)
-            built.append(Path(folder, output).read_bytes())
+            built.append((folder / output).read_bytes())
     return built[0] if len(built) == 1 else universal(built)
 
 
@@ -201,7 +201,7 @@ def _link_flags(platform: str, output: str) -> list[str]:
     return flags
 
 
-def _run(command: Sequence[str], folder: str) -> None:
+def _run(command: Sequence[str], folder: Path) -> None:
     try:
         done = subprocess.run(
             command, cwd=folder, env=_environment(folder),
@@ -216,7 +216,7 @@ def _run(command: Sequence[str], folder: str) -> None:
         )
 
 
-def _environment(folder: str) -> dict[str, str]:
+def _environment(folder: Path) -> dict[str, str]:
     """This process's environment; zig's cache is in the folder where home has no room for it."""
     environment = dict(os.environ)
     if os.name == "posix" and not environment.get("ZIG_GLOBAL_CACHE_DIR"):
@@ -227,7 +227,7 @@ def _environment(folder: str) -> dict[str, str]:
             usable = os.access(cache, os.W_OK)
         except OSError:
             usable = False
-        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else Path(folder, "zig-cache"))
+        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else folder / "zig-cache")
     return environment
 
 

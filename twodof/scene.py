@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,8 @@ from typing import Any, NamedTuple
 import coal
 import numpy as np
 from numpy.typing import NDArray
+
+from .files import temporary_folder
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # m
@@ -260,8 +261,8 @@ def load_mesh(name: str, content: bytes, scale: Array) -> Any:
         raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
     if suffix == ".obj":
         content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
-    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
-        file = Path(folder, Path(name).name)
+    with temporary_folder() as folder:
+        file = folder / Path(name).name
         file.write_bytes(content)
         # boxes along the axes: others take longer, and complain on stderr of odd triangles
         return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
