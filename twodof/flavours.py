@@ -90,7 +90,7 @@ def native_flavour(
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
 
     def header(guid: str) -> Files:
-        return {"model.h": model_header(robot, table, name=name, guid=guid).encode()}
+        return {"model.h": model_header(robot, table, guid).encode()}
 
     def finish(guid: str) -> Files:
         files = {f"sources/{path}": content for path, content in header(guid).items()}

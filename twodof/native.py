@@ -51,13 +51,14 @@ FLAGS = (
 """Multiplications are never fused with additions, so that platforms agree."""
 
 
-def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: str) -> str:
+def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
+
+    Names from the URDF, which may be anybody's, are string literals and nothing else.
 
     Args:
         robot: the robot, n joints in Pinocchio's order.
         table: its variables; a variable's place is its value reference.
-        name: model name and model identifier.
         guid: as the modelDescription has it.
 
     Raises:
@@ -77,10 +78,10 @@ def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: st
     frame = model.frames[robot.frame_id]
     path = [int(i) - 1 for i in model.supports[frame.parentJoint]][1:]
     sections = [
-        f"/* Constants of the robot {_quoted(robot.name)}, frame {_quoted(robot.frame)}: generated"
-        " from its URDF. SI units.\n   Each joint turns about, or slides along, the z axis of its"
-        " own frame. */\n#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
-        f"#define MODEL_NAME {_quoted(name)}\n#define MODEL_GUID {_quoted(guid)}\n"
+        "/* Constants of a robot, generated from its URDF. SI units. Each joint turns about, or\n"
+        "   slides along, the z axis of its own frame. */\n"
+        "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
+        f"#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n}\n#define N_AXES {m}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
         _value_references(groups),
