@@ -223,7 +223,13 @@ def test_a_saved_state_is_not_changed_by_what_follows(fmu_path):
     assert driver.call("serializeFMUstate", saved) == before
 
 
-@pytest.mark.parametrize("data", [b"not a state", b"[1, 2]", b"{}", b'{"identity": "x"}'])
+FOREIGN = (
+    b"not a state", b"[1, 2]", b"{}", b'{"identity": "x"}', b"", b"\xff\xfe", b"null", b"NaN",
+    b"[" * 60_000, b'{"a":' * 10_000, b"1" * 60_000, b"[" + b"1," * 10**7 + b"1]",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("data", FOREIGN, ids=range(len(FOREIGN)))
 @in_child_process
 def test_a_foreign_state_is_refused(fmu_path, data):
     driver = Driver(fmu_path).initialise()
@@ -234,6 +240,69 @@ def test_a_foreign_state_is_refused(fmu_path, data):
     assert driver.step(0.03) == DISCARD
     assert driver.outputs() == before
     assert driver.step(0.03) == OK
+
+
+NAN, INF = float("nan"), float("inf")
+UNSOUND = "the state is none that an instance can be in"
+FORGERIES = {
+    "phase": (("flying", "", 2, None, ["step mode"]), UNSOUND),
+    "time": ((NAN, INF, -INF, "0.03", 3, True, None, [0.03], 10**400), UNSOUND),
+    "refused": ((None, 0, [], "\ud800", "half \udc00"), UNSOUND),
+    "plant": ((None, [], {}, {"q": [0.1, 0.2]}, "step"), UNSOUND),
+    "more": ((1.0,), UNSOUND),
+    "plant.q": (([], [0.1], [0.1] * 3, [NAN, 0.1], [0.1, 3.2], [0.1, "0.1"], 0.1), UNSOUND),
+    "plant.v": (([INF, 0.0], [None, 0.0], [[0.0], 0.0], [False, 0.0]), UNSOUND),
+    "plant.x_des": (([NAN, 0.1], [0.1, 10**400]), UNSOUND),
+    "plant.Kn": ((NAN, -INF, [10.0], None), UNSOUND),
+    "plant.limit_effort": ((0, 1, 2.0, "true", None), UNSOUND),
+    "plant.q_min": (([0.9, 0.9],), UNSOUND),
+    "plant.step": ((1.0,), UNSOUND),
+    "plant._data": ((None,), UNSOUND),
+    "plant.max_step": ((0.0, -1.0), "max_step = .* must be > 0"),
+    "plant.rtol": ((0.0,), "rtol = 0 must be > 0"),
+    "plant.rcond": ((1.0,), r"rcond = 1 must be in \[0, 1\)"),
+}
+
+
+@in_child_process
+def test_a_state_with_a_wrong_field_is_refused_and_leaves_all_as_it_was(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    driver.run(3)
+    before = driver.outputs()
+    own = driver.call("serializeFMUstate", driver.call("getFMUstate"))
+    for field, (values, message) in FORGERIES.items():
+        for value in values:
+            state = json.loads(own)
+            holder = state["plant"] if "." in field else state
+            holder[field.rpartition(".")[2]] = value
+            refused(driver, json.dumps(state).encode(), message)
+    for missing in ("phase", "plant"):
+        state = json.loads(own)
+        del state[missing]
+        refused(driver, json.dumps(state).encode(), UNSOUND)
+    assert driver.outputs() == before
+    assert driver.call("serializeFMUstate", driver.call("getFMUstate")) == own
+
+
+def refused(driver, data, message):
+    driver.log.clear()
+    driver.call("setFMUstate", driver.call("deSerializeFMUstate", data))
+    ((status, text),) = driver.log
+    assert status == ERROR
+    assert re.fullmatch(f"fmi2SetFMUstate: {message}", text), data[:200]
+    assert driver.step(0.03) == DISCARD
+
+
+@in_child_process
+def test_a_state_from_before_the_run_keeps_what_is_yet_to_be_refused(fmu_path):
+    driver = Driver(fmu_path)
+    driver.set(rtol=-1.0)
+    data = driver.call("serializeFMUstate", driver.call("getFMUstate"))
+    driver.call("reset")
+    driver.call("setFMUstate", driver.call("deSerializeFMUstate", data))
+    assert driver.log == []
+    driver.initialise()
+    assert driver.log == [(ERROR, "rtol = -1 must be > 0")]
 
 
 @in_child_process
