@@ -1,5 +1,6 @@
 """The master: times, order, ends, and FMUs that misbehave."""
 
+import errno
 import logging
 import os
 import subprocess
@@ -201,6 +202,20 @@ def test_runs_that_start_at_once_leave_each_others_folders_alone(tmp_path):
     with ProcessPoolExecutor(4) as pool:
         for done in [pool.submit(take_folders, tmp_path, 500) for _ in range(4)]:
             done.result()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_could_not_be_locked_is_never_taken_for_abandoned(tmp_path, monkeypatch):
+    def fail(descriptor, operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fcntl.flock", fail)
+        held = temporary_folder(tmp_path)
+        folder = held.__enter__()
+    with temporary_folder(tmp_path):
+        assert folder.exists()
+    held.__exit__(None, None, None)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -98,8 +98,8 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
         _remove_abandoned(left)
     folder = Path(tempfile.mkdtemp(dir=parent))
     held = lock(folder)
-    # only now, as others find it locked, has it the name that they look for
-    folder = folder.rename(folder.with_name(TEMPORARY + folder.name))
+    if is_being_written(folder):  # only now, as others find it locked, the name that they look for
+        folder = folder.rename(folder.with_name(TEMPORARY + folder.name))
     try:
         yield folder
     finally:
