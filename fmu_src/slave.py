@@ -10,8 +10,10 @@ the next doStep a discard. The FMI state machine is the table ``ALLOWED``.
 
 import importlib
 import json
+import re
 import site
 import sys
+from copy import deepcopy
 from pathlib import Path
 
 PACKAGE = __name__.replace("slave_", "twodof_")
@@ -31,7 +33,10 @@ ALLOWED = {
     "fmi2Set of a parameter": {INSTANTIATED, INITIALIZATION},
     "fmi2Set of an input": {INSTANTIATED, INITIALIZATION, STEP},
 }
+PHASES = (INSTANTIATED, INITIALIZATION, STEP, TERMINATED, ERROR)
 TIME_TOLERANCE = 1e-9
+MAX_STATE = 64 * 1024  # bytes, of a serialised state; that of 128 joints has half of them
+UNSOUND = "the state is none that an instance can be in"
 
 
 def import_plant(site_packages: list[str]):
@@ -220,32 +225,48 @@ class TwoDofSlave(fmi.Fmi2Slave):
     # --- state ---
 
     def _get_fmu_state(self):
-        state = {"identity": self._identity, "phase": self._phase, "time": self._time}
-        state["refused"] = self._refused
         groups = {variable.group for variable in self._table if variable.causality != "output"}
-        for group in sorted(groups | {"q", "v"}):
-            value = getattr(self._plant, group)
-            state[group] = list(value) if isinstance(value, list) else value
-        return state
+        values = {group: getattr(self._plant, group) for group in sorted(groups | {"q", "v"})}
+        return {
+            "identity": self._identity, "phase": self._phase, "time": self._time,
+            "refused": self._refused, "plant": deepcopy(values),
+        }  # fmt: skip
 
     def _set_fmu_state(self, state):
-        if state.get("identity") != self._identity:
-            self._refuse("fmi2SetFMUstate: the state is not one of this FMU")
+        """Take over a state, which may have come as anybody's bytes: all of it, or nothing."""
+        try:
+            plant = self._plant_in(state)
+        except ValueError as reason:
+            self._refuse(f"fmi2SetFMUstate: {reason}")
             return
-        for key, value in state.items():
-            if key in ("phase", "time", "refused"):
-                setattr(self, f"_{key}", value)
-            elif key != "identity":
-                setattr(self._plant, key, list(value) if isinstance(value, list) else value)
-        self._plant.prepare()
+        self._plant = plant
+        self._phase, self._time, self._refused = state["phase"], state["time"], state["refused"]
         self._outputs.clear()
+
+    def _plant_in(self, state):
+        """The plant of a state. ValueError where no instance of this FMU can be in that state."""
+        if not isinstance(state, dict) or state.get("identity") != self._identity:
+            raise ValueError("the state is not one of this FMU")
+        if not (alike(state, self._get_fmu_state()) and state["phase"] in PHASES):
+            raise ValueError(UNSOUND)
+        plant = self._plant_module.Plant(self._plant.robot, self._table)
+        vars(plant).update(deepcopy(state["plant"]))
+        plant.prepare()
+        if state["phase"] in (STEP, TERMINATED):  # before, it is checked when the run begins
+            plant.initialise()
+            plant.q, plant.v = list(state["plant"]["q"]), list(state["plant"]["v"])
+            limits = zip(plant.q, plant.q_min, plant.q_max)
+            if not all(low <= q <= high for q, low, high in limits):
+                raise ValueError(UNSOUND)
+        return plant
 
     @staticmethod
     def _fmu_state_from_bytes(state):
+        """What the bytes say, None where that is nothing; it is checked when it is set."""
         try:
-            return dict(json.loads(state))
-        except (ValueError, TypeError):
-            return {}  # of no FMU: refused when it is set
+            return json.loads(state) if len(state) <= MAX_STATE else None
+        except (ValueError, RecursionError):
+            return None
 
     # --- refusals ---
 
@@ -281,3 +302,16 @@ class TwoDofSlave(fmi.Fmi2Slave):
     @staticmethod
     def _finite(value):
         return abs(value) < float("inf")
+
+
+def alike(value, own):
+    """Whether a value is of the types and sizes of one's own, its numbers finite, its text text."""
+    if type(value) is not type(own):
+        return False
+    if isinstance(own, dict):
+        return value.keys() == own.keys() and all(alike(value[key], own[key]) for key in own)
+    if isinstance(own, list):
+        return len(value) == len(own) and all(map(alike, value, own))
+    if isinstance(own, str):
+        return not re.search("[\ud800-\udfff]", value)  # halves that no encoding has
+    return abs(value) < float("inf")

@@ -67,7 +67,7 @@ class Model:
     def sources(self, *more: Path) -> dict[str, bytes]:
         headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
         files = {p.name: p.read_bytes() for p in (*sorted(SOURCES.iterdir()), *headers, *more)}
-        files["model.h"] = model_header(self.robot, self.table, name="Arm", guid=GUID).encode()
+        files["model.h"] = model_header(self.robot, self.table, GUID).encode()
         return files
 
 

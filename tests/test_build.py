@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +198,20 @@ def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("uri", ["/etc/passwd", "file:///etc/passwd", "package://etc/passwd"])
+def test_an_fmu_holds_no_file_that_is_none_of_the_robots(uri, tmp_path):
+    urdf = tmp_path / "in/arm.urdf"
+    urdf.parent.mkdir()
+    urdf.write_text(
+        SHAPES.sub(f"<mesh filename='{uri}'/>", data_file("urdf", "2dof.urdf").read_text())
+    )
+    with pytest.raises(
+        TwoDofError, match=f"mesh '{uri}' not found in '{urdf.parent}', .*--mesh-dir"
+    ):
+        build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
+    assert list(tmp_path.iterdir()) == [urdf.parent]
+
+
 def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
     urdf = tmp_path / "rough.urdf"
     text = SHAPES.sub("<sphere radius='0.01'/>", data_file("urdf", "2dof.urdf").read_text())
@@ -204,6 +219,59 @@ def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
     build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
     (record,) = caplog.records
     assert "joint 'joint1': friction is not modelled and is ignored" in record.getMessage()
+
+
+NAMES = (
+    ('*/ static int evil; /* "??/ \\', "two\nlines\t\r\x7f7 é1 \u2028 \U0001f916"),
+    ("<script>evil()</script> &amp; ${name} %s%n", "j" * 1000),
+)
+
+
+class Page(HTMLParser):
+    """The tags and the text of a page."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.text = set(), ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.add(tag)
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.mark.parametrize("native", [True, False], ids=["native", "python"])
+@pytest.mark.parametrize("names", NAMES)
+@in_child_process
+def test_names_of_a_urdf_are_text_in_all_that_the_fmu_holds(names, native, tmp_path):
+    robot = etree.fromstring(SHAPES.sub("<sphere/>", data_file("urdf", "2dof.urdf").read_text()))
+    robot.set("name", names[0])
+    for element in robot.iter():
+        for key, value in element.attrib.items():
+            for old, new in (("joint1", names[0]), ("joint2", names[1]), ("EndEffector", names[1])):
+                element.set(key, new if value == old else element.get(key))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_bytes(etree.tostring(robot))
+    options = FmuOptions(urdf=urdf, axes="xy", frame=names[1], name="Arm", native=native)
+    fmu = build_fmu(tmp_path / "Arm.fmu", options)
+    with zipfile.ZipFile(fmu) as archive:
+        described = etree.fromstring(archive.read("modelDescription.xml")).find(".//Robot")
+        page = Page(archive.read("documentation/index.html").decode())
+        if native:
+            header = archive.read("sources/model.h").decode()
+            assert header.isascii()
+            code = re.sub(r'(/\*.*?\*/)|"(?:\\.|[^"\\\n])*"', r"\1", header, flags=re.DOTALL)
+            assert "evil" not in code  # nor in a comment
+    assert [joint.get("name") for joint in described.iter("Joint")] == list(names)
+    assert (described.get("name"), described.get("frame")) == names
+    assert "script" not in page.tags
+    for name in names:
+        assert f"position, joint {name}" in page.text
+    log = Driver(fmu).initialise(q_start=(4.0, 4.0)).log
+    for joint, (_, message) in zip(names, log, strict=True):
+        assert f"of joint '{joint}"[:400] in message
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

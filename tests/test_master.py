@@ -1,9 +1,16 @@
 """The master: times, order, ends, and FMUs that misbehave."""
 
+import errno
 import logging
+import os
+import subprocess
+import sys
 import time
 import zipfile
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -14,6 +21,7 @@ from sinks import Memory
 
 import twodof
 from twodof.errors import FmuError, InputError, SimulationError
+from twodof.files import TEMPORARY, temporary_folder
 from twodof.master import RealTime
 
 
@@ -128,6 +136,83 @@ def test_an_abandoned_generator_removes_its_unzipped_fmu(fmu_path, tmp_path, mon
     next(run)
     assert len(list(tmp_path.iterdir())) == 1
     run.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+RUN_THAT_WAITS = """
+import os, signal, sys, tempfile
+tempfile.tempdir = sys.argv[2]
+import twodof
+run = twodof.samples(sys.argv[1], stop_time=1.0)
+next(run)
+print("ready", flush=True)
+sys.stdin.read()
+print(next(run).k, flush=True)
+"""
+
+
+@contextmanager
+def waiting_run(fmu, folder):
+    """A process in the middle of a run whose temporary folder is in this one."""
+    command = [sys.executable, "-c", RUN_THAT_WAITS, fmu, folder]
+    with subprocess.Popen(command, text=True, stdin=PIPE, stdout=PIPE) as process:
+        assert process.stdout.readline() == "ready\n"
+        yield process
+        process.kill()
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(
+    native_path, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    others = tmp_path / "others"
+    others.mkdir()
+    (tmp_path / f"{TEMPORARY}link").symlink_to(others)
+    (tmp_path / f"{TEMPORARY}file").touch()
+    (tmp_path / f"{TEMPORARY}foreign").mkdir()
+    os.chown(tmp_path / f"{TEMPORARY}foreign", 12345, 12345)
+    (tmp_path / "twodof").mkdir()
+    stay = set(tmp_path.iterdir())
+    with waiting_run(native_path, tmp_path) as killed, waiting_run(native_path, tmp_path) as alive:
+        (left, held) = set(tmp_path.iterdir()) - stay
+        (left / "link").symlink_to(others)
+        (others / "file").touch()
+        killed.kill()
+        killed.wait()
+        twodof.simulate(native_path, stop_time=0.01)
+        (kept,) = set(tmp_path.iterdir()) - stay
+        assert kept in (left, held)
+        assert stay < set(tmp_path.iterdir())
+        assert (others / "file").exists()
+        assert alive.communicate("") == ("1\n", None)
+    assert set(tmp_path.iterdir()) == stay
+
+
+def take_folders(parent, count):
+    for _ in range(count):
+        with temporary_folder(parent) as folder:
+            (folder / "file").write_text("mine")
+            assert (folder / "file").read_text() == "mine"
+
+
+def test_runs_that_start_at_once_leave_each_others_folders_alone(tmp_path):
+    with ProcessPoolExecutor(4) as pool:
+        for done in [pool.submit(take_folders, tmp_path, 500) for _ in range(4)]:
+            done.result()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_could_not_be_locked_is_never_taken_for_abandoned(tmp_path, monkeypatch):
+    def fail(descriptor, operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fcntl.flock", fail)
+        held = temporary_folder(tmp_path)
+        folder = held.__enter__()
+    with temporary_folder(tmp_path):
+        assert folder.exists()
+    held.__exit__(None, None, None)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,11 +12,13 @@ from twodof.errors import BuildError
 from twodof.meshes import collect_meshes
 
 FILES = {
+    "ws/arm_description/package.xml": b"<package/>",
     "ws/arm_description/urdf/arm.urdf": b"",
     "ws/arm_description/meshes/base.stl": b"base",
     "ws/arm_description/meshes/visual/link.stl": b"visual",
     "ws/arm_description/meshes/collision/link.stl": b"collision",
     "ws/arm_description/urdf/beside.stl": b"beside",
+    "ws/tool_description/package.xml": b"<package/>",
     "ws/tool_description/meshes/tool.stl": b"tool",
     "ws/arm_description/meshes/with space & more.stl": b"space",
     "secret.stl": b"secret",
@@ -60,9 +62,9 @@ FOUND = {
         "package://arm_description/meshes/visual/link.stl", "ws/arm_description/meshes", b"visual",
     ),
     "model://": ("model://arm_description/meshes/base.stl", "ws", b"base"),
-    "folders around the URDF": (PACKAGE, None, b"base"),
-    "another package around the URDF": (
-        "package://tool_description/meshes/tool.stl", None, b"tool",
+    "the URDF's package": (PACKAGE, None, b"base"),
+    "another package, mesh_dir holds both": (
+        "package://tool_description/meshes/tool.stl", "ws", b"tool",
     ),
     "the URDF's package in a folder of another name": (
         "package://renamed/meshes/base.stl", None, b"base",
@@ -70,6 +72,7 @@ FOUND = {
     "relative to the URDF": ("beside.stl", None, b"beside"),
     "relative to the URDF with ./": ("./beside.stl", None, b"beside"),
     "relative to the URDF though mesh_dir is given": ("beside.stl", "ws", b"beside"),
+    "relative, in the URDF's package": ("../meshes/base.stl", None, b"base"),
     "relative to mesh_dir": ("visual/link.stl", "ws/arm_description/meshes", b"visual"),
     "relative, out of the URDF's folder but inside mesh_dir": (
         "../meshes/base.stl", "ws/arm_description", b"base",
@@ -89,8 +92,17 @@ def test_mesh_is_found(disk: Path, uri: str, mesh_dir: str | None, content: byte
 
 
 @pytest.mark.parametrize("scheme", ["file://", ""])
-def test_absolute_name_is_found(disk: Path, scheme: str) -> None:
-    assert collect(disk, f"{scheme}{disk}/secret.stl", None) == b"secret"
+@pytest.mark.parametrize(
+    ("name", "mesh_dir"),
+    [("arm_description/urdf/beside.stl", None), ("arm_description/meshes/base.stl", None),
+     ("tool_description/meshes/tool.stl", "ws")],
+    ids=["URDF's folder", "URDF's package", "mesh_dir"],
+)  # fmt: skip
+def test_absolute_name_is_found_where_meshes_may_be(
+    disk: Path, scheme: str, name: str, mesh_dir: str | None
+) -> None:
+    content = FILES[f"ws/{name}"]
+    assert collect(disk, f"{scheme}{disk}/ws/{name}", mesh_dir) == content
 
 
 def test_package_in_mesh_dir_goes_before_a_shorter_match(disk: Path) -> None:
@@ -100,37 +112,79 @@ def test_package_in_mesh_dir_goes_before_a_shorter_match(disk: Path) -> None:
 
 
 REFUSED = {
-    "not there": ("package://arm_description/meshes/none.stl", "ws", "not found in .*ws"),
-    "not there, no mesh_dir": ("package://nowhere/none.stl", None, "not found; give .*--mesh-dir"),
-    "a folder": ("package://arm_description/meshes", "ws", "not found"),
-    "no path": ("package://", "ws", "not found"),
-    "no name": ("", "ws", "not found"),
-    "absolute, not there": ("/nowhere/none.stl", None, "not found"),
-    "another scheme": ("http://example.com/a.stl", "ws", "not found"),
-    "not a URI": ("package://[arm/a.stl", "ws", "not found"),
-    "too long a name": ("package://arm/" + "a" * 5000, "ws", "not found|too long"),
-    "out of mesh_dir": ("package://../secret.stl", "ws", "leaves its folder"),
-    "out of the package": ("package://arm_description/../../secret.stl", "ws", "leaves its folder"),
-    "out of the folders around": (
-        "package://arm_description/../../secret.stl", None, "leaves its folder",
-    ),
-    "percent": ("package://%2e%2e/secret.stl", "ws", "leaves its folder"),
-    "relative, out of the URDF's folder": ("../../../secret.stl", None, "leaves its folder"),
-    "relative, out of mesh_dir": ("../secret.stl", "ws", "leaves its folder"),
+    "not there": ("package://arm_description/meshes/none.stl", "ws"),
+    "not there, no mesh_dir": ("package://nowhere/none.stl", None),
+    "a folder": ("package://arm_description/meshes", "ws"),
+    "no path": ("package://", "ws"),
+    "no name": ("", "ws"),
+    "absolute, not there": ("/nowhere/none.stl", None),
+    "another scheme": ("http://example.com/a.stl", "ws"),
+    "not a URI": ("package://[arm/a.stl", "ws"),
+    "absolute": ("{disk}/secret.stl", "ws"),
+    "absolute, no mesh_dir": ("{disk}/secret.stl", None),
+    "file": ("file://{disk}/secret.stl", "ws"),
+    "file, no mesh_dir": ("file://{disk}/secret.stl", None),
+    "file, percent": ("file://{disk}/%73ecret.stl", None),
+    "file, relative": ("file://../../../secret.stl", None),
+    "absolute in a package": ("package://{disk}/secret.stl", "ws"),
+    "absolute in a package, no mesh_dir": ("package://{disk}/secret.stl", None),
+    "a folder above as the package": ("package://{disk.name}/secret.stl", None),
+    "a folder above as any package": ("package://any/secret.stl", None),
+    "a package beside the URDF's": ("package://tool_description/meshes/tool.stl", None),
+    "out of mesh_dir": ("package://../secret.stl", "ws"),
+    "out of the package": ("package://arm_description/../../secret.stl", "ws"),
+    "out of the URDF's package": ("package://arm_description/../../secret.stl", None),
+    "percent": ("package://%2e%2e/secret.stl", "ws"),
+    "relative, out of the URDF's package": ("../../../secret.stl", None),
+    "relative, out of mesh_dir": ("../secret.stl", "ws"),
+    "relative, beside mesh_dir": ("../ws2/secret.stl", "ws"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("uri", "mesh_dir", "reason"), REFUSED.values(), ids=REFUSED)
-def test_refusal_names_the_mesh(disk: Path, uri: str, mesh_dir: str | None, reason: str) -> None:
-    with pytest.raises(BuildError, match=reason) as refusal:
+@pytest.mark.parametrize(("uri", "mesh_dir"), REFUSED.values(), ids=REFUSED)
+def test_refusal_names_the_mesh_and_where_it_may_be(
+    disk: Path, uri: str, mesh_dir: str | None
+) -> None:
+    uri = uri.format(disk=disk)
+    (disk / "ws2").mkdir()
+    (disk / "ws2/secret.stl").write_bytes(b"secret")
+    with pytest.raises(BuildError, match=r"not found in .*--mesh-dir") as refusal:
         collect(disk, uri, mesh_dir)
-    assert f"mesh '{uri[:50]}" in str(refusal.value)
+    assert f"mesh '{uri}'" in str(refusal.value)
+    assert f"'{disk / (mesh_dir or 'ws/arm_description')}'" in str(refusal.value)
 
 
-def test_symbolic_link_out_of_the_folder_is_refused(disk: Path) -> None:
-    (disk / "ws/arm_description/meshes/link.stl").symlink_to(disk / "secret.stl")
-    with pytest.raises(BuildError, match="leaves its folder"):
-        collect(disk, "package://arm_description/meshes/link.stl", "ws")
+def test_too_long_a_name_is_refused(disk: Path) -> None:
+    with pytest.raises(BuildError, match=r"cannot be read: .*too long"):
+        collect(disk, "package://arm/" + "a" * 5000, "ws")
+
+
+@pytest.mark.parametrize("uri", ["../meshes/base.stl", PACKAGE])
+def test_folder_of_the_urdf_alone_where_there_is_no_package(disk: Path, uri: str) -> None:
+    """Whatever a folder above is called: the home folder has a name too."""
+    (disk / "ws/arm_description/package.xml").unlink()
+    with pytest.raises(BuildError, match="not found in"):
+        collect(disk, uri, None)
+    assert collect(disk, uri, "ws/arm_description") == b"base"
+    assert collect(disk, "beside.stl", None) == b"beside"
+
+
+@pytest.mark.parametrize("mesh_dir", ["ws", None])
+@pytest.mark.parametrize("link", ["meshes/link.stl", "urdf/link.stl", "more", "meshes/more"])
+def test_symbolic_link_out_of_the_places_is_refused(
+    disk: Path, link: str, mesh_dir: str | None
+) -> None:
+    folder = disk / "ws/arm_description"
+    folder.joinpath(link).symlink_to(disk if "more" in link else disk / "secret.stl")
+    name = f"{link}/secret.stl" if "more" in link else link
+    for uri in (f"package://arm_description/{name}", f"../{name}", f"{folder}/{name}"):
+        with pytest.raises(BuildError, match="not found in"):
+            collect(disk, uri, mesh_dir)
+
+
+def test_symbolic_link_inside_the_places_is_followed(disk: Path) -> None:
+    (disk / "ws/arm_description/urdf/link.stl").symlink_to("../meshes/base.stl")
+    assert collect(disk, "link.stl", None) == b"base"
 
 
 def test_mesh_that_cannot_be_read_is_refused(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:

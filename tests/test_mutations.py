@@ -323,7 +323,8 @@ def test_mutated_urdf(seed: int, jail: Jail, urdfs: list[tuple[bytes, list[str]]
     assert list(jail.target.iterdir()) == ([] if outcome.status else [fmu])
     if outcome.status == 0:
         with zipfile.ZipFile(fmu) as archive:
-            assert all(SECRET not in archive.read(name) for name in archive.namelist())
+            contents = [archive.read(name) for name in archive.namelist()]
+        assert not any(SECRET in content or b"root:x:0:0" in content for content in contents)
 
 
 # --- CSVs ---
@@ -682,8 +683,8 @@ def meshes(folder: Path) -> None:
     (folder / "in/folder").mkdir(parents=True)
     os.mkfifo(folder / "in/pipe")
     (folder / "in/zero").symlink_to("/dev/zero")
-    (folder / "in/out").symlink_to("../secret")
-    (folder / "in/up").symlink_to("..")
+    (folder / "in/out").symlink_to("../../secret")
+    (folder / "in/up").symlink_to("../..")
     (folder / "in/circle").symlink_to("circle")
     (folder / "in/good.stl").write_bytes(b"good")
     for i in range(3):
@@ -725,20 +726,20 @@ HOSTILE_URDFS: dict[str, tuple[Callable[[], str], str]] = {
     ),
     "a mesh that is a folder": (lambda: robot(tip(inside=shapes(["folder"]))), "not found"),
     "a mesh that is a pipe": (lambda: robot(tip(inside=shapes(["pipe"]))), "not found"),
-    "a mesh that is a device": (lambda: robot(tip(inside=shapes(["zero"]))), "leaves its folder"),
+    "a mesh that is a device": (lambda: robot(tip(inside=shapes(["zero"]))), "not found"),
     "a device by its own name": (
         lambda: robot(tip(inside=shapes(["file:///dev/zero"]))), "not found"
     ),
     "a file without an end": (
-        lambda: robot(tip(inside=shapes(["file:///proc/kcore"]))), "File too large|not found|read"
+        lambda: robot(tip(inside=shapes(["file:///proc/kcore"]))), "not found"
     ),
-    "a mesh that is a link out": (lambda: robot(tip(inside=shapes(["out"]))), "leaves its folder"),
+    "a mesh that is a link out": (lambda: robot(tip(inside=shapes(["out"]))), "not found"),
     "a mesh behind a link out": (
-        lambda: robot(tip(inside=shapes(["package://up/secret"]))), "leaves its folder"
+        lambda: robot(tip(inside=shapes(["package://up/secret"]))), "not found"
     ),
     "a mesh that is a link to itself": (lambda: robot(tip(inside=shapes(["circle"]))), "circle"),
     "a mesh of another folder": (
-        lambda: robot(tip(inside=shapes(["package://a/../../secret"]))), "leaves its folder"
+        lambda: robot(tip(inside=shapes(["../../secret"]))), "not found"
     ),
     "meshes of 300 MB": (
         lambda: robot(tip(inside=shapes(f"large{i}" for i in range(3)))), "File too large"

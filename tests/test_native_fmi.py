@@ -22,6 +22,7 @@ from harness import needs
 from native_models import GUID, HERE, executable, library, model
 
 from twodof.errors import BuildError
+from twodof.files import TEMPORARY
 from twodof.native import compile_library, universal
 
 OK, WARNING, DISCARD, ERROR = range(4)
@@ -368,6 +369,77 @@ def test_foreign_and_damaged_states_are_refused():
     arm.refused("null pointer", "setFMUState", ctypes.c_void_p())
 
 
+def forged(arm, field, value):
+    """The bytes of an instance's state with another value in a field, and the checksum right."""
+    blob = arm.snapshot()
+    n = len(arm.of.table)
+    head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
+    layout = struct.Struct(f"={head}s{n + 2}d4iQ")
+    fields = list(layout.unpack(blob))
+    names = ["time", "stop_time", "phase", "initialised", "has_x", "has_tau"]
+    place = n + 1 + names.index(field) if field in names else 1 + arm.of.reference(field)
+    fields[place] = value
+    fields[-1] = fnv(layout.pack(*fields)[:-8])
+    return layout.pack(*fields)
+
+
+def fnv(content):
+    """FNV-1a, 64 bits; RFC 9923."""
+    digest = 0xCBF29CE484222325
+    for byte in content:
+        digest = (digest ^ byte) * 0x100000001B3 % 2**64
+    return digest
+
+
+UNSOUND = "fmi2DeSerializeFMUstate: the state is none that an instance can be in"
+FORGERIES = {
+    "phase": ((-1, 5, 77, 2**31 - 1, -(2**31)), UNSOUND),
+    "time": ((np.nan, np.inf, -np.inf), UNSOUND),
+    "stop_time": ((np.nan, -np.inf), UNSOUND),
+    "x_des[1]": ((np.nan, np.inf), UNSOUND),
+    "Kn": ((-np.inf,), UNSOUND),
+    "q[1]": ((np.nan, np.inf, 3.2, -3.2), UNSOUND),
+    "v[2]": ((np.nan, np.inf), UNSOUND),
+    "gravity[3]": ((np.nan,), UNSOUND),
+    "max_step": ((0.0, -1.0), "max_step = .* must be > 0"),
+    "rtol": ((0.0,), "rtol = 0 must be > 0"),
+    "rcond": ((1.0,), r"rcond = 1 must be in \[0, 1\)"),
+    "q_min[1]": ((1.0,), UNSOUND),
+    "limit_effort": ((0.5, 2.0, np.nan), UNSOUND),
+}
+
+
+@pytest.mark.parametrize("field", FORGERIES)
+def test_a_state_with_a_right_checksum_and_a_wrong_field_is_refused(field):
+    arm = Arm()
+    arm.step()
+    assert forged(arm, "time", 0.01) == arm.snapshot()
+    values, message = FORGERIES[field]
+    for value in values:
+        arm.refused(message, "deSerializeFMUstate", forged(arm, field, value))
+
+
+@pytest.mark.parametrize("field", ["initialised", "has_x", "has_tau", "x[1]", "tau[1]"])
+def test_what_a_state_computes_on_demand_is_not_taken_from_its_bytes(field):
+    arm, other = Arm(), Arm(start=False)
+    arm.step()
+    arm.outputs()
+    for value in (0, 1, -7):
+        other.setFMUState(other.deSerializeFMUstate(forged(arm, field, value)))
+        assert other.outputs() == arm.outputs()
+
+
+def test_a_state_from_before_the_run_keeps_what_is_yet_to_be_refused():
+    arm = Arm(start=False)
+    arm.set("rtol", -1.0)
+    saved = arm.deSerializeFMUstate(arm.snapshot())
+    arm.reset()
+    arm.setFMUState(saved)
+    arm.setupExperiment(startTime=0.0)
+    arm.enterInitializationMode()
+    arm.refused("rtol = -1 must be > 0", "exitInitializationMode")
+
+
 def test_reset_repeats_the_first_run_bit_for_bit():
     arm = Arm()
     first = arm.run(100)
@@ -464,7 +536,7 @@ def test_compiler_errors():
 def test_equal_sources_give_equal_libraries():
     first = compile_library(model("twodof").sources(), "linux64", "Arm")
     assert compile_library(model("twodof").sources(), "linux64", "Arm") == first
-    assert b"/tmp" not in first and b"twodof-native" not in first
+    assert b"/tmp" not in first and TEMPORARY.encode() not in first
 
 
 def test_universal_header():

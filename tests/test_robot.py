@@ -86,6 +86,7 @@ REFUSED = {
     "entity": ("<?xml version='1.0'?>" + DTD + arm(), "document type"),
     "link without a name": (arm("<link/>"), "<link> without a name"),
     "joint without a name": (arm(elbow=elbow().replace('name="elbow"', "")), "<joint> without"),
+    "a name of 1001 characters": (arm(link("x" * 1001)), "<link> whose name has 1001 characters"),
     "two links of one name": (arm(link("tip")), "two links named 'tip'"),
     "two joints of one name": (arm(link("x"), joint("elbow", "tip", "x")), "two joints .*'elbow'"),
     "no links": (robot(), "no links"),

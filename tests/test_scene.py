@@ -7,8 +7,13 @@ they are COLLADA files, by Pinocchio.
 from __future__ import annotations
 
 import io
+import json
 import logging
 import math
+import os
+import struct
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Callable, Iterable
@@ -474,3 +479,36 @@ def test_mesh_that_cannot_be_read_is_left_out_and_named(
     assert "<mesh" not in description
     assert geometries(description) == []
     assert_same_robot(description, with_mesh())
+
+
+UP = "../" * 40  # from a temporary folder to the root
+
+
+def test_mesh_whose_geometry_is_in_another_file_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What a page shows, and a file made of it, would have the secret's bytes as vertices."""
+    (tmp_path / "secret").write_bytes(struct.pack("<9f", *range(9)))
+    content = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "buffers": [{"uri": f"{UP}{tmp_path}/secret", "byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+    }  # fmt: skip
+    urdf = with_mesh().replace("thing.stl", "thing.gltf")
+    description = Scene(urdf, [], "thing", lambda _: json.dumps(content).encode()).description
+    assert "its format '.gltf' is none of .stl" in caplog.text
+    assert geometries(description) == []
+
+
+def test_library_of_colours_is_not_read_with_a_mesh(tmp_path: Path) -> None:
+    """One that is a pipe would be waited for without end."""
+    os.mkfifo(tmp_path / "pipe")
+    content = f"mtllib {UP}{tmp_path}/pipe\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n"
+    code = (
+        "import sys, numpy; from twodof.scene import load_mesh;"
+        "print(load_mesh('a.obj', sys.argv[1].encode(), numpy.ones(3)).num_tris)"
+    )
+    command = [sys.executable, "-c", code, content]
+    assert subprocess.check_output(command, text=True, timeout=60) == "1\n"

@@ -12,10 +12,13 @@ import sysconfig
 import threading
 import time
 import zipfile
+from ctypes import c_double, c_size_t, c_void_p
 from pathlib import Path
 
+import fmpy
 import numpy as np
 import pytest
+from fmpy.fmi1 import FMICallException
 from harness import Driver, in_child_process
 from oracles import REST, position, task_error
 
@@ -25,6 +28,7 @@ from twodof.data import data_file
 from twodof.plant import Plant, load_robot, variable_table
 
 OK, DISCARD, ERROR = 0, 2, 3
+DO_STEP_STATUS = 0
 LIMITS = {"q_min": (-0.2, 0.8), "q_max": (0.8, 1.9), "q_start": (0.3, 1.3), "Kp": (400.0, 400.0)}
 INTO_A_LIMIT = {**LIMITS, "x_des": (0.14, -0.03)}
 
@@ -223,7 +227,13 @@ def test_a_saved_state_is_not_changed_by_what_follows(fmu_path):
     assert driver.call("serializeFMUstate", saved) == before
 
 
-@pytest.mark.parametrize("data", [b"not a state", b"[1, 2]", b"{}", b'{"identity": "x"}'])
+FOREIGN = (
+    b"not a state", b"[1, 2]", b"{}", b'{"identity": "x"}', b"", b"\xff\xfe", b"null", b"NaN",
+    b"[" * 60_000, b'{"a":' * 10_000, b"1" * 60_000, b"[" + b"1," * 10**7 + b"1]",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("data", FOREIGN, ids=range(len(FOREIGN)))
 @in_child_process
 def test_a_foreign_state_is_refused(fmu_path, data):
     driver = Driver(fmu_path).initialise()
@@ -234,6 +244,69 @@ def test_a_foreign_state_is_refused(fmu_path, data):
     assert driver.step(0.03) == DISCARD
     assert driver.outputs() == before
     assert driver.step(0.03) == OK
+
+
+NAN, INF = float("nan"), float("inf")
+UNSOUND = "the state is none that an instance can be in"
+FORGERIES = {
+    "phase": (("flying", "", 2, None, ["step mode"]), UNSOUND),
+    "time": ((NAN, INF, -INF, "0.03", 3, True, None, [0.03], 10**400), UNSOUND),
+    "refused": ((None, 0, [], "\ud800", "half \udc00"), UNSOUND),
+    "plant": ((None, [], {}, {"q": [0.1, 0.2]}, "step"), UNSOUND),
+    "more": ((1.0,), UNSOUND),
+    "plant.q": (([], [0.1], [0.1] * 3, [NAN, 0.1], [0.1, 3.2], [0.1, "0.1"], 0.1), UNSOUND),
+    "plant.v": (([INF, 0.0], [None, 0.0], [[0.0], 0.0], [False, 0.0]), UNSOUND),
+    "plant.x_des": (([NAN, 0.1], [0.1, 10**400]), UNSOUND),
+    "plant.Kn": ((NAN, -INF, [10.0], None), UNSOUND),
+    "plant.limit_effort": ((0, 1, 2.0, "true", None), UNSOUND),
+    "plant.q_min": (([0.9, 0.9],), UNSOUND),
+    "plant.step": ((1.0,), UNSOUND),
+    "plant._data": ((None,), UNSOUND),
+    "plant.max_step": ((0.0, -1.0), "max_step = .* must be > 0"),
+    "plant.rtol": ((0.0,), "rtol = 0 must be > 0"),
+    "plant.rcond": ((1.0,), r"rcond = 1 must be in \[0, 1\)"),
+}
+
+
+@in_child_process
+def test_a_state_with_a_wrong_field_is_refused_and_leaves_all_as_it_was(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    driver.run(3)
+    before = driver.outputs()
+    own = driver.call("serializeFMUstate", driver.call("getFMUstate"))
+    for field, (values, message) in FORGERIES.items():
+        for value in values:
+            state = json.loads(own)
+            holder = state["plant"] if "." in field else state
+            holder[field.rpartition(".")[2]] = value
+            refused(driver, json.dumps(state).encode(), message)
+    for missing in ("phase", "plant"):
+        state = json.loads(own)
+        del state[missing]
+        refused(driver, json.dumps(state).encode(), UNSOUND)
+    assert driver.outputs() == before
+    assert driver.call("serializeFMUstate", driver.call("getFMUstate")) == own
+
+
+def refused(driver, data, message):
+    driver.log.clear()
+    driver.call("setFMUstate", driver.call("deSerializeFMUstate", data))
+    ((status, text),) = driver.log
+    assert status == ERROR
+    assert re.fullmatch(f"fmi2SetFMUstate: {message}", text), data[:200]
+    assert driver.step(0.03) == DISCARD
+
+
+@in_child_process
+def test_a_state_from_before_the_run_keeps_what_is_yet_to_be_refused(fmu_path):
+    driver = Driver(fmu_path)
+    driver.set(rtol=-1.0)
+    data = driver.call("serializeFMUstate", driver.call("getFMUstate"))
+    driver.call("reset")
+    driver.call("setFMUstate", driver.call("deSerializeFMUstate", data))
+    assert driver.log == []
+    driver.initialise()
+    assert driver.log == [(ERROR, "rtol = -1 must be > 0")]
 
 
 @in_child_process
@@ -432,6 +505,90 @@ def test_log_messages_are_no_printf_formats(tmp_path):
     fmu = build_fmu(tmp_path / "P.fmu", FmuOptions(urdf=urdf, axes="xy", name="P"))
     driver = Driver(fmu).initialise(q_start=(4.0, 0.0))
     assert "joint '100%s%n' is outside its limits" in driver.log[-1][1]
+
+
+# --- what this flavour cannot do ---
+
+
+def refuse_a_call(fmu):
+    driver = Driver(fmu).initialise()
+    driver.set(Kn=float("nan"))
+    refused = driver.status
+    return refused == ERROR, (refused, driver.step(0.0)) == (OK, DISCARD)
+
+
+def discard_a_step_without_ending_the_run(fmu):
+    try:
+        rows = fmpy.simulate_fmu(str(fmu), start_values={"Kp[1]": 1e308, "x_des[1]": 1e300})
+    except FMICallException as error:
+        return error.status == DISCARD, False
+    return False, rows["time"].tolist() == [0.0, 0.0]
+
+
+def tell_its_guid_from_another(fmu):
+    try:
+        return False, Driver(fmu, guid="another").initialise().step(0.0) == OK
+    except Exception as error:  # FMPy's own
+        return "instantiate" in str(error), False
+
+
+def refuse_a_null_pointer(fmu):
+    driver, one = Driver(fmu).initialise(), c_size_t(1)
+    dll, component = driver.slave.dll, c_void_p(driver.slave.component)
+    calls = [
+        lambda: dll.fmi2GetReal(component, None, one, None),
+        lambda: dll.fmi2SetReal(component, None, one, None),
+        lambda: dll.fmi2DoStep(None, c_double(0.0), c_double(0.01), 0),
+    ]
+    ends = []
+    for call in calls:
+        if (child := os.fork()) == 0:
+            os._exit(call())
+        ends.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    return ends == [ERROR] * 3, ends == [-signal.SIGSEGV] * 3
+
+
+def keep_to_the_stop_time(fmu):
+    driver = Driver(fmu)
+    driver.call("setupExperiment", startTime=0.0, stopTime=0.01)
+    driver.call("enterInitializationMode")
+    driver.call("exitInitializationMode")
+    steps = driver.step(0.0), driver.step(0.01)
+    return steps == (OK, ERROR), steps == (OK, OK)
+
+
+def answer_getstatus(fmu):
+    driver = Driver(fmu).initialise()
+    driver.call("getStatus", DO_STEP_STATUS)
+    return driver.status == OK, driver.status == ERROR
+
+
+CANNOT = (
+    refuse_a_call, discard_a_step_without_ending_the_run, tell_its_guid_from_another,
+    refuse_a_null_pointer, keep_to_the_stop_time, answer_getstatus,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("row", CANNOT)
+@in_child_process
+def test_what_this_flavour_cannot_do_is_as_documented(row, fmu_path, native_path):
+    """Each gives whether it could be done, and whether what the row says happened instead."""
+    assert row(native_path) == (True, False)
+    assert row(fmu_path) == (False, True)
+
+
+def test_what_this_flavour_cannot_do_is_told_row_by_row(fmu_path, native_path):
+    rows = []
+    for fmu in (fmu_path, native_path):
+        with zipfile.ZipFile(fmu) as archive:
+            page = archive.read("documentation/index.html").decode()
+        section = page.partition("<h2>What this flavour cannot do</h2>")[2].partition("<h2>")[0]
+        rows.append(re.findall("<tr><td>(.*?)</td>", section, re.DOTALL))
+    python, native = rows
+    assert native == []
+    assert [re.sub(r"\W", "_", row.replace("fmi2", "")).lower() for row in python] == [
+        row.__name__ for row in CANNOT
+    ]
 
 
 # --- packages ---

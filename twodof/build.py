@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import logging
 import math
-import os
-import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from . import __version__
 from .data import data_file
 from .documentation import documentation
 from .errors import ZIP_ERRORS, BuildError
-from .files import check_archive, read_file
+from .files import check_archive, read_file, write_file
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
@@ -40,7 +39,7 @@ class FmuOptions:
 
     Attributes:
         urdf: the URDF; None for the shipped planar arm.
-        mesh_dir: folder in which ``package://`` names are looked up; None: around the URDF.
+        mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
         frame: link whose origin is controlled.
         axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else
@@ -217,20 +216,14 @@ def _holds(path: Path, description: bytes, platforms: Sequence[str]) -> bool:
 
 def _write_zip(path: Path, files: Files) -> None:
     """Sorted entries with fixed dates, so that equal inputs give equal bytes; whole or not."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name, ZIP_DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, files[name])
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.name, delete=False) as file:
-            partial = Path(file.name)
-            try:
-                with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-                    for name in sorted(files):
-                        entry = zipfile.ZipInfo(name, ZIP_DATE)
-                        entry.compress_type = zipfile.ZIP_DEFLATED
-                        entry.external_attr = 0o644 << 16
-                        archive.writestr(entry, files[name])
-                os.chmod(partial, 0o644)
-                os.replace(partial, path)
-            except BaseException:
-                partial.unlink(missing_ok=True)
-                raise
+        write_file(path, content.getvalue())
     except OSError as error:
         raise BuildError(f"cannot write '{path}': {error.strerror}") from error

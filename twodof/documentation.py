@@ -27,7 +27,7 @@ def documentation(
 
     Args:
         robot, table: the robot and its variables.
-        flavour: says what the FMU depends on and whose code it contains.
+        flavour: says what the FMU depends on, cannot do, and whose code it contains.
         name, guid, version: of the model description.
         urdf: text of resources/robot.urdf.
     """
@@ -43,6 +43,7 @@ def documentation(
         axes=", ".join(robot.axes),
         root=html.escape(robot.root),
         variables=rows,
+        limitations=flavour.limitations,
         version=version,
         guid=guid,
         urdf_digest=hashlib.sha256(urdf.encode()).hexdigest(),

@@ -1,16 +1,23 @@
-"""Files that others made: regular ones only, and no larger than can be borne."""
+"""Files that others made, regular ones only and no larger than can be borne; files written whole;
+folders marked as being written, and folders for a while."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
+import shutil
 import stat
 import tempfile
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 MAX_ARCHIVE = 2 * 1024**3
 MAX_DIRECTORY = 4 * 1024**2  # of a zip: some 50,000 members
+TEMPORARY = ".twodof."
+"""Prefix of folders whose process has died, or holds their lock."""
 
 
 def check_file(path: str | Path, most: int) -> None:
@@ -74,3 +81,71 @@ def write_file(path: Path, content: bytes) -> None:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
+
+
+@contextmanager
+def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
+    """A folder that is removed at the end, or, where its process is killed, by the next one.
+
+    Args:
+        parent: where it is made; None: the system's folder for temporary files.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    parent = Path(tempfile.gettempdir() if parent is None else parent)
+    for left in parent.glob(f"{TEMPORARY}*"):
+        _remove_abandoned(left)
+    folder = Path(tempfile.mkdtemp(dir=parent))
+    held = lock(folder)
+    if is_being_written(folder):  # only now, as others find it locked, the name that they look for
+        folder = folder.rename(folder.with_name(TEMPORARY + folder.name))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove a temporary folder of this user that no process holds."""
+    with suppress(OSError):  # gone, a link, another user's, held, or on a disk without locks
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            if os.fstat(descriptor).st_uid == os.geteuid():
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            os.close(descriptor)
+
+
+def lock(path: Path) -> int:
+    """Mark a folder as being written until the descriptor is closed or the process dies."""
+    folder = os.open(path, os.O_RDONLY)
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return folder
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a living process writes the folder."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(folder)
+    return False
+
+
+def sync(*paths: Path) -> None:
+    """Bring files and folders, as far as they are written, to the disk itself."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -38,6 +38,7 @@ class Flavour:
         platforms: FMI platforms of the binaries.
         finish: given the GUID, the files that contain it and the binaries.
         dependencies: text of documentation/externalDependencies.txt.
+        limitations: what it cannot do, a section of documentation/index.html; "" where nothing.
         licences: of others' code that the FMU contains, by name of the distribution.
     """
 
@@ -47,6 +48,7 @@ class Flavour:
     platforms: Sequence[str]
     finish: Callable[[str], Files]
     dependencies: bytes
+    limitations: str
     licences: Sequence[str]
 
 
@@ -75,6 +77,7 @@ def python_flavour(
         platforms=("linux64",),
         finish=lambda guid: {f"binaries/linux64/{name}.so": wrapper.read_bytes()},
         dependencies=data_file("fmu_src", "externalDependencies.txt").read_bytes(),
+        limitations=data_file("fmu_src", "limitations.html").read_text("utf-8"),
         licences=("pythonfmu",),
     )
 
@@ -90,7 +93,7 @@ def native_flavour(
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
 
     def header(guid: str) -> Files:
-        return {"model.h": model_header(robot, table, name=name, guid=guid).encode()}
+        return {"model.h": model_header(robot, table, guid).encode()}
 
     def finish(guid: str) -> Files:
         files = {f"sources/{path}": content for path, content in header(guid).items()}
@@ -106,6 +109,7 @@ def native_flavour(
         platforms=platforms,
         finish=finish,
         dependencies=b"None: the binaries need the C library and its mathematics only.\n",
+        limitations="",
         licences=(),
     )
 

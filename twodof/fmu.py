@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import stat
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,7 +24,7 @@ from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ModelDescription, ScalarVariable
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
-from .files import check_archive
+from .files import check_archive, temporary_folder
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
@@ -250,14 +249,14 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
             f"'{fmu.path}' has no binary for this platform ({fmpy.platform}),"
             f" only for: {', '.join(fmu.platforms) or 'none'}"
         )
-    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+    with temporary_folder() as folder:
         try:
             with zipfile.ZipFile(fmu.path) as archive:
                 archive.extractall(folder)
         except ZIP_ERRORS as error:
             raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
-        _check_python_wrapper(fmu, Path(folder))
-        instance = Instance(fmu, Path(folder))
+        _check_python_wrapper(fmu, folder)
+        instance = Instance(fmu, folder)
         try:
             yield instance
         finally:

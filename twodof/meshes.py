@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
@@ -17,13 +16,16 @@ MAX_MESHES = 256 * 1024**2  # bytes of all meshes together
 def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str, dict[str, bytes]]:
     """The URDF with its meshes renamed to ``package://meshes/…``, and the files by that name.
 
+    The URDF may be anybody's, and the FMU is mailed: a mesh comes from ``mesh_dir``, the URDF's
+    folder or its package, however it is named or linked, or it is refused.
+
     Args:
         urdf: XML text.
         folder: the URDF's own folder, where relative names and packages are looked for.
         mesh_dir: folder of the packages, of one package, or of the meshes themselves.
 
     Raises:
-        BuildError: a mesh that is missing, cannot be read, or leaves its package's folder.
+        BuildError: a mesh that is missing, cannot be read, or lies elsewhere.
     """
     tree = ET.fromstring(urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     files: dict[str, bytes] = {}
@@ -45,45 +47,39 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
 
 
 def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
-    for path in _candidates(uri, folder, mesh_dir):
-        if path.is_file():
-            return path
-    where = "" if mesh_dir is None else f" in '{mesh_dir}'"
-    raise BuildError(
-        f"mesh '{uri}' not found{where}; give the folder of the URDF's packages with --mesh-dir"
-    )
+    """The file of a mesh, its links followed, inside one of the places that it may come from.
 
-
-def _candidates(uri: str, folder: Path, mesh_dir: Path | None) -> Iterator[Path]:
+    The URDF's package is the nearest folder upwards with a package.xml. A folder that carries the
+    package's name is not enough: ``package://home/alice/.netrc`` names one too.
+    """
+    own = folder.resolve()
+    package = next((f for f in (own, *own.parents) if (f / "package.xml").is_file()), own)
+    places = [own, package] if mesh_dir is None else [mesh_dir.resolve(), own, package]
     scheme, separator, rest = uri.partition("://")
-    if not separator and PurePosixPath(uri).is_absolute():
-        yield Path(uri)
-    elif not separator:  # relative to the URDF, often as ../meshes/…, or to the mesh folder
-        yield _within(folder.resolve().parent, folder / uri, uri)
-        if mesh_dir is not None:
-            yield _within(mesh_dir, mesh_dir / uri, uri)
-    elif scheme == "file":
-        yield Path(unquote(rest))
+    if not separator or scheme == "file":
+        name = unquote(rest) if separator else uri
+        candidates = [root / name for root in (own, mesh_dir) if root is not None]
     else:
-        # package://NAME/PATH: the given folder may hold the package, be it, or be its meshes;
-        # without one, the packages are around the URDF
+        # package://NAME/PATH: the mesh folder may hold the package, be it, or be its meshes;
+        # the URDF's package may lie in a folder of another name
         parts = PurePosixPath(unquote(rest)).parts
-        roots = [folder, *folder.resolve().parents] if mesh_dir is None else [mesh_dir]
-        most = len(parts) if mesh_dir is not None else min(2, len(parts))
-        for root in roots:
-            for skipped in range(most):
-                yield _within(root, root.joinpath(*parts[skipped:]), uri)
-
-
-def _within(root: Path, path: Path, uri: str) -> Path:
-    if not path.resolve().is_relative_to(root.resolve()):
-        raise BuildError(f"mesh '{uri}' leaves its folder '{root}'")
-    return path
+        roots = [own, *own.parents] if mesh_dir is None else [mesh_dir]
+        most = min(2, len(parts)) if mesh_dir is None else len(parts)
+        candidates = [root.joinpath(*parts[i:]) for root in roots for i in range(most)]
+    for candidate in candidates:
+        path = candidate.resolve()
+        if any(path.is_relative_to(place) for place in places) and path.is_file():
+            return path
+    where = " or ".join(f"'{place}'" for place in dict.fromkeys(places))
+    raise BuildError(
+        f"mesh '{uri}' not found in {where}, and it may come from nowhere else; give the folder of"
+        " the meshes, or of their packages, with --mesh-dir"
+    )
 
 
 def _inside(path: Path, files: dict[str, bytes]) -> str:
     """A name under meshes/ that keeps as much of the original path as tells files apart."""
-    parts = [re.sub(r"[^A-Za-z0-9._-]", "_", part) for part in path.resolve().parts[1:]]
+    parts = [re.sub(r"[^A-Za-z0-9._-]", "_", part) for part in path.parts[1:]]
     for depth in range(1, len(parts) + 1):
         name = "/".join(("meshes", *parts[-depth:]))
         if name not in files:

@@ -14,7 +14,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import BuildError
+from .files import temporary_folder
 from .plant import Robot, Variable
 
 Array = NDArray[np.float64]
@@ -51,13 +51,14 @@ FLAGS = (
 """Multiplications are never fused with additions, so that platforms agree."""
 
 
-def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: str) -> str:
+def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
+
+    Names from the URDF, which may be anybody's, are string literals and nothing else.
 
     Args:
         robot: the robot, n joints in Pinocchio's order.
         table: its variables; a variable's place is its value reference.
-        name: model name and model identifier.
         guid: as the modelDescription has it.
 
     Raises:
@@ -77,10 +78,10 @@ def model_header(robot: Robot, table: Sequence[Variable], *, name: str, guid: st
     frame = model.frames[robot.frame_id]
     path = [int(i) - 1 for i in model.supports[frame.parentJoint]][1:]
     sections = [
-        f"/* Constants of the robot {_quoted(robot.name)}, frame {_quoted(robot.frame)}: generated"
-        " from its URDF. SI units.\n   Each joint turns about, or slides along, the z axis of its"
-        " own frame. */\n#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
-        f"#define MODEL_NAME {_quoted(name)}\n#define MODEL_GUID {_quoted(guid)}\n"
+        "/* Constants of a robot, generated from its URDF. SI units. Each joint turns about, or\n"
+        "   slides along, the z axis of its own frame. */\n"
+        "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
+        f"#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n}\n#define N_AXES {m}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
         _value_references(groups),
@@ -136,15 +137,15 @@ def compile_library(
     """
     if platform not in TARGETS:
         raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")
-    with tempfile.TemporaryDirectory(prefix="twodof-native-") as folder:
+    with temporary_folder() as folder:
         for file, content in sources.items():
-            Path(folder, file).write_bytes(content)
+            (folder / file).write_bytes(content)
         files = sorted(file for file in sources if file.endswith(".c"))
         output = name + EXTENSIONS[platform]
         built = []
         for compiler in _compilers(platform):
             _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *files], folder)
-            built.append(Path(folder, output).read_bytes())
+            built.append((folder / output).read_bytes())
     return built[0] if len(built) == 1 else universal(built)
 
 
@@ -201,7 +202,7 @@ def _link_flags(platform: str, output: str) -> list[str]:
     return flags
 
 
-def _run(command: Sequence[str], folder: str) -> None:
+def _run(command: Sequence[str], folder: Path) -> None:
     try:
         done = subprocess.run(
             command, cwd=folder, env=_environment(folder),
@@ -216,7 +217,7 @@ def _run(command: Sequence[str], folder: str) -> None:
         )
 
 
-def _environment(folder: str) -> dict[str, str]:
+def _environment(folder: Path) -> dict[str, str]:
     """This process's environment; zig's cache is in the folder where home has no room for it."""
     environment = dict(os.environ)
     if os.name == "posix" and not environment.get("ZIG_GLOBAL_CACHE_DIR"):
@@ -227,7 +228,7 @@ def _environment(folder: str) -> dict[str, str]:
             usable = os.access(cache, os.W_OK)
         except OSError:
             usable = False
-        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else Path(folder, "zig-cache"))
+        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else folder / "zig-cache")
     return environment
 
 

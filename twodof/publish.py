@@ -13,10 +13,8 @@ import os
 import re
 import socket
 import sys
-import tempfile
 from collections.abc import Callable, Mapping
 from math import isfinite
-from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
@@ -24,6 +22,7 @@ from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from .bag.messages import SCENE_TOPICS, STORE, STREAM, Messages, Serialised
 from .errors import PublishError, SimulationError
+from .files import temporary_folder
 from .inputs import Setting
 from .master import Experiment, Sample, Sink, at_rest
 
@@ -247,8 +246,8 @@ def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, di
 
     Cyclone DDS tells interfaces in its trace, and reasons of a failure on the standard error alone.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        trace, errors = Path(folder, "trace"), Path(folder, "errors")
+    with temporary_folder() as folder:
+        trace, errors = folder / "trace", folder / "errors"
         trace.touch()
         sys.stderr.flush()
         kept = os.dup(2)

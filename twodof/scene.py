@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,8 +16,12 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from .files import temporary_folder
+
 Array = NDArray[np.float64]
 LARGEST = 1e6  # m
+MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
+"""Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
 logger = logging.getLogger("twodof.scene")
 
 
@@ -251,10 +254,15 @@ def load_mesh(name: str, content: bytes, scale: Array) -> Any:
     """A mesh file as coal's model, its vertices in m.
 
     Raises:
-        ValueError: it cannot be read.
+        ValueError: it cannot be read, or is of a format that has other files read beside it.
     """
-    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
-        file = Path(folder, Path(name).name)
+    suffix = Path(name).suffix.lower()
+    if suffix not in MESH_FORMATS:
+        raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
+    if suffix == ".obj":
+        content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
+    with temporary_folder() as folder:
+        file = folder / Path(name).name
         file.write_bytes(content)
         # boxes along the axes: others take longer, and complain on stderr of odd triangles
         return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)

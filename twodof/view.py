@@ -123,7 +123,8 @@ class Replay:
             if found.guid == made["guid"]:
                 return text, partial(read_resource, found)
         shipped = data_file("urdf", "2dof.urdf")
-        renamed, files = collect_meshes(shipped.read_text("utf-8"), shipped.parent, None)
+        meshes = data_file("meshes")
+        renamed, files = collect_meshes(shipped.read_text("utf-8"), shipped.parent, meshes)
         return text, files.get if text.strip() == renamed.strip() else lambda name: None
 
     # --- what is shown ---

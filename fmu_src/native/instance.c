@@ -95,7 +95,7 @@ void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
-static fmi2Status check_parameters(Instance *instance)
+fmi2Status check_parameters(Instance *instance)
 {
     const double *value = instance->state.plant.value;
     const int positive[] = {RTOL, ATOL, MAX_STEP};

@@ -51,6 +51,9 @@ INTERNAL fmi2Status report(Instance *instance, fmi2Status status, const char *fo
 /* Set the state to that of a new instance. */
 INTERNAL void reset_state(State *state);
 
+/* Whether the parameters make sense; a refusal is logged. */
+INTERNAL fmi2Status check_parameters(Instance *instance);
+
 /* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
    clamped is logged too. */
 INTERNAL fmi2Status initialise(Instance *instance, int warn);

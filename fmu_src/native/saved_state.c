@@ -1,4 +1,5 @@
 /* FMI 2.0: saving, restoring and serialising the state, which is one plain struct. */
+#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -12,6 +13,7 @@ static fmi2Status refuse(Instance *instance, Call call, const char *reason)
 
 static const char NULL_POINTER[] = "null pointer";
 static const char FOREIGN[] = "the state is not one of this FMU";
+static const char UNSOUND[] = "the state is none that an instance can be in";
 
 static int is_own(const State *state)
 {
@@ -30,6 +32,28 @@ static uint64_t checksum(const void *bytes)
 }
 
 enum { SERIALIZED_SIZE = sizeof(State) + sizeof(uint64_t) };
+
+/* Take over a state from bytes that may be anybody's, with whatever checksum: each field is checked,
+   and what follows from others is computed anew. A refusal is logged. */
+static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
+{
+    State *state = &instance->state;
+    const double *value = state->plant.value;
+    memcpy(state, bytes, sizeof *state);
+    int sound = state->phase >= 0 && state->phase < N_PHASES && isfinite(state->time)
+                && state->stop_time > -HUGE_VAL
+                && (value[LIMIT_EFFORT] == 0.0 || value[LIMIT_EFFORT] == 1.0);
+    const int runs = state->phase >= STEP; /* before, what is wrong is told where it begins */
+    for (int i = 0; i < N_VARIABLES; i++)
+        sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));
+    for (int i = 0; i < N_JOINTS && runs; i++)
+        sound = sound && value[Q + i] >= value[Q_MIN + i] && value[Q + i] <= value[Q_MAX + i];
+    state->initialised = runs;
+    state->has_x = state->has_tau = 0;
+    if (!sound)
+        return refuse(instance, DESERIALIZE, UNSOUND);
+    return runs ? check_parameters(instance) : fmi2OK;
+}
 
 fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)
 {
@@ -112,10 +136,13 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes
     memcpy(&sum, bytes + sizeof(State), sizeof sum);
     if (sum != checksum(bytes) || memcmp(bytes, MODEL_GUID, sizeof MODEL_GUID) != 0)
         return refuse(instance, DESERIALIZE, FOREIGN);
+    Instance draft = *instance;
+    if (take_over(&draft, bytes) != fmi2OK)
+        return fmi2Error;
     if (!*saved)
         *saved = calloc(1, sizeof(State));
     if (!*saved)
         return refuse(instance, DESERIALIZE, "no memory");
-    memcpy(*saved, bytes, sizeof(State));
+    memcpy(*saved, &draft.state, sizeof(State));
     return fmi2OK;
 }

@@ -86,6 +86,28 @@ static fmi2Status variables(Instance *c)
     }
 }
 
+/* Another value in a field of a serialised state, with the checksum right (FNV-1a, RFC 9923). */
+static void forge(fmi2Byte *bytes)
+{
+    State state;
+    uint64_t sum = UINT64_C(0xcbf29ce484222325);
+    const unsigned vr = pick(N_VARIABLES);
+    memcpy(&state, bytes, sizeof state);
+    switch (pick(6)) {
+    case 0: state.phase = pick(2) ? (int)pick(N_PHASES + 4) - 2 : (int)(pick(1u << 31) << 1); break;
+    case 1: state.time = number(); break;
+    case 2: state.stop_time = number(); break;
+    case 3: state.initialised = (int)pick(3), state.has_x = (int)pick(3); break;
+    default: state.plant.value[vr] = number();
+    }
+    if (state.plant.value[MAX_STEP] > 0.0 && state.plant.value[MAX_STEP] < 1e-3)
+        state.plant.value[MAX_STEP] = 1e-3; /* as in variables() */
+    memcpy(bytes, &state, sizeof state);
+    for (size_t i = 0; i < sizeof state; i++)
+        sum = (sum ^ (unsigned char)bytes[i]) * UINT64_C(0x100000001b3);
+    memcpy(bytes + sizeof state, &sum, sizeof sum);
+}
+
 static fmi2Status saved_states(Instance *c, fmi2FMUstate *saved)
 {
     fmi2Byte bytes[sizeof(State) + 64];
@@ -102,6 +124,15 @@ static fmi2Status saved_states(Instance *c, fmi2FMUstate *saved)
         CHECK(fmi2SerializedFMUstateSize(c, *saved, &size) == fmi2OK && size <= sizeof bytes);
         CHECK(fmi2SerializeFMUstate(c, *saved, bytes, size - 1) == fmi2Error);
         CHECK(fmi2SerializeFMUstate(c, *saved, bytes, size) == fmi2OK);
+        if (pick(2)) {
+            forge(bytes);
+            status = fmi2DeSerializeFMUstate(c, bytes, size, &other);
+            CHECK((status == fmi2OK) == (other != NULL));
+            if (other)
+                CHECK(fmi2SetFMUstate(c, other) == fmi2OK && c->state.phase < N_PHASES);
+            fmi2FreeFMUstate(c, &other);
+            return status;
+        }
         if (pick(2)) {
             bytes[pick((unsigned)size)] ^= (fmi2Byte)(1 << pick(7));
             CHECK(fmi2DeSerializeFMUstate(c, bytes, size, &other) == fmi2Error && !other);

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
+from ..files import is_being_written
 from ..master import NANOSECONDS
 from .messages import JOINT_STATE, JOINT_STATES, STORE, Array, JointStateLayout
 from .provenance import read_provenance
 from .records import Channel, DamageError, read_messages, storage_files
-from .storage import is_being_written
 
 BATCH = 8192  # messages that are decoded at once
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -12,7 +12,6 @@ import shutil
 import sqlite3
 import struct
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -20,6 +19,8 @@ from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
 import lz4.frame
+
+from ..files import temporary_folder
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -210,13 +211,11 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a database without changing it: where a writer died over it, a copy is repaired."""
     unfinished = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
     unfinished = [file for file in unfinished if file.is_file() and file.stat().st_size]
-    with tempfile.TemporaryDirectory(
-        prefix=".twodof_", dir=path.absolute().parent.parent if unfinished else None
-    ) as folder:
+    with temporary_folder(path.absolute().parent.parent if unfinished else None) as folder:
         if unfinished:
             for file in (path, *unfinished):
-                shutil.copyfile(file, Path(folder) / file.name)
-            uri = (Path(folder) / path.name).as_uri()
+                shutil.copyfile(file, folder / file.name)
+            uri = (folder / path.name).as_uri()
         else:
             uri = path.absolute().as_uri() + "?immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:

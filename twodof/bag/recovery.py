@@ -19,10 +19,10 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..errors import BagError
-from ..files import read_file
+from ..files import is_being_written, lock, read_file, sync
 from . import provenance
 from .records import Channel, DamageError, read_messages, storage_files
-from .storage import KINDS, BagWriter, is_being_written, lock, sync
+from .storage import KINDS, BagWriter
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
 MAX_METADATA = 64 * 1024**2  # bytes

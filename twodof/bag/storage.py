@@ -7,10 +7,8 @@ killed leaves little or nothing.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import sqlite3
-from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal
@@ -127,35 +125,3 @@ class BagWriter(Writer):
             raise FileNotFoundError(errno.ENOENT, REMOVED)
         self.storage.flush(self._fsync)
         self._pending = 0
-
-
-def lock(path: Path) -> int:
-    """Mark a bag's folder as being written until the descriptor is closed or the process dies."""
-    folder = os.open(path, os.O_RDONLY)
-    with suppress(OSError):  # a file system without locks
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return folder
-
-
-def is_being_written(path: Path) -> bool:
-    """Whether a living process writes the bag."""
-    folder = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # a file system without locks
-        return False
-    finally:
-        os.close(folder)
-    return False
-
-
-def sync(*paths: Path) -> None:
-    """Bring files and folders, as far as they are written, to the disk itself."""
-    for path in paths:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -18,12 +18,12 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
-from ..files import read_file
+from ..files import is_being_written, lock, read_file, sync
 from ..inputs import Value
 from ..master import Experiment, Sample, Sink
 from .messages import JOINT_STATES, STORE, Messages, Serialised
 from .provenance import ProvenanceFile, read_provenance
-from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, is_being_written, lock, sync
+from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter
 
 MAX_METADATA = 64 * 1024**2  # bytes
 PROVENANCE_KEY = "twodof"

@@ -21,6 +21,7 @@ MOVING_TYPES = ("revolute", "continuous", "prismatic")
 MAX_LINKS = 1000
 MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
 MAX_DEPTH = 100  # of elements in elements
+MAX_NAME = 1000  # characters; a string literal of C holds 4095 bytes
 LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
 
 
@@ -180,6 +181,11 @@ def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
         name = element.get("name")
         if not name:
             raise RobotError(f"the URDF has a <{tag}> without a name")
+        if len(name) > MAX_NAME:
+            raise RobotError(
+                f"the URDF has a <{tag}> whose name has {len(name)} characters;"
+                f" at most {MAX_NAME} are supported"
+            )
         if name in found:
             raise RobotError(f"the URDF has two {tag}s named '{name}'")
         found[name] = element

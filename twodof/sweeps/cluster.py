@@ -7,7 +7,6 @@ import os
 import shlex
 import subprocess
 import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -20,6 +19,7 @@ from typing import Any
 
 from .. import __version__
 from ..errors import SweepError, TwoDofError
+from ..files import temporary_folder
 from .metrics import METRICS
 from .runner import Job, Point, Row, Runner
 
@@ -229,14 +229,14 @@ def _local(count: int) -> Iterator[tuple[Client, Callable[[], object]]]:
                 n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
             )
         )
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="twodof_"))
+        folder = stack.enter_context(temporary_folder())
         command = [
             sys.executable, "-m", "distributed.cli.dask_worker", cluster.scheduler_address,
             "--no-nanny", "--nthreads", "1", "--no-dashboard", "--memory-limit", "0",
-            "--death-timeout", f"{START_TIME:g}", "--local-directory", folder,
+            "--death-timeout", f"{START_TIME:g}", "--local-directory", str(folder),
         ]  # fmt: skip
         path = os.pathsep.join(entry for entry in sys.path if entry)
-        environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": path, "TMPDIR": folder}
+        environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": path, "TMPDIR": str(folder)}
         start = partial(
             subprocess.Popen, command, env=environment, start_new_session=True,
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,

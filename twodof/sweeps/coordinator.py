@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..bag.provenance import versions
+from ..files import temporary_folder
 from ..fmu import Fmu, load_fmu
 from ..inputs import Setting
 from ..master import experiment
@@ -121,5 +121,5 @@ def _folder(output: str | Path | None) -> Iterator[Path]:
     if output is not None:
         yield Path(output)
         return
-    with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
-        yield Path(folder) / "sweep"
+    with temporary_folder() as folder:
+        yield folder / "sweep"

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bag.storage import is_being_written, lock
 from ..errors import SweepError
-from ..files import write_file
+from ..files import is_being_written, lock, write_file
 from .metrics import METRICS
 from .runner import Row
 

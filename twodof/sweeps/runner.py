@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from array import array
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..bag import Bag
 from ..errors import SimulationError
+from ..files import temporary_folder
 from ..fmu import Instance, instantiate
 from ..inputs import Value, resolve
 from ..master import OUTPUTS, Experiment, Sample, Sink, experiment, simulate
@@ -58,7 +58,7 @@ class Runner:
         self._instance: Instance | None = None
         self._used = ExitStack()  # what the instance needs
         with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="twodof_")))
+            folder = stack.enter_context(temporary_folder())
             path = folder / job.file
             path.write_bytes(job.content)
             self._base = experiment(path, **job.options)
