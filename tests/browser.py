@@ -9,9 +9,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
@@ -87,7 +89,7 @@ def opened(browser: Browser, url: str, *, ready: str = "[data-value]") -> Iterat
         page.wait_for_selector("canvas")
         page.wait_for_selector(ready)
         yield page
-        assert errors == []
+        assert errors == [], errors
 
 
 class Served:
@@ -134,8 +136,8 @@ def served(*arguments: str | Path, cwd: Path) -> Iterator[Served]:
         command.process.communicate()
 
 
-def connect(url: str, origin: str | None = None) -> None:
-    """Connect as a browser does that has the page of that origin open, and leave at once."""
+def connect(url: str) -> None:
+    """Connect as a browser does that has the page open, and leave at once."""
     camera = _messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, 1.0), fov=0.6, near=0.01, far=10.0,
         image_height=100, image_width=100, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 1.0, 0.0),
@@ -143,11 +145,27 @@ def connect(url: str, origin: str | None = None) -> None:
     address = url.replace("http:", "ws:")
     protocol = Subprotocol(f"viser-v{viser.__version__}")
     with websockets.sync.client.connect(
-        address, origin=origin, subprotocols=[protocol], compression=None, max_size=None
+        address, subprotocols=[protocol], compression=None, max_size=None
     ) as connection:
         connection.send(msgspec.msgpack.encode(camera.as_serializable_dict()))
         connection.recv()
         time.sleep(0.1)
+
+
+UPGRADE = (
+    ("Connection", "Upgrade"), ("Upgrade", "websocket"), ("Sec-WebSocket-Version", "13"),
+    ("Sec-WebSocket-Key", "MDEyMzQ1Njc4OWFiY2RlZg=="),
+)  # fmt: skip
+
+
+def answer(url: str, *headers: tuple[str, str]) -> int:
+    """The status of the answer to a request with these headers and no others."""
+    with closing(HTTPConnection(*urlsplit(url).netloc.rsplit(":", 1), timeout=60)) as connection:
+        connection.putrequest("GET", "/", skip_host=True, skip_accept_encoding=True)
+        for header in headers:
+            connection.putheader(*header)
+        connection.endheaders()
+        return connection.getresponse().status
 
 
 def rows(page: Page) -> dict[str, str]:

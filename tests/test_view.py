@@ -7,7 +7,7 @@ import shutil
 import socket
 import subprocess
 import time as clock
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import browser
@@ -17,6 +17,7 @@ import pytest
 from browser import (
     LINKS,
     Served,
+    answer,
     chromium,
     colours,
     connect,
@@ -35,9 +36,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from playwright.sync_api import Browser, Page
-from websockets.exceptions import InvalidStatus
 
 import twodof
+import twodof.page
 from twodof.page import BUCKETS, outline
 from twodof.view import nearest
 
@@ -318,16 +319,60 @@ def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path) -> None:
     )
 
 
-def test_page_of_another_website_cannot_connect(command: Served) -> None:
-    connect(command.url)  # no browser
-    connect(command.url, origin=command.url)
-    other = command.url.replace("127.0.0.1", "localhost")
-    connect(other, origin=other)
-    port = command.url.rpartition(":")[2]
-    for origin in ("https://example.com", f"http://example.com:{port}", other, "null", "http://["):
-        with pytest.raises(InvalidStatus) as refused:
-            connect(command.url, origin=origin)
-        assert refused.value.response.status_code == 403
+def names_of(*names: str) -> list[str]:
+    """As a browser writes them into Host."""
+    return [f"{name}:{port}" for name in names for port in (80, 9000)] + [*names]
+
+
+LOOPBACK = ("127.0.0.1", "localhost", "LocalHost", "[::1]")
+STRANGERS = (
+    "evil.example",
+    "127.0.0.1.evil.example",
+    "localhost.evil.example",
+    "[::1].example",
+    "",
+)
+ASKED = {
+    "127.0.0.1": (LOOPBACK, (*STRANGERS, "192.0.2.1", "[2001:db8::1]")),
+    "localhost": (LOOPBACK, (*STRANGERS, "192.0.2.1")),
+    "0.0.0.0": ((*LOOPBACK, "192.0.2.1", "[2001:db8::1]", socket.gethostname()), STRANGERS),
+    socket.gethostname(): ((socket.gethostname(),), (*STRANGERS, "192.0.2.1")),
+}
+
+
+@pytest.mark.parametrize(("host", "own", "other"), [(k, *v) for k, v in ASKED.items()], ids=ASKED)
+def test_page_answers_to_its_own_name_and_its_own_page_alone(
+    host: str, own: Sequence[str], other: Sequence[str]
+) -> None:
+    """Requests for the page and for a websocket, with the headers that a browser sends."""
+    with twodof.page.Page("", host, 0) as served:
+        for rest, fine in (((), 200), (browser.UPGRADE, 101)):
+            for name in names_of(*other):
+                asked = ("Host", name), *rest
+                assert answer(served.url, *asked) == 403
+                assert answer(served.url, *asked, ("Origin", f"http://{name}")) == 403
+            for name in names_of(*own):
+                asked = ("Host", name), *rest
+                assert answer(served.url, *asked) == fine  # no browser, or a link
+                assert answer(served.url, *asked, ("Origin", f"http://{name}")) == fine
+                for origin in ("null", "http://[", "http://localhost:3000", "http://evil.example"):
+                    assert answer(served.url, *asked, ("Origin", origin)) == 403
+                assert answer(served.url, *asked, ("Host", name)) == 403
+            assert answer(served.url, *rest) == 403
+
+
+@pytest.mark.parametrize("link", ["websocket=ws://127.0.0.1:{port}", "playbackPath=data:,"])
+def test_link_cannot_have_the_page_listen_to_another_server(
+    shown: Browser, command: Served, link: str
+) -> None:
+    """viser's page runs the scripts of its server or recording, which its link may name."""
+    with socket.create_server(("127.0.0.1", 0)) as other, shown.new_context() as context:
+        page, port = context.new_page(), other.getsockname()[1]
+        assert page.goto(f"{command.url}/?{link.format(port=port)}").status == 403
+        page.wait_for_timeout(1000)
+        other.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            other.accept()
 
 
 def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
