@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from http.client import HTTPConnection
@@ -37,6 +38,12 @@ ARGUMENTS = (
     "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
 )  # fmt: skip
+HOSTILE = (
+    "<img src=x onerror=\"document.title='ran'\"><script>document.title='ran'</script>"
+    "<iframe srcdoc=\"<script>parent.document.title='ran'</script>\"></iframe>"
+    "[link](javascript:document.title='ran') &lt;"
+)
+"""What a page must show as it is."""
 COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
 ROWS = """() => Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
     cell => [cell.dataset.value, cell.textContent]))"""
@@ -166,6 +173,26 @@ def answer(url: str, *headers: tuple[str, str]) -> int:
             connection.putheader(*header)
         connection.endheaders()
         return connection.getresponse().status
+
+
+def hostile_arm() -> ET.Element:
+    """The default arm's URDF, all of whose names begin with HOSTILE, with spheres for meshes."""
+    robot = ET.parse(Path(__file__).parents[1] / "urdf/2dof.urdf").getroot()
+    for element in robot.iter():
+        for key in {"name", "link"} & element.attrib.keys():
+            element.set(key, HOSTILE + element.attrib[key])
+    for mesh in robot.iter("mesh"):
+        mesh.tag, mesh.attrib = "sphere", {"radius": "0.02"}
+    return robot
+
+
+def assert_shown_as_text(page: Page, *texts: str) -> None:
+    """HOSTILE and what follows are seen to the letter, and nothing of it is an element or runs."""
+    page.wait_for_timeout(500)  # a script would run by now
+    assert page.title() != "ran"
+    for text in texts:
+        assert page.get_by_text(HOSTILE + text).count() > 0, text
+    assert page.locator("img[src=x], iframe, a[href^=javascript], a:text-is('link')").count() == 0
 
 
 def rows(page: Page) -> dict[str, str]:

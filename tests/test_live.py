@@ -469,6 +469,23 @@ def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path)
         assert len(pixels(picture(page), LINKS[0])) > 200  # a joint's ball, as dark as link 1
 
 
+def test_text_of_an_fmu_is_text(shown: Browser, tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_bytes(ET.tostring(browser.hostile_arm()))
+    options = twodof.FmuOptions(
+        urdf=tmp_path / "arm.urdf", frame=browser.HOSTILE + "EndEffector", axes="xy"
+    )
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)
+    bag = browser.HOSTILE.replace("/", "")
+    with (
+        served("live", fmu, "-o", bag, cwd=tmp_path) as command,
+        opened(shown, command.url) as page,
+    ):
+        press(page, "Record")
+        press(page, "Stop recording")
+        page.get_by_text(f"{bag}, ").wait_for()  # the note
+        browser.assert_shown_as_text(page, "joint1", "joint1, N·m")
+
+
 def test_port_in_use(native_path: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import shutil
 import socket
 import subprocess
 import time as clock
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -319,6 +322,44 @@ def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path) -> None:
     )
 
 
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag all of whose texts are hostile."""
+    folder, robot = tmp_path_factory.mktemp("hostile"), browser.hostile_arm()
+    (folder / "arm.urdf").write_bytes(ET.tostring(robot))
+    frame = browser.HOSTILE + "EndEffector"
+    options = twodof.FmuOptions(urdf=folder / "arm.urdf", frame=frame, axes="xy")
+    run = twodof.experiment(twodof.build_fmu(folder / "Arm.fmu", options), stop_time=0.1)
+    bag = folder / browser.HOSTILE.replace("/", "")
+    twodof.simulate(run, [twodof.Bag(bag, run)])
+    made = json.loads((bag / "run.json").read_text())
+    for sphere in robot.iter("sphere"):
+        sphere.tag = "mesh"
+        sphere.set("filename", f"package://meshes/{browser.HOSTILE}mesh")
+    made["urdf"] = ET.tostring(robot, encoding="unicode")
+    made["fmu"] = dict.fromkeys(made["fmu"], browser.HOSTILE)
+    made |= dict.fromkeys(("robot", "root", "command_line"), browser.HOSTILE)
+    (bag / "run.json").write_text(json.dumps(made))
+    return bag
+
+
+def test_text_of_a_bag_is_text(shown: Browser, hostile: Path) -> None:
+    with served("view", hostile, cwd=hostile.parent) as command, opened(shown, command.url) as page:
+        browser.assert_shown_as_text(page, "joint1", "joint2", "mesh")
+        assert page.get_by_text(f"twodof - {hostile.name}").count() > 0
+
+
+def test_text_of_a_bag_is_text_in_an_exported_file(shown: Browser, hostile: Path) -> None:
+    done = run_view(hostile.name, "--export", "hostile.html", cwd=hostile.parent)
+    assert done.returncode == 0
+    with shown.new_context() as context:
+        page = context.new_page()
+        page.goto((hostile.parent / "hostile.html").as_uri())
+        page.wait_for_selector("canvas")
+        browser.assert_shown_as_text(page)
+        assert page.title() == f"{hostile.name} - twodof"
+
+
 def names_of(*names: str) -> list[str]:
     """As a browser writes them into Host."""
     return [f"{name}:{port}" for name in names for port in (80, 9000)] + [*names]
@@ -373,6 +414,14 @@ def test_link_cannot_have_the_page_listen_to_another_server(
         other.setblocking(False)
         with pytest.raises(BlockingIOError):
             other.accept()
+
+
+def test_bag_whose_name_is_no_text_is_shown(shown: Browser, folder: Path, tmp_path: Path) -> None:
+    name = os.fsdecode(b"bag\xff")
+    shutil.copytree(folder / "bag", tmp_path / name)
+    with served("view", name, cwd=tmp_path) as command, opened(shown, command.url) as page:
+        assert page.get_by_text("twodof - bag?").count() > 0
+    assert run_view(name, "--export", "bag.html", cwd=tmp_path).returncode == 0
 
 
 def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:

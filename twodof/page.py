@@ -66,7 +66,7 @@ class Page:
     def __init__(self, title: str, host: str = HOST, port: int = PORT) -> None:
         address = _resolve(host, port)
         with _quiet(), _own_pages(host, address):  # viser prints a table
-            self._server = _Server(host=host, port=port, label=title, verbose=False)
+            self._server = _Server(host=host, port=port, label=_text(title), verbose=False)
         self.gui: Any = self._server.gui
         self.scene = self._server.scene
         if port and self._server.get_port() != port:  # taken since: viser has gone on to the next
@@ -105,7 +105,14 @@ class Page:
     def notify(self, title: str, text: str) -> None:
         """Tell all browsers, until it is read."""
         for client in self._server.get_clients().values():
-            client.add_notification(title, text, auto_close_seconds=8.0)
+            client.add_notification(title, _text(text), auto_close_seconds=8.0)
+
+    def add_text(self, text: str) -> None:
+        """Text in the control panel, whatever it holds: viser's markdown would be HTML."""
+        self.gui.add_html(
+            '<div style="font-size:12.5px;margin:2px 10px;overflow-wrap:anywhere">'
+            f"{html.escape(_text(text))}</div>"
+        )
 
     def frame(self, points: Array, axes: str, up: Sequence[float]) -> float:
         """Place the camera so that points (N × 3, m) fill the picture; the size of what is seen, m.
@@ -203,7 +210,8 @@ class Page:
         for duration in frames:
             serializer.insert_sleep(duration)
         text: str = serializer.as_html()
-        return text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>").encode()
+        title = html.escape(_text(title))
+        return text.replace("<title>Viser</title>", f"<title>{title}</title>").encode()
 
 
 class _Server(viser.ViserServer):  # type: ignore[misc, unused-ignore]
@@ -437,6 +445,11 @@ def _resolve(host: str, port: int) -> str:
             raise _in_use(host, port) from error
         raise PageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
     return str(address[0])
+
+
+def _text(text: str) -> str:
+    """A text as it can be sent; names of files need not be UTF-8."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def _in_use(host: str, port: int) -> PageError:
