@@ -424,6 +424,26 @@ def test_bag_whose_name_is_no_text_is_shown(shown: Browser, folder: Path, tmp_pa
     assert run_view(name, "--export", "bag.html", cwd=tmp_path).returncode == 0
 
 
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<geometry><sphere radius="wide"/></geometry>',
+        '<geometry><box size="1 1 x"/></geometry>',
+        '<geometry><mesh filename="package://meshes/link1.stl" scale="a"/></geometry>',
+        '<geometry><box/></geometry><origin rpy="0"/>',
+        '<geometry><box/></geometry><material name="red"><color rgba="1"/></material>',
+    ],
+)
+def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "bag", tmp_path / "bag")
+    made = json.loads((tmp_path / "bag/run.json").read_text())
+    made["urdf"] = made["urdf"].replace("<visual>", f"<visual>{shape}</visual><visual>", 1)
+    (tmp_path / "bag/run.json").write_text(json.dumps(made))
+    done = run_view("bag", "--export", "bag.html", cwd=tmp_path)
+    assert done.returncode == 1
+    assert re.fullmatch(r"twodof: error: link 'link1' cannot be drawn: [^\n]+\n", done.stderr)
+
+
 def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [*browser.COMMAND, "view", *map(str, arguments), "--no-browser"]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
