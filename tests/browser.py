@@ -32,6 +32,7 @@ LINKS = (
     lambda r, g, b: (r > 190) & (g > 110) & (g < 180) & (b < 100),
 )
 """What colours the default arm's two links have."""
+PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
 VIEWPORT = {"width": 900, "height": 560}
 ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -88,6 +89,7 @@ def chromium() -> Iterator[Browser]:
 def opened(browser: Browser, url: str, *, ready: str = "[data-value]") -> Iterator[Page]:
     """A page that is shown; at its end, no error is in its console."""
     with browser.new_context(viewport=VIEWPORT) as context:
+        context.set_default_timeout(1e3 * PATIENCE)
         page = context.new_page()
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -118,7 +120,7 @@ class Served:
     def interrupt(self, number: int = signal.SIGINT) -> tuple[int, str, str]:
         """Ctrl-C; exit status and what was printed on stdout and stderr."""
         self.process.send_signal(number)
-        output, errors = self.process.communicate(timeout=20)
+        output, errors = self.process.communicate(timeout=PATIENCE)
         return self.process.returncode, output, errors
 
     def children(self) -> list[int]:
@@ -205,7 +207,9 @@ def numbers(text: str) -> list[float]:
     return [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", text)]
 
 
-def until(page: Page, condition: Callable[[dict[str, str]], bool], timeout: float = 15.0) -> Any:
+def until(
+    page: Page, condition: Callable[[dict[str, str]], bool], timeout: float = PATIENCE
+) -> Any:
     """The readout once it fulfils a condition."""
     end = time.monotonic() + timeout
     while not condition(found := rows(page)):
@@ -243,6 +247,11 @@ def latency(page: Page, label: str, value: float) -> float:
 def picture(page: Page) -> np.ndarray:
     """What the 3D scene shows now, without the notes before it, height × width × 3."""
     page.evaluate(DRAWN)
+    return still(page)
+
+
+def still(page: Page) -> np.ndarray:
+    """The same of a page whose time stands still, and so draws nothing."""
     shot = page.screenshot(clip=page.locator("canvas").first.bounding_box(), style=NOTES)
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
