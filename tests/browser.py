@@ -207,12 +207,10 @@ def numbers(text: str) -> list[float]:
     return [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", text)]
 
 
-def until(
-    page: Page, condition: Callable[[dict[str, str]], bool], timeout: float = PATIENCE
-) -> Any:
-    """The readout once it fulfils a condition."""
-    end = time.monotonic() + timeout
-    while not condition(found := rows(page)):
+def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], Any] = rows) -> Any:
+    """What is seen on a page, its readout by default, once it fulfils a condition."""
+    end = time.monotonic() + PATIENCE
+    while not condition(found := look(page)):
         assert time.monotonic() < end, found
         page.wait_for_timeout(20)
     return found

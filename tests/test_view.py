@@ -136,10 +136,9 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     press(page, "Pause")
     page.get_by_role("button", name="Play").wait_for()
     page.wait_for_timeout(500)
-    paused = numbers(rows(page)["time"])[0]
-    assert float(browser.field_of(page, "time, s").input_value()) == pytest.approx(
-        paused, abs=0.006
-    )
+    paused = pytest.approx(numbers(rows(page)["time"])[0], abs=0.006)
+    slider = browser.field_of(page, "time, s")
+    until(page, lambda value: float(value) == paused, lambda _: slider.input_value())
     scrub(page, 3.8)
     press(page, "Play")
     until(page, lambda found: found["sample"] == "400 of 400")
@@ -208,13 +207,16 @@ def slope(page: Page) -> float:
 
 
 def test_plots_hold_the_bag_and_a_mark_at_the_time(page: Page, truth: np.ndarray) -> None:
+    def positions(page: Page) -> np.ndarray:
+        plots = page.evaluate(browser.PLOTS)
+        return np.array(next(data for title, data in plots if title == "position, rad"), float)
+
+    def is_marked(found: np.ndarray) -> bool:
+        return found[0, np.isfinite(found[3])] == pytest.approx([1.49, 1.5])
+
     scrub(page, 1.5)
-    page.wait_for_timeout(400)
-    plots = page.evaluate(browser.PLOTS)
-    positions = next(data for title, data in plots if title == "position, rad")
-    times, q1, q2, mark = np.array(positions, dtype=float)
-    assert np.column_stack([times, q1, q2]) == pytest.approx(truth)
-    assert times[np.isfinite(mark)] == pytest.approx([1.49, 1.5])
+    marked = until(page, is_marked, positions)
+    assert marked[:3].transpose() == pytest.approx(truth)
 
 
 def test_two_viewers_see_the_same(shown: Browser, command: Served, page: Page) -> None:
