@@ -8,10 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
@@ -29,12 +32,19 @@ LINKS = (
     lambda r, g, b: (r > 190) & (g > 110) & (g < 180) & (b < 100),
 )
 """What colours the default arm's two links have."""
+PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
 VIEWPORT = {"width": 900, "height": 560}
 ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
     "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
 )  # fmt: skip
+HOSTILE = (
+    "<img src=x onerror=\"document.title='ran'\"><script>document.title='ran'</script>"
+    "<iframe srcdoc=\"<script>parent.document.title='ran'</script>\"></iframe>"
+    "[link](javascript:document.title='ran') &lt;"
+)
+"""What a page must show as it is."""
 COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
 ROWS = """() => Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
     cell => [cell.dataset.value, cell.textContent]))"""
@@ -79,6 +89,7 @@ def chromium() -> Iterator[Browser]:
 def opened(browser: Browser, url: str, *, ready: str = "[data-value]") -> Iterator[Page]:
     """A page that is shown; at its end, no error is in its console."""
     with browser.new_context(viewport=VIEWPORT) as context:
+        context.set_default_timeout(1e3 * PATIENCE)
         page = context.new_page()
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -87,7 +98,7 @@ def opened(browser: Browser, url: str, *, ready: str = "[data-value]") -> Iterat
         page.wait_for_selector("canvas")
         page.wait_for_selector(ready)
         yield page
-        assert errors == []
+        assert errors == [], errors
 
 
 class Served:
@@ -109,7 +120,7 @@ class Served:
     def interrupt(self, number: int = signal.SIGINT) -> tuple[int, str, str]:
         """Ctrl-C; exit status and what was printed on stdout and stderr."""
         self.process.send_signal(number)
-        output, errors = self.process.communicate(timeout=20)
+        output, errors = self.process.communicate(timeout=PATIENCE)
         return self.process.returncode, output, errors
 
     def children(self) -> list[int]:
@@ -134,8 +145,8 @@ def served(*arguments: str | Path, cwd: Path) -> Iterator[Served]:
         command.process.communicate()
 
 
-def connect(url: str, origin: str | None = None) -> None:
-    """Connect as a browser does that has the page of that origin open, and leave at once."""
+def connect(url: str) -> None:
+    """Connect as a browser does that has the page open, and leave at once."""
     camera = _messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, 1.0), fov=0.6, near=0.01, far=10.0,
         image_height=100, image_width=100, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 1.0, 0.0),
@@ -143,11 +154,47 @@ def connect(url: str, origin: str | None = None) -> None:
     address = url.replace("http:", "ws:")
     protocol = Subprotocol(f"viser-v{viser.__version__}")
     with websockets.sync.client.connect(
-        address, origin=origin, subprotocols=[protocol], compression=None, max_size=None
+        address, subprotocols=[protocol], compression=None, max_size=None
     ) as connection:
         connection.send(msgspec.msgpack.encode(camera.as_serializable_dict()))
         connection.recv()
         time.sleep(0.1)
+
+
+UPGRADE = (
+    ("Connection", "Upgrade"), ("Upgrade", "websocket"), ("Sec-WebSocket-Version", "13"),
+    ("Sec-WebSocket-Key", "MDEyMzQ1Njc4OWFiY2RlZg=="),
+)  # fmt: skip
+
+
+def answer(url: str, *headers: tuple[str, str]) -> int:
+    """The status of the answer to a request with these headers and no others."""
+    with closing(HTTPConnection(*urlsplit(url).netloc.rsplit(":", 1), timeout=60)) as connection:
+        connection.putrequest("GET", "/", skip_host=True, skip_accept_encoding=True)
+        for header in headers:
+            connection.putheader(*header)
+        connection.endheaders()
+        return connection.getresponse().status
+
+
+def hostile_arm() -> ET.Element:
+    """The default arm's URDF, all of whose names begin with HOSTILE, with spheres for meshes."""
+    robot = ET.parse(Path(__file__).parents[1] / "urdf/2dof.urdf").getroot()
+    for element in robot.iter():
+        for key in {"name", "link"} & element.attrib.keys():
+            element.set(key, HOSTILE + element.attrib[key])
+    for mesh in robot.iter("mesh"):
+        mesh.tag, mesh.attrib = "sphere", {"radius": "0.02"}
+    return robot
+
+
+def assert_shown_as_text(page: Page, *texts: str) -> None:
+    """HOSTILE and what follows are seen to the letter, and nothing of it is an element or runs."""
+    page.wait_for_timeout(500)  # a script would run by now
+    assert page.title() != "ran"
+    for text in texts:
+        assert page.get_by_text(HOSTILE + text).count() > 0, text
+    assert page.locator("img[src=x], iframe, a[href^=javascript], a:text-is('link')").count() == 0
 
 
 def rows(page: Page) -> dict[str, str]:
@@ -160,10 +207,10 @@ def numbers(text: str) -> list[float]:
     return [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", text)]
 
 
-def until(page: Page, condition: Callable[[dict[str, str]], bool], timeout: float = 15.0) -> Any:
-    """The readout once it fulfils a condition."""
-    end = time.monotonic() + timeout
-    while not condition(found := rows(page)):
+def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], Any] = rows) -> Any:
+    """What is seen on a page, its readout by default, once it fulfils a condition."""
+    end = time.monotonic() + PATIENCE
+    while not condition(found := look(page)):
         assert time.monotonic() < end, found
         page.wait_for_timeout(20)
     return found
@@ -198,6 +245,11 @@ def latency(page: Page, label: str, value: float) -> float:
 def picture(page: Page) -> np.ndarray:
     """What the 3D scene shows now, without the notes before it, height × width × 3."""
     page.evaluate(DRAWN)
+    return still(page)
+
+
+def still(page: Page) -> np.ndarray:
+    """The same of a page whose time stands still, and so draws nothing."""
     shot = page.screenshot(clip=page.locator("canvas").first.bounding_box(), style=NOTES)
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 

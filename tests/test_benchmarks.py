@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 import sys
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from harness import needs
+from scipy.integrate import solve_ivp
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -67,26 +70,59 @@ def test_growth_is_the_largest_exponent(benchmark: ModuleType) -> None:
     assert benchmark.growth([1, 2, 4], [1.0, 2.0, 16.0]) == pytest.approx(3.0)
 
 
-def test_arms_have_the_joints_that_the_table_says(benchmark: ModuleType) -> None:
-    for arm, joints in ((benchmark.panda(), 7), (benchmark.chain(16), 16)):
-        assert len(arm.robot.joints) == joints and not any(arm.robot.damping)
+def test_robots_are_measured_as_they_come(benchmark: ModuleType, robots: Path) -> None:
+    urdf = ET.parse(robots / "panda_description/urdf/panda.urdf")
+    damping = [
+        float(dynamics.get("damping"))
+        for joint in urdf.iter("joint")
+        if joint.get("type") == "revolute" and (dynamics := joint.find("dynamics")) is not None
+    ]
+    assert list(benchmark.panda().robot.damping) == damping and len(damping) == 7
+    assert list(benchmark.chain(16).robot.damping) == [0.0] * 16
 
 
-def test_mujoco_has_the_same_arm(benchmark: ModuleType) -> None:
+@pytest.fixture(scope="module")
+def mujoco(
+    benchmark: ModuleType, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str, int], tuple[float, list[float]]]:
+    needs("cc")
+    return benchmark.mujoco_runner(tmp_path_factory.mktemp("mujoco"))
+
+
+def test_mujoco_has_the_same_arm(benchmark: ModuleType, mujoco: Callable) -> None:
     """Free fall from the start: MuJoCo's motion is that of Pinocchio's dynamics."""
-    model, robot = benchmark.mujoco_arm(), benchmark.shipped_arm().robot
-    data, reference = mujoco.MjData(model), robot.model.copy()
-    reference.gravity.linear = np.array(benchmark.STARTS["gravity"])
-    data.qpos[:], data.qvel[:] = benchmark.Q_START, (1.0, -2.0)
-    mujoco.mj_forward(model, data)
-    expected = pin.aba(reference, reference.createData(), data.qpos, data.qvel, np.zeros(2))
-    np.testing.assert_allclose(data.qacc, expected, rtol=1e-9)
+    robot = benchmark.shipped_arm().robot
+    model = robot.model.copy()
+    model.gravity.linear = np.array(benchmark.STARTS["gravity"])
+    data = model.createData()
+
+    def motion(_t: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[2:], pin.aba(model, data, y[:2], y[2:], np.zeros(2))])
+
+    start = [*benchmark.Q_START, 0.0, 0.0]
+    expected = solve_ivp(motion, (0.0, 0.3), start, "DOP853", rtol=1e-12, atol=1e-12).y[:2, -1]
+    assert mujoco("free", 30)[1] == pytest.approx(expected, abs=1e-7)
 
 
-def test_steps_are_timed_from_c(benchmark: ModuleType, tmp_path, monkeypatch) -> None:
+def test_mujoco_has_the_same_controller(benchmark: ModuleType, mujoco: Callable) -> None:
+    for steps in (1, 5, 50, 500):
+        x = benchmark.position(mujoco("controlled", steps)[1])
+        assert x == pytest.approx(benchmark.exact(steps), abs=1e-9)
+
+
+def test_mujoco_is_measured_without_its_python_package() -> None:
+    """That has the library ask for the time, at more than the cost of a step."""
+    code = "import sys, run; sys.exit('mujoco' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True)
+
+
+def test_steps_are_timed_from_c(
+    benchmark: ModuleType, mujoco: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(benchmark, "STEPS", 100)  # clock() has a resolution of 1 µs
-    native = benchmark.native_cost(benchmark.shipped_arm(), tmp_path)
-    rows = [benchmark.RowInC("", 2, cost, 61.0) for cost in (native, benchmark.mujoco_cost())]
+    costs = [benchmark.native_cost(benchmark.shipped_arm(), tmp_path)]
+    costs += [lambda kind=kind: mujoco(kind, 100)[0] for kind in ("free", "controlled")]
+    rows = [benchmark.RowInC("", 2, "", cost, 61.0) for cost in costs]
     assert all(0.0 < cost < 1e-3 for cost in benchmark.times_in_c(rows, rounds=3))
 
 

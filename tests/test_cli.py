@@ -27,7 +27,12 @@ EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 def twodof_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own."""
     return subprocess.run(
-        [*COMMAND, *arguments], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=60
+        [*COMMAND, *arguments],
+        cwd=cwd,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
 
 
@@ -641,7 +646,7 @@ def test_reader_that_leaves_early_gets_no_traceback(line: str, folder: Path) -> 
         stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     os.close(writing)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=120)
     assert err == ""
 
 
@@ -650,7 +655,7 @@ def test_output_that_cannot_be_written_gives_no_traceback(output: str | None, fo
     redirect = f">{output}" if output else ">&-"
     done = subprocess.run(
         ["sh", "-c", f'"$0" "$@" {redirect}', *COMMAND, "info", "arm.fmu"],
-        cwd=folder, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, timeout=20,
+        cwd=folder, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, timeout=120,
     )  # fmt: skip
     assert "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) <= 1

@@ -133,13 +133,14 @@ def test_arm_follows_the_target_as_the_closed_form_says(page: Page) -> None:
 
 
 def test_readout_tells_how_well_time_is_kept(page: Page) -> None:
-    seen = play(page, 2.5)
-    factors = [float(found["real-time factor"]) for found in seen if time_of(found) > 1.5]
-    assert np.median(factors) == pytest.approx(1.0, abs=0.1)
+    seen = play(page, 1.0)
     counts = [numbers(found["deadlines missed"]) for found in seen]
     for found, (missed, steps, worst) in zip(seen, counts):
         assert steps - counts[0][1] == round(100 * (time_of(found) - time_of(seen[0])))
         assert 0 <= missed <= steps and worst >= 0.0
+    press(page, "Play")
+    until(page, lambda found: numbers(found["real-time factor"]) == pytest.approx([1.0], abs=0.1))
+    pause(page)
 
 
 def test_plots_are_those_of_what_was_shown(page: Page) -> None:
@@ -153,7 +154,7 @@ def test_plots_are_those_of_what_was_shown(page: Page) -> None:
     found = rows(page)
     count = round(100 * time_of(found)) + 1
     drawn = f"() => ({browser.PLOTS})().every(([_, [age]]) => age.length === {count})"
-    page.wait_for_function(drawn, timeout=5000)
+    page.wait_for_function(drawn)
     (title, (age, q1, q2)), (_, (_, error)) = page.evaluate(browser.PLOTS)
     assert title == "position, rad"
     assert np.diff(age) == pytest.approx(0.01) and age[-1] == 0.0
@@ -468,12 +469,29 @@ def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path)
         assert len(pixels(picture(page), LINKS[0])) > 200  # a joint's ball, as dark as link 1
 
 
+def test_text_of_an_fmu_is_text(shown: Browser, tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_bytes(ET.tostring(browser.hostile_arm()))
+    options = twodof.FmuOptions(
+        urdf=tmp_path / "arm.urdf", frame=browser.HOSTILE + "EndEffector", axes="xy"
+    )
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)
+    bag = browser.HOSTILE.replace("/", "")
+    with (
+        served("live", fmu, "-o", bag, cwd=tmp_path) as command,
+        opened(shown, command.url) as page,
+    ):
+        press(page, "Record")
+        press(page, "Stop recording")
+        page.get_by_text(f"{bag}, ").wait_for()  # the note
+        browser.assert_shown_as_text(page, "joint1", "joint1, N·m")
+
+
 def test_port_in_use(native_path: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = subprocess.run(
             [*browser.COMMAND, "live", str(native_path), "--port", f"{port}"],
-            cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+            cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
         )  # fmt: skip
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(rf"twodof: error: port {port} of 127.0.0.1 is in use[^\n]*\n", done.stderr)

@@ -1,4 +1,4 @@
-"""However a run is driven, its bag tells what drove it: distances and closed form by the bag alone."""
+"""However a run is driven, its bag tells what drove it: distance and closed form by that alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that mean harm: read or refused in one line, within seconds and bounded memory.
+"""Files that mean harm: read or refused in one line, with bounded processor time and memory.
 
 MCAP files are made record by record after the specification, with the mcap project's own writer
 where it can write them.
@@ -112,22 +112,25 @@ from twodof.cli import main
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 import twodof.bag
 status = main(sys.argv[1:])
-print("grew by", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, file=sys.stderr)
+used = resource.getrusage(resource.RUSAGE_SELF)
+print(used.ru_maxrss - before, used.ru_utime + used.ru_stime, file=sys.stderr)
 raise SystemExit(status)
 """
 
 
 def refused(verb: str, bag: Path, folder: Path) -> str:
-    """What the command says: one line, within ten seconds and half a gigabyte, leaving nothing."""
+    """What the command says: one line, for ten seconds and half a gigabyte, leaving nothing."""
     before = sorted(folder.rglob("*"))
     done = subprocess.run(
-        [sys.executable, "-c", COMMAND, verb, str(bag)], capture_output=True, text=True, timeout=10
+        [sys.executable, "-c", COMMAND, verb, str(bag)], capture_output=True, text=True, timeout=300
     )
-    *lines, grew = done.stderr.splitlines()
+    *lines, used = done.stderr.splitlines()
     assert done.returncode == 1, (done.stdout, lines)
     (line,) = lines
     assert line.startswith("twodof: error:")
-    assert int(grew.split()[-1]) < 1024**2 // 2  # KiB
+    memory, processor = used.split()
+    assert int(memory) < 1024**2 // 2  # KiB
+    assert float(processor) < 10.0  # s
     assert sorted(folder.rglob("*")) == before
     return line
 
@@ -274,7 +277,9 @@ def test_provenance_without_end_is_refused(fmu_path: Path, tmp_path: Path) -> No
 
 
 @both_storages
-def test_recover_of_a_million_topics_takes_seconds(tmp_path: Path, storage: str) -> None:
+def test_recover_of_a_million_topics_takes_seconds_of_the_processor(
+    tmp_path: Path, storage: str
+) -> None:
     bag = tmp_path / "bag"
     bag.mkdir()
     if storage == "mcap":
@@ -287,7 +292,7 @@ def test_recover_of_a_million_topics_takes_seconds(tmp_path: Path, storage: str)
     else:
         database(bag / "bag.db3", *DATABASES["a million topics"])
         (bag / "metadata.yaml").unlink()
-    begin = time.monotonic()
+    begin = time.process_time()
     done = twodof.recover(bag)
-    assert time.monotonic() - begin < 10.0
+    assert time.process_time() - begin < 10.0
     assert len(done.counts) == (999 if storage == "mcap" else 0)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import shutil
 import socket
 import subprocess
 import time as clock
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import browser
@@ -17,6 +20,7 @@ import pytest
 from browser import (
     LINKS,
     Served,
+    answer,
     chromium,
     colours,
     connect,
@@ -35,9 +39,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from playwright.sync_api import Browser, Page
-from websockets.exceptions import InvalidStatus
 
 import twodof
+import twodof.page
 from twodof.page import BUCKETS, outline
 from twodof.view import nearest
 
@@ -100,8 +104,7 @@ def scrub(page: Page, time: float) -> dict[str, str]:
 
 
 def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: np.ndarray) -> None:
-    first = until(page, lambda found: numbers(found["time"])[0] > 0.0)
-    until(page, lambda found: numbers(found["time"])[0] > numbers(first["time"])[0])
+    until(page, lambda found: numbers(found["time"])[0] > 0.0)
     pictures = []
     for time in (1.23, 0.05, 3.99):
         found = scrub(page, time)
@@ -133,10 +136,9 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     press(page, "Pause")
     page.get_by_role("button", name="Play").wait_for()
     page.wait_for_timeout(500)
-    paused = numbers(rows(page)["time"])[0]
-    assert float(browser.field_of(page, "time, s").input_value()) == pytest.approx(
-        paused, abs=0.006
-    )
+    paused = pytest.approx(numbers(rows(page)["time"])[0], abs=0.006)
+    slider = browser.field_of(page, "time, s")
+    until(page, lambda value: float(value) == paused, lambda _: slider.input_value())
     scrub(page, 3.8)
     press(page, "Play")
     until(page, lambda found: found["sample"] == "400 of 400")
@@ -181,9 +183,17 @@ def misfits(links: list[list[np.ndarray]], q: np.ndarray) -> float:
 
 @pytest.mark.parametrize("speed", [1.0, 0.25])
 def test_speed_is_that_of_the_wall_clock(page: Page, speed: float) -> None:
-    """Told from those of half and of twice as much, though a slow browser may show it late."""
+    """Told from those of half and of twice as much, once a busy machine shows it in time."""
     page.get_by_role("combobox").last.click()
     page.get_by_role("option", name=f"{speed:g} ×", exact=True).click()
+    shown: list[float] = []
+    while not shown or not 0.7 < shown[-1] < 1.4:
+        assert len(shown) < 10, shown
+        shown.append(slope(page) / speed)
+
+
+def slope(page: Page) -> float:
+    """How fast time goes on the page, in s per s."""
     scrub(page, 0.5)
     press(page, "Play")
     until(page, lambda found: numbers(found["time"])[0] > 0.5)
@@ -193,18 +203,20 @@ def test_speed_is_that_of_the_wall_clock(page: Page, speed: float) -> None:
         seen.append((clock.monotonic(), *numbers(rows(page)["time"])))
     press(page, "Pause")
     page.get_by_role("button", name="Play").wait_for()
-    slope = np.polyfit(*np.transpose(seen), 1)[0]
-    assert 0.7 < slope / speed < 1.4
+    return float(np.polyfit(*np.transpose(seen), 1)[0])
 
 
 def test_plots_hold_the_bag_and_a_mark_at_the_time(page: Page, truth: np.ndarray) -> None:
+    def positions(page: Page) -> np.ndarray:
+        plots = page.evaluate(browser.PLOTS)
+        return np.array(next(data for title, data in plots if title == "position, rad"), float)
+
+    def is_marked(found: np.ndarray) -> bool:
+        return found[0, np.isfinite(found[3])] == pytest.approx([1.49, 1.5])
+
     scrub(page, 1.5)
-    page.wait_for_timeout(400)
-    plots = page.evaluate(browser.PLOTS)
-    positions = next(data for title, data in plots if title == "position, rad")
-    times, q1, q2, mark = np.array(positions, dtype=float)
-    assert np.column_stack([times, q1, q2]) == pytest.approx(truth)
-    assert times[np.isfinite(mark)] == pytest.approx([1.49, 1.5])
+    marked = until(page, is_marked, positions)
+    assert marked[:3].transpose() == pytest.approx(truth)
 
 
 def test_two_viewers_see_the_same(shown: Browser, command: Served, page: Page) -> None:
@@ -234,21 +246,25 @@ def test_exported_file_replays_offline(shown: Browser, folder: Path, truth: np.n
     )  # fmt: skip
     assert done.stderr == ""
     with shown.new_context(viewport={"width": 450, "height": 280}, offline=True) as context:
+        context.set_default_timeout(1e3 * browser.PATIENCE)
         page = context.new_page()
         asked, errors = [], []
         page.on("request", lambda request: asked.append(request.url))
         page.on("pageerror", lambda error: errors.append(str(error)))
+        page.clock.install(time=0)
+        page.clock.pause_at(1)  # a replay that never waits leaves a busy machine no time to look
         page.goto((folder / "replay.html").as_uri())
         page.wait_for_selector("canvas")
 
         def moment() -> tuple[float, int]:
             """How far the picture is off the bag, rad, and the sample that it is nearest to."""
-            shot = picture(page)
+            page.clock.run_for(100)
+            shot = browser.still(page)
             found = [direction(pixels(shot, colour)) for colour in LINKS]
             off = np.abs(np.sin(found - np.cumsum(truth[:, 1:], axis=1))).max(axis=1)
             return off.min(), int(off.argmin())
 
-        end = clock.monotonic() + 15.0
+        end = clock.monotonic() + browser.PATIENCE
         while moment()[0] > 0.03:  # the scene is still being loaded
             assert clock.monotonic() < end
         seen = [moment() for _ in range(5)]
@@ -318,21 +334,134 @@ def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path) -> None:
     )
 
 
-def test_page_of_another_website_cannot_connect(command: Served) -> None:
-    connect(command.url)  # no browser
-    connect(command.url, origin=command.url)
-    other = command.url.replace("127.0.0.1", "localhost")
-    connect(other, origin=other)
-    port = command.url.rpartition(":")[2]
-    for origin in ("https://example.com", f"http://example.com:{port}", other, "null", "http://["):
-        with pytest.raises(InvalidStatus) as refused:
-            connect(command.url, origin=origin)
-        assert refused.value.response.status_code == 403
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag all of whose texts are hostile."""
+    folder, robot = tmp_path_factory.mktemp("hostile"), browser.hostile_arm()
+    (folder / "arm.urdf").write_bytes(ET.tostring(robot))
+    frame = browser.HOSTILE + "EndEffector"
+    options = twodof.FmuOptions(urdf=folder / "arm.urdf", frame=frame, axes="xy")
+    run = twodof.experiment(twodof.build_fmu(folder / "Arm.fmu", options), stop_time=0.1)
+    bag = folder / browser.HOSTILE.replace("/", "")
+    twodof.simulate(run, twodof.Bag(bag))
+    made = json.loads((bag / "run.json").read_text())
+    for sphere in robot.iter("sphere"):
+        sphere.tag = "mesh"
+        sphere.set("filename", f"package://meshes/{browser.HOSTILE}mesh")
+    made["urdf"] = ET.tostring(robot, encoding="unicode")
+    made["fmu"] = dict.fromkeys(made["fmu"], browser.HOSTILE)
+    made |= dict.fromkeys(("robot", "root", "command_line"), browser.HOSTILE)
+    (bag / "run.json").write_text(json.dumps(made))
+    return bag
+
+
+def test_text_of_a_bag_is_text(shown: Browser, hostile: Path) -> None:
+    with served("view", hostile, cwd=hostile.parent) as command, opened(shown, command.url) as page:
+        browser.assert_shown_as_text(page, "joint1", "joint2", "mesh")
+        assert page.get_by_text(f"twodof - {hostile.name}").count() > 0
+
+
+def test_text_of_a_bag_is_text_in_an_exported_file(shown: Browser, hostile: Path) -> None:
+    done = run_view(hostile.name, "--export", "hostile.html", cwd=hostile.parent)
+    assert done.returncode == 0
+    with shown.new_context() as context:
+        context.set_default_timeout(1e3 * browser.PATIENCE)
+        page = context.new_page()
+        page.goto((hostile.parent / "hostile.html").as_uri())
+        page.wait_for_selector("canvas")
+        browser.assert_shown_as_text(page)
+        assert page.title() == f"{hostile.name} - twodof"
+
+
+def names_of(*names: str) -> list[str]:
+    """As a browser writes them into Host."""
+    return [f"{name}:{port}" for name in names for port in (80, 9000)] + [*names]
+
+
+LOOPBACK = ("127.0.0.1", "localhost", "LocalHost", "[::1]")
+STRANGERS = (
+    "evil.example",
+    "127.0.0.1.evil.example",
+    "localhost.evil.example",
+    "[::1].example",
+    "",
+)
+ASKED = {
+    "127.0.0.1": (LOOPBACK, (*STRANGERS, "192.0.2.1", "[2001:db8::1]")),
+    "localhost": (LOOPBACK, (*STRANGERS, "192.0.2.1")),
+    "0.0.0.0": ((*LOOPBACK, "192.0.2.1", "[2001:db8::1]", socket.gethostname()), STRANGERS),
+    socket.gethostname(): ((socket.gethostname(),), (*STRANGERS, "192.0.2.1")),
+}
+
+
+@pytest.mark.parametrize(("host", "own", "other"), [(k, *v) for k, v in ASKED.items()], ids=ASKED)
+def test_page_answers_to_its_own_name_and_its_own_page_alone(
+    host: str, own: Sequence[str], other: Sequence[str]
+) -> None:
+    """Requests for the page and for a websocket, with the headers that a browser sends."""
+    with twodof.page.Page("", host, 0) as served:
+        for rest, fine in (((), 200), (browser.UPGRADE, 101)):
+            for name in names_of(*other):
+                asked = ("Host", name), *rest
+                assert answer(served.url, *asked) == 403
+                assert answer(served.url, *asked, ("Origin", f"http://{name}")) == 403
+            for name in names_of(*own):
+                asked = ("Host", name), *rest
+                assert answer(served.url, *asked) == fine  # no browser, or a link
+                assert answer(served.url, *asked, ("Origin", f"http://{name}")) == fine
+                for origin in ("null", "http://[", "http://localhost:3000", "http://evil.example"):
+                    assert answer(served.url, *asked, ("Origin", origin)) == 403
+                assert answer(served.url, *asked, ("Host", name)) == 403
+            assert answer(served.url, *rest) == 403
+
+
+@pytest.mark.parametrize("link", ["websocket=ws://127.0.0.1:{port}", "playbackPath=data:,"])
+def test_link_cannot_have_the_page_listen_to_another_server(
+    shown: Browser, command: Served, link: str
+) -> None:
+    """viser's page runs the scripts of its server or recording, which its link may name."""
+    with socket.create_server(("127.0.0.1", 0)) as other, shown.new_context() as context:
+        page, port = context.new_page(), other.getsockname()[1]
+        assert page.goto(f"{command.url}/?{link.format(port=port)}").status == 403
+        page.wait_for_timeout(1000)
+        other.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            other.accept()
+
+
+def test_bag_whose_name_is_no_text_is_shown(shown: Browser, folder: Path, tmp_path: Path) -> None:
+    name = os.fsdecode(b"bag\xff")
+    shutil.copytree(folder / "bag", tmp_path / name)
+    with served("view", name, cwd=tmp_path) as command, opened(shown, command.url) as page:
+        assert page.get_by_text("twodof - bag?").count() > 0
+    assert run_view(name, "--export", "bag.html", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<geometry><sphere radius="wide"/></geometry>',
+        '<geometry><box size="1 1 x"/></geometry>',
+        '<geometry><mesh filename="package://meshes/link1.stl" scale="a"/></geometry>',
+        '<geometry><box/></geometry><origin rpy="0"/>',
+        '<geometry><box/></geometry><material name="red"><color rgba="1"/></material>',
+    ],
+)
+def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "bag", tmp_path / "bag")
+    made = json.loads((tmp_path / "bag/run.json").read_text())
+    made["urdf"] = made["urdf"].replace("<visual>", f"<visual>{shape}</visual><visual>", 1)
+    (tmp_path / "bag/run.json").write_text(json.dumps(made))
+    done = run_view("bag", "--export", "bag.html", cwd=tmp_path)
+    assert done.returncode == 1
+    assert re.fullmatch(r"twodof: error: link 'link1' cannot be drawn: [^\n]+\n", done.stderr)
 
 
 def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [*browser.COMMAND, "view", *map(str, arguments), "--no-browser"]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 def test_port_in_use(folder: Path) -> None:

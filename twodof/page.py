@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import errno
 import html
+import re
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from io import StringIO
+from ipaddress import ip_address
 from itertools import cycle
 from math import ceil, floor, log10, pi, tan
 from typing import Any
@@ -43,6 +45,8 @@ SMALLEST_RANGE = 1e-3  # of values in a plot
 BUCKETS = 400
 """Parts of a long line over time that each keep their extremes; a plot is as many pixels wide."""
 FIELD_OF_VIEW = 0.6  # rad, vertical
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+REFUSED = "open this page as twodof prints it; --host gives it another address or name\n"
 
 
 class Page:
@@ -60,9 +64,9 @@ class Page:
     """
 
     def __init__(self, title: str, host: str = HOST, port: int = PORT) -> None:
-        _check_address(host, port)
-        with _quiet():  # viser prints a table
-            self._server = _Server(host=host, port=port, label=title, verbose=False)
+        address = _resolve(host, port)
+        with _quiet(), _own_pages(host, address):  # viser prints a table
+            self._server = _Server(host=host, port=port, label=_text(title), verbose=False)
         self.gui: Any = self._server.gui
         self.scene = self._server.scene
         if port and self._server.get_port() != port:  # taken since: viser has gone on to the next
@@ -101,7 +105,14 @@ class Page:
     def notify(self, title: str, text: str) -> None:
         """Tell all browsers, until it is read."""
         for client in self._server.get_clients().values():
-            client.add_notification(title, text, auto_close_seconds=8.0)
+            client.add_notification(title, _text(text), auto_close_seconds=8.0)
+
+    def add_text(self, text: str) -> None:
+        """Text in the control panel, whatever it holds: viser's markdown would be HTML."""
+        self.gui.add_html(
+            '<div style="font-size:12.5px;margin:2px 10px;overflow-wrap:anywhere">'
+            f"{html.escape(_text(text))}</div>"
+        )
 
     def frame(self, points: Array, axes: str, up: Sequence[float]) -> float:
         """Place the camera so that points (N × 3, m) fill the picture; the size of what is seen, m.
@@ -199,15 +210,12 @@ class Page:
         for duration in frames:
             serializer.insert_sleep(duration)
         text: str = serializer.as_html()
-        return text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>").encode()
+        title = html.escape(_text(title))
+        return text.replace("<title>Viser</title>", f"<title>{title}</title>").encode()
 
 
 class _Server(viser.ViserServer):  # type: ignore[misc, unused-ignore]
-    """viser's server for its own pages alone, which cannot ask it to become public."""
-
-    def __init__(self, **options: Any) -> None:
-        with _own_pages():
-            super().__init__(**options)
+    """viser's server, which pages cannot ask to become public."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -368,16 +376,15 @@ def _quiet() -> Iterator[None]:
 
 
 @contextmanager
-def _own_pages() -> Iterator[None]:
-    """Where viser begins to serve: else any website's page that is open here could connect."""
+def _own_pages(host: str, address: str) -> Iterator[None]:
+    """Where viser begins to serve: its own page alone, and that to its own requests alone."""
     serve = websockets.asyncio.server.serve
 
-    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+    def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
-            origin, host = request.headers.get("Origin"), request.headers.get("Host")
-            if origin is not None and origin.partition("://")[2] != host:
-                return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
-            return process_request and process_request(connection, request)
+            if not _is_own(request, host, address):
+                return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
+            return process_request(connection, request)
 
         return serve(*arguments, process_request=answer, **options)
 
@@ -388,8 +395,41 @@ def _own_pages() -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _check_address(host: str, port: int) -> None:
-    """viser would try a thousand ports, one after the other, whatever is wrong."""
+def _is_own(request: Any, host: str, address: str) -> bool:
+    """Whether a request is for the plain page, by what was asked to listen on, and not another's.
+
+    Any website may have its own name resolve to this machine, and then its Origin is the Host that
+    it asks for. An address is not resolved, so where all are listened on, any is good. And a link
+    with parameters may have viser's page run the scripts of another server.
+
+    Args:
+        request: what is asked for.
+        host, address: what was asked to listen on, and what that is resolved to.
+    """
+    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    foreign = any(origin.partition("://")[2] not in hosts for origin in origins)
+    if len(hosts) != 1 or foreign or "?" in request.path:
+        return False
+    name = re.sub(r":\d+$", "", hosts[0].lower()).strip("[]")
+    listening = ip_address(address)
+    if listening.is_unspecified:
+        return name in (*LOOPBACK, socket.gethostname().lower()) or _is_address(name)
+    return name in (host.lower(), address) or (listening.is_loopback and name in LOOPBACK)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _resolve(host: str, port: int) -> str:
+    """The address to listen on, as long as it is free.
+
+    viser would try a thousand ports, one after the other, whatever is wrong.
+    """
     if not 0 <= port <= 65535:
         raise PageError(f"port {port} is not in 0…65535")
     try:
@@ -404,6 +444,12 @@ def _check_address(host: str, port: int) -> None:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise _in_use(host, port) from error
         raise PageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+    return str(address[0])
+
+
+def _text(text: str) -> str:
+    """A text as it can be sent; names of files need not be UTF-8."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def _in_use(host: str, port: int) -> PageError:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import PageError
 from .page import COLOURS, Page
 from .scene import Scene, Transform, floats, load_mesh, origin, quaternion
 
@@ -39,6 +40,9 @@ class PageRobot:
 
     Attributes:
         missing: names of meshes that are not at hand; where no mesh is, links are drawn as sticks.
+
+    Raises:
+        PageError: a shape is not described by numbers.
     """
 
     def __init__(
@@ -46,11 +50,13 @@ class PageRobot:
     ) -> None:
         tree = ET.fromstring(urdf)
         self.missing: list[str] = []
-        visuals = {
-            link.get("name", ""): list(self._visuals(tree, link, read))
-            for link in tree.findall("link")
-        }
+        visuals = {}
         for link in tree.findall("link"):
+            name = link.get("name", "")
+            try:
+                visuals[name] = list(self._visuals(tree, link, read))
+            except ValueError as error:
+                raise PageError(f"link {name!r} cannot be drawn: {error}") from error
             for part in list(link):
                 link.remove(part)
         self._kinematics = Scene(

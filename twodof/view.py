@@ -188,7 +188,7 @@ class Replay:
             for title, (names, rows) in lines.items()
         ]
         for remark in self.remarks:
-            gui.add_markdown(remark)
+            page.add_text(remark)
 
     def show(self, k: int) -> None:
         """Set the scene to sample k."""
