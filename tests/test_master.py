@@ -241,6 +241,9 @@ class Clock:
     def perf_counter(self):
         return self.now
 
+    def time_ns(self):
+        return int(self.now * 1e9)
+
     def sleep(self, seconds):
         self.now += seconds
 

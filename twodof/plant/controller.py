@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+from operator import mul
 
 WELL_CONDITIONED = 1e-3
 """Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12."""
@@ -101,7 +102,4 @@ def _by_singular_values(
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    total = 0.0
-    for x, y in zip(a, b):
-        total += x * y
-    return total
+    return sum(map(mul, a, b))

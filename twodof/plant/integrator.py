@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import inf, isfinite, sqrt, ulp
+from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +176,7 @@ def _until_event(
     K[0, :n] = y[n:]
     K[0, n:] = f
     ranks = [rank] * (STAGES + 1)
+    size = np.abs(y)
     step, growth = first, MAX_FACTOR
     while True:
         last = t + step * (1 + 1e-9) >= end
@@ -182,7 +184,8 @@ def _until_event(
         if last:
             step = end - t
         y_new, error = _dormand_prince(equations, y, step, stops.held, K, ranks)
-        ratio = error / (atol + rtol * np.maximum(np.abs(y), np.abs(y_new)))
+        size_new = np.abs(y_new)
+        ratio = error / (atol + rtol * np.maximum(size, size_new))
         norm = sqrt(ratio.dot(ratio) / (2 * n))
         factor = MIN_FACTOR
         if isfinite(norm):
@@ -195,7 +198,7 @@ def _until_event(
                 return (end if last and passed == step else t + passed), y, stopped
             if last:
                 return end, y_new, []
-            t, y = t + step, y_new
+            t, y, size = t + step, y_new, size_new
             K[0], ranks[0] = K[-1], ranks[-1]
             if norm < 1.0:  # else the error says nothing about the next step
                 step = min(max_step, step * max(MIN_FACTOR, min(growth, factor)))
@@ -223,12 +226,14 @@ def _dormand_prince(
     equations.evaluations += STAGES
     weights = step * A
     for stage in range(1, STAGES + 1):
-        y_new = y + weights[stage - 1, :stage].dot(K[:stage])
+        y_new = weights[stage - 1, :stage].dot(K[:stage])
+        y_new += y
         v = y_new[n:]
-        K[stage, :n] = v
-        K[stage, n:], ranks[stage] = acceleration(y_new[:n], v)
+        rates = K[stage]
+        rates[:n] = v
+        rates[n:], ranks[stage] = acceleration(y_new[:n], v)
         for i in held:
-            K[stage, n + i] = 0.0
+            rates[n + i] = 0.0
     return y_new, step * E.dot(K)
 
 
@@ -277,13 +282,16 @@ def _first_event(
     Returns that time, the state from there on, and the joints that reached a limit.
     """
     n = len(stops.limits)
+    at_the_end = _events(equations, y_new, stops)
+    if not at_the_end and min(map(mul, y[n:].tolist(), y_new[n:].tolist())) >= 0.0:
+        return None  # no joint has turned
     Q = K.T.dot(P)
 
     def state(passed: float) -> Array:
         return y_new if passed == step else _dense_output(y, Q, passed / step, step)
 
     latest = step
-    if not _events(equations, y_new, stops):
+    if not at_the_end:
         excursion = _excursion(y, y_new, state, step, stops.limits)
         if excursion is None:
             return None

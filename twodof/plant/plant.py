@@ -77,7 +77,8 @@ class Plant:
         self._data = self._model.createData()
         self._still = np.zeros(len(robot.joints))
         self._axes = ["xyz".index(axis) for axis in robot.axes]
-        self._placement = self._data.oMf[robot.frame_id]
+        # a view: it follows what Pinocchio computes
+        self._position = self._data.oMf[robot.frame_id].translation
 
     def initialise(self) -> list[str]:
         """Check the parameters and set the state to its start; what was clamped, a line each.
@@ -144,7 +145,7 @@ class Plant:
         """Position of the task frame along the task axes, m, root frame."""
         q = np.array(self.q)
         pin.framesForwardKinematics(self._model, self._data, q)
-        position: list[float] = self._placement.translation.tolist()
+        position: list[float] = self._position.tolist()
         return [position[axis] for axis in self._axes]
 
     @property
@@ -161,15 +162,15 @@ class Plant:
         """q̈_cmd of the controller at a state, n values, and the rank of its J⁺."""
         model, data, frame = self._model, self._data, self.robot.frame_id
         forward_kinematics(model, data, q, v, self._still)
-        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).reshape(6, -1).tolist()
+        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).tolist()
         # with q̈ = 0 the frame's acceleration is the drift J̇v
         drift = frame_acceleration(model, data, frame, WORLD_ALIGNED).linear.tolist()
-        x = self._placement.translation.tolist()
+        x = self._position.tolist()
         velocity = v.tolist()
-        Kn = self.Kn
+        Kn, several = self.Kn, len(velocity) > 1
         rows, command = [], []
         for axis, x_des, xd_des, xdd_des, Kp, Kd in self._task:
-            row = jacobian[axis]
+            row = jacobian[axis] if several else [jacobian[axis]]
             xd = sum(map(mul, row, velocity))
             rows.append(row)
             command.append(
