@@ -16,8 +16,8 @@ def smooth(acceleration):
 
 
 def test_coefficients_are_those_of_scipy():
-    assert np.array_equal(integrator.A[:5, :5], RK45.A[1:6])
-    assert np.array_equal(integrator.A[5], RK45.B)
+    for row, expected in zip(integrator.A, [*RK45.A[1:6], RK45.B], strict=True):
+        assert np.array_equal(row, expected[: len(row)]) and not any(expected[len(row) :])
     assert np.array_equal(integrator.E, RK45.E)
     assert np.array_equal(integrator.P, RK45.P)
 

@@ -334,7 +334,7 @@ def test_gravity_is_a_parameter():
     assert plant.tau == pytest.approx(weight, abs=1e-14)
 
 
-@pytest.mark.parametrize("gain", [1e150, 1e200, 1e308])
+@pytest.mark.parametrize("gain", [1e308, -1e308])
 def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -> None:
     plant = default_arm()
     plant.Kp = [gain] * 2

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
-from operator import mul
 
 WELL_CONDITIONED = 1e-3
 """Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12."""
@@ -44,7 +43,9 @@ def apply_pseudo_inverse(
     smallest = max(rcond * rcond, WELL_CONDITIONED)
     if len(rows) == 2:
         r0, r1 = rows
-        g00, g01, g11 = _dot(r0, r0), _dot(r0, r1), _dot(r1, r1)
+        g00 = g01 = g11 = 0.0
+        for x0, x1 in zip(r0, r1):
+            g00, g01, g11 = g00 + x0 * x0, g01 + x0 * x1, g11 + x1 * x1
         determinant = g00 * g11 - g01 * g01
         trace = g00 + g11
         if determinant > smallest * trace * trace:  # ≤ σ_min²/σ_max²: nothing is dropped
@@ -53,8 +54,10 @@ def apply_pseudo_inverse(
             return [y0 * x0 + y1 * x1 for x0, x1 in zip(r0, r1)], 2
     elif len(rows) == 3:
         r0, r1, r2 = rows
-        g00, g01, g02 = _dot(r0, r0), _dot(r0, r1), _dot(r0, r2)
-        g11, g12, g22 = _dot(r1, r1), _dot(r1, r2), _dot(r2, r2)
+        g00 = g01 = g02 = g11 = g12 = g22 = 0.0
+        for x0, x1, x2 in zip(r0, r1, r2):
+            g00, g01, g02 = g00 + x0 * x0, g01 + x0 * x1, g02 + x0 * x2
+            g11, g12, g22 = g11 + x1 * x1, g12 + x1 * x2, g22 + x2 * x2
         c00, c01, c02 = g11 * g22 - g12 * g12, g02 * g12 - g01 * g22, g01 * g12 - g02 * g11
         determinant = g00 * c00 + g01 * c01 + g02 * c02
         trace = g00 + g11 + g22
@@ -102,4 +105,7 @@ def _by_singular_values(
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return sum(map(mul, a, b))
+    total = 0.0
+    for x, y in zip(a, b):
+        total += x * y
+    return total

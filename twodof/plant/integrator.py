@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from math import inf, isfinite, sqrt, ulp
 from operator import mul
 
@@ -22,24 +22,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+State = list[float]
+"""(q, v), 2n values. Plain floats: at this size a call of numpy costs more than the arithmetic."""
 Acceleration = Callable[[Array, Array], tuple[Sequence[float], int]]
 """At (q, v), joint limits left out: q̈ of the equations of motion, n values, and the rank that J⁺
 was given, the number of its singular values that were not dropped."""
 Limits = Sequence[tuple[float, float]]
 """Per joint (q_min, q_max)."""
 
-A = np.array(
-    [
-        [1 / 5, 0, 0, 0, 0, 0],
-        [3 / 40, 9 / 40, 0, 0, 0, 0],
-        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
-        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
-    ]
+A = (
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (44 / 45, -56 / 15, 32 / 9),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
 """Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution."""
-E = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
+E = (-71 / 57600, 0.0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40)
 P = np.array(
     [
         [1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
@@ -58,6 +58,7 @@ step across that passes the error test. One of this size, whose stages had diffe
 taken."""
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
+ALL = slice(None)
 STAGES = 6
 """Evaluations that an integration step costs."""
 PATIENCE = 0.25
@@ -82,16 +83,21 @@ class StepError(ArithmeticError):
         self.too_fine, self.joint, self.rate = too_fine, joint, rate
 
 
-@dataclass
 class _Equations:
-    """The equations of motion, and how often they were evaluated."""
+    """The equations of motion as a system of first order, and how often they were evaluated."""
 
-    acceleration: Acceleration
-    evaluations: int = 0
+    def __init__(self, acceleration: Acceleration, n: int) -> None:
+        self._acceleration = acceleration
+        state = np.empty(2 * n)
+        self._write, self._q, self._v = state.__setitem__, state[:n], state[n:]
+        self.n, self.evaluations = n, 0
 
-    def __call__(self, q: Array, v: Array) -> tuple[Sequence[float], int]:
+    def acceleration(self, y: State) -> tuple[list[float], int]:
+        """q̈ at y, and its rank."""
         self.evaluations += 1
-        return self.acceleration(q, v)
+        self._write(ALL, y)
+        a, rank = self._acceleration(self._q, self._v)
+        return list(a), rank
 
 
 @dataclass
@@ -130,8 +136,8 @@ def advance(
         FloatingPointError: the equations gave a value that is not finite.
         StepError: they change too fast.
     """
-    equations = _Equations(acceleration)
-    y = np.array([*q, *v])
+    equations = _Equations(acceleration, len(limits))
+    y = [*q, *v]
     t = 0.0
     patience = PATIENCE * min(max_step, h)
     left = [-inf] * len(limits)  # when each joint last left its limit
@@ -148,13 +154,12 @@ def advance(
         for i in stopped:
             if t - left[i] < patience:
                 kept[i] = t + patience
-    state = y.tolist()
-    return state[: len(q)], state[len(q) :]
+    return y[: len(q)], y[len(q) :]
 
 
 def _until_event(
     equations: _Equations,
-    y: Array,
+    y: State,
     f: list[float],
     rank: int,
     t: float,
@@ -163,30 +168,23 @@ def _until_event(
     rtol: float,
     atol: float,
     max_step: float,
-) -> tuple[float, Array, list[int]]:
+) -> tuple[float, State, list[int]]:
     """Integrate from t until a joint reaches or leaves a limit, or until the end.
 
     Returns the time, the state there, and the joints that reached a limit. f is q̈ at y, of this
     rank.
     """
-    n = len(f)
     first = min(max_step, end - t)
     jump_step = JUMP_STEP * first
-    K = np.empty((STAGES + 1, 2 * n))
-    K[0, :n] = y[n:]
-    K[0, n:] = f
-    ranks = [rank] * (STAGES + 1)
-    size = np.abs(y)
+    rates = [*y[equations.n :], *f]
     step, growth = first, MAX_FACTOR
     while True:
         last = t + step * (1 + 1e-9) >= end
         small = step <= jump_step  # also where it is stretched to the end
         if last:
             step = end - t
-        y_new, error = _dormand_prince(equations, y, step, stops.held, K, ranks)
-        size_new = np.abs(y_new)
-        ratio = error / (atol + rtol * np.maximum(size, size_new))
-        norm = sqrt(ratio.dot(ratio) / (2 * n))
+        y_new, K, ranks = _dormand_prince(equations, y, step, stops.held, rates, rank)
+        norm = _error_norm(K, y, y_new, step, rtol, atol)
         factor = MIN_FACTOR
         if isfinite(norm):
             factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
@@ -198,8 +196,7 @@ def _until_event(
                 return (end if last and passed == step else t + passed), y, stopped
             if last:
                 return end, y_new, []
-            t, y, size = t + step, y_new, size_new
-            K[0], ranks[0] = K[-1], ranks[-1]
+            t, y, rates, rank = t + step, y_new, K[-1], ranks[-1]
             if norm < 1.0:  # else the error says nothing about the next step
                 step = min(max_step, step * max(MIN_FACTOR, min(growth, factor)))
             growth = MAX_FACTOR
@@ -208,52 +205,83 @@ def _until_event(
             step = shorter if small else max(jump_step, shorter)
             growth = 1.0  # SciPy's rule: no growth right after a rejection
             if step < 10 * ulp(t):
-                if not np.isfinite(K).all():
-                    raise FloatingPointError(
-                        "the equations of motion gave a value that is not finite"
-                    )
+                if not all(map(isfinite, chain(*K))):
+                    text = "the equations of motion gave a value that is not finite"
+                    raise FloatingPointError(text)
                 raise _too_fast(equations, y, too_fine=True)
         if equations.evaluations > BUDGET:
             raise _too_fast(equations, y, too_fine=False)
 
 
 def _dormand_prince(
-    equations: _Equations, y: Array, step: float, held: list[int], K: Array, ranks: list[int]
-) -> tuple[Array, Array]:
-    """One step from y, whose derivative is K[0]: (y_new, error); fills K[1:] and ranks[1:]."""
-    n = len(y) // 2
-    acceleration = equations.acceleration
-    equations.evaluations += STAGES
-    weights = step * A
-    for stage in range(1, STAGES + 1):
-        y_new = weights[stage - 1, :stage].dot(K[:stage])
-        y_new += y
-        v = y_new[n:]
-        rates = K[stage]
-        rates[:n] = v
-        rates[n:], ranks[stage] = acceleration(y_new[:n], v)
+    equations: _Equations, y: State, step: float, held: list[int], k1: State, rank: int
+) -> tuple[State, list[State], list[int]]:
+    """One step from y, where the derivative is k1: y_new, the stages' derivatives and ranks."""
+    n, ranks = equations.n, [rank]
+
+    def rates(y: State) -> State:
+        a, rank = equations.acceleration(y)
         for i in held:
-            rates[n + i] = 0.0
-    return y_new, step * E.dot(K)
+            a[i] = 0.0
+        ranks.append(rank)
+        return y[n:] + a
+
+    s2, s3, s4, s5, s6, s7 = ([step * weight for weight in row] for row in A)
+    (a,) = s2
+    k2 = rates([u + a * p for u, p in zip(y, k1)])
+    a, b = s3
+    k3 = rates([u + (a * p + b * q) for u, p, q in zip(y, k1, k2)])
+    a, b, c = s4
+    k4 = rates([u + (a * p + b * q + c * r) for u, p, q, r in zip(y, k1, k2, k3)])
+    a, b, c, d = s5
+    k5 = rates([u + (a * p + b * q + c * r + d * s) for u, p, q, r, s in zip(y, k1, k2, k3, k4)])
+    a, b, c, d, e = s6
+    k6 = rates(
+        [
+            u + (a * p + b * q + c * r + d * s + e * t)
+            for u, p, q, r, s, t in zip(y, k1, k2, k3, k4, k5)
+        ]
+    )
+    a, _, b, c, d, e = s7
+    y_new = [
+        u + (a * p + b * q + c * r + d * s + e * t)
+        for u, p, q, r, s, t in zip(y, k1, k3, k4, k5, k6)
+    ]
+    return y_new, [k1, k2, k3, k4, k5, k6, rates(y_new)], ranks
 
 
-def _too_fast(equations: _Equations, y: Array, *, too_fine: bool) -> StepError:
+def _error_norm(
+    K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float
+) -> float:
+    """Root mean square of the error over its tolerance; the step passes below 1."""
+    a, _, b, c, d, e, f = (step * weight for weight in E)
+    k1, _, k3, k4, k5, k6, k7 = K
+    total = 0.0
+    for old, new, p, q, r, s, t, u in zip(y, y_new, k1, k3, k4, k5, k6, k7):
+        size = max(abs(old), abs(new))
+        error = a * p + b * q + c * r + d * s + e * t + f * u
+        ratio = error / (atol + rtol * size)
+        total += ratio * ratio
+    return sqrt(total / len(y))
+
+
+def _too_fast(equations: _Equations, y: State, *, too_fine: bool) -> StepError:
     """Names the joint whose own acceleration answers most to its position or velocity at y."""
-    n = len(y) // 2
-    a = equations(y[:n], y[n:])[0]
+    n = equations.n
+    a, _ = equations.acceleration(y)
     rates = []
     for i, order in product(range(n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
         nudged = y.copy()
         nudged[i + n * (order == 1)] += NUDGE
-        change = abs(equations(nudged[:n], nudged[n:])[0][i] - a[i]) / NUDGE
+        change = abs(equations.acceleration(nudged)[0][i] - a[i]) / NUDGE
         rates.append((change ** (1 / order) if isfinite(change) else inf, i))
     rate, joint = max(rates)
     return StepError(too_fine=too_fine, joint=joint, rate=rate)
 
 
 def _hold(
-    equations: _Equations, y: Array, limits: Limits, kept: list[bool]
-) -> tuple[_Stops, Array, list[float], int]:
+    equations: _Equations, y: State, limits: Limits, kept: list[bool]
+) -> tuple[_Stops, State, list[float], int]:
     """Joints that rest at a limit; y with the velocity into it taken; what acceleration is left.
 
     That is of the rank that is the last value.
@@ -263,8 +291,7 @@ def _hold(
     for i, (low, high) in enumerate(limits):
         if (y[i] >= high and y[n + i] > 0.0) or (y[i] <= low and y[n + i] < 0.0):
             y[n + i] = 0.0
-    f, rank = equations(y[:n], y[n:])
-    a = list(f)
+    a, rank = equations.acceleration(y)
     held = []
     for i, (low, high) in enumerate(limits):
         into = (y[i] >= high and a[i] >= 0.0) or (y[i] <= low and a[i] <= 0.0)
@@ -275,20 +302,20 @@ def _hold(
 
 
 def _first_event(
-    equations: _Equations, y: Array, y_new: Array, step: float, stops: _Stops, K: Array
-) -> tuple[float, Array, list[int]] | None:
+    equations: _Equations, y: State, y_new: State, step: float, stops: _Stops, K: list[State]
+) -> tuple[float, State, list[int]] | None:
     """First time in (0, step] at which a limit is reached or left.
 
     Returns that time, the state from there on, and the joints that reached a limit.
     """
-    n = len(stops.limits)
+    n = equations.n
     at_the_end = _events(equations, y_new, stops)
-    if not at_the_end and min(map(mul, y[n:].tolist(), y_new[n:].tolist())) >= 0.0:
+    if not at_the_end and min(map(mul, y[n:], y_new[n:])) >= 0.0:
         return None  # no joint has turned
-    Q = K.T.dot(P)
+    start, Q = np.array(y), np.array(K).T.dot(P)
 
-    def state(passed: float) -> Array:
-        return y_new if passed == step else _dense_output(y, Q, passed / step, step)
+    def state(passed: float) -> State:
+        return y_new if passed == step else _dense_output(start, Q, passed / step, step).tolist()
 
     latest = step
     if not at_the_end:
@@ -306,44 +333,40 @@ def _first_event(
     return latest, y, stopped
 
 
-def _events(equations: _Equations, y: Array, stops: _Stops) -> list[int]:
+def _events(equations: _Equations, y: State, stops: _Stops) -> list[int]:
     """Free joints that are past a limit and watched joints that leave theirs, at y."""
-    n = len(stops.limits)
-    values = y.tolist()
-    found = []
-    for i, (low, high) in enumerate(stops.limits):
-        q, v = values[i], values[n + i]
+    events = []
+    for i, ((low, high), q, v) in enumerate(zip(stops.limits, y, y[equations.n :])):
         if (q >= high and (q > high or v > 0.0)) or (q <= low and (q < low or v < 0.0)):
-            found.append(i)
+            events.append(i)
     if stops.watched:
-        a, _ = equations(y[:n], y[n:])
+        a, _ = equations.acceleration(y)
         for i in stops.watched:
             low, high = stops.limits[i]
-            leaves = a[i] < 0.0 if values[i] >= high else a[i] > 0.0
+            leaves = a[i] < 0.0 if y[i] >= high else a[i] > 0.0
             if leaves and low < high:
-                found.append(i)
-    return found
+                events.append(i)
+    return events
 
 
 def _excursion(
-    y: Array, y_new: Array, state: Callable[[float], Array], step: float, limits: Limits
+    y: State, y_new: State, state: Callable[[float], State], step: float, limits: Limits
 ) -> float | None:
     """When a joint is furthest past a limit, where it is so within one step and back at its end."""
     n = len(limits)
-    before, after = y.tolist(), y_new.tolist()
     times = []
     for i, (low, high) in enumerate(limits):
-        q, v = before[i], before[n + i]
+        q, v = y[i], y[n + i]
         limit = high if v > 0.0 else low
-        if v * after[n + i] < 0.0 and abs(v) * step > abs(limit - q):
+        if v * y_new[n + i] < 0.0 and abs(v) * step > abs(limit - q):
             turn = _turn(state, n + i, v, step)
-            if (float(state(turn)[i]) - limit) * v > 0.0:
+            if (state(turn)[i] - limit) * v > 0.0:
                 times.append(turn)
     return min(times, default=None)
 
 
-def _turn(state: Callable[[float], Array], component: int, v: float, step: float) -> float:
-    return _bisect(lambda passed: float(state(passed)[component]) * v <= 0.0, step, step)
+def _turn(state: Callable[[float], State], component: int, v: float, step: float) -> float:
+    return _bisect(lambda passed: state(passed)[component] * v <= 0.0, step, step)
 
 
 def _dense_output(y: Array, Q: Array, x: float, step: float) -> Array:
