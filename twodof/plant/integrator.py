@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
 from math import inf, isfinite, sqrt, ulp
-from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
@@ -309,9 +308,13 @@ def _first_event(
     Returns that time, the state from there on, and the joints that reached a limit.
     """
     n = equations.n
+    if not stops.watched:
+        for (low, high), q, v, before in zip(stops.limits, y_new, y_new[n:], y[n:]):
+            if not low < q < high or v * before < 0.0:
+                break
+        else:  # all are inside, and none has turned
+            return None
     at_the_end = _events(equations, y_new, stops)
-    if not at_the_end and min(map(mul, y[n:], y_new[n:])) >= 0.0:
-        return None  # no joint has turned
     start, Q = np.array(y), np.array(K).T.dot(P)
 
     def state(passed: float) -> State:

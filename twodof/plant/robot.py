@@ -6,27 +6,13 @@ checked before Pinocchio sees it, and every refusal names the joint or the link.
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-UNBOUNDED = 1.7976931348623157e308
-"""Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
-
-NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
-MOVING_TYPES = ("revolute", "continuous", "prismatic")
-MAX_LINKS = 1000
-MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
-MAX_DEPTH = 100  # of elements in elements
-MAX_NAME = 1000  # characters; a string literal of C holds 4095 bytes
-LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
-
-
-class RobotError(ValueError):
-    """A robot description that cannot be simulated; the message names the culprit."""
+from .urdf import NUMERIC_TAGS, Joint, RobotError, Urdf, attribute, number, read_urdf
 
 
 @dataclass(frozen=True)
@@ -67,11 +53,11 @@ class Robot:
         return tuple(i + 1 in supports for i in range(len(self.joints)))
 
 
-def load_robot(urdf: str, frame: str, axes: str) -> Robot:
+def load_robot(text: str, frame: str, axes: str) -> Robot:
     """Robot from the text of a URDF.
 
     Args:
-        urdf: XML text.
+        text: XML text.
         frame: name of the link whose origin is the end effector.
         axes: one to three different letters of "xyz", the task's axes in the root frame.
 
@@ -80,182 +66,52 @@ def load_robot(urdf: str, frame: str, axes: str) -> Robot:
     """
     if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
         raise RobotError(f"axes '{axes}': expected one to three different letters of x, y, z")
-    tree = _parse(urdf)
-    root, warnings = _check(tree)
-    links = [str(link.get("name")) for link in tree.findall("link")]
-    if frame not in links:
-        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(links)}")
+    urdf = read_urdf(text)
+    for element in urdf.tree.findall("joint"):
+        if element.find("mimic") is not None:
+            raise RobotError(
+                f"joint '{element.get('name')}' mimics another joint, which is not supported;"
+                " make it fixed, or leave out its <mimic> to move it on its own"
+            )
+    for joint in urdf.joints.values():
+        if joint.moves:
+            _check_body(urdf, joint)
+    if frame not in urdf.links:
+        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
     try:
-        model = pin.buildModelFromXML(ET.tostring(_mechanism(tree), encoding="unicode"))
+        model = pin.buildModelFromXML(ET.tostring(_mechanism(urdf), encoding="unicode"))
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"Pinocchio cannot read the URDF: {error}") from error
-    xml = {str(joint.get("name")): joint for joint in tree.findall("joint")}
-    joints = tuple(model.names)[1:]
-    _check_mass_matrix(model, joints)
+    names = tuple(model.names)[1:]
+    _check_mass_matrix(model, names)
+    joints = [urdf.joints[name] for name in names]
     robot = Robot(
-        name=tree.get("name", ""),
+        name=urdf.name,
         model=model,
-        joints=joints,
-        prismatic=tuple(xml[j].get("type") == "prismatic" for j in joints),
-        q_min=tuple(_limits(xml[j])[0] for j in joints),
-        q_max=tuple(_limits(xml[j])[1] for j in joints),
-        effort=tuple(_attribute(xml[j], "limit", "effort", 0.0) or math.inf for j in joints),
-        damping=tuple(_attribute(xml[j], "dynamics", "damping", 0.0) for j in joints),
+        joints=names,
+        prismatic=tuple(joint.prismatic for joint in joints),
+        q_min=tuple(joint.low for joint in joints),
+        q_max=tuple(joint.high for joint in joints),
+        effort=tuple(joint.effort for joint in joints),
+        damping=tuple(joint.damping for joint in joints),
         frame=frame,
         frame_id=model.getFrameId(frame, pin.FrameType.BODY),
         axes=axes,
-        root=root,
-        warnings=tuple(warnings),
+        root=urdf.root,
+        warnings=urdf.warnings,
     )
     if not any(robot.moves_frame()):
         raise RobotError(f"no joint moves the frame '{frame}'")
     return robot
 
 
-def _parse(urdf: str) -> ET.Element:
-    if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
-        raise RobotError("the URDF has a document type declaration; remove it")
-    try:
-        tree = ET.fromstring(urdf)
-    except (ET.ParseError, ValueError) as error:
-        raise RobotError(f"the URDF is not XML: {error}") from error
-    if tree.tag != "robot":
-        raise RobotError(f"the URDF's root element is <{tree.tag}>, expected <robot>")
-    depth, level = 1, [tree]
-    while level := [child for element in level for child in element]:
-        depth += 1
-        if depth > MAX_DEPTH:  # what writes XML goes down by recursion
-            raise RobotError(f"the URDF's elements are nested deeper than {MAX_DEPTH}")
-    return tree
-
-
-def _check(tree: ET.Element) -> tuple[str, list[str]]:
-    """Refuse what is not supported; the root link's name and the warnings."""
-    links = _by_name(tree, "link")
-    joints = _by_name(tree, "joint")
-    moving = [name for name, joint in joints.items() if joint.get("type") != "fixed"]
-    for what, names, most in (("links", links, MAX_LINKS), ("moving joints", moving, MAX_JOINTS)):
-        if len(names) > most:
-            raise RobotError(f"the URDF has {len(names)} {what}; at most {most} are supported")
-    for tag, elements in (("link", links), ("joint", joints)):
-        for name, element in elements.items():
-            _check_numbers(element, f"{tag} '{name}'")
-    root = _check_tree(links, joints)
-    warnings = []
-    for name, joint in joints.items():
-        kind = joint.get("type")
-        if kind not in (*MOVING_TYPES, "fixed"):
-            raise RobotError(
-                f"joint '{name}' is of type '{kind}', which is not supported;"
-                f" supported are fixed, {', '.join(MOVING_TYPES)}"
-            )
-        if joint.find("mimic") is not None:
-            raise RobotError(
-                f"joint '{name}' mimics another joint, which is not supported;"
-                " make it fixed, or leave out its <mimic> to move it on its own"
-            )
-        if kind == "fixed":
-            continue
-        if kind != "continuous":
-            if joint.find("limit") is None:
-                raise RobotError(f"joint '{name}' has no <limit>, which type '{kind}' needs")
-            lower, upper = _limits(joint)
-            if lower > upper:
-                raise RobotError(f"joint '{name}': lower limit {lower:g} > upper limit {upper:g}")
-        for tag, key in (("limit", "effort"), ("dynamics", "damping")):
-            if _attribute(joint, tag, key, 0.0) < 0:
-                raise RobotError(f"joint '{name}': negative {key}")
-        if _attribute(joint, "dynamics", "friction", 0.0):
-            warnings.append(f"joint '{name}': friction is not modelled and is ignored")
-        if not any(_vector(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))):
-            raise RobotError(f"joint '{name}': its axis is zero")
-        _check_body(joint, links, joints)
-    if not moving:
-        raise RobotError("the URDF has no moving joint")
-    return root, warnings
-
-
-def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
-    found: dict[str, ET.Element] = {}
-    for element in tree.findall(tag):
-        name = element.get("name")
-        if not name:
-            raise RobotError(f"the URDF has a <{tag}> without a name")
-        if len(name) > MAX_NAME:
-            raise RobotError(
-                f"the URDF has a <{tag}> whose name has {len(name)} characters;"
-                f" at most {MAX_NAME} are supported"
-            )
-        if name in found:
-            raise RobotError(f"the URDF has two {tag}s named '{name}'")
-        found[name] = element
-    return found
-
-
-def _check_numbers(element: ET.Element, owner: str) -> None:
-    counts = {"xyz": 3, "rpy": 3}
-    for tag in NUMERIC_TAGS:
-        for found in element.iter(tag):
-            for key, text in found.attrib.items():
-                try:
-                    numbers = [_number(word) for word in text.split()]
-                except ValueError:
-                    numbers = []
-                if len(numbers) != counts.get(key, 1):
-                    raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not a number or vector")
-                if not all(abs(number) <= LARGEST for number in numbers):
-                    if tag == "limit" and not any(map(math.isnan, numbers)):
-                        continue  # a huge limit is a common way to write "none"
-                    raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not finite or too large")
-
-
-def _number(word: str) -> float:
-    """A number that other readers read as Python does: without underscores and other digits."""
-    if not word.isascii() or "_" in word:
-        raise ValueError(word)
-    return float(word)
-
-
-def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> str:
-    parent: dict[str, str] = {}
-    for name, joint in joints.items():
-        for side in ("parent", "child"):
-            if _link(joint, side) not in links:
-                raise RobotError(
-                    f"joint '{name}': its {side} link '{_link(joint, side)}' does not exist"
-                )
-        child = _link(joint, "child")
-        if child in parent:
-            raise RobotError(f"link '{child}' has two parents: closed loops are not supported")
-        parent[child] = _link(joint, "parent")
-    if not links:
-        raise RobotError("the URDF has no links")
-    roots = [link for link in links if link not in parent]
-    reached = set(roots)
-    for link in links:
-        path = [link]
-        while path[-1] not in reached:
-            path.append(parent[path[-1]])
-            if len(path) > len(links):
-                raise RobotError(f"link '{link}' is its own ancestor: loops are not supported")
-        reached.update(path)
-    if len(roots) != 1:
-        raise RobotError(f"the URDF needs one root link, it has {len(roots)}: {', '.join(roots)}")
-    return roots[0]
-
-
-def _check_body(
-    joint: ET.Element, links: dict[str, ET.Element], joints: dict[str, ET.Element]
-) -> None:
+def _check_body(urdf: Urdf, joint: Joint) -> None:
     """A moving body, that is a link with all that is fixed to it, needs physical inertia."""
-    first = _link(joint, "child")
-    children: dict[str, list[str]] = {}
-    for other in joints.values():
-        if other.get("type") == "fixed":
-            children.setdefault(_link(other, "parent"), []).append(_link(other, "child"))
-    body = [first]
+    fixed = [other for other in urdf.joints.values() if not other.moves]
+    body = [joint.child]
     for name in body:
-        body.extend(children.get(name, ()))
+        body.extend(other.child for other in fixed if other.parent == name)
+    links = {str(link.get("name")): link for link in urdf.tree.findall("link")}
     mass = 0.0
     for name in body:
         inertial = links[name].find("inertial")
@@ -263,7 +119,7 @@ def _check_body(
             mass += _check_inertia(name, inertial)
     if mass == 0.0:
         raise RobotError(
-            f"link '{first}' moves (joint '{joint.get('name')}') but has no mass;"
+            f"link '{joint.child}' moves (joint '{joint.name}') but has no mass;"
             " give it an <inertial> with the mass and inertia of the part"
         )
 
@@ -272,10 +128,10 @@ def _check_inertia(link: str, inertial: ET.Element) -> float:
     """The link's mass, after the checks."""
     if missing := _missing(inertial):
         raise RobotError(f"link '{link}': its <inertial> has no {missing}")
-    mass = _attribute(inertial, "mass", "value", 0.0)
+    mass = attribute(inertial, "mass", "value", 0.0)
     if mass < 0.0:
         raise RobotError(f"link '{link}': negative mass {mass:g} kg")
-    xx, xy, xz, yy, yz, zz = (_attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS)
+    xx, xy, xz, yy, yz, zz = (attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS)
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     slack = 1e-6 * float(np.abs(moments).sum()) + 1e-15  # URDFs are written with few digits
     if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
@@ -300,39 +156,33 @@ def _missing(inertial: ET.Element) -> str:
     return ""
 
 
-def _mechanism(tree: ET.Element) -> ET.Element:
+def _mechanism(urdf: Urdf) -> ET.Element:
     """The URDF of the bare mechanism: inertias, joints, limits, and nothing else.
 
     urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here, and
     takes a number with a space behind it for 0. Continuous joints become revolute without limits,
     so that Pinocchio's state is the angle.
     """
-    bare = ET.Element("robot", name=tree.get("name") or "robot")
-    for link in tree.findall("link"):
+    bare = ET.Element("robot", name=urdf.name or "robot")
+    for link in urdf.tree.findall("link"):
         copy = ET.SubElement(bare, "link", name=str(link.get("name")))
         copy.extend(e for e in link.findall("inertial") if not _missing(e))
-    for joint in tree.findall("joint"):
-        kind = str(joint.get("type"))
-        copy = ET.SubElement(bare, "joint", name=str(joint.get("name")), type=kind)
-        copy.extend(e for e in joint if e.tag in ("parent", "child", "origin"))
-        if kind == "fixed":
+    for element in urdf.tree.findall("joint"):
+        joint = urdf.joints[str(element.get("name"))]
+        copy = ET.SubElement(bare, "joint", name=joint.name, type=joint.type)
+        copy.extend(e for e in element if e.tag in ("parent", "child", "origin"))
+        if not joint.moves:
             continue
-        copy.extend(joint.findall("axis"))
-        low, high = _limits(joint)
-        ET.SubElement(copy, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
-        if kind == "continuous":
+        copy.extend(element.findall("axis"))
+        low, high = repr(joint.low), repr(joint.high)
+        ET.SubElement(copy, "limit", lower=low, upper=high, effort="0", velocity="0")
+        if joint.type == "continuous":
             copy.set("type", "revolute")
     for tag in NUMERIC_TAGS:
         for element in bare.iter(tag):
             for key, text in element.attrib.items():
-                element.set(key, " ".join(repr(_number(word)) for word in text.split()))
+                element.set(key, " ".join(repr(number(word)) for word in text.split()))
     return bare
-
-
-def _limits(joint: ET.Element) -> tuple[float, float]:
-    if joint.get("type") == "continuous":
-        return -UNBOUNDED, UNBOUNDED
-    return _attribute(joint, "limit", "lower", 0.0), _attribute(joint, "limit", "upper", 0.0)
 
 
 def _check_mass_matrix(model: pin.Model, joints: tuple[str, ...]) -> None:
@@ -346,20 +196,3 @@ def _check_mass_matrix(model: pin.Model, joints: tuple[str, ...]) -> None:
                 f"joint '{joints[i]}': the links behind it have no inertia about its axis,"
                 " so its acceleration is not defined"
             )
-
-
-def _link(joint: ET.Element, side: str) -> str:
-    element = joint.find(side)
-    return "" if element is None else element.get("link", "")
-
-
-def _attribute(element: ET.Element, tag: str, key: str, default: float) -> float:
-    child = element.find(tag)
-    value = default if child is None else float(child.get(key, default))
-    return max(-UNBOUNDED, min(UNBOUNDED, value))
-
-
-def _vector(element: ET.Element | None, key: str, default: tuple[float, ...]) -> tuple[float, ...]:
-    if element is None or element.get(key) is None:
-        return default
-    return tuple(float(word) for word in str(element.get(key)).split())

@@ -1,0 +1,268 @@
+"""A URDF as the tree of links and joints that it describes, read once and checked.
+
+What only a simulation needs, masses and inertias, is checked where the model is made. Imports the
+standard library alone.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+
+UNBOUNDED = 1.7976931348623157e308
+"""Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
+
+NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+MAX_LINKS = 1000
+MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
+MAX_DEPTH = 100  # of elements in elements
+MAX_NAME = 1000  # characters; a string literal of C holds 4095 bytes
+LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
+
+Vector = tuple[float, float, float]
+
+
+class RobotError(ValueError):
+    """A robot description that cannot be used; the message names the culprit."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint.
+
+    Attributes:
+        name: its name.
+        type: "fixed", "revolute", "continuous" or "prismatic".
+        parent, child: links.
+        xyz, rpy: of its frame in the parent's at q = 0, m and rad about the fixed axes x, y, z.
+        axis: in its frame, of length 1.
+        low, high: position limits, rad or m; ∓UNBOUNDED where there is none.
+        effort: limit, N·m or N; infinite where the URDF has 0 or none.
+        damping: viscous, N·m·s/rad or N·s/m.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    xyz: Vector
+    rpy: Vector
+    axis: Vector
+    low: float
+    high: float
+    effort: float
+    damping: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is not fixed."""
+        return self.type != "fixed"
+
+    @property
+    def prismatic(self) -> bool:
+        """Whether its coordinate is a length."""
+        return self.type == "prismatic"
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A robot as its URDF describes it.
+
+    Attributes:
+        name: the robot's.
+        root: the link without a parent.
+        links: names, in the order of the file.
+        joints: by name, in the order of the file.
+        tree: the XML, for what is not said here.
+        warnings: what was read but has no effect, one line each.
+    """
+
+    name: str
+    root: str
+    links: tuple[str, ...]
+    joints: dict[str, Joint]
+    tree: ET.Element
+    warnings: tuple[str, ...]
+
+    def chain(self, link: str) -> list[Joint]:
+        """The joints from the root to a link."""
+        above = {joint.child: joint for joint in self.joints.values()}
+        chain = []
+        while link in above:
+            chain.append(above[link])
+            link = above[link].parent
+        return chain[::-1]
+
+
+def read_urdf(text: str) -> Urdf:
+    """The robot from the text of a URDF.
+
+    Raises:
+        RobotError: anything that is not supported, naming the joint, link or attribute.
+    """
+    tree = _parse(text)
+    links = _by_name(tree, "link")
+    elements = _by_name(tree, "joint")
+    moving = [name for name, joint in elements.items() if joint.get("type") != "fixed"]
+    for what, names, most in (("links", links, MAX_LINKS), ("moving joints", moving, MAX_JOINTS)):
+        if len(names) > most:
+            raise RobotError(f"the URDF has {len(names)} {what}; at most {most} are supported")
+    for tag, named in (("link", links), ("joint", elements)):
+        for name, element in named.items():
+            _check_numbers(element, f"{tag} '{name}'")
+    root = _check_tree(links, elements)
+    if not moving:
+        raise RobotError("the URDF has no moving joint")
+    joints = {name: _joint(name, element) for name, element in elements.items()}
+    frictional = [n for n, e in elements.items() if attribute(e, "dynamics", "friction", 0.0)]
+    warnings = [f"joint '{name}': friction is not modelled and is ignored" for name in frictional]
+    return Urdf(tree.get("name", ""), root, tuple(links), joints, tree, tuple(warnings))
+
+
+def _parse(urdf: str) -> ET.Element:
+    if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
+        raise RobotError("the URDF has a document type declaration; remove it")
+    try:
+        tree = ET.fromstring(urdf)
+    except (ET.ParseError, ValueError) as error:
+        raise RobotError(f"the URDF is not XML: {error}") from error
+    if tree.tag != "robot":
+        raise RobotError(f"the URDF's root element is <{tree.tag}>, expected <robot>")
+    depth, level = 1, [tree]
+    while level := [child for element in level for child in element]:
+        depth += 1
+        if depth > MAX_DEPTH:  # what writes XML goes down by recursion
+            raise RobotError(f"the URDF's elements are nested deeper than {MAX_DEPTH}")
+    return tree
+
+
+def _joint(name: str, element: ET.Element) -> Joint:
+    kind = str(element.get("type"))
+    if kind not in (*MOVING_TYPES, "fixed"):
+        raise RobotError(
+            f"joint '{name}' is of type '{kind}', which is not supported;"
+            f" supported are fixed, {', '.join(MOVING_TYPES)}"
+        )
+    low, high = -UNBOUNDED, UNBOUNDED
+    if kind in ("revolute", "prismatic"):
+        if element.find("limit") is None:
+            raise RobotError(f"joint '{name}' has no <limit>, which type '{kind}' needs")
+        low, high = (attribute(element, "limit", key, 0.0) for key in ("lower", "upper"))
+        if low > high:
+            raise RobotError(f"joint '{name}': lower limit {low:g} > upper limit {high:g}")
+    effort = attribute(element, "limit", "effort", 0.0)
+    damping = attribute(element, "dynamics", "damping", 0.0)
+    for key, value in (("effort", effort), ("damping", damping)):
+        if kind != "fixed" and value < 0:
+            raise RobotError(f"joint '{name}': negative {key}")
+    axis = _vector(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
+    length = math.hypot(*axis)
+    if kind == "fixed":
+        axis, length = (1.0, 0.0, 0.0), 1.0
+    if not length:
+        raise RobotError(f"joint '{name}': its axis is zero")
+    x, y, z = (component / length for component in axis)
+    origin = element.find("origin")
+    return Joint(
+        name=name,
+        type=kind,
+        parent=_link(element, "parent"),
+        child=_link(element, "child"),
+        xyz=_vector(origin, "xyz", (0.0, 0.0, 0.0)),
+        rpy=_vector(origin, "rpy", (0.0, 0.0, 0.0)),
+        axis=(x, y, z),
+        low=low,
+        high=high,
+        effort=effort or math.inf,
+        damping=damping,
+    )
+
+
+def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
+    found: dict[str, ET.Element] = {}
+    for element in tree.findall(tag):
+        name = element.get("name")
+        if not name:
+            raise RobotError(f"the URDF has a <{tag}> without a name")
+        if len(name) > MAX_NAME:
+            raise RobotError(
+                f"the URDF has a <{tag}> whose name has {len(name)} characters;"
+                f" at most {MAX_NAME} are supported"
+            )
+        if name in found:
+            raise RobotError(f"the URDF has two {tag}s named '{name}'")
+        found[name] = element
+    return found
+
+
+def _check_numbers(element: ET.Element, owner: str) -> None:
+    counts = {"xyz": 3, "rpy": 3}
+    for tag in NUMERIC_TAGS:
+        for found in element.iter(tag):
+            for key, text in found.attrib.items():
+                try:
+                    numbers = [number(word) for word in text.split()]
+                except ValueError:
+                    numbers = []
+                if len(numbers) != counts.get(key, 1):
+                    raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not a number or vector")
+                if not all(abs(number) <= LARGEST for number in numbers):
+                    if tag == "limit" and not any(map(math.isnan, numbers)):
+                        continue  # a huge limit is a common way to write "none"
+                    raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not finite or too large")
+
+
+def number(word: str) -> float:
+    """A number that other readers read as Python does: without underscores and other digits."""
+    if not word.isascii() or "_" in word:
+        raise ValueError(word)
+    return float(word)
+
+
+def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> str:
+    parent: dict[str, str] = {}
+    for name, joint in joints.items():
+        for side in ("parent", "child"):
+            if _link(joint, side) not in links:
+                raise RobotError(
+                    f"joint '{name}': its {side} link '{_link(joint, side)}' does not exist"
+                )
+        child = _link(joint, "child")
+        if child in parent:
+            raise RobotError(f"link '{child}' has two parents: closed loops are not supported")
+        parent[child] = _link(joint, "parent")
+    if not links:
+        raise RobotError("the URDF has no links")
+    roots = [link for link in links if link not in parent]
+    reached = set(roots)
+    for link in links:
+        path = [link]
+        while path[-1] not in reached:
+            path.append(parent[path[-1]])
+            if len(path) > len(links):
+                raise RobotError(f"link '{link}' is its own ancestor: loops are not supported")
+        reached.update(path)
+    if len(roots) != 1:
+        raise RobotError(f"the URDF needs one root link, it has {len(roots)}: {', '.join(roots)}")
+    return roots[0]
+
+
+def _link(joint: ET.Element, side: str) -> str:
+    element = joint.find(side)
+    return "" if element is None else element.get("link", "")
+
+
+def attribute(element: ET.Element, tag: str, key: str, default: float) -> float:
+    """A number of an element's first child of some tag, not beyond the largest double."""
+    child = element.find(tag)
+    value = default if child is None else float(child.get(key, default))
+    return max(-UNBOUNDED, min(UNBOUNDED, value))
+
+
+def _vector(element: ET.Element | None, key: str, default: Vector) -> Vector:
+    if element is None or element.get(key) is None:
+        return default
+    x, y, z = (float(word) for word in str(element.get(key)).split())
+    return x, y, z
