@@ -53,7 +53,9 @@ from listing import PendulumSimulator  # noqa: E402
 import twodof  # noqa: E402
 from twodof.flavours import native_flavour  # noqa: E402
 from twodof.native import FLAGS, compile_library, host_platform  # noqa: E402
-from twodof.plant import Plant, Robot, load_robot, variable_table  # noqa: E402
+from twodof.plant.plant import Plant  # noqa: E402
+from twodof.plant.robot import Robot, load_robot  # noqa: E402
+from twodof.plant.variables import variable_table  # noqa: E402
 
 URDF = ROOT / "urdf" / "2dof.urdf"
 STEP, STEPS = 0.01, 500  # s; the default run of 5 s

@@ -27,7 +27,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from twodof.plant import Plant, load_robot, variable_table  # noqa: E402
+from twodof.plant.plant import Plant  # noqa: E402
+from twodof.plant.robot import load_robot  # noqa: E402
+from twodof.plant.variables import variable_table  # noqa: E402
 
 STEP, STEPS = 0.01, 200  # s; 2 s
 HALF_BOX = 0.5  # m

@@ -40,14 +40,14 @@ UNSOUND = "the state is none that an instance can be in"
 
 
 def import_plant(site_packages: list[str]):
-    """The plant package of this FMU; says what to install where a package is missing."""
+    """The plant module of this FMU; says what to install where a package is missing."""
     try:
-        return importlib.import_module(f"{PACKAGE}.plant")
+        return importlib.import_module(f"{PACKAGE}.plant.plant")
     except ModuleNotFoundError:
         for folder in site_packages:
             site.addsitedir(folder)  # with its .pth files: pin keeps its modules behind one
     try:
-        return importlib.import_module(f"{PACKAGE}.plant")
+        return importlib.import_module(f"{PACKAGE}.plant.plant")
     except ModuleNotFoundError as missing:
         version = ".".join(map(str, sys.version_info[:3]))
         linked = f" and neither have {', '.join(site_packages)}" if site_packages else ""
@@ -70,9 +70,12 @@ class TwoDofSlave(fmi.Fmi2Slave):
         config = json.loads((resources / "plant.json").read_text("utf-8"))
         self._plant_module = import_plant(config["site_packages"])
         urdf = (resources / "robot.urdf").read_text("utf-8")
-        robot = self._plant_module.load_robot(urdf, config["frame"], config["axes"])
+        robot = importlib.import_module(f"{PACKAGE}.plant.robot").load_robot(
+            urdf, config["frame"], config["axes"]
+        )
         starts = {k: tuple(v) if isinstance(v, list) else v for k, v in config["starts"].items()}
-        self._table = self._plant_module.variable_table(robot, starts)
+        variables = importlib.import_module(f"{PACKAGE}.plant.variables")
+        self._table = variables.variable_table(robot, starts)
         self._plant = self._plant_module.Plant(robot, self._table)
         self._identity = config["identity"]
         self._phase = INSTANTIATED

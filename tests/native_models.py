@@ -17,7 +17,9 @@ import numpy as np
 import pinocchio as pin
 
 from twodof.native import compile_library, host_platform, model_header
-from twodof.plant import Plant, Robot, Variable, load_robot, variable_table
+from twodof.plant.plant import Plant
+from twodof.plant.robot import Robot, load_robot
+from twodof.plant.variables import Variable, variable_table
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "fmu_src" / "native"

@@ -12,7 +12,9 @@ from oracles import LINK, REST, TwoLinkArm, drift, jacobian, position, task_erro
 
 from twodof.build import DEFAULT_ARM
 from twodof.data import data_file
-from twodof.plant import DiscardError, ParameterError, Plant, load_robot, variable_table
+from twodof.plant.plant import DiscardError, ParameterError, Plant
+from twodof.plant.robot import load_robot
+from twodof.plant.variables import variable_table
 
 KP, KD = 50.0, 40.0
 URDF = Path(data_file("urdf", "2dof.urdf"))

@@ -15,7 +15,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from twodof.plant import UNBOUNDED, Robot, RobotError, load_robot
+from twodof.plant.robot import Robot, load_robot
+from twodof.plant.urdf import UNBOUNDED, RobotError
 
 LIMIT = '<limit lower="-1" upper="2" effort="3" velocity="4"/>'
 
@@ -193,7 +194,8 @@ def test_any_number_of_joints_that_is_not_refused_loads_in_two_gigabytes() -> No
     # Pinocchio's Data takes 100 GB for 1000 joints; in a process of its own, with a limit
     code = f"""
         import resource, sys
-        from twodof.plant import RobotError, load_robot
+        from twodof.plant.robot import load_robot
+        from twodof.plant.urdf import RobotError
         resource.setrlimit(resource.RLIMIT_AS, (2 * 1024**3,) * 2)
         try:
             load_robot({chain(999)!r}, "link1", "xyz")

@@ -110,7 +110,7 @@ def robot(request: pytest.FixtureRequest, robots: Path) -> str:
 @pytest.mark.parametrize("robot", list(ROBOTS), indirect=True)
 def test_transforms_are_the_placements_of_pinocchio(robot: str) -> None:
     joints = moving_joints(robot)[::-1]  # not in the order of the file
-    scene = Scene(robot, joints, "", nothing)
+    scene = Scene(robot, joints, ET.fromstring(robot).find("link").get("name"), nothing)
     random = np.random.default_rng(0)
     for _ in range(10):
         q = random.uniform(-4.0, 4.0, len(joints))

@@ -25,7 +25,9 @@ from oracles import REST, position, task_error
 from twodof import FmuOptions, build_fmu
 from twodof.build import DEFAULT_ARM
 from twodof.data import data_file
-from twodof.plant import Plant, load_robot, variable_table
+from twodof.plant.plant import Plant
+from twodof.plant.robot import load_robot
+from twodof.plant.variables import variable_table
 
 OK, DISCARD, ERROR = 0, 2, 3
 DO_STEP_STATUS = 0

@@ -27,7 +27,7 @@ from oracles import REST
 
 from twodof import FmuOptions, build_fmu
 from twodof.data import data_file
-from twodof.plant import Robot, load_robot
+from twodof.plant.robot import Robot, load_robot
 
 OK, DISCARD, ERROR = 0, 2, 3
 ESCAPED = "gave a value that is not finite"

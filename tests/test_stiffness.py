@@ -14,7 +14,7 @@ import pytest
 from native_models import ROOT, Engine, from_urdf, robots_folder
 from scipy.integrate import solve_ivp
 
-from twodof.plant import DiscardError, Plant
+from twodof.plant.plant import DiscardError, Plant
 
 STEP = 0.01
 TIGHT, DEFAULT = (1e-9, 1e-12), (1e-3, 1e-6)

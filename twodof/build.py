@@ -21,7 +21,10 @@ from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
 from .native import host_platform
-from .plant import Plant, Robot, RobotError, Variable, load_robot, variable_table
+from .plant.plant import Plant
+from .plant.robot import Robot, load_robot
+from .plant.urdf import RobotError
+from .plant.variables import Variable, variable_table
 
 logger = logging.getLogger("twodof.build")
 

@@ -10,7 +10,8 @@ from string import Template
 
 from .data import data_file
 from .flavours import Files, Flavour
-from .plant import Robot, Variable
+from .plant.robot import Robot
+from .plant.variables import Variable
 
 
 def documentation(

@@ -16,7 +16,8 @@ import pythonfmu
 
 from .data import data_file
 from .native import EXTENSIONS, compile_library, model_header
-from .plant import Robot, Variable
+from .plant.robot import Robot
+from .plant.variables import Variable
 
 Files = dict[str, bytes]
 """Contents by path inside the FMU."""

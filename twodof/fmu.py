@@ -298,7 +298,7 @@ def read_resource(fmu: Fmu, name: str) -> bytes | None:
         raise FmuError(f"cannot read resources/{name} of '{fmu.path}': {error}") from error
 
 
-def read_urdf(fmu: Fmu) -> str | None:
+def urdf_text(fmu: Fmu) -> str | None:
     """The text of resources/robot.urdf, None where there is none."""
     content = read_resource(fmu, "robot.urdf")
     try:

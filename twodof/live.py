@@ -11,7 +11,7 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 
 from .bag import Bag
 from .errors import BagError, PageError, SimulationError, TwoDofError
-from .fmu import Fmu, load_fmu, read_resource, read_urdf
+from .fmu import Fmu, load_fmu, read_resource, urdf_text
 from .inputs import Setting, Value, resolve
 from .master import Experiment, RealTime, Sample, at_rest, experiment, samples
 from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Page, Plot, Readout, Switch
 from .page_robot import PageRobot
-from .plant import Robot, RobotError, load_robot
+from .plant.urdf import Joint, RobotError, read_urdf
 
 Array = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ class Loop:
 
     def __init__(self, run: Experiment, *, bag: str | None = None, command_line: str = "") -> None:
         fmu = run.fmu
-        if read_urdf(fmu) is None or not fmu.axes or not fmu.vector("x_des"):
+        if urdf_text(fmu) is None or not fmu.axes or not fmu.vector("x_des"):
             raise PageError(f"'{fmu.path}' carries no robot, or has no inputs x_des[k]")
         self._run, self._bag, self._command_line = run, bag, command_line
         self.recorded: list[Path] = []
@@ -285,11 +285,12 @@ class Controls:
     def __init__(
         self, page: Page, fmu: Fmu, start_values: Mapping[str, Value], step: float, loop: Connection
     ) -> None:
-        urdf = read_urdf(fmu) or ""
+        urdf = urdf_text(fmu) or ""
         try:
-            robot = load_robot(urdf, fmu.frame, fmu.axes)
-        except RobotError as error:
-            raise PageError(f"'{fmu.path}': {error}") from error
+            robot = read_urdf(urdf)
+            joints = [robot.joints[name] for name in fmu.joints]
+        except (RobotError, KeyError) as error:
+            raise PageError(f"'{fmu.path}': its robot cannot be shown: {error}") from error
         self._page, self._fmu, self._starts, self._loop = page, fmu, start_values, loop
         self._sending = Lock()
         self._changed = -inf
@@ -299,7 +300,7 @@ class Controls:
         self._rows = np.array(self._news.rows[-1:])
         self._robot = PageRobot(page, urdf, fmu.joints, fmu.frame, partial(read_resource, fmu))
         self._set_scene()
-        self._add_controls(robot)
+        self._add_controls(joints)
 
     def _tell(self, order: str, value: Any = None) -> None:
         if order == "change":
@@ -362,7 +363,7 @@ class Controls:
         self._trail = self._page.add_line("/trail", TRAIL, 4.0)
         self._robot.pose(sample.q)
 
-    def _add_controls(self, robot: Robot) -> None:
+    def _add_controls(self, joints: Sequence[Joint]) -> None:
         page, gui, fmu = self._page, self._page.gui, self._fmu
         tell = self._tell
         self._play = Switch(page, "Play", "Pause", partial(tell, "play"), True)
@@ -381,13 +382,13 @@ class Controls:
             for group, unit in (("Kp", "s⁻²"), ("Kd", "s⁻¹")):
                 self._add_gain(group, unit, change)
         if fmu.vector("tau_ext"):
-            self._add_disturbance(robot, change)
-        self._units = ["m" if prismatic else "rad" for prismatic in robot.prismatic]
+            self._add_disturbance(joints, change)
+        self._units = ["m" if joint.prismatic else "rad" for joint in joints]
         units = " or ".join(dict.fromkeys(self._units))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
-        joints, error = f"position, {units}", "distance from the target, mm"
+        position, error = f"position, {units}", "distance from the target, mm"
         self._plots = (
-            Plot(page, joints, fmu.joints, age, rows[:, :-1], marked=False),
+            Plot(page, position, fmu.joints, age, rows[:, :-1], marked=False),
             Plot(page, error, ["error"], age, rows[:, -1:], marked=False),
         )
 
@@ -425,17 +426,19 @@ class Controls:
         for axis, k in axes.items():
             fields[axis].on_update(partial(typed, k))
 
-    def _add_disturbance(self, robot: Robot, change: Change) -> None:
+    def _add_disturbance(self, joints: Sequence[Joint], change: Change) -> None:
         names, starts = self._fmu.vector("tau_ext"), self._starts
         sliders = {}
         with self._page.gui.add_folder("Disturbance", expand_by_default=len(names) <= 3):
-            for name, joint, effort, prismatic in zip(
-                names, robot.joints, robot.effort, robot.prismatic
-            ):
+            for name, joint in zip(names, joints):
                 start = float(starts[name])
-                most = max(0.1 * effort if isfinite(effort) else 1.0, abs(start))
+                most = max(0.1 * joint.effort if isfinite(joint.effort) else 1.0, abs(start))
                 sliders[name] = self._page.gui.add_slider(
-                    f"{joint}, {'N' if prismatic else 'N·m'}", -most, most, most / 100, start
+                    f"{joint.name}, {'N' if joint.prismatic else 'N·m'}",
+                    -most,
+                    most,
+                    most / 100,
+                    start,
                 )
             release = self._page.gui.add_button("No disturbance")
 

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from .errors import BuildError
 from .files import temporary_folder
-from .plant import Robot, Variable
+from .plant.robot import Robot
+from .plant.variables import Variable
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .bag import Run
 from .figure import COLOURS, DASHES, GREY, INK, PALE, TICK_STYLE, Drawing, drawn
-from .track import Joint, Track, common_settings, labels, number, outcome, read_tracks, summary
+from .track import JointTrack, Track, common_settings, labels, number, outcome, read_tracks, summary
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
@@ -267,7 +267,7 @@ def _wrapped(name: str, height: float) -> str:
     return "\n".join(lines)
 
 
-def _draw_joint(axes: Axes, lines: Sequence[tuple[Array, Joint, _Look]], kind: str) -> None:
+def _draw_joint(axes: Axes, lines: Sequence[tuple[Array, JointTrack, _Look]], kind: str) -> None:
     shown = [(t, getattr(joint, kind), look) for t, joint, look in lines]
     shown = [(t, y, look) for t, y, look in shown if y.size]
     for t, y, look in shown:
@@ -284,7 +284,7 @@ def _draw_joint(axes: Axes, lines: Sequence[tuple[Array, Joint, _Look]], kind: s
 
 
 def _draw_limits(
-    axes: Axes, joints: Sequence[Joint], low: float, high: float
+    axes: Axes, joints: Sequence[JointTrack], low: float, high: float
 ) -> tuple[float, float]:
     """Lines at the limits and their numbers; the range widened to the limits that are near."""
     pairs = dict.fromkeys((joint.low, joint.high) for joint in joints)

@@ -12,11 +12,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import coal
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from .files import temporary_folder
+from .kinematics import Kinematics, Placement
+from .plant.urdf import Joint, RobotError, read_urdf
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # m
@@ -34,15 +36,6 @@ class Transform(NamedTuple):
     rotation: tuple[float, float, float, float]
 
 
-class _Joint(NamedTuple):
-    parent: str
-    child: str
-    kind: str
-    origin: Array  # 4×4
-    axis: Array  # 3
-    coordinate: int | None  # index into q; None for fixed joints
-
-
 class Scene:
     """A robot to be shown.
 
@@ -56,6 +49,9 @@ class Scene:
         description: the URDF with each mesh replaced by its best-fitting box or cylinder, which
             renders where the mesh files are not at hand.
         fixed: transforms of the fixed joints.
+
+    Raises:
+        RobotError: the URDF is not sound.
     """
 
     def __init__(
@@ -65,49 +61,30 @@ class Scene:
         frame: str,
         read: Callable[[str], bytes | None],
     ) -> None:
-        tree = ET.fromstring(urdf)
-        self._joints = {}
-        for element in tree.findall("joint"):
-            joint = _read_joint(element, joints)
-            self._joints[joint.child] = joint
-        self._frame = frame
-        self.fixed = [
-            _transform(joint, 0.0) for joint in self._joints.values() if joint.coordinate is None
-        ]
-        _replace_meshes(tree, read)
-        self.description = ET.tostring(tree, encoding="unicode")
+        robot = read_urdf(urdf)
+        if frame not in robot.links:
+            raise RobotError(f"it has no link '{frame}'")
+        self._kinematics, self._frame = Kinematics(robot, joints), frame
+        self._moving = [joint for joint in robot.joints.values() if joint.name in joints]
+        fixed = [joint for joint in robot.joints.values() if joint.name not in joints]
+        self.fixed = [self._transform(joint, [0.0] * len(joints)) for joint in fixed]
+        _replace_meshes(robot.tree, read)
+        self.description = ET.tostring(robot.tree, encoding="unicode")
 
     def moving(self, q: Sequence[float]) -> list[Transform]:
         """Transforms of the moving joints at positions q (rad or m)."""
-        return [
-            _transform(j, q[j.coordinate])
-            for j in self._joints.values()
-            if j.coordinate is not None
-        ]
+        return [self._transform(joint, q) for joint in self._moving]
+
+    def _transform(self, joint: Joint, q: Sequence[float]) -> Transform:
+        place = self._kinematics.in_parent(joint, [q])
+        x, y, z = place.translation[0].tolist()
+        qx, qy, qz, qw = place.rotation.as_quat()[0].tolist()
+        return Transform(joint.parent, joint.child, (x, y, z), (qx, qy, qz, qw))
 
     def end_effector(self, q: Sequence[float]) -> tuple[float, float, float]:
         """Position of the end effector in the root frame, m."""
-        point = np.array([0.0, 0.0, 0.0, 1.0])
-        link = self._frame
-        while link in self._joints:
-            joint = self._joints[link]
-            point = _pose(joint, 0.0 if joint.coordinate is None else q[joint.coordinate]) @ point
-            link = joint.parent
-        x, y, z = point[:3].tolist()
+        x, y, z = self._kinematics.path(self._frame, [q])[0].tolist()
         return x, y, z
-
-
-def _read_joint(element: ET.Element, joints: Sequence[str]) -> _Joint:
-    name = element.get("name", "")
-    axis = floats(element.find("axis"), "xyz", "1 0 0")
-    return _Joint(
-        parent=element.find("parent").get("link", ""),  # type: ignore[union-attr]
-        child=element.find("child").get("link", ""),  # type: ignore[union-attr]
-        kind=element.get("type", ""),
-        origin=origin(element.find("origin")),
-        axis=axis / (np.linalg.norm(axis) or 1.0),  # fixed joints may have a zero axis
-        coordinate=joints.index(name) if name in joints else None,
-    )
 
 
 def floats(element: ET.Element | None, key: str, default: str) -> Array:
@@ -116,67 +93,14 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
     return np.array([float(word) for word in text.split()])
 
 
-def origin(element: ET.Element | None) -> Array:
-    """URDF's xyz and rpy (fixed axes x, y, z) as a homogeneous matrix."""
-    pose = np.eye(4)
-    pose[:3, 3] = floats(element, "xyz", "0 0 0")
-    roll, pitch, yaw = floats(element, "rpy", "0 0 0")
-    pose[:3, :3] = (
-        _rotation(np.array([0.0, 0.0, 1.0]), yaw)
-        @ _rotation(np.array([0.0, 1.0, 0.0]), pitch)
-        @ _rotation(np.array([1.0, 0.0, 0.0]), roll)
-    )
-    return pose
-
-
-def _rotation(axis: Array, angle: float) -> Array:
-    """Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Array = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
-    return rotation
-
-
-def _pose(joint: _Joint, q: float) -> Array:
-    motion = np.eye(4)
-    if joint.kind == "prismatic":
-        motion[:3, 3] = q * joint.axis
-    elif joint.kind != "fixed":
-        motion[:3, :3] = _rotation(joint.axis, q)
-    return joint.origin @ motion
-
-
-def _transform(joint: _Joint, q: float) -> Transform:
-    pose = _pose(joint, q)
-    x, y, z = pose[:3, 3].tolist()
-    return Transform(joint.parent, joint.child, (x, y, z), quaternion(pose[:3, :3]))
-
-
-def quaternion(r: Array) -> tuple[float, float, float, float]:
-    """Unit quaternion of a rotation matrix, from its largest component (Shepperd, 1978)."""
-    squares = np.array(
-        [
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-        ]
-    )
-    products = np.array(
-        [
-            [squares[0], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
-            [r[1, 0] + r[0, 1], squares[1], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
-            [r[0, 2] + r[2, 0], r[2, 1] + r[1, 2], squares[2], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
-        ]
-    )
-    quaternion = products[int(np.argmax(squares))]
-    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
-    return x, y, z, w
+def origin(element: ET.Element | None) -> Placement:
+    """URDF's xyz and rpy, about the fixed axes x, y and z."""
+    rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0"))
+    return Placement(floats(element, "xyz", "0 0 0"), rotation)
 
 
 def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> None:
-    fitted: dict[tuple[str, str], tuple[ET.Element, Array] | None] = {}
+    fitted: dict[tuple[str, str], tuple[ET.Element, Placement] | None] = {}
     for link in tree.findall("link"):
         for part in [*link.findall("visual"), *link.findall("collision")]:
             geometry = part.find("geometry")
@@ -193,12 +117,12 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
             shape, placement = found
             geometry.remove(mesh)
             geometry.append(shape)
-            _place(part, origin(part.find("origin")) @ placement)
+            _place(part, origin(part.find("origin")) * placement)
 
 
 def _fit(
     uri: str, scale: Array, read: Callable[[str], bytes | None]
-) -> tuple[ET.Element, Array] | None:
+) -> tuple[ET.Element, Placement] | None:
     """Smallest box or cylinder along the mesh's principal axes or its own, and its pose."""
     vertices = _vertices(uri, scale, read)
     if vertices is None:
@@ -218,9 +142,7 @@ def _fit(
             round_size = np.array([r, height])
             candidates.append((math.pi * r * r * height, "cylinder", round_size, turned, middle))
     _, kind, size, rotation, centre = min(candidates, key=lambda candidate: candidate[0])
-    placement = np.eye(4)
-    placement[:3, :3] = rotation
-    placement[:3, 3] = rotation @ centre
+    placement = Placement(rotation @ centre, Rotation.from_matrix(rotation))
     if kind == "box":
         return ET.Element("box", size=_text(size)), placement
     radius, length = (repr(float(value)) for value in size)
@@ -256,6 +178,10 @@ def load_mesh(name: str, content: bytes, scale: Array) -> Any:
     Raises:
         ValueError: it cannot be read, or is of a format that has other files read beside it.
     """
+    try:
+        import coal
+    except ImportError as missing:
+        raise ValueError(f"{missing}; install the package 'coal'") from missing
     suffix = Path(name).suffix.lower()
     if suffix not in MESH_FORMATS:
         raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
@@ -268,17 +194,17 @@ def load_mesh(name: str, content: bytes, scale: Array) -> Any:
         return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
 
 
-def _place(part: ET.Element, pose: Array) -> None:
+def _place(part: ET.Element, place: Placement) -> None:
     origin = part.find("origin")
     if origin is None:
         origin = ET.SubElement(part, "origin")
-    r = pose[:3, :3]
-    # roll from what yaw leaves: exact too where the two turn about the same axis
+    r = place.rotation.as_matrix()
+    # roll from what yaw leaves: exact too where the two turn about one axis, as SciPy's are not
     yaw = math.atan2(r[1, 0], r[0, 0])
     sin, cos = math.sin(yaw), math.cos(yaw)
     pitch = math.atan2(-r[2, 0], cos * r[0, 0] + sin * r[1, 0])
     roll = math.atan2(sin * r[0, 2] - cos * r[1, 2], cos * r[1, 1] - sin * r[0, 1])
-    origin.set("xyz", _text(pose[:3, 3]))
+    origin.set("xyz", _text(place.translation))
     origin.set("rpy", _text((roll, pitch, yaw)))
 
 

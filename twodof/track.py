@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from math import ceil, inf, isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from .bag import Run, read_bag
+from .bag.provenance import KNOWN_UNTIL
 from .closed_form import Held, task_error
 from .errors import PlotError
 from .files import read_file
-from .plant import UNBOUNDED, Robot, RobotError, load_robot
+from .kinematics import Kinematics
+from .plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, check_axes, read_urdf
 
 Array = NDArray[np.float64]
 Schedule = list[tuple[int, Mapping[str, Any]]]
@@ -45,7 +45,7 @@ TOLD = {
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointTrack:
     """One joint's coordinate over time.
 
     Attributes:
@@ -143,7 +143,7 @@ class Track:
     run: Run
     settings: Mapping[str, str]
     t: Array
-    joints: tuple[Joint, ...]
+    joints: tuple[JointTrack, ...]
     motion: Motion | None
     task: Task | None
 
@@ -215,7 +215,8 @@ def _with_robot(
     if robot is not None:
         q = _in_robot_order(run, robot, names, run.q)
         motion = _motion(robot, q)
-        if "x_des[1]" in schedule[0][1] and made.get("axes") and made["frame"] == robot.frame:
+        known = "x_des[1]" in schedule[0][1] and KNOWN_UNTIL not in made
+        if known and made.get("axes") and made["frame"] == robot.frame:
             v = _in_robot_order(run, robot, names, run.v)
             task = _task(run, robot, q, v[0], motion.path, schedule)
             disturbances = _disturbances(robot, q, joints, task, schedule)
@@ -226,55 +227,59 @@ def _with_robot(
 # --- the robot ---
 
 
-def _load(urdf: str, frame: str, axes: str) -> Robot:
-    """The robot, of which the picture needs geometry, limits and damping alone.
+class _Robot(NamedTuple):
+    """What a picture needs of a robot: geometry, limits and damping.
 
-    So masses are all made alike and mimic joints move on their own, as they do in a bag; a URDF
-    is not refused for them.
+    Attributes:
+        urdf: the robot; its masses need not make sense.
+        kinematics: of the joints in ``moving``.
+        moving: all joints that move, mimic joints too, which move on their own in a bag.
+        frame: the end effector's link.
+        axes: the task's, of "xyz".
     """
-    try:
-        if "<!DOCTYPE" in urdf:
-            raise ValueError
-        tree = ET.fromstring(urdf)
-    except (ET.ParseError, ValueError):
-        return load_robot(urdf, frame, axes)  # which says what is wrong
-    for link in tree.findall("link"):
-        for part in list(link):
-            link.remove(part)
-        inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "mass", value="1")
-        ET.SubElement(inertial, "inertia", ixx="1", iyy="1", izz="1", ixy="0", ixz="0", iyz="0")
-    for joint in tree.findall("joint"):
-        for mimic in joint.findall("mimic"):
-            joint.remove(mimic)
-    text = ET.tostring(tree, encoding="unicode")
-    links = [link.get("name", "") for link in tree.findall("link")]
-    if frame or DEFAULT_FRAME in links:
-        return load_robot(text, frame or DEFAULT_FRAME, axes)
-    moved = [
-        child.get("link", "")
-        for joint in tree.findall("joint")
-        if joint.get("type") != "fixed" and (child := joint.find("child")) is not None
-    ]
-    robot = load_robot(text, moved[0] if moved else "", axes)
-    bodies = {i: f for i, f in enumerate(robot.model.frames) if f.type == pin.FrameType.BODY}
-    last = max(bodies, key=lambda i: (len(robot.model.supports[bodies[i].parentJoint]), i))
-    return replace(robot, frame=bodies[last].name, frame_id=last)
+
+    urdf: Urdf
+    kinematics: Kinematics
+    moving: tuple[Joint, ...]
+    frame: str
+    axes: str
+
+    @property
+    def chain(self) -> list[Joint]:
+        """The joints that move the frame, from the root on."""
+        return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
 
 
-def _joints(run: Run, names: Sequence[str], robot: Robot | None) -> tuple[Joint, ...]:
+def _load(text: str, frame: str, axes: str) -> _Robot:
+    check_axes(axes)
+    urdf = read_urdf(text)
+    moving = tuple(joint for joint in urdf.joints.values() if joint.moves)
+    if not frame:
+        depths = {link: sum(j.moves for j in urdf.chain(link)) for link in urdf.links}
+        last = max(enumerate(urdf.links), key=lambda link: (depths[link[1]], link[0]))[1]
+        frame = DEFAULT_FRAME if DEFAULT_FRAME in urdf.links else last
+    if frame not in urdf.links:
+        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
+    kinematics = Kinematics(urdf, [joint.name for joint in moving])
+    robot = _Robot(urdf, kinematics, moving, frame, axes)
+    if not robot.chain:
+        raise RobotError(f"no joint moves the frame '{frame}'")
+    return robot
+
+
+def _joints(run: Run, names: Sequence[str], robot: _Robot | None) -> tuple[JointTrack, ...]:
     starts = run.provenance.get("start_values", {})
     joints = []
     for i, name in enumerate(names):
         unit = ""
         low, high = starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]")
-        if robot is not None and name in robot.joints:
-            j = robot.joints.index(name)
-            unit = "m" if robot.prismatic[j] else "rad"
-            low = robot.q_min[j] if low is None else low
-            high = robot.q_max[j] if high is None else high
+        if robot is not None and name in robot.urdf.joints:
+            joint = robot.urdf.joints[name]
+            unit = "m" if joint.prismatic else "rad"
+            low = joint.low if low is None else low
+            high = joint.high if high is None else high
         joints.append(
-            Joint(
+            JointTrack(
                 name,
                 unit,
                 None if low is None or low <= -UNBOUNDED else low,
@@ -286,92 +291,67 @@ def _joints(run: Run, names: Sequence[str], robot: Robot | None) -> tuple[Joint,
     return tuple(joints)
 
 
-def _in_robot_order(run: Run, robot: Robot, names: Sequence[str], values: Array) -> Array:
+def _in_robot_order(run: Run, robot: _Robot, names: Sequence[str], values: Array) -> Array:
     """Columns of a bag's q or v for the robot's joints; 0 for those that do not move the frame.
 
     Raises:
         PlotError: a joint that moves the frame is not in the bag.
     """
-    ordered = np.zeros((len(values), len(robot.joints)))
-    for j, (name, needed) in enumerate(zip(robot.joints, robot.moves_frame())):
-        if name in names:
+    ordered = np.zeros((len(values), len(robot.moving)))
+    needed = robot.chain
+    for j, joint in enumerate(robot.moving):
+        if joint.name in names:
             if values.shape == run.q.shape:
-                ordered[:, j] = values[:, names.index(name)]
-        elif needed:
+                ordered[:, j] = values[:, names.index(joint.name)]
+        elif joint in needed:
             raise PlotError(
-                f"'{run.path}' has no joint '{name}', which the robot '{robot.name}' needs to"
-                f" move '{robot.frame}'; its joints are: {', '.join(names)}"
+                f"'{run.path}' has no joint '{joint.name}', which the robot '{robot.urdf.name}'"
+                f" needs to move '{robot.frame}'; its joints are: {', '.join(names)}"
             )
     return ordered
 
 
-def _motion(robot: Robot, q: Array) -> Motion:
+def _motion(robot: _Robot, q: Array) -> Motion:
+    start, end = _skeletons(robot, q[[0, -1]])
     return Motion(
-        robot=robot.name,
+        robot=robot.urdf.name,
         frame=robot.frame,
-        root=robot.root,
-        path=_path(robot, q),
-        start=_skeleton(robot, q[0]),
-        end=_skeleton(robot, q[-1]),
+        root=robot.urdf.root,
+        path=robot.kinematics.path(robot.frame, q),
+        start=start,
+        end=end,
         reach=_reach(robot),
     )
 
 
-def _path(robot: Robot, q: Array) -> Array:
-    """Positions of the frame in the root frame, N × 3, m; q is N × joints.
-
-    For all samples at once, as a call of Pinocchio for each takes ten times as long. A joint turns
-    a point p about its axis a by Rodrigues' formula, p + sin(q) a × p + (1 - cos(q)) a × (a × p).
-    """
-    model = robot.model
-    path = np.tile(model.frames[robot.frame_id].placement.translation, (len(q), 1))
-    for i in reversed(_chain(robot)[1:]):
-        joint, placement = model.joints[i], model.jointPlacements[i]
-        slide, axis = np.reshape(joint.createData().S, (2, 3))
-        across, moved = pin.skew(axis).T, q[:, joint.idx_q, None]
-        turned = path @ across
-        path += np.sin(moved) * turned + (1.0 - np.cos(moved)) * (turned @ across) + moved * slide
-        path = path @ placement.rotation.T + placement.translation
-    return path
+def _skeletons(robot: _Robot, q: Array) -> Array:
+    """Origins of the root, of the joints that move the frame, and of the frame; N × points × 3."""
+    chain = robot.urdf.chain(robot.frame)
+    places = robot.kinematics.along(chain, q)
+    shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), -1]
+    return np.stack([places[i].translation for i in shown], axis=1)
 
 
-def _chain(robot: Robot) -> list[int]:
-    """Pinocchio's indices of the root, 0, and of the joints that move the frame."""
-    return list(robot.model.supports[robot.model.frames[robot.frame_id].parentJoint])
-
-
-def _skeleton(robot: Robot, q: Array) -> Array:
-    """Origins of the root, of the joints that move the frame, and of the frame; × 3."""
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, q)
-    points = [data.oMi[i].translation for i in _chain(robot)]
-    return np.array([*points, data.oMf[robot.frame_id].translation])
-
-
-def _velocity(robot: Robot, q: Array, v: Array) -> Array:
-    """Velocity of the frame in the root frame, m/s, 3 values."""
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q, v)
-    aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    velocity: Array = pin.getFrameVelocity(robot.model, data, robot.frame_id, aligned).linear
-    return velocity
-
-
-def _reach(robot: Robot) -> Reach | None:
+def _reach(robot: _Robot) -> Reach | None:
     """The circle, where all joints turn about one of the root's axes.
 
     Distances between neighbouring joints do not change, so no point is farther than their sum; in
     a plane the stretched arm is that long. For arms in space the sum would be too large.
     """
-    model, joints = robot.model, _chain(robot)[1:]
-    data = model.createData()
-    pin.computeJointJacobians(model, data, np.zeros(model.nq))
-    jacobian = np.reshape(data.J, (6, -1))
-    turns = np.abs([jacobian[3:, i - 1] for i in joints])  # 0 for prismatic joints
+    at_zero = np.zeros((1, len(robot.moving)))
+    chain = robot.urdf.chain(robot.frame)
+    places = robot.kinematics.along(chain, at_zero)[1:]
+    turns = np.abs(
+        [
+            place.rotation.apply(joint.axis)[0] * (not joint.prismatic)
+            for joint, place in zip(chain, places)
+            if joint.moves
+        ]
+    )
     normal = int(np.argmax(turns[0]))
     if (turns[:, normal] < 1.0 - 1e-9).any():
         return None
-    points = _skeleton(robot, np.zeros(model.nq))[1:]
+    points = _skeletons(robot, at_zero)[0, 1:]
     links = np.delete(np.diff(points, axis=0), normal, axis=1)
     return Reach(points[0], float(np.linalg.norm(links, axis=1).sum()), normal)
 
@@ -409,7 +389,7 @@ def _steps(run: Run) -> NDArray[np.int64]:
     return steps
 
 
-def _task(run: Run, robot: Robot, q: Array, v0: Array, path: Array, schedule: Schedule) -> Task:
+def _task(run: Run, robot: _Robot, q: Array, v0: Array, path: Array, schedule: Schedule) -> Task:
     axes = ["xyz".index(axis) for axis in robot.axes]
     x, steps = path[:, axes], _steps(run)
 
@@ -427,7 +407,8 @@ def _task(run: Run, robot: Robot, q: Array, v0: Array, path: Array, schedule: Sc
             raise ValueError("positions or targets are beyond all bounds")
         if all(f"{group}[1]" in schedule[0][1] for group in Held._fields):
             held = [(k, Held(*(vector(values, g) for g in Held._fields))) for k, values in schedule]
-            step, xd0 = run.provenance["step"], _velocity(robot, q[0], v0)[axes]
+            step = run.provenance["step"]
+            xd0 = (robot.kinematics.jacobian(robot.frame, q[:1])[0] @ v0)[axes]
             e = task_error(x[0].tolist(), xd0.tolist(), held, step, int(steps[-1]))[steps]
             closed_form = np.linalg.norm(e, axis=1)
             departure = float(np.linalg.norm(x - target - e, axis=1).max())
@@ -442,7 +423,7 @@ def _task(run: Run, robot: Robot, q: Array, v0: Array, path: Array, schedule: Sc
 
 
 def _disturbances(
-    robot: Robot, q: Array, joints: Sequence[Joint], task: Task, schedule: Schedule
+    robot: _Robot, q: Array, joints: Sequence[JointTrack], task: Task, schedule: Schedule
 ) -> tuple[str, ...]:
     """What moves, brakes or stops the arm and is not in the closed form."""
     first = schedule[0][1]
@@ -452,23 +433,18 @@ def _disturbances(
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
         "singularities": astray and _is_singular(robot, q, float(first.get("rcond", 0.0))),
-        "damping": any(robot.damping),
+        "damping": any(joint.damping for joint in robot.moving),
         "external torque": any(values[name] for _, values in schedule for name in external),
     }
     return tuple(name for name, present in found.items() if present)
 
 
-def _is_singular(robot: Robot, q: Array, rcond: float) -> bool:
+def _is_singular(robot: _Robot, q: Array, rcond: float) -> bool:
     """Whether the arm has been where it cannot follow any command: σ_min ≤ rcond·σ_max of J."""
-    data = robot.model.createData()
-    aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     axes = ["xyz".index(axis) for axis in robot.axes]
-    for row in q[:: ceil(len(q) / LOOKS)]:
-        jacobian = pin.computeFrameJacobian(robot.model, data, row, robot.frame_id, aligned)
-        sigma = np.linalg.svd(np.reshape(jacobian, (6, -1))[axes], compute_uv=False)
-        if len(sigma) < len(axes) or sigma[-1] <= rcond * sigma[0]:
-            return True
-    return False
+    J = robot.kinematics.jacobian(robot.frame, q[:: ceil(len(q) / LOOKS)])[:, axes]
+    sigma = np.linalg.svd(J, compute_uv=False)
+    return sigma.shape[1] < len(axes) or bool((sigma[:, -1] <= rcond * sigma[:, 0]).any())
 
 
 def _settings(run: Run, schedule: Schedule) -> dict[str, str]:

@@ -19,9 +19,9 @@ from rosbags.interfaces import (
 from rosbags.typesys import Stores, get_typestore
 
 from ..errors import BagError
-from ..fmu import read_resource, read_urdf
+from ..fmu import read_resource, urdf_text
 from ..master import NANOSECONDS, Experiment, Sample
-from ..plant import RobotError, load_robot
+from ..plant.urdf import RobotError
 from ..scene import Scene, Transform
 
 Array = NDArray[np.float64]
@@ -184,14 +184,13 @@ class Messages:
 
 
 def _load_scene(run: Experiment) -> Scene:
-    urdf = read_urdf(run.fmu)
+    urdf = urdf_text(run.fmu)
     if urdf is None or not run.fmu.axes:
         raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which a scene shows")
     try:
-        load_robot(urdf, run.fmu.frame, run.fmu.axes)  # a scene takes the URDF to be sound
+        return Scene(urdf, run.fmu.joints, run.fmu.frame, lambda name: read_resource(run.fmu, name))
     except RobotError as error:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
-    return Scene(urdf, run.fmu.joints, run.fmu.frame, lambda name: read_resource(run.fmu, name))
 
 
 def _serialise(topic_and_message: tuple[str, Any]) -> tuple[str, Serialised]:

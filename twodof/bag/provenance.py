@@ -10,7 +10,7 @@ from typing import Any
 from .. import __version__
 from ..errors import BagError
 from ..files import read_file
-from ..fmu import read_urdf
+from ..fmu import urdf_text
 from ..inputs import Changes
 from ..master import Experiment
 
@@ -86,7 +86,7 @@ def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
         "start_values": dict(run.start_values),
         "versions": versions(*PACKAGES),
         "command_line": command_line,
-        "urdf": read_urdf(fmu),
+        "urdf": urdf_text(fmu),
     }
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from .urdf import NUMERIC_TAGS, Joint, RobotError, Urdf, attribute, number, read_urdf
+from .urdf import NUMERIC_TAGS, Joint, RobotError, Urdf, attribute, check_axes, number, read_urdf
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     Raises:
         RobotError: anything that is not supported, naming the joint, link or attribute.
     """
-    if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
-        raise RobotError(f"axes '{axes}': expected one to three different letters of x, y, z")
+    check_axes(axes)
     urdf = read_urdf(text)
     for element in urdf.tree.findall("joint"):
         if element.find("mimic") is not None:
@@ -76,6 +75,8 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     for joint in urdf.joints.values():
         if joint.moves:
             _check_body(urdf, joint)
+    if not any(joint.moves for joint in urdf.joints.values()):
+        raise RobotError("the URDF has no moving joint")
     if frame not in urdf.links:
         raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
     try:

@@ -96,6 +96,16 @@ class Urdf:
         return chain[::-1]
 
 
+def check_axes(axes: str) -> None:
+    """Refuse what are no task axes.
+
+    Raises:
+        RobotError: they are not one to three different letters of "xyz".
+    """
+    if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
+        raise RobotError(f"axes '{axes}': expected one to three different letters of x, y, z")
+
+
 def read_urdf(text: str) -> Urdf:
     """The robot from the text of a URDF.
 
@@ -113,8 +123,6 @@ def read_urdf(text: str) -> Urdf:
         for name, element in named.items():
             _check_numbers(element, f"{tag} '{name}'")
     root = _check_tree(links, elements)
-    if not moving:
-        raise RobotError("the URDF has no moving joint")
     joints = {name: _joint(name, element) for name, element in elements.items()}
     frictional = [n for n, e in elements.items() if attribute(e, "dynamics", "friction", 0.0)]
     warnings = [f"joint '{name}': friction is not modelled and is ignored" for name in frictional]

@@ -1,0 +1,93 @@
+"""Forward kinematics of a URDF, for all samples at a time: for transforms, plots and pages.
+
+    p_child = p_parent + R_parent (xyz + R(rpy) a q),  R_child = R_parent R(rpy)            sliding
+    p_child = p_parent + R_parent xyz,                 R_child = R_parent R(rpy) exp[a q]×  turning
+
+with a the joint's axis, and a column of the Jacobian of a point p
+
+    a                  sliding,        a × (p − p_child)        turning
+
+with a in the root's axes. Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009,
+sections 2.8 and 3.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from .plant.urdf import Joint, Urdf
+
+Array = NDArray[np.float64]
+
+
+class Placement(NamedTuple):
+    """Where a frame is in another, at N samples: N × 3, m, and N rotations."""
+
+    translation: Array
+    rotation: Rotation
+
+    def __mul__(self, inner: Placement) -> Placement:  # type: ignore[override]
+        """Where a frame is that is placed in this one."""
+        translation = self.translation + self.rotation.apply(inner.translation)
+        return Placement(translation, self.rotation * inner.rotation)
+
+
+class Kinematics:
+    """A robot's geometry.
+
+    Args:
+        urdf: the robot.
+        joints: names of the joints whose positions are the columns of q; all others rest at 0.
+    """
+
+    def __init__(self, urdf: Urdf, joints: Sequence[str]) -> None:
+        self.urdf = urdf
+        self._columns = {name: i for i, name in enumerate(joints)}
+        self._origins = {
+            joint.name: Rotation.from_euler("xyz", joint.rpy) for joint in urdf.joints.values()
+        }
+
+    def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
+        """Where a joint's child is in its parent; q is N × joints, rad or m."""
+        q = np.asarray(q, dtype=np.float64)
+        column = self._columns.get(joint.name)
+        moved = np.zeros((len(q), 1)) if column is None else q[:, column, None]
+        origin, along = self._origins[joint.name], moved * joint.axis
+        if joint.prismatic:
+            turn = Rotation.from_rotvec(np.zeros_like(along))
+            return Placement(joint.xyz + origin.apply(along), origin * turn)
+        return Placement(np.tile(joint.xyz, (len(q), 1)), origin * Rotation.from_rotvec(along))
+
+    def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
+        """Where the root is, and the child of each joint of a chain that begins there."""
+        n = len(np.asarray(q))
+        places = [Placement(np.zeros((n, 3)), Rotation.from_rotvec(np.zeros((n, 3))))]
+        for joint in chain:
+            places.append(places[-1] * self.in_parent(joint, q))
+        return places
+
+    def path(self, link: str, q: ArrayLike) -> Array:
+        """Positions of a link's origin in the root frame, N × 3, m."""
+        return self.along(self.urdf.chain(link), q)[-1].translation
+
+    def links(self, q: ArrayLike) -> dict[str, Placement]:
+        """Where all links are in the root frame."""
+        return {link: self.along(self.urdf.chain(link), q)[-1] for link in self.urdf.links}
+
+    def jacobian(self, link: str, q: ArrayLike) -> Array:
+        """Of the link's origin in the root's axes, N × 3 × joints: its velocity is J v."""
+        chain = self.urdf.chain(link)
+        places = self.along(chain, q)
+        end = places[-1].translation
+        jacobian = np.zeros((len(end), 3, len(self._columns)))
+        for joint, place in zip(chain, places[1:]):
+            if joint.name in self._columns:
+                axis = place.rotation.apply(joint.axis)
+                column = axis if joint.prismatic else np.cross(axis, end - place.translation)
+                jacobian[:, :, self._columns[joint.name]] = column
+        return jacobian
