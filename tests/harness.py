@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.util
+import itertools
 import multiprocessing
 import os
 import re
 import shutil
+import sys
 import tempfile
+import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor
 from ctypes import byref
+from pathlib import Path
 
 import fmpy
 import pytest
@@ -72,6 +77,45 @@ def _serve(pipe):
     while True:
         function, arguments = pipe.recv()
         pipe.send(function(*arguments))
+
+
+def lay_traps(folder):
+    """Modules that nobody must import, by every name that this process knows."""
+    names = {*sys.stdlib_module_names, *(name.partition(".")[0] for name in sys.modules)}
+    for name in {*names, "sitecustomize", "usercustomize"} - {"__main__", "program"}:
+        with open(os.path.join(folder, f"{name}.py"), "w") as file:
+            file.write("open(__file__ + '.sprung', 'w'); raise ImportError(__file__)")
+
+
+def asked(times):
+    """Asks to stop when it is looked at so many times: what never looks would hang."""
+    looks = itertools.count(1)
+    return lambda: next(looks) >= times
+
+
+def wait_until(condition):
+    """A hang fails the test."""
+    end = time.monotonic() + 120.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def children_of(process):
+    """Processes that it has started, and that have not ended."""
+    found = []
+    for children in Path(f"/proc/{process}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            found += map(int, children.read_text().split())
+    return list(filter(lives, found))
+
+
+def lives(process):
+    """Whether it has not ended."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 _description = functools.cache(fmpy.read_model_description)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
 import subprocess
+import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
@@ -34,9 +36,11 @@ from browser import (
     type_into,
     until,
 )
+from harness import asked, children_of, lives, wait_until
 from playwright.sync_api import Browser, Page
 
 import twodof
+from twodof.live import live
 
 Q_START = np.array([0.5, 0.35])
 KP, KD = 50.0, 40.0  # those of the default FMU
@@ -495,3 +499,66 @@ def test_port_in_use(native_path: Path, tmp_path: Path) -> None:
         )  # fmt: skip
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(rf"twodof: error: port {port} of 127.0.0.1 is in use[^\n]*\n", done.stderr)
+
+
+PROGRAM = """
+import sys
+from twodof.live import live
+def run():
+    urls = []
+    live(sys.argv[-1], lambda: bool(urls), urls.append, port=0)
+    assert urls[0].startswith("http://127.0.0.1:")
+run()
+sys.path.append(sys.argv[-2])
+from harness import lay_traps
+lay_traps(".")  # only now: this process itself may import from here
+run()
+"""
+
+
+@pytest.mark.parametrize("way", [["-c", PROGRAM], ["program.py"], ["-m", "program"]])
+def test_the_page_imports_nothing_from_the_working_directory(
+    way: list[str], native_path: Path, tmp_path: Path
+) -> None:
+    """Nor the program itself, which shields nothing by ``if __name__ == "__main__"``."""
+    (tmp_path / "program.py").write_text(PROGRAM)
+    done = subprocess.run(
+        [sys.executable, *way, str(Path(__file__).parent), str(native_path)], cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": ":."}, capture_output=True, text=True, check=False,
+        timeout=120,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "numpy.py").exists() and not list(tmp_path.glob("*.sprung"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("raise ImportError('no such luck')", "a child process failed: ImportError: no such luck"),
+        ("import os; os._exit(3)", "the process of the page has ended: exit status 3"),
+    ],
+)
+def test_a_page_that_cannot_start_tells_why(
+    text: str, said: str, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "numpy.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(twodof.TwoDofError, match=said):
+        live(native_path, lambda: False)
+
+
+def test_live_can_be_ended_while_its_page_starts(
+    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "numpy.py").write_text("import time; time.sleep(1e6)")
+    monkeypatch.syspath_prepend(tmp_path)
+    before, urls = children_of(os.getpid()), []
+    assert live(native_path, asked(5), urls.append) == urls == []
+    assert children_of(os.getpid()) == before
+
+
+def test_the_page_ends_with_the_command(native_path: Path, tmp_path: Path) -> None:
+    with served("live", native_path, cwd=tmp_path) as command:
+        (page,) = command.children()
+        command.process.kill()
+        wait_until(lambda: not lives(page))

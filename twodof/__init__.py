@@ -15,14 +15,15 @@ if TYPE_CHECKING:
     from .master import RealTime, Sample, Sink, Summary, experiment, samples, simulate
     from .plot import plot_bags
     from .publish import Publisher
-    from .sweeps import read_sweep, sweep
+    from .sweeps.coordinator import sweep
+    from .sweeps.results import read_sweep
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOME = {
     "Bag": "bag",
     "Run": "bag",
     "read_bag": "bag",
-    "read_sweep": "sweeps",
+    "read_sweep": "sweeps.results",
     "recover": "bag",
     "FmuOptions": "build",
     "build_fmu": "build",
@@ -38,7 +39,7 @@ _HOME = {
     "Publisher": "publish",
     "samples": "master",
     "simulate": "master",
-    "sweep": "sweeps",
+    "sweep": "sweeps.coordinator",
 }
 __all__ = [
     "Bag",

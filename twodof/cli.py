@@ -444,8 +444,8 @@ def _plot_bags(options: argparse.Namespace) -> int:
 
 
 def _plot_sweep(options: argparse.Namespace, folder: Path) -> int:
-    from .sweeps import read_sweep
     from .sweeps.map import drawing
+    from .sweeps.results import read_sweep
 
     table, provenance = read_sweep(folder)
     _show_or_save(drawing(table, provenance, folder.resolve().name), options.output)
@@ -467,7 +467,8 @@ def _sweep(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from .inputs import parse_settings
-    from .sweeps import parse_grids, parse_ranges, sweep
+    from .sweeps.coordinator import sweep
+    from .sweeps.design import parse_grids, parse_ranges
 
     if options.resume and not options.output:
         raise InputError("--resume needs the sweep to go on with: -o OUT")
@@ -513,7 +514,8 @@ def _sweep(options: argparse.Namespace) -> int:
 
 def _print_best(table: DataFrame) -> None:
     """The first few runs by settling time, effort and final error."""
-    from .sweeps import METRICS, ranked
+    from .sweeps.metrics import METRICS
+    from .sweeps.results import ranked
 
     best = ranked(table).head(5)
     columns = [*best.columns]

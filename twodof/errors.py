@@ -43,7 +43,11 @@ class BagError(TwoDofError):
 
 
 class SweepError(TwoDofError):
-    """A sweep cannot be run, stored or read: Dask, its workers or the folder is at fault."""
+    """A sweep cannot be run, stored or read: its workers, Dask or the folder is at fault."""
+
+
+class ChildError(TwoDofError):
+    """A process that this one has started failed for no reason of its own that has a name here."""
 
 
 class PlotError(TwoDofError):

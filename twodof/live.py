@@ -8,7 +8,6 @@ and thirty times a second that it is ready for more, whereupon the loop tells wh
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +16,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, count
 from math import inf, isfinite
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Lock
@@ -27,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bag import Bag
-from .errors import BagError, PageError, SimulationError, TwoDofError
+from .children import Child
+from .errors import BagError, PageError, SimulationError
 from .fmu import Fmu, load_fmu, read_resource, urdf_text
 from .inputs import Setting, Value, resolve
 from .master import Experiment, RealTime, Sample, at_rest, experiment, samples
@@ -493,53 +492,38 @@ def serve_page(
     loop: Connection, path: Path, start_values: Mapping[str, Value], step: float,
     host: str, port: int,
 ) -> None:  # fmt: skip
-    """The process of the page: tells the loop its URL, or what is wrong; ends with the loop."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the loop
+    """The process of the page, which tells the loop its URL first."""
     if hasattr(os, "nice"):
         os.nice(5)  # the loop goes first
-    try:
-        fmu = load_fmu(path)
-        with Page(f"twodof - {fmu.name}", host, port) as page:
-            controls = Controls(page, fmu, start_values, step, loop)
-            loop.send(("url", page.url))
-            controls.show()
-    except TwoDofError as error:
-        loop.send(("error", error))
-    except (EOFError, OSError):
-        pass  # the loop has ended
+    fmu = load_fmu(path)
+    with Page(f"twodof - {fmu.name}", host, port) as page:
+        controls = Controls(page, fmu, start_values, step, loop)
+        loop.send(("url", page.url))
+        controls.show()
 
 
 @contextmanager
-def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Iterator[tuple[str, Connection]]:
-    """The URL of a loop's page, and the connection to its process.
+def page_of(
+    loop: Loop, run: Experiment, host: str, port: int, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[str | None, Connection]]:
+    """The URL of a loop's page, None if ``stop`` came first, and the connection to its process.
 
     Raises:
         PageError: it cannot be shown.
     """
-    context = get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(
-        target=serve_page,
-        args=(theirs, run.fmu.path, dict(run.start_values), run.step, host, port),
-        daemon=True,
-    )
-    process.start()
-    theirs.close()
-    try:
+    starts, url = dict(run.start_values), None
+    with Child(serve_page, run.fmu.path, starts, run.step, host, port) as page:
         try:
-            order, value = ours.recv()
-            while order == "more":
-                ours.send(loop.news())
-                order, value = ours.recv()
-        except (EOFError, OSError) as error:
-            raise PageError("the process of the page has ended") from error
-        if order == "error":
-            raise value
-        yield value, ours
-    finally:
-        ours.close()
-        process.join(5.0)
-        process.kill()
+            while url is None and not stop():
+                if page.poll(IDLE):
+                    order, value = page.recv()
+                    if order == "more":
+                        page.send(loop.news())
+                    else:
+                        url = value
+        except EOFError as error:
+            raise PageError(f"the process of the page has ended: {error}") from error
+        yield url, page
 
 
 def live(
@@ -568,7 +552,8 @@ def live(
     """
     run = experiment(fmu, step=step, stop_time=inf, settings=settings)
     loop = Loop(run, bag=bag, command_line=command_line)
-    with page_of(loop, run, host, port) as (url, page):
-        opened(url)
+    with page_of(loop, run, host, port, stop) as (url, page):
+        if url is not None:
+            opened(url)
         loop.play(page, stop)
     return loop.recorded

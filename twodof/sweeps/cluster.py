@@ -1,59 +1,33 @@
-"""Runs of a sweep on Dask's workers, those of this machine or of a cluster. All of Dask is here."""
+"""Runs of a sweep on the workers of a Dask cluster that runs already. All of Dask is here.
+
+Who reaches its scheduler runs code on its workers, and in this process. What keeps others away is
+Dask's own configuration, ``distributed.comm.tls``.
+"""
 
 from __future__ import annotations
 
-import logging
 import os
-import shlex
-import subprocess
-import sys
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
-from math import nan
-from threading import Lock
-from typing import Any
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
+from threading import Event, Lock, Thread
 
 from .. import __version__
 from ..errors import SweepError, TwoDofError
-from ..files import temporary_folder
-from .metrics import METRICS
+from .batches import LOOK, Batches
 from .runner import Job, Point, Row, Runner
 
 try:
-    import dask
-    from distributed import (
-        Client,
-        Future,
-        KilledWorker,
-        LocalCluster,
-        Worker,
-        WorkerPlugin,
-        get_worker,
-        wait,
-    )
+    from distributed import Client, Future, KilledWorker, Worker, WorkerPlugin, get_worker, wait
 except ImportError as missing:
-    raise SweepError(
-        f"cannot sweep: {missing}; install the extra 'sweep' (pip install 'twodof[sweep]')"
-    ) from missing
+    remedy = "install the extra 'cluster' (pip install 'twodof[cluster]')"
+    raise SweepError(f"cannot use a cluster: {missing}; {remedy}") from missing
 
 PATIENCE = 5.0  # s for a scheduler to answer
-START_TIME = 60.0  # s for the first worker to start
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 NO_WORKER = 60.0  # s after which nobody hopes for another
-BATCH_TIME = 0.25  # s, of one task
-MAX_BATCH = 256
 IN_HAND = 2  # tasks a worker, so that it never waits for the next
-CONFIG = {
-    # the scheduler of a local cluster would remember every task
-    "distributed.admin.log-length": 100,
-    "distributed.admin.low-level-log-length": 100,
-    "distributed.scheduler.allowed-failures": 1,
-    "distributed.comm.timeouts.connect": PATIENCE,
-}
 
 
 class JobPlugin(WorkerPlugin):  # type: ignore[misc]
@@ -77,208 +51,106 @@ class JobPlugin(WorkerPlugin):  # type: ignore[misc]
             if self._runner is not None:
                 self._runner.__exit__(None, None, None)
 
-    def run(self, points: Sequence[Point]) -> tuple[list[Row], float]:
-        """Rows of some points, and the time it took, s."""
+    def run_all(self, points: Sequence[Point]) -> tuple[list[Row], float]:
+        """Rows of some points, and the time they took, s."""
         with self._lock:
             if self._runner is None:
                 self._runner = Runner(self._job)
-            begin = time.perf_counter()
-            rows = [self._runner.run(point) for point in points]
-            return rows, time.perf_counter() - begin
+            return self._runner.run_all(points)
 
 
 def run_batch(name: str, points: Sequence[Point]) -> tuple[list[Row], float]:
     """What a task does on a worker."""
     plugin: JobPlugin = get_worker().plugins[name]
-    return plugin.run(points)
+    return plugin.run_all(points)
 
 
 class Cluster:
-    """Workers that can run a job; a context.
+    """The workers of a cluster; a context, in which one at least is there.
+
+    Dask is asked in a thread, since it waits for what does not answer, and mostly for ever.
 
     Args:
         job: what all runs share.
-        workers: local processes; None: as many as there are cores.
-        scheduler: address of a cluster's scheduler, in place of local workers.
+        batches: the runs.
+        address: of the scheduler.
+        stop: asked all the time; True ends it.
 
     Raises:
-        SweepError: there are no workers, or they cannot run the job.
+        SweepError: there are no workers, they cannot run the job, or the scheduler is gone.
+        FmuError, InputError, BagError: from a run, for a reason that others will meet too.
     """
 
-    def __init__(self, job: Job, workers: int | None, scheduler: str | None) -> None:
-        if workers is not None and workers < 1:
-            raise SweepError(f"{workers} workers; at least 1 is needed")
-        self._job, self._scheduler = job, scheduler
-        self._workers = workers or os.cpu_count() or 1
+    def __init__(self, job: Job, batches: Batches, address: str, stop: Callable[[], bool]) -> None:
+        self._job, self._batches, self._address, self._stop = job, batches, address, stop
+        self._news: SimpleQueue[list[Row] | Exception | None] = SimpleQueue()
+        self._ended = Event()
 
-    def __enter__(self) -> Cluster:
-        with ExitStack() as stack:
-            workers = _local(self._workers) if self._scheduler is None else _remote(self._scheduler)
-            self._client, self._mend = stack.enter_context(workers)
-            self._name = stack.enter_context(_registered(self._client, self._job))
-            self._exit = stack.pop_all()
-        return self
+    def __enter__(self) -> Iterator[list[Row]]:
+        self._thread = Thread(target=self._serve, daemon=True)
+        self._thread.start()
+        self._answers = self._next() is not None
+        return iter(self._next, None)
 
     def __exit__(self, *exception: object) -> None:
-        self._exit.close()
+        self._ended.set()
+        if self._answers:
+            self._thread.join(PATIENCE)  # it takes back the job
 
-    def run(
-        self, points: Iterator[Point], stop: Callable[[], bool]
-    ) -> Generator[list[Row], None, None]:
-        """Rows of all points as they come, in any order, until ``stop`` is true.
+    def _next(self) -> list[Row] | None:
+        """What the thread tells next; None at its end, or if the sweep is to stop."""
+        while not self._stop():
+            with suppress(Empty):
+                news = self._news.get(timeout=LOOK)
+                if isinstance(news, Exception):
+                    raise news
+                return news
+        return None
 
-        A run whose worker dies is done again elsewhere. Where that happens to it repeatedly, Dask
-        gives it up, or its neighbours; each of them is then run once more with nothing beside it,
-        and has the outcome "crashed" if that kills workers again.
+    def _serve(self) -> None:
+        try:
+            with _client(self._address) as client, _registered(client, self._job) as name:
+                self._news.put([])
+                self._run(client, name)
+            self._news.put(None)
+        except Exception as error:
+            self._news.put(error)
 
-        Raises:
-            FmuError, InputError, BagError: from a run, for a reason that others will meet too.
-            SweepError: a worker failed otherwise, or the scheduler is gone.
-        """
-        batches = _Batches(points)
+    def _run(self, client: Client, name: str) -> None:
+        batches = self._batches
         tasks: dict[Future, list[Point]] = {}
         seen = time.monotonic()
-        while not stop():
-            workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
+        while batches.left and not self._ended.is_set():
+            workers = len(client.scheduler_info(n_workers=-1)["workers"])
             now = time.monotonic()
             seen = now if workers else seen
             if now - seen > NO_WORKER:
                 raise SweepError("no worker is left; go on with --resume")
-            self._mend()
             width = IN_HAND * max(1, workers)
+            # a worker's death is blamed on all that it had in hand
             while len(tasks) < width and (batch := batches.next(alone=not tasks)):
-                tasks[self._client.submit(run_batch, self._name, batch, pure=False)] = batch
-            if not tasks:
-                return
-            for future in _finished(tasks):
-                batch = tasks.pop(future)
-                try:
-                    rows, duration = future.result()
-                except KilledWorker:
-                    rows, duration = batches.suspect(batch), 0.0
-                except TwoDofError:
-                    raise
-                except CancelledError as error:
-                    raise SweepError("the scheduler is gone; go on with --resume") from error
-                except Exception as error:
-                    raise SweepError(f"a worker failed: {error!r:.300}") from error
-                batches.adapt(len(rows), duration)
-                if rows:
-                    yield rows
+                tasks[client.submit(run_batch, name, batch, pure=False)] = batch
+            with suppress(TimeoutError):
+                wait(list(tasks), timeout=LOOK, return_when="FIRST_COMPLETED")
+            for future in [future for future in tasks if future.done()]:
+                self._news.put(_result(future, tasks.pop(future), batches))
 
 
-class _Batches:
-    """Cuts points into batches of about a quarter of a second."""
-
-    def __init__(self, points: Iterator[Point]) -> None:
-        self._points = points
-        self._suspects: deque[Point] = deque()
-        self._tried: Point | None = None
-        self._size = 1
-
-    def next(self, *, alone: bool) -> list[Point]:
-        """The next one; empty at the end, or if what is left must run with nothing beside it."""
-        if self._tried is not None and not alone:
-            return []
-        self._tried = None
-        batch = [point for _, point in zip(range(self._size), self._points)]
-        if not batch and alone and self._suspects:
-            self._tried = self._suspects.popleft()
-            return [self._tried]
-        return batch
-
-    def suspect(self, batch: Sequence[Point]) -> list[Row]:
-        """Take back what Dask gave up; the rows of what ran alone and is at fault."""
-        if self._tried is not None:
-            return [_crashed(*self._tried)]
-        self._suspects.extend(batch)
-        return []
-
-    def adapt(self, count: int, duration: float) -> None:
-        """Learn how long runs take, s."""
-        if duration > 0.0:
-            fitting = int(BATCH_TIME * count / duration)
-            self._size = max(1, min(MAX_BATCH, fitting, 4 * self._size))
-
-
-def _finished(tasks: dict[Future, Any]) -> list[Future]:
-    """Those that are done, after a wait of half a second at most."""
+def _result(future: Future, batch: list[Point], batches: Batches) -> list[Row]:
     try:
-        return list(wait(list(tasks), timeout=0.5, return_when="FIRST_COMPLETED").done)
-    except TimeoutError:
-        return []
-
-
-def _crashed(number: int, values: tuple[float, ...]) -> Row:
-    metrics = [nan] * len(METRICS)
-    return (number, *values, *metrics, nan, "crashed", "the process that ran it died, repeatedly")
-
-
-@contextmanager
-def _local(count: int) -> Iterator[tuple[Client, Callable[[], object]]]:
-    """Processes of this machine, and what replaces those that have died.
-
-    They are started by hand: Dask's nannies give up on workers that die as they start, and import
-    the program's main module. In a session of their own, the terminal's Ctrl-C is not for them.
-    """
-    with ExitStack() as stack:
-        stack.enter_context(_silent(logging.getLogger("distributed")))
-        stack.enter_context(dask.config.set(CONFIG))
-        cluster = stack.enter_context(
-            LocalCluster(
-                n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL
-            )
-        )
-        folder = stack.enter_context(temporary_folder())
-        command = [
-            sys.executable, "-m", "distributed.cli.dask_worker", cluster.scheduler_address,
-            "--no-nanny", "--nthreads", "1", "--no-dashboard", "--memory-limit", "0",
-            "--death-timeout", f"{START_TIME:g}", "--local-directory", str(folder),
-        ]  # fmt: skip
-        path = os.pathsep.join(entry for entry in sys.path if entry)
-        environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": path, "TMPDIR": str(folder)}
-        start = partial(
-            subprocess.Popen, command, env=environment, start_new_session=True,
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        workers: list[subprocess.Popen[Any]] = []
-        stack.callback(_end, workers)
-
-        def mend() -> None:
-            workers[:] = [worker for worker in workers if worker.poll() is None]
-            while len(workers) < count:
-                workers.append(start())
-
-        mend()
-        client = stack.enter_context(Client(cluster))
-        try:
-            client.wait_for_workers(1, timeout=START_TIME)
-        except TimeoutError:
-            raise SweepError(f"no worker has started: try {shlex.join(command)}") from None
-        yield client, mend
-
-
-def _end(workers: Sequence[subprocess.Popen[Any]]) -> None:
-    for worker in workers:
-        worker.kill()  # what they have, they have told; their folder goes with this process
-    for worker in workers:
-        worker.wait()
+        return batches.done(*future.result())
+    except KilledWorker:
+        return batches.died(batch)
+    except TwoDofError:
+        raise
+    except CancelledError as error:
+        raise SweepError("the scheduler is gone; go on with --resume") from error
+    except Exception as error:
+        raise SweepError(f"a worker failed: {error!r:.300}") from error
 
 
 @contextmanager
-def _silent(logger: logging.Logger) -> Iterator[None]:
-    """It tells of every worker that comes and goes, and of some that are slow to."""
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
-@contextmanager
-def _remote(address: str) -> Iterator[tuple[Client, Callable[[], object]]]:
-    """The workers of a cluster that runs already, which mends itself."""
+def _client(address: str) -> Iterator[Client]:
     try:
         client = Client(address, timeout=PATIENCE)
     except (OSError, ValueError, TypeError) as error:
@@ -288,7 +160,7 @@ def _remote(address: str) -> Iterator[tuple[Client, Callable[[], object]]]:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError:
             raise SweepError(f"the scheduler '{address}' has no workers") from None
-        yield client, lambda: None
+        yield client
 
 
 @contextmanager
@@ -300,7 +172,7 @@ def _registered(client: Client, job: Job) -> Iterator[str]:
     except TwoDofError:
         raise
     except Exception as error:  # Dask hands on what a worker said, as one of these
-        remedy = f"install twodof {__version__} and its extra 'sweep' there"
+        remedy = f"install twodof {__version__} and its extra 'cluster' there"
         raise SweepError(f"a worker cannot take the job: {error!s:.300}; {remedy}") from error
     try:
         yield name

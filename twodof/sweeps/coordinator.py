@@ -1,10 +1,11 @@
-"""Many runs of one FMU: a design, its runs on Dask's workers, and a table of their metrics."""
+"""Many runs of one FMU: a design, its runs in other processes, and a table of their metrics."""
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,15 +16,16 @@ from ..files import temporary_folder
 from ..fmu import Fmu, load_fmu
 from ..inputs import Setting
 from ..master import experiment
-from .cluster import Cluster
+from .batches import Batches
 from .design import make_design
+from .pool import Pool
 from .results import Results, read_sweep
-from .runner import Job, Point
+from .runner import Job, Point, Row
 
 if TYPE_CHECKING:
     import pandas
 
-PACKAGES = ("numpy", "fmpy", "distributed", "pandas", "pyarrow")
+PACKAGES = ("numpy", "fmpy", "pandas", "pyarrow")
 
 
 def sweep(
@@ -61,15 +63,17 @@ def sweep(
         output: folder for the table; None: it is not kept.
         resume: go on with the sweep in ``output``; what is done is not repeated.
         bags: write a bag of each run, ``output``/bags/<run>; workers must see that folder.
-        workers: local processes; None: as many as there are cores.
-        scheduler: address of a Dask scheduler whose workers are to be used instead.
+        workers: processes of this machine; None: as many as there are cores.
+        scheduler: address of a Dask scheduler whose workers are to be used instead. Who can reach
+            it runs code as you, unless Dask is configured to use TLS.
         progress: told the number of runs that are done, and of all.
-        stop: asked twice a second; True ends the sweep with what it has.
+        stop: asked at least twice a second; True ends the sweep with what it has.
         command_line: for the provenance.
 
     Raises:
         InputError, FmuError: the design or the FMU is wrong.
         SweepError: naming the folder, the scheduler or the workers at fault.
+        ChildError: a worker failed for another reason.
         BagError: a bag cannot be written.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
@@ -96,15 +100,26 @@ def sweep(
         progress(int(results.done.sum()), len(design))
         missing = np.flatnonzero(~results.done)
         with ExitStack() as stack:
-            if len(missing):
-                cluster = stack.enter_context(Cluster(job, workers, scheduler))
+            batches = Batches(_points(missing, design.points()), len(missing))
+            runs = _runs(job, batches, workers, scheduler, stop)
+            news = stack.enter_context(runs) if len(missing) else iter(())
             stack.enter_context(results)  # writes nothing before the workers are there
-            if len(missing):
-                for rows in cluster.run(_points(missing, design.points()), stop):
-                    results.add(rows)
-                    progress(int(results.done.sum()), len(design))
+            for rows in news:
+                results.add(rows)
+                progress(int(results.done.sum()), len(design))
         table, _ = read_sweep(path)
     return table
+
+
+def _runs(
+    job: Job, batches: Batches, count: int | None, scheduler: str | None, stop: Callable[[], bool]
+) -> AbstractContextManager[Iterator[list[Row]]]:
+    """Workers, as a context of the rows that come from them."""
+    if scheduler is None:
+        return Pool(job, batches, os.cpu_count() or 1 if count is None else count, stop)
+    from .cluster import Cluster  # Dask takes a second to import
+
+    return Cluster(job, batches, scheduler, stop)
 
 
 def _points(numbers: Iterable[int], values: Any) -> Iterator[Point]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from math import nan
@@ -13,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bag import Bag
 from ..errors import SimulationError
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
@@ -85,6 +85,8 @@ class Runner:
         trace = _Trace()
         sinks: list[Sink] = [trace]
         if self._job.bags is not None:
+            from ..bag import Bag  # rosbags takes half a second to import
+
             sinks.append(Bag(Path(self._job.bags) / f"{number:06d}", overwrite=True))
         try:
             simulate(run, *sinks, instance=self._fresh())
@@ -95,6 +97,11 @@ class Runner:
         metrics = trace.metrics()
         found = [metrics[name] for name in METRICS]
         return (number, *values, *found, run.time(run.steps), "finished", None)
+
+    def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
+        """Rows of some points, and the time they took, s; errors as of ``run``."""
+        begin = time.perf_counter()
+        return [self.run(point) for point in points], time.perf_counter() - begin
 
     def _fresh(self) -> Instance:
         """The instance as it was instantiated."""

@@ -1,0 +1,58 @@
+"""The runs of a sweep as workers take them, and what becomes of those whose worker dies."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from itertools import islice
+from math import nan
+
+from .metrics import METRICS
+from .runner import Point, Row
+
+BATCH_TIME = 0.25  # s, of one batch
+MAX_BATCH = 256
+MOST_DEATHS = 3  # of a run's worker, two of them while it ran alone
+LOOK = 0.2  # s between two looks at whether to go on
+
+
+class Batches:
+    """Cuts points into batches of about a quarter of a second.
+
+    A run whose worker dies is done again, with nothing beside it that could be at fault. Where that
+    kills its worker twice more, it has the outcome "crashed".
+
+    Args:
+        points: of all runs.
+        left: number of runs that have no row yet.
+    """
+
+    def __init__(self, points: Iterator[Point], left: int) -> None:
+        self._points, self.left = points, left
+        self._size = 1
+        self._suspects: deque[Point] = deque()
+        self._deaths: Counter[int] = Counter()
+
+    def next(self, *, alone: bool) -> list[Point]:
+        """The next one; empty if all are taken, or if what is left must run alone and would not."""
+        batch = list(islice(self._points, self._size))
+        return [self._suspects.popleft()] if not batch and alone and self._suspects else batch
+
+    def done(self, rows: list[Row], duration: float) -> list[Row]:
+        """The rows of a batch, after a look at the time it took, s."""
+        self.left -= len(rows)
+        if duration > 0.0:
+            fitting = int(BATCH_TIME * len(rows) / duration)
+            self._size = max(1, min(MAX_BATCH, fitting, 4 * self._size))
+        return rows
+
+    def died(self, batch: list[Point]) -> list[Row]:
+        """Rows of those runs of a batch that are given up, now that its worker has died."""
+        self._deaths.update(number for number, _ in batch)
+        self._suspects.extend(p for p in batch if self._deaths[p[0]] < MOST_DEATHS)
+        return self.done([_crashed(*p) for p in batch if self._deaths[p[0]] >= MOST_DEATHS], 0.0)
+
+
+def _crashed(number: int, values: tuple[float, ...]) -> Row:
+    metrics = [nan] * len(METRICS)
+    return (number, *values, *metrics, nan, "crashed", "the process that ran it died, repeatedly")
