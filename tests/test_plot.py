@@ -1191,7 +1191,7 @@ BAD: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "entities": (
         '<!DOCTYPE robot [<!ENTITY a "b">]>' + chain_urdf("zz"), {}, "document type declaration",
     ),
-    "no joints": ('<robot name="r"><link name="a"/></robot>', {}, "no frame|no moving joint"),
+    "no joints": ('<robot name="r"><link name="a"/></robot>', {}, "no frame|no moving joint|no joint moves"),
     "a planar joint": (chain_urdf("zz").replace("revolute", "planar"), {}, "'j1' is of type 'plan"),
     "no such frame": (chain_urdf("zz"), {"frame": "hand"}, "no frame 'hand'.*: base, l1, l2, tip$"),
     "a frame at rest": (chain_urdf("zz"), {"frame": "base"}, "no joint moves the frame 'base'"),
