@@ -61,8 +61,9 @@ def main() -> None:
         return browse(sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, build_fmu
-    from twodof.live import Loop, page_of
-    from twodof.master import experiment
+    from twodof.experiment import experiment
+    from twodof.pages.live import page_of
+    from twodof.pages.loop import Loop
 
     with tempfile.TemporaryDirectory() as folder:
         native = sys.argv[2:3] != ["python"]

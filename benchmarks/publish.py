@@ -58,8 +58,9 @@ def receive() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from twodof.bag.messages import JOINT_STATE, STREAM
-    from twodof.publish import Network, dds_qos, dds_type, open_domain
+    from twodof.ros.messages import JOINT_STATE, STREAM
+    from twodof.ros.network import Network, open_domain
+    from twodof.ros.publisher import dds_qos, dds_type
 
     _domain, _interfaces = open_domain(Network(DOMAIN, loopback=True))
     participant = DomainParticipant(DOMAIN)
@@ -94,7 +95,7 @@ def main() -> None:
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, Publisher, build_fmu, experiment, simulate
     from twodof.master import RealTime
-    from twodof.publish import Network
+    from twodof.ros.network import Network
 
     with tempfile.TemporaryDirectory() as folder:
         native = sys.argv[2:3] != ["python"]

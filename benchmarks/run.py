@@ -51,8 +51,12 @@ sys.path[:0] = [str(HERE), str(ROOT)]
 from listing import PendulumSimulator  # noqa: E402
 
 import twodof  # noqa: E402
-from twodof.flavours import native_flavour  # noqa: E402
-from twodof.native import FLAGS, compile_library, host_platform  # noqa: E402
+from twodof.export.compiler import (  # noqa: E402
+    FLAGS,
+    compile_library,
+    host_platform,
+)
+from twodof.export.flavours import native_flavour  # noqa: E402
 from twodof.plant.plant import Plant  # noqa: E402
 from twodof.plant.robot import Robot, load_robot  # noqa: E402
 from twodof.plant.variables import variable_table  # noqa: E402
@@ -499,7 +503,9 @@ def bare_rosbags(stack: ExitStack, path: Path, storage: str) -> Callable[[int], 
 
 def help_time() -> float:
     """Median time of five ``twodof --help``, each a process of its own, s."""
-    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from twodof.cli import main; main()"
+    program = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r}); from twodof.cli.main import main; main()"
+    )
     walls = []
     for _ in range(5):
         begin = time.perf_counter()

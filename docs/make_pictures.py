@@ -26,9 +26,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import twodof  # noqa: E402
-from twodof.figure import drawn  # noqa: E402
-from twodof.plot import plot_bags  # noqa: E402
-from twodof.sweeps.map import drawing  # noqa: E402
+from twodof.plots.figure import drawn  # noqa: E402
+from twodof.plots.runs import plot_bags  # noqa: E402
+from twodof.plots.sweeps import drawing  # noqa: E402
 
 LINK = 0.15  # m
 LINK_COLOURS = {"link1": (0.33, 0.40, 0.49), "link2": (0.96, 0.55, 0.14)}

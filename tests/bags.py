@@ -20,7 +20,8 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from twodof.master import Experiment, Sample
+from twodof.experiment import Experiment
+from twodof.master import Sample
 
 STORAGES = ("mcap", "sqlite3")
 START = 1_700_000_000  # s since the epoch

@@ -45,7 +45,7 @@ HOSTILE = (
     "[link](javascript:document.title='ran') &lt;"
 )
 """What a page must show as it is."""
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
 ROWS = """() => Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
     cell => [cell.dataset.value, cell.textContent]))"""
 PLOTS = """() => Object.values(window.__viserTestpoints.uplots).map(({chart}) =>

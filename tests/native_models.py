@@ -16,7 +16,8 @@ import fmpy
 import numpy as np
 import pinocchio as pin
 
-from twodof.native import compile_library, host_platform, model_header
+from twodof.export.compiler import compile_library, host_platform
+from twodof.export.native import model_header
 from twodof.plant.plant import Plant
 from twodof.plant.robot import Robot, load_robot
 from twodof.plant.variables import Variable, variable_table

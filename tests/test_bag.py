@@ -50,7 +50,8 @@ from sinks import Collector
 
 import twodof
 from twodof.errors import BagError, InputError
-from twodof.master import Experiment, Sample
+from twodof.experiment import Experiment
+from twodof.master import Sample
 
 KIB, MIB = 1024, 1024**2
 

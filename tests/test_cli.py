@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 import twodof
-from twodof.cli import main
+from twodof.cli.main import main
 
 ROOT = Path(__file__).parents[1]
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 

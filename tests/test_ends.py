@@ -17,9 +17,9 @@ import pytest
 from bags import START, assert_consistent, both_storages, read_with_rosbags
 
 from twodof import cli
-from twodof.cli import main
+from twodof.cli.main import main
 
-TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
 ENDLESS = ["--stop-time", "1e5", "--stamp-start", str(START)]
 
 

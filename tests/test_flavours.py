@@ -10,7 +10,7 @@ from oracles import position, task_error
 
 import twodof
 from twodof import FmuOptions, build_fmu
-from twodof.cli import main
+from twodof.cli.main import main
 
 RUNS = {
     "default": {},
@@ -78,8 +78,10 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("twodof.native.host_platform", lambda: "darwin64")
-    monkeypatch.setattr("twodof.build.host_platform", lambda: "linux64")  # what can run here
+    monkeypatch.setattr("twodof.export.compiler.host_platform", lambda: "darwin64")
+    monkeypatch.setattr(
+        "twodof.export.package.host_platform", lambda: "linux64"
+    )  # what can run here
     assert main(["run", "--stop-time", "0.1", "-o", "bag"]) == 0
     captured = capsys.readouterr()
     assert "the Python flavour is for Linux x86-64: building the native one" in captured.err
@@ -87,7 +89,7 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
 
 
 def test_a_machine_that_is_no_fmi_platform_needs_to_be_told_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("twodof.build.host_platform", lambda: "")
+    monkeypatch.setattr("twodof.export.package.host_platform", lambda: "")
     with pytest.raises(twodof.TwoDofError, match="choose one with --platform"):
         build_fmu(tmp_path / "A.fmu", FmuOptions(native=True))
 

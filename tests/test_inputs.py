@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import twodof
+from twodof.cli.common import parse_settings
 from twodof.errors import InputError
+from twodof.experiment import Setting, read_changes, resolve
 from twodof.fmu import Fmu
-from twodof.inputs import Setting, parse_settings, read_changes, resolve
 from twodof.master import Sample
 
 

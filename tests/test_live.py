@@ -40,7 +40,7 @@ from harness import asked, children_of, lives, wait_until
 from playwright.sync_api import Browser, Page
 
 import twodof
-from twodof.live import live
+from twodof.pages.live import live
 
 Q_START = np.array([0.5, 0.35])
 KP, KD = 50.0, 40.0  # those of the default FMU
@@ -503,7 +503,7 @@ def test_port_in_use(native_path: Path, tmp_path: Path) -> None:
 
 PROGRAM = """
 import sys
-from twodof.live import live
+from twodof.pages.live import live
 def run():
     urls = []
     live(sys.argv[-1], lambda: bool(urls), urls.append, port=0)

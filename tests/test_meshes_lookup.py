@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from twodof.errors import BuildError
-from twodof.meshes import collect_meshes
+from twodof.export.meshes import collect_meshes
 
 FILES = {
     "ws/arm_description/package.xml": b"<package/>",

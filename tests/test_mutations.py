@@ -37,7 +37,7 @@ from rosbags.typesys import Stores, get_typestore
 from sinks import resident
 
 import twodof
-from twodof.cli import main
+from twodof.cli.main import main
 from twodof.errors import FmuError
 
 if sys.version_info >= (3, 14):
@@ -115,7 +115,14 @@ class Worker:
         self._process.communicate()
 
 
-MODULES = ("twodof.bag", "twodof.build", "twodof.master", "twodof.scene", "lxml.etree", "tqdm")
+MODULES = (
+    "twodof.bag",
+    "twodof.export.package",
+    "twodof.master",
+    "twodof.ros.scene",
+    "lxml.etree",
+    "tqdm",
+)
 
 
 def serve() -> None:

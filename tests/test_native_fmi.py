@@ -22,8 +22,8 @@ from harness import needs
 from native_models import GUID, HERE, executable, library, model
 
 from twodof.errors import BuildError
+from twodof.export.compiler import compile_library, universal
 from twodof.files import TEMPORARY
-from twodof.native import compile_library, universal
 
 OK, WARNING, DISCARD, ERROR = range(4)
 

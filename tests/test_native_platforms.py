@@ -21,9 +21,9 @@ import pytest
 from harness import in_child_process, needs
 
 from twodof import FmuOptions, build_fmu
-from twodof.cli import main
+from twodof.cli.main import main
 from twodof.errors import BuildError
-from twodof.native import TARGETS, host_platform
+from twodof.export.compiler import TARGETS, host_platform
 
 HOST = Path(__file__).parent / "native" / "host.c"
 PLATFORMS = ("linux64", "win64", "darwin64")
@@ -311,7 +311,7 @@ def test_own_compiler_serves_without_zig(shipped, tmp_path, without_zig):
 def build_elsewhere(folder: Path, *platforms: str, **environment: str) -> bytes:
     """An FMU from a process of its own, in a folder of its own."""
     folder.mkdir()
-    command = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+    command = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
     command += ["build", "-o", "arm.fmu", "--native"]
     for platform in platforms:
         command += ["--platform", platform]

@@ -18,8 +18,8 @@ import pytest
 from sinks import Collector
 
 import twodof
-from twodof.live import Loop
-from twodof.track import read_tracks
+from twodof.pages.loop import Loop
+from twodof.plots.track import read_tracks
 
 TARGETS = {0: (0.2, 0.05), 20: (0.15, 0.1), 45: (0.1, 0.2)}  # by the step that they hold from
 STEPS = 80

@@ -29,11 +29,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import twodof
-from twodof.cli import main
-from twodof.publish import LAST_DOMAIN, Network, network
+from twodof.cli.main import main
+from twodof.ros.network import LAST_DOMAIN, Network, network
 
 HERE = Path(__file__).resolve().parent
-TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
 STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
 LATCHED = ("/robot_description", "/tf_static")
 COMMANDS = ("/target_command", "/clicked_point")
@@ -506,8 +506,8 @@ import sys, time
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
-from twodof.bag.messages import STREAM
-from twodof.publish import dds_qos, dds_type
+from twodof.ros.messages import STREAM
+from twodof.ros.publisher import dds_qos, dds_type
 
 number, configuration = int(sys.argv[1]), sys.argv[2]
 domain = Domain(number, f"<CycloneDDS><Domain>{configuration}</Domain></CycloneDDS>")
@@ -577,7 +577,7 @@ import sys
 import twodof
 from sinks import Memory
 from twodof.master import RealTime
-from twodof.publish import Publisher
+from twodof.ros.publisher import Publisher
 
 steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
 run = twodof.experiment(sys.argv[1], stop_time=steps / 100)

@@ -108,7 +108,7 @@ MCAPS: dict[str, Callable[[], bytes]] = {
 COMMAND = """
 import resource, sys
 import twodof
-from twodof.cli import main
+from twodof.cli.main import main
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 import twodof.bag
 status = main(sys.argv[1:])

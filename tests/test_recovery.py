@@ -39,11 +39,11 @@ from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 import twodof
-from twodof.cli import main
+from twodof.cli.main import main
 from twodof.errors import BagError
-from twodof.master import Experiment
+from twodof.experiment import Experiment
 
-TWODOF = [sys.executable, "-c", "from twodof.cli import main; raise SystemExit(main())"]
+TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
 BATCH = 40  # samples between two flushes
 
 
@@ -241,7 +241,7 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
     tmp_path: Path, compression: CompressionMode
 ) -> None:
     """Two files, as of a recorder that splits; the last lacks its end."""
-    from twodof.bag.messages import LATCHED
+    from twodof.ros.messages import LATCHED
 
     text = STORE.types["std_msgs/msg/String"]
     expected = []

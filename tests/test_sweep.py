@@ -28,17 +28,17 @@ from harness import asked, changed_plant, children_of, lay_traps, lives, needs, 
 
 import twodof
 from twodof import TwoDofError, sweep
-from twodof.cli import main
-from twodof.figure import drawn, save
+from twodof.cli.main import main
+from twodof.plots.figure import drawn, save
+from twodof.plots.sweeps import drawing
 from twodof.sweeps import runner as runner_module
-from twodof.sweeps.map import drawing
 from twodof.sweeps.metrics import METRICS
 from twodof.sweeps.results import read_sweep
 from twodof.sweeps.runner import Job, Runner
 
 Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
 STEP, STOP = 0.01, 5.0
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
 SMALL = {"Kp": (20.0, 60.0, 180.0), "Kd": (8.0, 30.0)}
 GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
 

@@ -41,9 +41,9 @@ from mcap_ros2.decoder import DecoderFactory
 from playwright.sync_api import Browser, Page
 
 import twodof
-import twodof.page
-from twodof.page import BUCKETS, outline
-from twodof.view import nearest
+import twodof.pages.page
+from twodof.pages.replay import nearest
+from twodof.pages.widgets import BUCKETS, outline
 
 CHANGE = 2.0  # s
 TARGETS = ((0.2, 0.05), (0.1, 0.2))
@@ -399,7 +399,7 @@ def test_page_answers_to_its_own_name_and_its_own_page_alone(
     host: str, own: Sequence[str], other: Sequence[str]
 ) -> None:
     """Requests for the page and for a websocket, with the headers that a browser sends."""
-    with twodof.page.Page("", host, 0) as served:
+    with twodof.pages.page.Page("", host, 0) as served:
         for rest, fine in (((), 200), (browser.UPGRADE, 101)):
             for name in names_of(*other):
                 asked = ("Host", name), *rest

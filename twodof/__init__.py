@@ -1,71 +1,77 @@
-"""From a URDF to an FMU that every FMI tool loads, from a co-simulation to a ROS 2 bag."""
+"""From a URDF to an FMU that every FMI tool loads, from a co-simulation to a ROS 2 bag.
+
+fmu = twodof.build_fmu("TwoDof.fmu")
+summary = twodof.simulate(fmu, twodof.Bag("my_bag"), stop_time=5)
+"""
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from .version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from .bag import Bag, Run, read_bag, recover
-    from .build import FmuOptions, build_fmu
-    from .errors import TwoDofError
-    from .fmu import Fmu, load_fmu
-    from .master import RealTime, Sample, Sink, Summary, experiment, samples, simulate
-    from .plot import plot_bags
-    from .publish import Publisher
-    from .sweeps.coordinator import sweep
-    from .sweeps.results import read_sweep
+    from .bag.reader import Run as Run
+    from .bag.reader import read_bag as read_bag
+    from .bag.recovery import recover as recover
+    from .bag.writer import Bag as Bag
+    from .errors import TwoDofError as TwoDofError
+    from .experiment import Experiment as Experiment
+    from .experiment import experiment as experiment
+    from .export.package import FmuOptions as FmuOptions
+    from .export.package import build_fmu as build_fmu
+    from .fmu import Fmu as Fmu
+    from .fmu import load_fmu as load_fmu
+    from .master import RealTime as RealTime
+    from .master import Sample as Sample
+    from .master import Sink as Sink
+    from .master import Summary as Summary
+    from .master import samples as samples
+    from .master import simulate as simulate
+    from .pages.live import live as live
+    from .pages.replay import view as view
+    from .plots.runs import plot_bags as plot_bags
+    from .ros.publisher import Publisher as Publisher
+    from .sweeps.coordinator import sweep as sweep
+    from .sweeps.results import read_sweep as read_sweep
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
-_HOME = {
-    "Bag": "bag",
-    "Run": "bag",
-    "read_bag": "bag",
-    "read_sweep": "sweeps.results",
-    "recover": "bag",
-    "FmuOptions": "build",
-    "build_fmu": "build",
-    "TwoDofError": "errors",
-    "Fmu": "fmu",
-    "load_fmu": "fmu",
-    "RealTime": "master",
-    "Sample": "master",
-    "Sink": "master",
-    "Summary": "master",
-    "experiment": "master",
-    "plot_bags": "plot",
-    "Publisher": "publish",
-    "samples": "master",
-    "simulate": "master",
-    "sweep": "sweeps.coordinator",
+_HOMES = {
+    "bag.reader": ("Run", "read_bag"),
+    "bag.recovery": ("recover",),
+    "bag.writer": ("Bag",),
+    "errors": ("TwoDofError",),
+    "experiment": ("Experiment", "experiment"),
+    "export.package": ("FmuOptions", "build_fmu"),
+    "fmu": ("Fmu", "load_fmu"),
+    "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
+    "pages.live": ("live",),
+    "pages.replay": ("view",),
+    "plots.runs": ("plot_bags",),
+    "ros.publisher": ("Publisher",),
+    "sweeps.coordinator": ("sweep",),
+    "sweeps.results": ("read_sweep",),
 }
-__all__ = [
-    "Bag",
-    "Fmu",
-    "FmuOptions",
-    "Publisher",
-    "RealTime",
-    "Run",
-    "Sample",
-    "Sink",
-    "Summary",
-    "TwoDofError",
-    "build_fmu",
-    "experiment",
-    "load_fmu",
-    "plot_bags",
-    "read_bag",
-    "read_sweep",
-    "recover",
-    "samples",
-    "simulate",
-    "sweep",
-]
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+__all__ = [*sorted(_HOME), "__version__"]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    if name not in _HOME:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    from .errors import TwoDofError
+
+    try:
+        value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    except TwoDofError as error:  # an extra is missing, which it says when it is used
+        missing = error
+
+        def value(*_arguments: object, **_named: object) -> None:
+            raise missing
+
+    return value

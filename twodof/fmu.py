@@ -26,7 +26,7 @@ from fmpy.model_description import ModelDescription, ScalarVariable
 from .errors import ZIP_ERRORS, FmuError, SimulationError
 from .files import check_archive, temporary_folder
 
-logger = logging.getLogger("twodof.fmu")
+logger = logging.getLogger(__name__)
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 

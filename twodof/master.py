@@ -13,22 +13,18 @@ from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
-from fractions import Fraction
 from itertools import accumulate, count
-from math import dist, inf, isfinite
+from math import dist, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .errors import InputError, SimulationError
-from .fmu import Fmu, Instance, instantiate, load_fmu
-from .inputs import Changes, Setting, Value, read_changes, resolve
+from .errors import SimulationError
+from .experiment import NANOSECONDS, TIME_TOLERANCE, Experiment, Setting, Value, experiment, resolve
+from .fmu import Fmu, Instance, instantiate
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-TIME_TOLERANCE = 1e-9
-NANOSECONDS = 1_000_000_000
-LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
 OUTPUTS = ("q", "v", "x", "tau")
 
@@ -97,121 +93,6 @@ class Sink:
 
 Resume = Callable[[Sample, SimulationError], Mapping[str, Setting] | None]
 """What a run goes on with after a step that was discarded: the sample before it, and the reason."""
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """One run of an FMU, checked before anything is instantiated; made by ``experiment``.
-
-    Attributes:
-        fmu: the FMU.
-        start_time, step: s.
-        steps: N, the number of communication steps; infinite for a run without end.
-        start_values: all inputs and parameters with the values they start with.
-        given: those of them that differ from the model description on purpose.
-        changes: inputs over time.
-        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
-    """
-
-    fmu: Fmu
-    start_time: float
-    step: float
-    steps: float
-    start_values: Mapping[str, Value]
-    given: Mapping[str, Value]
-    changes: Changes
-    stamp_start: float | None
-
-    def time(self, k: float) -> float:
-        """Time after k steps, s; never accumulated."""
-        return self.start_time + k * self.step
-
-    def first_stamp(self) -> int:
-        """Stamp of the first sample if the run began now, ns since the epoch.
-
-        Raises:
-            InputError: ROS 2 has no such time.
-        """
-        start = self.stamp_start
-        # a fraction: a double of today's nanoseconds is good to 256 only
-        first = time.time_ns() if start is None else round(Fraction(start) * NANOSECONDS)
-        last = first + (self.steps * self.step * NANOSECONDS if self.steps < inf else 0)
-        if not 0 <= first <= last <= LATEST_STAMP:
-            whose = "the wall clock" if start is None else f"stamp_start = {start:g} s"
-            raise InputError(f"the stamps of a run from {whose} on are not those of 1970 to 2038")
-        return first
-
-
-def experiment(
-    fmu: Fmu | str | Path,
-    *,
-    start_time: float = 0.0,
-    stop_time: float = 5.0,
-    step: float = 0.01,
-    settings: Mapping[str, Setting] | None = None,
-    input_file: str | Path | None = None,
-    stamp_start: float | None = None,
-) -> Experiment:
-    """Check what a run is asked to do.
-
-    Args:
-        fmu: the FMU or its path.
-        start_time, stop_time, step: s; the stop a whole number of steps after the start, or
-            infinite.
-        settings: start values of inputs and parameters by name; a vector's name takes one value
-            for all elements or a sequence.
-        input_file: CSV of inputs over time (``inputs.read_changes``).
-        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
-
-    Raises:
-        InputError, FmuError: naming what is wrong.
-    """
-    fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
-    given = resolve(fmu, settings or {})
-    changes = [] if input_file is None else read_changes(fmu, input_file)
-    for name in changes[0][1] if changes else ():
-        if name in given:
-            raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
-    if stamp_start is not None and not isfinite(stamp_start):
-        raise InputError(f"stamp_start = {stamp_start} is not finite")
-    run = Experiment(
-        fmu=fmu,
-        start_time=start_time,
-        step=step,
-        steps=_steps(start_time, stop_time, step),
-        start_values={**_declared_starts(fmu), **given},
-        given=given,
-        changes=changes,
-        stamp_start=stamp_start,
-    )
-    run.first_stamp()  # which refuses what has none
-    return run
-
-
-def _steps(start: float, stop: float, h: float) -> float:
-    if not (h > 0.0 and isfinite(h)):
-        raise InputError(f"step {h:g} s must be > 0")
-    if stop == inf and isfinite(start):
-        return inf
-    if not (isfinite(start) and isfinite(stop) and stop > start):
-        raise InputError(f"stop time {stop:g} s must be after the start time {start:g} s")
-    if not isfinite((stop - start) / h):
-        raise InputError(f"step {h!r} s is too small for a run of {stop - start:g} s")
-    steps = round((stop - start) / h)
-    if abs(steps * h - (stop - start)) > TIME_TOLERANCE * h * max(1, steps):
-        raise InputError(f"the run of {stop - start:g} s is no whole number of steps of {h:g} s")
-    return steps
-
-
-def _declared_starts(fmu: Fmu) -> dict[str, Value]:
-    starts: dict[str, Value] = {}
-    for name, variable in fmu.variables.items():
-        if variable.causality in ("input", "parameter") and variable.start is not None:
-            if variable.type == "Boolean":
-                starts[name] = variable.start in ("true", "1")
-            elif variable.type == "Real":
-                starts[name] = float(variable.start)
-    return starts
 
 
 class RealTime:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 from pathlib import Path
 from typing import Any
 
-from .. import __version__
 from ..errors import BagError
+from ..experiment import Changes, Experiment
 from ..files import read_file
 from ..fmu import urdf_text
-from ..inputs import Changes
-from ..master import Experiment
+from ..version import versions
 
 FILE = "run.json"
 FORMAT = 1
@@ -93,12 +91,6 @@ def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
 def _as_json(content: Any) -> bytes:
     """Without a single space: writers of YAML, which holds it too, fold there, not all rightly."""
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
-
-
-def versions(*packages: str) -> dict[str, str]:
-    """Of this package, and of others that are installed."""
-    installed = {name: importlib.metadata.version(name) for name in packages}
-    return {"twodof": __version__, **installed}
 
 
 def read_provenance(path: Path) -> dict[str, Any]:

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
+from ..experiment import NANOSECONDS
 from ..files import is_being_written
-from ..master import NANOSECONDS
-from .messages import JOINT_STATE, JOINT_STATES, STORE, Array, JointStateLayout
+from ..ros.messages import JOINT_STATE, JOINT_STATES, STORE, Array, JointStateLayout
 from .provenance import read_provenance
 from .records import Channel, DamageError, read_messages, storage_files
 

@@ -18,10 +18,10 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
+from ..experiment import Experiment, Value
 from ..files import is_being_written, lock, read_file, sync
-from ..inputs import Value
-from ..master import Experiment, Sample, Sink
-from .messages import JOINT_STATES, STORE, Messages, Serialised
+from ..master import Sample, Sink
+from ..ros.messages import JOINT_STATES, STORE, Messages, Serialised
 from .provenance import ProvenanceFile, read_provenance
 from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter
 

@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
 from threading import Event, Lock, Thread
 
-from .. import __version__
 from ..errors import SweepError, TwoDofError
+from ..version import __version__
 from .batches import LOOK, Batches
 from .runner import Job, Point, Row, Runner
 

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..bag.provenance import versions
+from ..experiment import Setting, experiment
 from ..files import temporary_folder
 from ..fmu import Fmu, load_fmu
-from ..inputs import Setting
-from ..master import experiment
+from ..version import versions
 from .batches import Batches
 from .design import make_design
 from .pool import Pool

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..experiment import Setting, resolve
 from ..fmu import Fmu
-from ..inputs import Setting, resolve
 
 MAX_RUNS = 1_000_000
 

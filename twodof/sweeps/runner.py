@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SimulationError
+from ..experiment import Experiment, Value, experiment, resolve
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
-from ..inputs import Value, resolve
-from ..master import OUTPUTS, Experiment, Sample, Sink, experiment, simulate
+from ..master import OUTPUTS, Sample, Sink, simulate
 from .metrics import METRICS, measure
 
 Point = tuple[int, tuple[float, ...]]
@@ -85,7 +85,7 @@ class Runner:
         trace = _Trace()
         sinks: list[Sink] = [trace]
         if self._job.bags is not None:
-            from ..bag import Bag  # rosbags takes half a second to import
+            from ..bag.writer import Bag  # rosbags takes half a second to import
 
             sinks.append(Bag(Path(self._job.bags) / f"{number:06d}", overwrite=True))
         try:

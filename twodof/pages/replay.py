@@ -13,26 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .bag import Run, read_bag
-from .data import data_file
-from .errors import BuildError, FmuError, PageError
-from .files import write_file
-from .fmu import load_fmu, read_resource
-from .meshes import collect_meshes
-from .page import (
-    HOST,
-    PATH,
-    PLOT_RATE,
-    PORT,
-    RATE,
-    TRAIL,
-    Page,
-    Plot,
-    Readout,
-    Switch,
-)
-from .page_robot import PageRobot, ReadMesh
-from .track import read_tracks
+from ..bag.reader import Run, read_bag
+from ..data import data_file
+from ..errors import BuildError, FmuError, PageError
+from ..export.meshes import collect_meshes
+from ..files import write_file
+from ..fmu import load_fmu, read_resource
+from ..plots.track import read_tracks
+from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Page
+from .robot import PageRobot, ReadMesh
+from .widgets import Plot, Readout, Switch
 
 Array = NDArray[np.float64]
 

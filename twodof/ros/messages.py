@@ -19,10 +19,11 @@ from rosbags.interfaces import (
 from rosbags.typesys import Stores, get_typestore
 
 from ..errors import BagError
+from ..experiment import NANOSECONDS, Experiment
 from ..fmu import read_resource, urdf_text
-from ..master import NANOSECONDS, Experiment, Sample
+from ..master import Sample
 from ..plant.urdf import RobotError
-from ..scene import Scene, Transform
+from .scene import Scene, Transform
 
 Array = NDArray[np.float64]
 JOINT_STATES = "/joint_states"

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .bag import Run
+from ..bag.reader import Run
 from .figure import COLOURS, DASHES, GREY, INK, PALE, TICK_STYLE, Drawing, drawn
-from .track import JointTrack, Track, common_settings, labels, number, outcome, read_tracks, summary
+from .track import JointTrack, Track, number, read_tracks
+from .words import common_settings, labels, outcome, summary
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so

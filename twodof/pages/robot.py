@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .errors import PageError
-from .kinematics import Kinematics
+from ..errors import PageError
+from ..kinematics import Kinematics
+from ..plant.urdf import Joint, RobotError, Urdf, read_urdf
+from ..ros.scene import floats, load_mesh, origin
 from .page import COLOURS, Page
-from .plant.urdf import Joint, RobotError, Urdf, read_urdf
-from .scene import floats, load_mesh, origin
 
 Array = NDArray[np.float64]
 ReadMesh = Callable[[str], bytes | None]

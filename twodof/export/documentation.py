@@ -8,10 +8,10 @@ import importlib.metadata
 from collections.abc import Sequence
 from string import Template
 
-from .data import data_file
+from ..data import data_file
+from ..plant.robot import Robot
+from ..plant.variables import Variable
 from .flavours import Files, Flavour
-from .plant.robot import Robot
-from .plant.variables import Variable
 
 
 def documentation(

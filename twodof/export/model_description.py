@@ -5,8 +5,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
-from .plant.robot import Robot
-from .plant.variables import Variable
+from ..plant.robot import Robot
+from ..plant.variables import Variable
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},

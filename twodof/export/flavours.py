@@ -14,10 +14,11 @@ from typing import Any
 
 import pythonfmu
 
-from .data import data_file
-from .native import EXTENSIONS, compile_library, model_header
-from .plant.robot import Robot
-from .plant.variables import Variable
+from ..data import data_file
+from ..plant.robot import Robot
+from ..plant.variables import Variable
+from .compiler import EXTENSIONS, compile_library
+from .native import model_header
 
 Files = dict[str, bytes]
 """Contents by path inside the FMU."""
@@ -117,7 +118,7 @@ def native_flavour(
 
 def _slave_sources() -> Files:
     """The Python code of the FMU under names that no other FMU's code has."""
-    plant = Path(__file__).parent / "plant"
+    plant = Path(__file__).parents[1] / "plant"
     package = {f"plant/{path.name}": path.read_bytes() for path in plant.glob("*.py")}
     for name in PYTHONFMU_FILES:
         package[f"pythonfmu/{name}"] = (_pythonfmu() / name).read_bytes()

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import PlotError
-from ..figure import COLOURS, GREY, INK, PALE, TICK_STYLE, Drawing
-from .metrics import METRICS
-from .results import RANKED, ranked
+from ..sweeps.metrics import METRICS
+from ..sweeps.results import RANKED, ranked
+from .figure import COLOURS, GREY, INK, PALE, TICK_STYLE, Drawing
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so

@@ -7,8 +7,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from .errors import BuildError
-from .files import read_file
+from ..errors import BuildError
+from ..files import read_file
 
 MAX_MESHES = 256 * 1024**2  # bytes of all meshes together
 

@@ -14,9 +14,9 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from . import __version__
-from .errors import PlotError
-from .files import write_file
+from ..errors import PlotError
+from ..files import write_file
+from ..version import __version__
 
 try:
     import matplotlib.style

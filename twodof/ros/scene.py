@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .files import temporary_folder
-from .kinematics import Kinematics, Placement
-from .plant.urdf import Joint, RobotError, read_urdf
+from ..files import temporary_folder
+from ..kinematics import Kinematics, Placement
+from ..plant.urdf import Joint, RobotError, read_urdf
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # m
 MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
 """Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
-logger = logging.getLogger("twodof.scene")
+logger = logging.getLogger(__name__)
 
 
 class Transform(NamedTuple):

@@ -12,21 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import __version__
-from .data import data_file
+from ..data import data_file
+from ..errors import ZIP_ERRORS, BuildError
+from ..files import check_archive, read_file, write_file
+from ..plant.plant import Plant
+from ..plant.robot import Robot, load_robot
+from ..plant.urdf import RobotError
+from ..plant.variables import Variable, variable_table
+from ..version import __version__
+from .compiler import host_platform
 from .documentation import documentation
-from .errors import ZIP_ERRORS, BuildError
-from .files import check_archive, read_file, write_file
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
-from .native import host_platform
-from .plant.plant import Plant
-from .plant.robot import Robot, load_robot
-from .plant.urdf import RobotError
-from .plant.variables import Variable, variable_table
 
-logger = logging.getLogger("twodof.build")
+logger = logging.getLogger(__name__)
 
 DEFAULT_FRAME = "EndEffector"
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}

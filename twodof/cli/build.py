@@ -1,0 +1,78 @@
+"""build: an FMU from a URDF."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .common import controlled, print_next, print_table, quote
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    build = verbs.add_parser("build", help="build an FMU from a URDF")
+    build.add_argument("-o", dest="output", metavar="FILE.fmu", help="default: <name>.fmu")
+    build.add_argument("--urdf", type=Path, help="default: the shipped planar 2-DoF arm")
+    build.add_argument(
+        "--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes"
+    )
+    build.add_argument("--frame", default="EndEffector", help="controlled link (%(default)s)")
+    build.add_argument("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
+    build.add_argument(
+        "--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"),
+        help="m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)",
+    )  # fmt: skip
+    build.add_argument(
+        "--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m"
+    )
+    build.add_argument("--name", default="TwoDof", help="name of the model (%(default)s)")
+    build.add_argument(
+        "--link-environment", action="store_true",
+        help="remember in the FMU where this Python's packages are",
+    )  # fmt: skip
+    build.add_argument(
+        "--native", action="store_true", help="compiled C, which needs no Python where it runs"
+    )
+    build.add_argument(
+        "--platform", dest="platforms", action="append", default=[], metavar="P",
+        help="of a native FMU: linux64, win64, darwin64 or all; repeatable (this machine's)",
+    )  # fmt: skip
+    build.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from ..export.package import FmuOptions, build_fmu
+
+    gravity = None if options.gravity is None else tuple(options.gravity)
+    chosen = FmuOptions(
+        urdf=options.urdf,
+        mesh_dir=options.mesh_dir,
+        frame=options.frame,
+        axes=options.axes,
+        gravity=gravity,
+        q_start=None if options.q_start is None else tuple(options.q_start),
+        name=options.name,
+        link_environment=options.link_environment,
+        native=options.native,
+        platforms=_platforms(options.platforms),
+    )
+    path = build_fmu(options.output, chosen)
+    from ..fmu import load_fmu
+
+    fmu = load_fmu(path)
+    print_table(
+        ("FMU", f"{path} ({path.stat().st_size / 1024:.0f} KB, {', '.join(fmu.platforms)})"),
+        ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
+        ("controlled", controlled(fmu)),
+    )
+    print_next(f"twodof run {quote(path)}", f"twodof info {quote(path)}")
+    return 0
+
+
+def _platforms(chosen: Sequence[str]) -> tuple[str, ...]:
+    from ..export.compiler import TARGETS
+
+    return tuple(TARGETS) if "all" in chosen else tuple(dict.fromkeys(chosen))

@@ -1,0 +1,228 @@
+"""What several verbs do and print."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import BuildError, InputError, SimulationError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from ..bag.writer import Bag
+    from ..experiment import Experiment, Setting
+    from ..fmu import Fmu
+    from ..master import RealTime, Summary
+
+INTERRUPTED = 130
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM")
+SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
+PATIENCE = 5.0  # s for what is under way to end when it was asked to
+
+
+def parse_settings(texts: Iterable[str]) -> dict[str, Setting]:
+    """NAME=VALUE texts of a command line: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
+    settings: dict[str, Setting] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise InputError(f"--set {text}: expected NAME=VALUE")
+        if name in settings:
+            raise InputError(f"--set {name} is given twice")
+        settings[name] = _parse_value(name, value.strip())
+    return settings
+
+
+def _parse_value(name: str, text: str) -> Setting:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--set {name}={text}: '{text}' is not a number") from None
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Whether a signal asked the run to end; read between steps, so that a step is never cut.
+
+    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once, and
+    so does the clock where the first has no effect; more are ignored, as all that is left is
+    closing the bag.
+    """
+    asked = False
+
+    def ask(_number: int, _frame: object) -> None:
+        nonlocal asked
+        if asked:
+            for number in SIGNALS:
+                signal.signal(number, signal.SIG_IGN)
+            raise KeyboardInterrupt
+        asked = True
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+
+    before = {number: signal.signal(number, ask) for number in SIGNALS}
+    try:
+        yield lambda: asked
+    except SimulationError as error:
+        if asked:  # the Python flavour discards a step that is interrupted
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def experiment_of(options: argparse.Namespace, stop_time: float, step: float) -> Experiment:
+    """The experiment that the options ask for."""
+    from ..experiment import experiment
+
+    return experiment(
+        chosen_fmu(options), stop_time=stop_time, step=step,
+        settings=parse_settings(options.settings), input_file=options.input,
+        stamp_start=options.stamp_start,
+    )  # fmt: skip
+
+
+def bag_of(options: argparse.Namespace, path: str) -> Bag:
+    """The bag that the options ask for."""
+    from ..bag.writer import Bag
+
+    return Bag(
+        path,
+        storage=options.storage,
+        scene=options.scene,
+        effort=options.effort,
+        overwrite=options.overwrite,
+        fsync=options.fsync,
+        command_line=options.command_line,
+    )
+
+
+def fast_fmu(options: argparse.Namespace) -> Path:
+    """The FMU that is named, else the default arm's, native where it can be built."""
+    from ..export.package import FmuOptions, build_fmu
+
+    if options.fmu:
+        return Path(options.fmu)
+    try:
+        return build_fmu(None, FmuOptions(native=True))
+    except BuildError as error:
+        print(f"{error}; running the Python flavour, which is slower", file=sys.stderr)
+        return build_fmu(None, FmuOptions())
+
+
+def chosen_fmu(options: argparse.Namespace) -> Path:
+    """The FMU that is named, else the default arm's, built if need be."""
+    from ..export.compiler import host_platform
+    from ..export.package import FmuOptions, build_fmu
+
+    if options.fmu:
+        if options.native:
+            raise InputError("--native builds the default arm's FMU; leave it out beside an FMU")
+        return Path(options.fmu)
+    native = options.native or host_platform() != "linux64"
+    if native and not options.native:
+        print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
+    return build_fmu(None, FmuOptions(native=native))
+
+
+def print_summary(
+    run: Experiment, bag: Bag | None, storage: str, summary: Summary, pace: RealTime | None
+) -> None:
+    """How a run went."""
+    last = summary.last
+    simulated = last.k * run.step
+    rows = [("FMU", f"{run.fmu.path}")]
+    if bag is not None:
+        rows.append(("bag", f"{bag.path} ({last.k + 1} messages on /joint_states, {storage})"))
+    if summary.error is not None:
+        target = ", ".join(f"{value:g}" for value in last.target or ())
+        rows.append(("end effector", f"{length(summary.error)} from its target ({target}) m"))
+    speed = simulated / summary.wall_time if summary.wall_time else 0.0
+    rows.append(
+        ("time", f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time")
+    )
+    if pace is not None:
+        rows.append(
+            ("deadlines", f"{pace.missed} of {last.k + 1} missed, worst {pace.worst * 1e3:.1f} ms")
+        )
+    if summary.stopped:
+        complete = "" if bag is None else "; the bag is complete up to there"
+        rows.append(("stopped", f"on request at {last.t:g} s{complete}"))
+    print_table(*rows)
+
+
+def length(metres: float) -> str:
+    """A length with the unit that suits it."""
+    for factor, unit in ((1.0, "m"), (1e3, "mm"), (1e6, "µm")):
+        if metres * factor >= 1.0:
+            return f"{metres * factor:.3g} {unit}"
+    return f"{metres * 1e9:.3g} nm" if metres >= 1e-9 else "less than 1 nm"
+
+
+def controlled(fmu: Fmu) -> str:
+    """What an FMU controls."""
+    return f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}" if fmu.frame else "unknown"
+
+
+def open_page(
+    options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None
+) -> None:
+    """Tell where the page is, and open it where there is a display."""
+    for remark in remarks:
+        print(f"WARNING: {remark}", file=sys.stderr)
+    what = f"{fmu}; " if fmu is not None else ""
+    print(f"open  {url} ({what}Ctrl-C ends)", flush=True)
+    if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+        import webbrowser
+
+        webbrowser.open(url)
+
+
+def print_best(table: DataFrame) -> None:
+    """The first few runs by settling time, effort and final error."""
+    from ..sweeps.metrics import METRICS
+    from ..sweeps.results import ranked
+
+    best = ranked(table).head(5)
+    columns = [*best.columns]
+    columns = columns[: columns.index("end_time")]
+    units = [METRICS[name].unit if name in METRICS else "" for name in columns]
+    rows = [[f"{row[name]:.4g}" for name in columns] for row in best.to_dict("records")]
+    widths = [max(map(len, cells)) for cells in zip(columns, units, *rows)]
+    print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
+    for cells in [columns, units, *rows] if rows else []:
+        print("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
+
+
+def quote(path: Path) -> str:
+    """A path as a shell takes it."""
+    return shlex.quote(str(path))
+
+
+def print_table(*rows: tuple[str, str]) -> None:
+    """Labels and texts, one pair a line."""
+    width = max(len(label) for label, _ in rows)
+    for label, text in rows:
+        print(f"{label.ljust(width)}  {text}")
+
+
+def print_next(*commands: str) -> None:
+    """What to type next."""
+    print("\nnext")
+    for command in commands:
+        print(f"  {command}")

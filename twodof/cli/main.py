@@ -1,0 +1,95 @@
+"""The command line: calls the function behind each verb, and prints.
+
+Imports are inside the verbs, so that ``twodof --help`` is instant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import logging
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Sequence
+
+from ..errors import TwoDofError
+from ..version import __version__
+from . import build, info, live, plot, publish, recover, run, sweep, view
+from .common import INTERRUPTED
+
+VERBS = (build, run, publish, info, plot, view, live, sweep, recover)
+LONGEST_LINE = 2000
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser; what it gives has the verb's name as ``verb``."""
+    program = argparse.ArgumentParser(
+        prog="twodof",
+        description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
+        epilog="'twodof run' alone builds the default arm's FMU, runs it for 5 s and leaves a bag.",
+    )
+    program.add_argument("--version", action="version", version=f"twodof {__version__}")
+    verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for verb in VERBS:
+        verb.add(verbs)
+    return program
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    options = parser().parse_args(arguments)
+    options.command_line = shlex.join(["twodof", *arguments])
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    # the FMU's errors come back with the exception that they cause
+    logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
+    try:
+        status: int = options.call(options)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        if status == INTERRUPTED:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process is at its end
+        return status
+    except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return _fail("interrupted", INTERRUPTED)
+    except TwoDofError as error:
+        return _fail(str(error))
+    except BrokenPipeError:  # the reader of our output has left: nothing more to say
+        _silence()
+        return 1
+    except MemoryError:
+        return _fail("there is not enough memory")
+    except ImportError as error:  # of a broken environment, or where memory does not do
+        return _fail(f"cannot load what it needs: {error}")
+    except OSError as error:
+        if _is_interrupt(error):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            return _fail("interrupted", INTERRUPTED)
+        _silence()
+        culprit = "" if error.filename is None else f"'{error.filename}': "
+        return _fail(f"{culprit}{error.strerror or error}")
+
+
+def _is_interrupt(error: OSError) -> bool:
+    """Whether Ctrl-C came while a file was closed, which then is closed again and fails.
+
+    So does ``shutil.rmtree``, which removes the folder that an FMU was unzipped to.
+    """
+    return error.errno == errno.EBADF and isinstance(error.__context__, KeyboardInterrupt)
+
+
+def _fail(message: str, status: int = 1) -> int:
+    line = " ".join(message.split())
+    if len(line) > LONGEST_LINE:  # a name of a file from elsewhere can have any length
+        line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
+    print("twodof: error:", line, file=sys.stderr)
+    return status
+
+
+def _silence() -> None:
+    """What is still in the output's buffer cannot be written and must not fail again at exit."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,67 @@
+"""Options that several verbs have."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Of a run that may leave a bag."""
+    parser.add_argument(
+        "fmu", nargs="?", metavar="FMU", help="default: TwoDof.fmu, built if need be"
+    )
+    parser.add_argument(
+        "--native", action="store_true", help="build and run the native default FMU instead"
+    )
+    add_set_option(parser)
+    parser.add_argument(
+        "--input", metavar="CSV", help="inputs over time: a column 'time' and one for each input"
+    )
+    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
+    parser.add_argument(
+        "--scene", action="store_true", help="add robot description, tf, target and end effector"
+    )
+    parser.add_argument("--effort", action="store_true", help="add the control effort")
+    parser.add_argument(
+        "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
+    parser.add_argument(
+        "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
+    )
+
+
+def add_time_options(parser: argparse.ArgumentParser) -> None:
+    """Stop time and step."""
+    parser.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
+    add_step_option(parser)
+
+
+def add_step_option(parser: argparse.ArgumentParser) -> None:
+    """Communication step."""
+    parser.add_argument(
+        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
+    )
+
+
+def add_set_option(parser: argparse.ArgumentParser) -> None:
+    """Start values."""
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
+        help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
+    )  # fmt: skip
+
+
+def add_robot_options(parser: argparse.ArgumentParser) -> None:
+    """Robot of a bag from elsewhere."""
+    parser.add_argument("--urdf", metavar="U", help="the robot of a bag that carries none")
+    parser.add_argument("--frame", metavar="LINK", help="its end effector")
+
+
+def add_page_options(parser: argparse.ArgumentParser) -> None:
+    """Where a page is served."""
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (%(default)s, this machine alone)"
+    )
+    parser.add_argument("--port", type=int, default=8080, help="(%(default)s); 0: any that is free")
+    parser.add_argument("--no-browser", action="store_true", help="open no browser")

@@ -1,0 +1,75 @@
+"""plot: bags, or the map of a sweep, in one figure."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError
+from .common import print_best, print_table
+from .options import add_robot_options
+
+if TYPE_CHECKING:
+    from ..plots.figure import Drawing
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    plot = verbs.add_parser(
+        "plot", help="draw bags, or the map of a sweep, into one figure",
+        description="Draw joint positions and velocities, the end effector's path and its error;"
+        " of a sweep, each metric over the variables.",
+    )  # fmt: skip
+    plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
+    plot.add_argument(
+        "-o", dest="output", metavar="FILE", help=".png, .svg, .pdf or .html (a window)"
+    )
+    add_robot_options(plot)
+    plot.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from ..plots.figure import file_kind
+
+    if options.output is not None:
+        file_kind(options.output)  # before the bags are read
+    sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
+    if not sweeps:
+        return _plot_bags(options)
+    if len(options.bags) > 1:
+        raise InputError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
+    return _plot_sweep(options, Path(sweeps[0]))
+
+
+def _plot_bags(options: argparse.Namespace) -> int:
+    from ..plots.runs import drawing
+    from ..plots.track import read_tracks
+    from ..plots.words import labels, outcome
+
+    tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
+    results = [pair for pair in zip(labels(tracks), map(outcome, tracks)) if pair[1]]
+    _show_or_save(drawing(tracks), options.output, *results)
+    return 0
+
+
+def _plot_sweep(options: argparse.Namespace, folder: Path) -> int:
+    from ..plots.sweeps import drawing
+    from ..sweeps.results import read_sweep
+
+    table, provenance = read_sweep(folder)
+    _show_or_save(drawing(table, provenance, folder.resolve().name), options.output)
+    print_best(table)
+    return 0
+
+
+def _show_or_save(drawing: Drawing, output: str | None, *results: tuple[str, str]) -> None:
+    """A window where there is a terminal and a display, else a file and a word about it."""
+    from ..plots.figure import save, show
+
+    if output is None and sys.stdout.isatty() and show(drawing):
+        return
+    path = save(drawing, output)
+    print_table(("plot", f"{path} ({path.stat().st_size / 1024:.0f} KB)"), *results)

@@ -1,0 +1,37 @@
+"""recover: a bag whose writer died, made complete."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from .common import print_next, print_table, quote
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    recover = verbs.add_parser(
+        "recover", help="make a bag whose writer died complete",
+        description="Make a bag whose writer died complete, so that every reader opens it.",
+    )  # fmt: skip
+    recover.add_argument("bag", metavar="BAG", type=Path)
+    recover.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from ..bag.recovery import recover
+
+    done = recover(options.bag)
+    if done.original is None:
+        print(f"'{done.path}' is complete; there is nothing to recover")
+        return 0
+    print_table(
+        ("bag", f"{done.path} ({sum(done.counts.values())} messages)"),
+        *((topic, f"{count}") for topic, count in sorted(done.counts.items())),
+        *([("damage", done.damage)] if done.damage else []),
+        ("original", f"{done.original}, as it was; delete it when you are content"),
+    )
+    print_next(f"twodof info {quote(done.path)}", f"ros2 bag play {quote(done.path)}")
+    return 0

@@ -1,0 +1,84 @@
+"""run: an FMU simulated, and its bag."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import TYPE_CHECKING, Any
+
+from .common import (
+    INTERRUPTED,
+    asked_to_stop,
+    bag_of,
+    experiment_of,
+    print_next,
+    print_summary,
+    quote,
+)
+from .options import add_run_options, add_time_options
+
+if TYPE_CHECKING:
+    from ..experiment import Experiment
+    from ..master import Sample, Sink
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    run = verbs.add_parser(
+        "run", help="simulate an FMU and write a bag",
+        description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
+    )  # fmt: skip
+    run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
+    add_time_options(run)
+    run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
+    add_run_options(run)
+    run.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from ..master import RealTime, simulate
+
+    run = experiment_of(options, options.stop_time, options.step)
+    bag = bag_of(options, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
+    pace = RealTime() if options.realtime else None
+    with asked_to_stop() as asked:
+        summary = simulate(run, bag, progress(), pace=pace, stop=asked)
+    print_summary(run, bag, options.storage, summary, pace)
+    file = bag.path / f"{bag.path.name}.{'mcap' if options.storage == 'mcap' else 'db3'}"
+    viewer = "Foxglove: open" if options.storage == "mcap" else "RViz: play"
+    print_next(
+        f"twodof info {quote(bag.path)}",
+        f"ros2 bag play {quote(bag.path)}",
+        f"{viewer} {quote(file)}",
+    )
+    return INTERRUPTED if summary.stopped else 0
+
+
+def progress() -> Sink:
+    """A sink that shows a bar on a terminal and nothing in a pipe."""
+    from tqdm import tqdm
+
+    from ..master import Sink
+
+    class Progress(Sink):
+        def begin(self, run: Experiment) -> Progress:
+            self._run = run
+            return self
+
+        def __enter__(self) -> Progress:
+            run = self._run
+            self._bar = tqdm(
+                total=run.steps * run.step, unit="s", disable=None, leave=False, desc="simulating",
+                bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s,"
+                " {remaining} left",
+            )  # fmt: skip
+            return self
+
+        def write(self, sample: Sample) -> None:
+            self._bar.update(self._run.step if sample.k else 0.0)
+
+        def __exit__(self, *exception: object) -> None:
+            self._bar.close()
+
+    return Progress()

@@ -1,0 +1,102 @@
+"""sweep: an FMU over many gains."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from .common import (
+    INTERRUPTED,
+    asked_to_stop,
+    fast_fmu,
+    parse_settings,
+    print_best,
+    print_next,
+    print_table,
+    quote,
+)  # fmt: skip
+from .options import add_set_option, add_time_options
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    sweep = verbs.add_parser(
+        "sweep", help="run an FMU over many gains, and map what comes out",
+        description="Run an FMU over a grid or random values of any of its inputs and parameters."
+        " The native default FMU is built where none is named.",
+    )  # fmt: skip
+    sweep.add_argument("fmu", nargs="?", metavar="FMU", help="default: the default arm's")
+    sweep.add_argument(
+        "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",
+        help="values evenly spaced; all combinations of several",
+    )  # fmt: skip
+    sweep.add_argument("--random", type=int, default=0, metavar="N", help="draws of each --range")
+    sweep.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="of the draws (%(default)s)"
+    )
+    sweep.add_argument(
+        "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH",
+        help="values drawn uniformly",
+    )  # fmt: skip
+    add_time_options(sweep)
+    add_set_option(sweep)
+    sweep.add_argument("-o", dest="output", metavar="OUT", help="default: sweep_<date and time>")
+    sweep.add_argument(
+        "--resume", action="store_true", help="go on with OUT; what is done is not repeated"
+    )
+    sweep.add_argument("--bags", action="store_true", help="keep a bag of each run in OUT/bags")
+    sweep.add_argument("--workers", type=int, metavar="N", help="local processes (one for a core)")
+    sweep.add_argument("--scheduler", metavar="tcp://…", help="of a Dask cluster to use instead")
+    sweep.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from tqdm import tqdm
+
+    from ..sweeps.coordinator import sweep
+    from ..sweeps.design import parse_grids, parse_ranges
+
+    if options.resume and not options.output:
+        raise InputError("--resume needs the sweep to go on with: -o OUT")
+    grid, ranges = parse_grids(options.grids), parse_ranges(options.ranges)
+    settings = parse_settings(options.settings)
+    fmu = fast_fmu(options)
+    output = Path(options.output or time.strftime("sweep_%Y_%m_%d-%H_%M_%S"))
+    begin = time.perf_counter()
+    total = 0
+    with (
+        asked_to_stop() as asked,
+        tqdm(unit="run", disable=None, leave=False, desc="sweeping", smoothing=0.05) as bar,
+    ):
+
+        def progress(done: int, runs: int) -> None:
+            nonlocal total
+            if not total:  # what an earlier sweep has done says nothing about the rate
+                bar.total, bar.initial, bar.n = runs, done, done
+            total = runs
+            bar.update(done - bar.n)
+
+        table = sweep(
+            fmu, grid=grid, ranges=ranges, random=options.random, seed=options.seed,
+            stop_time=options.stop_time, step=options.step, settings=settings, output=output,
+            resume=options.resume, bags=options.bags, workers=options.workers,
+            scheduler=options.scheduler, progress=progress, stop=asked,
+            command_line=options.command_line,
+        )  # fmt: skip
+    stopped = len(table) < total
+    counts = table["outcome"].value_counts()
+    outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    print_table(
+        ("FMU", f"{fmu}"),
+        ("sweep", f"{output} ({len(table)} of {total} runs{outcomes and f': {outcomes}'})"),
+        ("time", f"{time.perf_counter() - begin:.1f} s"),
+    )
+    print_best(table)
+    again = options.command_line if options.resume else f"{options.command_line} --resume"
+    again += "" if options.output else f" -o {quote(output)}"
+    print_next(*([again] if stopped else []), f"twodof plot {quote(output)}")
+    return INTERRUPTED if stopped else 0

@@ -1,0 +1,146 @@
+"""Compiling the C sources of an FMU, for every platform from any platform."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform as host
+import shutil
+import struct
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ..errors import BuildError
+from ..files import temporary_folder
+
+TARGETS: dict[str, tuple[str, ...]] = {
+    "linux64": ("x86_64-linux-gnu.2.17",),
+    "win64": ("x86_64-windows-gnu",),
+    "darwin64": ("x86_64-macos.11.0", "aarch64-macos.11.0"),
+}
+"""zig's targets by FMI platform; several are joined into one universal library."""
+EXTENSIONS = {"linux64": ".so", "win64": ".dll", "darwin64": ".dylib"}
+FLAGS = (
+    "-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden",
+    "-Wall", "-Wextra", "-pedantic", "-shared",
+)  # fmt: skip
+"""Multiplications are never fused with additions, so that platforms agree."""
+
+
+def compile_library(
+    sources: Mapping[str, bytes],
+    platform: str,
+    name: str,
+    *,
+    flags: Sequence[str] = (),
+) -> bytes:
+    """The shared library of an FMU.
+
+    Args:
+        sources: contents of the C files and headers by file name, ``model.h`` and the headers of
+            the FMI standard among them.
+        platform: FMI platform, a key of ``TARGETS``.
+        name: model identifier, the library's name without extension.
+        flags: further flags for the compiler.
+
+    Raises:
+        BuildError: the platform does not exist, there is no compiler for it, or the compiler
+            failed.
+    """
+    if platform not in TARGETS:
+        raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")
+    with temporary_folder() as folder:
+        for file, content in sources.items():
+            (folder / file).write_bytes(content)
+        files = sorted(file for file in sources if file.endswith(".c"))
+        output = name + EXTENSIONS[platform]
+        built = []
+        for compiler in _compilers(platform):
+            _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *files], folder)
+            built.append((folder / output).read_bytes())
+    return built[0] if len(built) == 1 else universal(built)
+
+
+def host_platform() -> str:
+    """FMI platform of this machine; "" where the native flavour knows none."""
+    if host.machine().lower() in ("x86_64", "amd64") or sys.platform == "darwin":
+        return {"linux": "linux64", "win32": "win64", "darwin": "darwin64"}.get(sys.platform, "")
+    return ""
+
+
+def universal(libraries: Sequence[bytes]) -> bytes:
+    """Mach-O libraries of several architectures as one file.
+
+    Its header is that of ``mach-o/fat.h``: magic and count, and per architecture CPU type and
+    subtype (from its own header), offset, size and alignment (2¹⁴), big-endian.
+    """
+    align = 14
+    entries, body = [], b""
+    offset = 1 << align
+    for library in libraries:
+        cpu, subtype = struct.unpack_from("<II", library, 4)
+        body += b"\0" * (-len(body) % (1 << align)) + library
+        entries.append(struct.pack(">5I", cpu, subtype, offset, len(library), align))
+        offset = (1 << align) + len(body) + -len(body) % (1 << align)
+    header = struct.pack(">II", 0xCAFEBABE, len(libraries)) + b"".join(entries)
+    return header.ljust(1 << align, b"\0") + body
+
+
+def _compilers(platform: str) -> list[list[str]]:
+    """Commands that compile for a platform, one for each architecture."""
+    if importlib.util.find_spec("ziglang") is not None:
+        zig = [sys.executable, "-m", "ziglang", "cc", "-target"]
+        return [[*zig, target] for target in TARGETS[platform]]
+    own = next((cc for cc in ("cc", "gcc", "clang") if shutil.which(cc)), None)
+    if platform == host_platform() and own:
+        architectures = ["-arch", "x86_64", "-arch", "arm64"] if platform == "darwin64" else []
+        return [[own, *architectures]]
+    missing = f"this machine's own compiler builds for {host_platform() or 'no FMI platform'} only"
+    if platform == host_platform():
+        missing = "this machine has no C compiler"
+    raise BuildError(
+        f"cannot compile for {platform}: {missing}; install the package 'ziglang'"
+        " (the extra 'native'), which compiles for every platform"
+    )
+
+
+def _link_flags(platform: str, output: str) -> list[str]:
+    """Flags that leave nothing of this machine and this moment in the library."""
+    flags = ["-s", "-o", output]
+    if platform == "linux64":
+        return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
+    if platform == "darwin64":
+        return [*flags, f"-Wl,-install_name,@rpath/{output}"]
+    return flags
+
+
+def _run(command: Sequence[str], folder: Path) -> None:
+    try:
+        done = subprocess.run(
+            command, cwd=folder, env=_environment(folder),
+            capture_output=True, text=True, errors="replace", check=False,
+        )  # fmt: skip
+    except OSError as error:
+        raise BuildError(f"cannot run the compiler '{command[0]}': {error}") from error
+    if done.returncode != 0:
+        raise BuildError(
+            f"the compiler failed (exit status {done.returncode}): {' '.join(command)}\n"
+            f"{done.stderr.strip() or done.stdout.strip()}"
+        )
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """This process's environment; zig's cache is in the folder where home has no room for it."""
+    environment = dict(os.environ)
+    if os.name == "posix" and not environment.get("ZIG_GLOBAL_CACHE_DIR"):
+        home = environment.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+        cache = Path(home, "zig")
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            usable = os.access(cache, os.W_OK)
+        except OSError:
+            usable = False
+        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else folder / "zig-cache")
+    return environment

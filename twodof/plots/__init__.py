@@ -1,0 +1,1 @@
+"""Figures of bags and of sweeps."""

@@ -1,0 +1,75 @@
+"""What is told of tracks in words and numbers: beside figures, and on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .track import Track, number
+
+TOLD = {
+    "x_des": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²", "Kp": "", "Kd": "", "Kn": "0 s⁻¹",
+    "tau_ext": "0", "limit_effort": "false", "step": "", "FMU": "",
+}  # fmt: skip
+"""Settings that a figure tells, and the values that go without saying."""
+
+
+def labels(tracks: Sequence[Track]) -> list[str]:
+    """What tells each track from the others: up to three settings, or else the bag's name."""
+    every = list(dict.fromkeys(key for track in tracks for key in track.settings))
+    differing = [key for key in every if len({track.settings.get(key) for track in tracks}) > 1]
+    told = [
+        ", ".join(_setting(key, track.settings[key]) for key in differing if key in track.settings)
+        for track in tracks
+    ]
+    clear = 0 < len(differing) <= 3 and all(told) and len(set(told)) == len(told)
+    if clear and max(map(len, told)) <= 80:
+        return told
+    names = [track.name for track in tracks]
+    return names if len(set(names)) == len(names) else [str(track.run.path) for track in tracks]
+
+
+def common_settings(tracks: Sequence[Track]) -> str:
+    """What tracks have in common and a reader wants to know."""
+    told = []
+    for key, silent in TOLD.items():
+        values = {track.settings.get(key, silent) for track in tracks}
+        if len(values) == 1 and values != {silent}:
+            told.append(_setting(key, values.pop()))
+    if len(tracks) == 1 and tracks[0].motion:  # else it is the title
+        told.append(f"bag {tracks[0].name}")
+    return ", ".join(told)
+
+
+def _setting(key: str, text: str) -> str:
+    if key in ("FMU", "robot"):
+        return text
+    return f"{key} {text}" if key == "step" or text == "varied" else f"{key} = {text}"
+
+
+def outcome(track: Track) -> str:
+    """How near the end effector came to its target and to the closed form; "" if not known."""
+    if track.task is None:
+        return ""
+    text = f"{track.task.error[-1]:.3g} m from its target at the end"
+    if track.task.departure is not None:
+        text += f"; at most {track.task.departure:.1g} m off the closed form"
+    return text
+
+
+def summary(track: Track) -> dict[str, str]:
+    """The main numbers of a run in words, by what they are."""
+    made = {
+        key: track.settings[key] for key in ("FMU", "step", "x_des", "Kp", "Kd") if track.settings
+    }
+    stopped = [joint.name for joint in track.joints if joint.at_limit]
+    rows = {
+        "bag": track.name,
+        "robot": track.motion.robot if track.motion else "",
+        "end effector": track.motion.frame if track.motion else "",
+        "duration": f"{number(float(track.t[-1]))} s, {len(track.t)} samples",
+        **made,
+        "at a limit": ", ".join(stopped) or "no joint",
+    }
+    if track.task:
+        rows["result"] = outcome(track)
+    return rows

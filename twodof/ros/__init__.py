@@ -1,0 +1,1 @@
+"""What ROS 2 says and hears, and how."""

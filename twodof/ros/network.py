@@ -1,0 +1,200 @@
+"""The network of ROS 2: who can hear a run, as its environment variables say, and the DDS domain.
+
+Variables are those of rcl and rmw_cyclonedds of Jazzy.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import sys
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+from ..errors import PublishError
+from ..files import temporary_folder
+
+try:
+    from cyclonedds import core, domain
+except ImportError as missing:
+    raise PublishError(
+        f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')"
+    ) from missing
+
+LOG = logging.getLogger(__name__)
+RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
+LAST_DOMAIN = 232  # the ports of later ones are beyond 65535
+LOOPBACK = {"lo": "127.0.0.1"}
+MOST_PARTICIPANTS = 32  # of one host, that are looked for; as rmw_cyclonedds
+NO_NETWORK = (
+    "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
+)
+ANNOUNCED = 1  # s between two announcements to participants of this host
+
+
+class Network(NamedTuple):
+    """Where a run is published.
+
+    Attributes:
+        domain: ROS_DOMAIN_ID.
+        range: how far participants look for each other, ROS_AUTOMATIC_DISCOVERY_RANGE.
+        peers: other hosts that are told of us, ROS_STATIC_PEERS.
+        loopback: on the loopback interface alone, ROS_LOCALHOST_ONLY.
+        custom: configuration that has the last word, CYCLONEDDS_URI.
+    """
+
+    domain: int = 0
+    range: str = "LOCALHOST"
+    peers: tuple[str, ...] = ()
+    loopback: bool = False
+    custom: str = ""
+
+    @property
+    def reach(self) -> str:
+        """Who can hear, in words."""
+        if self.loopback:
+            return "loopback alone (ROS_LOCALHOST_ONLY)"
+        words = {"LOCALHOST": "this host alone; --subnet opens it", "OFF": "nobody"}
+        return f"range {self.range} ({words.get(self.range, 'other hosts too')})"
+
+    def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
+        """What Cyclone DDS is told, as rmw_cyclonedds of Jazzy does.
+
+        LOCALHOST looks for others by messages to this host's own addresses, and so is heard by
+        nobody else. Unlike there it keeps doing so each second: a participant that starts later,
+        and announces itself by multicast alone, else would find us after half a minute or never.
+        And it uses the loopback interface too: Fast DDS speaks to its own host there, and Cyclone
+        DDS drops what comes by an interface that it does not use.
+
+        Args:
+            trace: file for the account of what was configured.
+            own: addresses by interface, those to use; None: what Cyclone DDS chooses.
+        """
+        off, localhost = self.range == "OFF", self.range == "LOCALHOST"
+        general, discovery = "", ""
+        if (off or localhost) and not self.loopback:  # which nothing leaves; older nodes need it
+            general += "<AllowMulticast>false</AllowMulticast>"
+        if own:
+            named = "".join(f"<NetworkInterface name={quoteattr(name)}/>" for name in own)
+            general += f"<Interfaces>{named}</Interfaces>"
+        if off:
+            discovery = "<ParticipantIndex>none</ParticipantIndex>"  # ports that nobody guesses
+        elif self.range != "SYSTEM_DEFAULT":
+            discovery = (
+                "<ParticipantIndex>auto</ParticipantIndex>"
+                f"<MaxAutoParticipantIndex>{MOST_PARTICIPANTS}</MaxAutoParticipantIndex>"
+            )
+            peers = "".join(f"<Peer Address={quoteattr(peer)}/>" for peer in self.peers)
+            if localhost:
+                discovery += f"<SPDPInterval>{ANNOUNCED} s</SPDPInterval>"
+                for address in (own or {"": "localhost"}).values():
+                    peers += f'<Peer Address="{address}" PruneDelay="inf"/>'
+            discovery += f"<Peers>{peers}</Peers>"
+        tracing = f"<Category>config</Category><OutputFile>{trace}</OutputFile>"
+        return (
+            f"<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery>"
+            f"<Tracing>{tracing}</Tracing></Domain></CycloneDDS>,{self.custom}"
+        )
+
+
+def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) -> Network:
+    """The network that the environment variables of ROS 2 ask for.
+
+    Unlike ROS 2, whose default range is SUBNET, nothing leaves the host unless asked for.
+
+    Args:
+        variables: the environment.
+        subnet: range SUBNET, whatever they say.
+
+    Raises:
+        PublishError: naming the variable that is at fault.
+    """
+    number = variables.get("ROS_DOMAIN_ID") or "0"
+    if not re.fullmatch("[0-9]{1,9}", number) or int(number) > LAST_DOMAIN:
+        raise PublishError(f"ROS_DOMAIN_ID is '{number}', not a number from 0 to {LAST_DOMAIN}")
+    custom = variables.get("CYCLONEDDS_URI", "")
+    if subnet:
+        return Network(int(number), "SUBNET", _peers(variables), custom=custom)
+    local = variables.get("ROS_LOCALHOST_ONLY") or "0"
+    if local not in ("0", "1"):
+        raise PublishError(f"ROS_LOCALHOST_ONLY is '{local}', not 0 or 1")
+    if local == "1":
+        return Network(int(number), loopback=True, custom=custom)
+    reach = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or RANGES[0]
+    if reach not in RANGES:
+        raise PublishError(
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', not one of {', '.join(RANGES)}"
+        )
+    return Network(int(number), reach, _peers(variables), custom=custom)
+
+
+def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
+    peers = tuple(filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")))
+    for peer in peers:
+        try:
+            socket.getaddrinfo(peer, None)  # Cyclone DDS would end the process
+        except (OSError, UnicodeError) as error:
+            raise PublishError(f"ROS_STATIC_PEERS: '{peer}' is not found: {error}") from error
+    return peers
+
+
+def open_domain(place: Network) -> tuple[Any, str]:
+    """A DDS domain, and the names of the interfaces that it uses.
+
+    Raises:
+        PublishError: saying what Cyclone DDS says.
+    """
+    own = LOOPBACK if place.loopback else None
+    opened, used, said = _try_to_open(place, own)
+    if opened and place.range == "LOCALHOST" and not used.keys() & LOOPBACK:
+        del opened  # which closes it
+        opened, both, said = _try_to_open(place, {**used, **LOOPBACK})
+        if opened:
+            used = both
+        else:  # CYCLONEDDS_URI names interfaces, and none may be named twice
+            opened, used, said = _try_to_open(place, own)
+    interfaces = ", ".join(used) or "an interface of CYCLONEDDS_URI"
+    if opened is None and "failed to find interfaces" in said:
+        LOG.warning("there is no network interface: nobody can hear what is published")
+        interfaces = "no interface"
+        opened = domain.Domain(place.domain, NO_NETWORK)
+    elif opened is None:
+        names = ", ".join(name for _, name in socket.if_nameindex())
+        blame = f"; correct CYCLONEDDS_URI (interfaces here: {names})" if place.custom else ""
+        raise PublishError(f"DDS domain {place.domain} cannot be opened: {said}{blame}")
+    elif said:
+        LOG.warning("Cyclone DDS: %s", said)
+    return opened, interfaces
+
+
+def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
+    """A domain or None, the addresses of the interfaces in use by name, and what went wrong.
+
+    Cyclone DDS tells interfaces in its trace, and reasons of a failure on the standard error alone.
+    """
+    with temporary_folder() as folder:
+        trace, errors = folder / "trace", folder / "errors"
+        trace.touch()
+        sys.stderr.flush()
+        kept = os.dup(2)
+        try:
+            with errors.open("wb") as file:
+                os.dup2(file.fileno(), 2)
+            opened = domain.Domain(place.domain, place.configuration(str(trace), own))
+        except (core.DDSException, UnicodeEncodeError):
+            opened = None
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        account = trace.read_text("utf-8", "replace")
+        lines = errors.read_text("utf-8", "replace").splitlines()
+    present = dict(
+        re.findall(r"(\S+) udp/([\d.]+)", "".join(re.findall(": interfaces: .*", account)))
+    )
+    chosen = re.findall(r"(\S+) \(index", "".join(re.findall("selected interfaces: .*", account)))
+    # each line of an error begins with time, domain and program
+    said = "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
+    return opened, {name: present.get(name, "localhost") for name in chosen}, said

@@ -1,0 +1,218 @@
+"""A run on a ROS 2 network: the messages of the bag over DDS, and targets that others ask for.
+
+Names, types and qualities of service are those of ROS 2 (REP 2011's type hashes, rmw_cyclonedds of
+Jazzy), so that its tools see the run as they see any node's.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable, Mapping
+from math import isfinite
+from typing import Any
+
+from rosbags.interfaces import Nodetype, Qos, QosDurability
+
+from ..errors import PublishError, SimulationError
+from ..experiment import Experiment, Setting
+from ..master import Sample, Sink, at_rest
+from .messages import SCENE_TOPICS, STORE, STREAM, Messages, Serialised
+from .network import Network, network, open_domain
+
+# isort: split
+from cyclonedds import core, domain, idl, pub, qos, sub, topic  # where missing, network says so
+
+LOG = logging.getLogger(__name__)
+POINT = SCENE_TOPICS["/target"].type
+COMMANDS = ("/target_command", "/clicked_point")
+LONGEST_NAME = 80  # of a frame, that is told
+
+
+class Carrier:
+    """What every DDS type does with its messages: carry them serialised.
+
+    What the bytes mean is rosbags' business.
+    """
+
+    def __init__(self, cdr: Serialised) -> None:
+        self.cdr = cdr
+
+    def serialize(self, **_options: object) -> bytes:
+        """The bytes, as Cyclone DDS asks for them."""
+        return bytes(self.cdr)
+
+    @classmethod
+    def deserialize(cls, cdr: bytes) -> Carrier:
+        """A message that has come."""
+        return cls(cdr)
+
+    @classmethod
+    def deserialize_key(cls, _key: bytes) -> None:
+        """A notice without a message, that a writer has left."""
+
+
+@functools.cache
+def dds_type(name: str) -> Any:
+    """The DDS type of a ROS 2 message type, with the names that rosidl_generator_dds_idl gives."""
+    package, _, kind = name.split("/")
+    fields = {f"{field}_": _field_type(*of) for field, of in STORE.fielddefs[name][1]}
+    made = idl.make_idl_struct(
+        f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False
+    )
+    for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
+        setattr(made, method, vars(Carrier)[method])  # a base would be part of the type
+    return made
+
+
+def _field_type(node: Nodetype, of: Any) -> Any:
+    if node is Nodetype.NAME:
+        return dds_type(of)
+    if node is Nodetype.SEQUENCE:
+        return idl.types.sequence[_field_type(*of[0])]
+    return str if of[0] == "string" else getattr(idl.types, of[0])
+
+
+def dds_qos(offered: Qos, type_name: str) -> Any:
+    """Quality of service of a writer or reader.
+
+    A write never waits for a reader: one that does not keep up misses messages.
+    """
+    latched = offered.durability is QosDurability.TRANSIENT_LOCAL
+    return qos.Qos(
+        qos.Policy.Reliability.Reliable(max_blocking_time=0),
+        qos.Policy.Durability.TransientLocal if latched else qos.Policy.Durability.Volatile,
+        qos.Policy.History.KeepLast(offered.depth),
+        qos.Policy.DataRepresentation(use_cdrv0_representation=True),
+        qos.Policy.Userdata(f"typehash={STORE.hash_rihs01(type_name)};".encode()),
+    )
+
+
+class Publisher(Sink):
+    """A sink that publishes each sample, and hears of targets.
+
+    Args:
+        place: the network; None: what the environment asks for.
+        scene: also the robot description, transforms, target and end effector.
+        effort: put the control effort into JointState.effort.
+        opened: told when the network is open.
+
+    Attributes:
+        place: the network.
+        interface: names of the network interfaces in use, known when it is open.
+        topics: what is published.
+        commands: the topics on which targets are heard of; none where the FMU has no inputs
+            x_des[k], or does not say which axes of which frame they are. Known when it has begun.
+
+    Raises:
+        PublishError: the network cannot be used as asked for.
+    """
+
+    def __init__(
+        self,
+        place: Network | None = None,
+        *,
+        scene: bool = False,
+        effort: bool = False,
+        opened: Callable[[Publisher], None] = lambda publisher: None,
+    ) -> None:
+        self._opened = opened
+        self.place = network() if place is None else place
+        self.interface = ""
+        self._scene, self._effort = scene, effort
+        self._begun = False
+        self._warned: set[str] = set()
+
+    def begin(self, run: Experiment) -> Publisher:
+        """Take the experiment whose samples come.
+
+        Raises:
+            BagError: the FMU has not what is asked for.
+        """
+        self._fmu, self._axes, self._root = run.fmu, run.fmu.axes, run.fmu.root
+        self._messages = Messages(run, scene=self._scene, effort=self._effort)
+        self.topics = tuple(self._messages.topics)
+        self.commands = COMMANDS if self._axes and run.fmu.vector("x_des") else ()
+        return self
+
+    def __enter__(self) -> Publisher:
+        self._domain, self.interface = open_domain(self.place)
+        try:
+            self._participant = domain.DomainParticipant(self.place.domain)
+            self._writers = {
+                name: pub.DataWriter(
+                    self._participant, self._topic(name, said.type), dds_qos(said.qos, said.type)
+                )
+                for name, said in self._messages.topics.items()
+            }
+            self._readers = [
+                sub.DataReader(self._participant, self._topic(name, POINT), dds_qos(STREAM, POINT))
+                for name in self.commands
+            ]
+        except core.DDSException as error:
+            raise PublishError(f"DDS domain {self.place.domain} fails: {error}") from error
+        self._opened(self)
+        return self
+
+    def _topic(self, name: str, type_name: str) -> Any:
+        return topic.Topic(self._participant, f"rt{name}", dds_type(type_name))
+
+    def write(self, sample: Sample) -> None:
+        """Publish one sample: one JointState, and the scene's messages."""
+        if not self._begun:
+            self._begun = True
+            self._publish(self._messages.latched(sample.stamp))
+        self._publish(self._messages.of(sample))
+
+    def _publish(self, messages: list[tuple[str, Serialised]]) -> None:
+        for name, cdr in messages:
+            writer = self._writers[name]
+            try:
+                writer.write(writer.data_type(cdr))
+            except core.DDSException as error:
+                self._warn_once(name, f"messages on {name} are lost: {error}")
+
+    def command(self) -> dict[str, tuple[float, ...]] | None:
+        """The target that was asked for since the last call, as inputs of the FMU, if one was.
+
+        Points are in the frame of the robot's root, which an empty frame_id means too. One in
+        another frame, or whose numbers are not finite, is ignored.
+        """
+        target = None
+        for name, reader in zip(self.commands, self._readers):
+            for message in reader.take(STREAM.depth):
+                if message.sample_info.valid_data:
+                    target = self._target(name, message.cdr) or target
+        return None if target is None else {"x_des": target}
+
+    def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
+        """What a run goes on with where a step was discarded: who asks for targets ends no run."""
+        rest = at_rest(self._fmu, sample) if self.commands else None
+        if rest is not None:
+            self._warn_once("rest", f"{error}: the robot is stopped, and its target is where it is")
+        return rest
+
+    def _target(self, name: str, cdr: Serialised) -> tuple[float, ...] | None:
+        try:
+            message: Any = STORE.deserialize_cdr(cdr, POINT)
+        except Exception as error:  # the bytes are anybody's
+            self._warn_once("bytes", f"a point on {name} cannot be read ({error}): ignored")
+            return None
+        frame, point = message.header.frame_id, message.point
+        if frame not in ("", self._root):
+            told = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
+            self._warn_once("frame", f"a point on {name} is in frame {told}: ignored")
+            return None
+        if not all(map(isfinite, (point.x, point.y, point.z))):
+            self._warn_once("finite", f"a point on {name} is not finite: ignored")
+            return None
+        return tuple(getattr(point, axis) for axis in self._axes)
+
+    def _warn_once(self, kind: str, text: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
+            LOG.warning("%s; there may be more like it", text)
+
+    def __exit__(self, *exception: object) -> None:
+        # entities are deleted with their last reference, writers after waiting for readers
+        del self._readers, self._writers, self._participant, self._domain
