@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import logging
 import math
 import os
@@ -41,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = parser().parse_args(arguments)
     options.command_line = shlex.join(["twodof", *arguments])
+    if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
+        sys.stdout.reconfigure(errors="backslashreplace")
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
@@ -323,9 +326,9 @@ def _length(metres: float) -> str:
 def _info(options: argparse.Namespace) -> int:
     path = options.path
     if path.is_dir():
-        from .bag import read_bag
+        from .bag import read_ends
 
-        _print_bag(read_bag(path))
+        _print_bag(*read_ends(path))
     elif path.suffix in (".mcap", ".db3") and path.is_file():
         raise InputError(f"'{path}' is a bag's file; give the bag's folder, '{path.parent}'")
     else:
@@ -383,13 +386,13 @@ def _start(text: str) -> str:
     return "none" if abs(value) > 1e300 else f"{value:g}"
 
 
-def _print_bag(run: Run) -> None:
+def _print_bag(run: Run, count: int) -> None:
     duration = float(run.t[-1])
-    rate = (len(run.t) - 1) / duration if duration else 0.0
+    rate = (count - 1) / duration if duration else 0.0
     rows = [
         ("bag", str(run.path)),
         ("joints", ", ".join(run.joints)),
-        ("duration", f"{duration:g} s, {len(run.t)} joint states, {rate:g} Hz"),
+        ("duration", f"{duration:g} s, {count} joint states, {rate:g} Hz"),
         ("first stamp", f"{run.stamps[0] / 1e9:.9f} s"),
         ("first state", _state(run, 0)),
         ("last state", _state(run, -1)),

@@ -42,6 +42,11 @@ def read_file(path: str | Path, most: int) -> bytes:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
+def shown(path: str | Path) -> str:
+    """A path as text that can be written anywhere: what is no UTF-8 in it as escapes."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
+
+
 def check_archive(path: str | Path) -> None:
     """Refuse a zip archive with more members than can be listed.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .bag import Run, read_bag
 from .closed_form import Held, task_error
 from .errors import PlotError
-from .files import read_file
+from .files import read_file, shown
 from .plant import UNBOUNDED, Robot, RobotError, load_robot
 
 Array = NDArray[np.float64]
@@ -150,7 +150,7 @@ class Track:
     @property
     def name(self) -> str:
         """The bag's name."""
-        return self.run.path.resolve().name
+        return shown(self.run.path.resolve().name)
 
 
 def read_tracks(
@@ -525,7 +525,7 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     if clear and max(map(len, told)) <= 80:
         return told
     names = [track.name for track in tracks]
-    return names if len(set(names)) == len(names) else [str(track.run.path) for track in tracks]
+    return names if len(set(names)) == len(names) else [shown(track.run.path) for track in tracks]
 
 
 def common_settings(tracks: Sequence[Track]) -> str:

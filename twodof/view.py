@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .bag import Run, read_bag
 from .data import data_file
 from .errors import BuildError, FmuError, PageError
-from .files import write_file
+from .files import shown, write_file
 from .fmu import load_fmu, read_resource
 from .meshes import collect_meshes
 from .page import (
@@ -316,7 +316,7 @@ def view(
         robot: options of ``Replay``.
     """
     bag = bag if isinstance(bag, Run) else read_bag(bag)
-    with Page(f"twodof - {bag.path.resolve().name}", host, port) as page:
+    with Page(f"twodof - {shown(bag.path.resolve().name)}", host, port) as page:
         replay = Replay(page, bag, **robot)
         replay.add_controls()
         opened(page.url, replay.remarks)

@@ -10,7 +10,6 @@ import errno
 import fcntl
 import os
 import sqlite3
-from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal
@@ -21,11 +20,14 @@ from rosbags.rosbag2.enums import CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
+from ..errors import BagError
+
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
 REMOVED = "it was removed while it was being written"
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
+OVERHEAD = 64  # bytes that a message takes beside its data until it is flushed
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
 
 
@@ -110,9 +112,16 @@ class BagWriter(Writer):
         self._pending = 0
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Write one message; some hundred KiB are flushed together."""
-        super().write(connection, timestamp, data)
-        self._pending += len(data)
+        """Write one message; some hundred KiB are flushed together.
+
+        rosbags' own would look through all topics first, for each.
+        """
+        assert self.storage is not None
+        self.storage.write(connection, timestamp, data)
+        self.counts[connection.id] += 1
+        self.min_timestamp = min(timestamp, self.min_timestamp)
+        self.max_timestamp = max(timestamp, self.max_timestamp)
+        self._pending += OVERHEAD + len(data)
         if self._pending > BATCH_SIZE:
             self.flush()
 
@@ -129,11 +138,43 @@ class BagWriter(Writer):
         self._pending = 0
 
 
-def lock(path: Path) -> int:
-    """Mark a bag's folder as being written until the descriptor is closed or the process dies."""
-    folder = os.open(path, os.O_RDONLY)
-    with suppress(OSError):  # a file system without locks
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+def check_path(path: Path, storage: str) -> None:
+    """Refuse a place where a bag of this storage would not be found again.
+
+    Its name is written into metadata.yaml; rosbags makes a URI of a database's whole path.
+
+    Raises:
+        BagError: another name is needed.
+    """
+    part, text = ("path", str(path)) if storage == "sqlite3" else ("name", path.name)
+    if storage == "sqlite3" and any(c in text for c in "?#%"):
+        raise BagError(f"'{path}': a sqlite3 bag cannot have ?, # or % in its path")
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise BagError(f"'{path}': the {part} of a {storage} bag must be UTF-8") from error
+
+
+def lock(path: Path, *, wait: bool = False) -> int:
+    """Keep other writers from a folder until the descriptor is closed or the process dies.
+
+    Args:
+        path: the folder.
+        wait: for those that look whether it is being written.
+
+    Raises:
+        BlockingIOError: another process writes it.
+        OSError: it cannot be opened.
+    """
+    folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place would be waited for
+    try:
+        if not _locked(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB)) or (
+            not os.path.samestat(os.fstat(folder), os.stat(path))
+        ):
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process writes it", str(path))
+    except BaseException:
+        os.close(folder)
+        raise
     return folder
 
 
@@ -141,14 +182,19 @@ def is_being_written(path: Path) -> bool:
     """Whether a living process writes the bag."""
     folder = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # a file system without locks
-        return False
+        return not _locked(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
     finally:
         os.close(folder)
-    return False
+
+
+def _locked(folder: int, how: int) -> bool:
+    try:
+        fcntl.flock(folder, how)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True
 
 
 def sync(*paths: Path) -> None:

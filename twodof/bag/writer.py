@@ -24,7 +24,7 @@ from ..inputs import Changes
 from ..master import Experiment, Sample
 from . import provenance
 from .messages import JOINT_STATES, STORE, Messages, Serialised, Stamps
-from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, is_being_written, lock, sync
+from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, check_path, lock, sync
 
 MAX_METADATA = 64 * 1024**2  # bytes
 PROVENANCE_KEY = "twodof"
@@ -86,14 +86,14 @@ class Bag:
         self._run = run
         if storage not in STORAGES:
             raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
-        if storage == "sqlite3" and any(c in str(self.path) for c in "?#%"):
-            raise BagError(f"'{path}': a sqlite3 bag cannot have ?, # or % in its path")
+        check_path(self.path, storage)
         self._storage = storage
         self._overwrite = overwrite
         self._fsync = fsync
         self._open_ended = open_ended
         self._command_line = command_line
         self.count = 0
+        self._lock = -1  # no descriptor yet
         self._inputs, self._latest = run.start_values, run.start_time
         self._changes: Changes = []
         self.stamps = Stamps(run, stamp_start)
@@ -101,12 +101,10 @@ class Bag:
         _check_free(self.path, overwrite)
 
     def __enter__(self) -> Bag:
-        _check_free(self.path, self._overwrite)
         start = self.stamps.now() if self._open_ended else self.stamps.start
         text = provenance.provenance(self._run, start, self._command_line)
         try:
-            if self.path.exists():
-                shutil.rmtree(self.path)
+            _check_free(self.path, self._overwrite, clear=True)
             self._writer = BagWriter(self.path, self._storage, fsync=self._fsync)
             self._open(text)
         except WriterError as error:  # the folder appeared meanwhile and is not ours
@@ -187,6 +185,7 @@ class Bag:
         try:
             self._writer.set_custom_data(PROVENANCE_KEY, text)
             self._writer.open()
+            self._lock = lock(self.path, wait=True)  # before it is a bag that others may overwrite
             (self.path / provenance.FILE).write_text(text + "\n", "utf-8")
             with (self.path / RESERVE).open("wb") as reserve:
                 reserve.write(b"\0" * RESERVE_SIZE)
@@ -201,13 +200,14 @@ class Bag:
             self._writer.flush()
             if self._fsync:
                 sync(self.path / provenance.FILE, self.path, self.path.absolute().parent)
-            self._lock = lock(self.path)
-        except WriterError:
+        except (WriterError, BlockingIOError):  # the folder is another's
             raise
         except BaseException:
             with suppress(OSError, sqlite3.Error):
                 self._writer.abort()
             shutil.rmtree(self.path, ignore_errors=True)
+            with suppress(OSError):
+                os.close(self._lock)
             raise
 
     def _give(self, messages: Iterable[tuple[str, Serialised]], stamp: int) -> None:
@@ -282,18 +282,27 @@ def _reason(error: Exception) -> str:
     return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
-def _check_free(path: Path, overwrite: bool) -> None:
+def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
+    """Refuse what is in a bag's place; with ``clear``, remove what may be overwritten."""
     try:
         if not path.exists():
             return
+        if not overwrite:
+            reason = "exists already; choose another name with -o or use --overwrite"
+            raise BagError(f"'{path}' {reason}")
+        held = lock(path)
+        try:
+            if path.is_symlink() or not _is_bag(path):
+                raise BagError(f"'{path}' is not a bag and is not overwritten")
+            if clear:
+                shutil.rmtree(path)
+        finally:
+            os.close(held)
+    except BlockingIOError as error:
+        reason = "is being written by another process and is not overwritten"
+        raise BagError(f"'{path}' {reason}") from error
     except OSError as error:
         raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
-    if not overwrite:
-        raise BagError(f"'{path}' exists already; choose another name with -o or use --overwrite")
-    if path.is_symlink() or not _is_bag(path):
-        raise BagError(f"'{path}' is not a bag and is not overwritten")
-    if is_being_written(path):
-        raise BagError(f"'{path}' is being written by another process and is not overwritten")
 
 
 def _is_bag(path: Path) -> bool:
