@@ -61,7 +61,7 @@ def main() -> None:
         return browse(sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, build_fmu
-    from twodof.experiment import experiment
+    from twodof.experiments import experiment
     from twodof.pages.live import page_of
     from twodof.pages.loop import Loop
 

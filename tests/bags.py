@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from twodof.experiment import Experiment
+from twodof.experiments import Experiment
 from twodof.master import Sample
 
 STORAGES = ("mcap", "sqlite3")

@@ -6,9 +6,11 @@ path is a closed form; type hashes are those that ROS 2 publishes.
 
 from __future__ import annotations
 
+import fcntl
 import importlib.metadata
 import json
 import math
+import os
 import re
 import shutil
 import sqlite3
@@ -18,7 +20,9 @@ import time
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
+from threading import Timer
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,8 +53,11 @@ from ruamel.yaml import YAML
 from sinks import Collector
 
 import twodof
+from twodof.bag.reader import read_ends
+from twodof.bag.storage import BagWriter
 from twodof.errors import BagError, InputError
-from twodof.experiment import Experiment
+from twodof.experiments import Experiment
+from twodof.files import is_being_written
 from twodof.master import Sample
 
 KIB, MIB = 1024, 1024**2
@@ -537,6 +544,45 @@ def test_bag_whose_joint_states_name_different_joints_is_refused(
         twodof.read_bag(tmp_path / "bag")
 
 
+def joint_states_of_another_writer(rng: np.random.Generator) -> Iterator[tuple[int, bytes]]:
+    """Of three joints, in frames of any length, with stamps in any order, either byte order, and
+    anything in the gaps that CDR leaves: for these, the bytes that two serialisations differ in."""
+    kind = "sensor_msgs/msg/JointState"
+    header, time = STORE.types["std_msgs/msg/Header"], STORE.types["builtin_interfaces/msg/Time"]
+    for k in rng.permutation(60).tolist():
+        frame, names = "x" * (k // 10), ["a", "joint2", "ö"]
+        state = STORE.types[kind](
+            header(time(k, 0), frame), names, rng.random(3), rng.random(3), np.array([])
+        )
+        data = bytearray(STORE.serialize_cdr(state, kind, little_endian=k % 7 != 0))
+        end = 16 + len(frame) + 1
+        for text in ("", *names):  # the frame is before the list, whose length needs no gap
+            end += (4 + len(text.encode()) + 1) if text else 0
+            gap = -end % 4
+            data[end : end + gap] = rng.bytes(gap)
+            end += gap + (0 if text else 4)
+        yield k * SECOND, bytes(data)
+
+
+def test_joint_states_are_read_as_rosbags_reads_them_in_whatever_form(tmp_path: Path) -> None:
+    kind = "sensor_msgs/msg/JointState"
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joint_states", kind, typestore=STORE)
+        for stamp, data in joint_states_of_another_writer(np.random.default_rng(0)):
+            writer.write(connection, stamp, data)
+    expected = read_with_rosbags(tmp_path / "bag")
+    found = twodof.read_bag(tmp_path / "bag")
+    assert found.joints == ("a", "joint2", "ö") and len(expected) == 60
+    for i, state in enumerate(sorted(expected)):
+        q, v = found.q[i].tobytes(), found.v[i].tobytes()
+        assert (found.stamps[i], q, v) == (state.log_time, state.position, state.velocity)
+    ends, count = read_ends(tmp_path / "bag")
+    assert count == 60
+    np.testing.assert_array_equal(ends.stamps, found.stamps[[0, -1]])
+    np.testing.assert_array_equal(ends.q, found.q[[0, -1]])
+    np.testing.assert_array_equal(ends.v, found.v[[0, -1]])
+
+
 def test_bag_without_joint_states_topic_is_refused(tmp_path: Path) -> None:
     write_elsewhere(tmp_path / "bag", [], "")
     with pytest.raises(BagError, match="has no joint states"):
@@ -605,6 +651,52 @@ def test_existing_bag_is_kept_unless_told_otherwise(
         for k in range(3):
             bag.write(sample(run, k))
     assert len(read_with_rosbags(path)) == 3
+
+
+@pytest.mark.parametrize("moment", ["remove", "open", "add_connection"])
+def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(
+    run: Experiment, tmp_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second comes just before the first removes the old bag, opens its own, adds a topic."""
+    path = tmp_path / "bag"
+    with twodof.Bag(path).begin(run):
+        pass
+    first, second = (twodof.Bag(path, overwrite=True).begin(run) for _ in range(2))
+    place, name = (shutil, "rmtree") if moment == "remove" else (BagWriter, moment)
+    original, begun = getattr(place, name), []
+
+    def begin(bag: twodof.Bag) -> None:
+        with suppress(BagError):
+            begun.append(bag.__enter__())
+
+    def intruded(*arguments: Any, **named: Any) -> Any:
+        monkeypatch.setattr(place, name, original)
+        begin(second)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(place, name, intruded)
+    begin(first)
+    (winner,) = begun
+    for k in range(3):
+        winner.write(sample(run, k))
+    winner.__exit__(None, None, None)
+    assert assert_consistent(path, "mcap") == 3
+
+
+def test_bag_is_locked_though_another_looks_whether_it_is(
+    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = BagWriter.open
+
+    def looked_at(writer: BagWriter) -> None:
+        opened(writer)
+        folder = os.open(writer.path, os.O_RDONLY)
+        fcntl.flock(folder, fcntl.LOCK_SH)
+        Timer(0.2, os.close, [folder]).start()
+
+    monkeypatch.setattr(BagWriter, "open", looked_at)
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        assert is_being_written(bag.path)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 import twodof
 from twodof.cli.common import parse_settings
 from twodof.errors import InputError
-from twodof.experiment import Setting, read_changes, resolve
+from twodof.experiments import Setting, read_changes, resolve
 from twodof.fmu import Fmu
 from twodof.master import Sample
 

@@ -27,6 +27,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple, NoReturn
 
+import lz4.frame
 import mutations
 import numpy as np
 import pytest
@@ -116,7 +117,8 @@ class Worker:
 
 
 MODULES = (
-    "twodof.bag",
+    "twodof.bag.reader",
+    "twodof.bag.recovery",
     "twodof.export.package",
     "twodof.master",
     "twodof.ros.scene",
@@ -825,7 +827,6 @@ def words(*texts: str) -> bytes:
 JOINT_STATE = "sensor_msgs/msg/JointState"
 SCHEMA = record(3, struct.pack("<H", 1), words(JOINT_STATE, "ros2msg", ""))
 CHANNEL = record(4, struct.pack("<HH", 1, 1), words("/joint_states", "cdr"), bytes(4))
-MESSAGE = record(5, struct.pack("<HIQQ", 1, 0, 1, 1), b"\0\1\0\0", bytes(40))
 
 
 def mcap_of(*records: bytes) -> bytes:
@@ -883,6 +884,60 @@ def many_files(bag: Path) -> None:
         (bag / f"x_{i}.mcap").write_bytes(b"")
 
 
+def circle(bag: Path) -> None:
+    """Rows enough for pages of pages, whose children then are all the same full one."""
+    with_sql(
+        f"{ENDLESS} INSERT INTO messages SELECT i + 99, 1, i, zeroblob(300) FROM r LIMIT 200000"
+    )(bag)
+    file = bag / "bag.db3"
+    pages = bytearray(file.read_bytes())
+    interior = [start for start in range(4096, len(pages), 4096) if pages[start] == 5]
+    assert len(interior) > 2
+    for start in interior:
+        (cells,) = struct.unpack_from(">H", pages, start + 3)
+        (last,) = struct.unpack_from(">I", pages, start + 8)
+        for i in range(cells):
+            (cell,) = struct.unpack_from(">H", pages, start + 12 + 2 * i)
+            struct.pack_into(">I", pages, start + cell, last)
+    file.write_bytes(pages)
+
+
+def lz4_zeros(size: int) -> bytes:
+    packer = lz4.frame.LZ4FrameCompressor()
+    parts = [packer.begin(), *(packer.compress(bytes(MIB)) for _ in range(size // MIB))]
+    return b"".join([*parts, packer.flush()])
+
+
+def channel(number: int, qos: str = "") -> bytes:
+    metadata = words("offered_qos_profiles", qos)
+    head = struct.pack("<HH", number % 65536, 1)
+    return record(4, head, words(f"/t{number}", "cdr"), struct.pack("<I", len(metadata)), metadata)
+
+
+def message(data: bytes, number: int = 1) -> bytes:
+    return record(5, struct.pack("<HIQQ", number, 0, 1, 1), data)
+
+
+def joint_state(positions: int, names: int) -> bytes:
+    """A joint state that is nearly nothing when packed."""
+    types, kind = STORE.types, "sensor_msgs/msg/JointState"
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
+    none = np.zeros(0)
+    state = types[kind](header, ["a"] * names, np.zeros(positions), none, none)
+    return bytes(STORE.serialize_cdr(state, kind))
+
+
+def hollow(size: int, content: bytes) -> Callable[[Path], None]:
+    """A file of this size, that unpacks to the same over and over, 32 MiB a chunk."""
+
+    def make() -> bytes:
+        chunks = content * (32 * MIB // len(content))
+        packed = chunk(zipped(chunks), len(chunks), "zstd")
+        return mcap_of(SCHEMA, *map(channel, range(1, 1000)), *[packed] * (size // len(packed)))
+
+    return with_mcap(make)
+
+
 ENDLESS = "WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r)"
 HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     **{
@@ -905,21 +960,32 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     ),
     "250 MB of messages in a chunk": with_mcap(
         lambda: mcap_of(SCHEMA, CHANNEL, chunk(
-            zipped(MESSAGE * 1000, 3500), len(MESSAGE) * 3_500_000, "zstd"))
+            zipped(message(bytes(44)) * 1000, 3500), 75 * 3_500_000, "zstd"))
     ),
-    "100,000 channels": with_mcap(
-        lambda: mcap_of(SCHEMA, *(
-            record(4, struct.pack("<HH", i % 65536, 1), words(f"/t{i}", "cdr"), bytes(4))
-            for i in range(100_000)))
+    "2.5 GB in a chunk of lz4": with_mcap(
+        lambda: mcap_of(chunk(lz4_zeros(2500 * MIB), 1000, "lz4"))
+    ),
+    "434 kB of empty messages": hollow(
+        434_000, b"".join(message(b"", i) for i in range(1, 1000))
+    ),
+    "434 kB of joint states of nothing": hollow(434_000, message(joint_state(0, 0))),
+    "434 kB of joint states of 40,000 joints": hollow(434_000, message(joint_state(40_000, 0))),
+    "434 kB of joint states of 80,000 names": hollow(434_000, message(joint_state(0, 80_000))),
+    "434 kB of topics of 1 MB": hollow(434_000, channel(1, " " * MIB)),
+    "100,000 channels": with_mcap(lambda: mcap_of(SCHEMA, *map(channel, range(100_000)))),
+    "a thousand topics with profiles of their own": with_mcap(
+        lambda: mcap_of(
+            SCHEMA,
+            *(channel(i, "- {depth: [" + "1," * 200 + f"]}}#{i}") for i in range(1, 1000)),
+            *(message(bytes(4), i) for i in range(1, 1000)),
+        )
     ),
     "a message of 700 MB": with_mcap(
-        lambda: mcap_of(SCHEMA, CHANNEL, record(5, struct.pack("<HIQQ", 1, 0, 1, 1),
-                                                bytes(700 * MIB)))
+        lambda: mcap_of(SCHEMA, CHANNEL, message(bytes(700 * MIB)))
     ),
     "60 MB of small records": with_mcap(lambda: mcap_of(record(8) * (7 * MIB))),
     "an array of 4 billion": with_mcap(
-        lambda: mcap_of(SCHEMA, CHANNEL, record(5, struct.pack("<HIQQ", 1, 0, 1, 1),
-                                                b"\0\1\0\0", bytes(8), b"\xff" * 400))
+        lambda: mcap_of(SCHEMA, CHANNEL, message(b"\0\1\0\0" + bytes(8) + b"\xff" * 400))
     ),
     "no topic in CDR": with_sql(
         "UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"
@@ -927,19 +993,11 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
     "stamps before 1970": with_sql(
         "UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"
     ),
-    "a view of endless messages": with_sql(
-        f"DROP TABLE messages; CREATE VIEW messages AS {ENDLESS}"
-        " SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM r"
-    ),
-    "a view of endless topics": with_sql(
-        f"DROP TABLE topics; CREATE VIEW topics AS {ENDLESS} SELECT i AS id, 'a' || i AS name,"
+    "a view of topics without end": with_sql(
+        f"DROP TABLE topics; CREATE VIEW topics AS {ENDLESS} SELECT max(i) AS id, 'a' AS name,"
         " 'b' AS type, 'cdr' AS serialization_format, '' AS offered_qos_profiles FROM r"
     ),
-    "a computed column": with_sql(
-        "DROP TABLE messages; CREATE TABLE messages(id INTEGER, topic_id INTEGER,"
-        " timestamp INTEGER, data AS (zeroblob(900000000)));"
-        " INSERT INTO messages VALUES (1, 1, 1), (2, 1, 2)"
-    ),
+    "pages in a circle": circle,
     "100,000 topics": with_sql(
         f"{ENDLESS} INSERT INTO topics SELECT i + 9, 't' || i, 'x', 'cdr', '', '' FROM r"
         " LIMIT 100000"
@@ -976,7 +1034,8 @@ SLOW = {
     "7 MB of attributes", "8 MB of links", "100,000 meshes that are not there", "meshes of 300 MB",
     "200 MB of meshes", "100,000 uses of a mesh", "a chain of 128 joints",
     "60 MB of rows", "60 MB of line breaks", "60 MB of one letter", "60 MB of one cell",
-    "5000 files", "10 GB in a chunk", "10 GB in a chunk of 1 kB", "250 MB of zeros in a chunk",
+    "5000 files", "pages in a circle", "10 GB in a chunk", "10 GB in a chunk of 1 kB",
+    "2.5 GB in a chunk of lz4", "250 MB of zeros in a chunk",
     "250 MB of one record in each of 500 chunks", "250 MB of messages in a chunk",
     "a message of 700 MB", "a message of 300 MB in a database", "60 MB of small records",
     "60 MB of metadata", "60 MB of provenance",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import os
 import random
 import re
@@ -41,7 +41,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError
-from twodof.experiment import Experiment
+from twodof.experiments import Experiment
 
 TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
 BATCH = 40  # samples between two flushes
@@ -180,7 +180,11 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(
     assert assert_consistent(bag, "mcap") == there
 
 
-def test_sqlite3_transaction_that_was_cut_is_rolled_back(run: Experiment, tmp_path: Path) -> None:
+@pytest.mark.parametrize("named", ["", "a file", "nothing"])
+def test_sqlite3_transaction_that_was_cut_is_rolled_back(
+    run: Experiment, tmp_path: Path, named: str
+) -> None:
+    """Also where its journal names that of several databases, which SQLite would delete."""
     bag = unfinished(tmp_path, run, "sqlite3", 200)
     file = bag / "bag.db3"
     committed = len(read_with_sqlite3(bag))
@@ -198,11 +202,27 @@ def test_sqlite3_transaction_that_was_cut_is_rolled_back(run: Experiment, tmp_pa
     assert (cut / "bag.db3-journal").stat().st_size > 0
     (cut / "bag.db3").rename(cut / "cut.db3")
     (cut / "bag.db3-journal").rename(cut / "cut.db3-journal")
+    victim = tmp_path / "victim"
+    if named:
+        with (cut / "cut.db3-journal").open("ab") as journal:
+            journal.write(super_journal(victim))
+    if named == "a file":
+        victim.write_text("precious")
+    (cut / "metadata.yaml").touch()
     before = content(cut)
+    assert len(twodof.read_bag(cut).t) == committed
     twodof.recover(cut)
     assert read_with_rosbags(cut) == [joint_state(k, sample(run, k)) for k in range(committed)]
     assert content(tmp_path / "cut.unfinished") == before
+    assert victim.exists() == (named == "a file")
     assert assert_consistent(cut, "sqlite3") == committed > 100
+
+
+def super_journal(path: Path) -> bytes:
+    """What ends the journal of a transaction over several databases, from SQLite's pager.c."""
+    name = os.fsencode(path)
+    magic = bytes.fromhex("d9d505f920a163d7")
+    return struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name)) + magic
 
 
 @both_storages
@@ -376,7 +396,7 @@ def test_bag_on_a_disk_without_room_for_another_stays_as_it_was(
     folder = disk(content_size(big) // 1024 + 200)
     shutil.copytree(big, folder / "bag")
     before = content(folder)
-    with pytest.raises(BagError, match=r"cannot recover .*; it is as it was"):
+    with pytest.raises(BagError, match=r"cannot recover .*; nothing is lost"):
         twodof.recover(folder / "bag")
     assert content(folder) == before
 
@@ -410,18 +430,151 @@ def test_recovery_that_is_killed_can_be_begun_again(
     assert kept > 5900
 
 
-def test_two_recoveries_at_once_are_refused(run: Experiment, tmp_path: Path) -> None:
-    bag = unfinished(tmp_path, run, "mcap", 10)
-    work = tmp_path / ".bag.recovering"
-    work.mkdir()
-    held = os.open(work, os.O_RDONLY)
-    fcntl.flock(held, fcntl.LOCK_EX)
-    with pytest.raises(BagError, match="another process"):
+KILLED_ANYWHERE = """
+import os, signal, sys
+from twodof.bag.recovery import recover
+bags = sys.argv[1:]
+for last, bag in enumerate(bags):
+    if os.fork() == 0:
+        changes = 0
+
+        def count(event, arguments):
+            global changes
+            if event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir"):
+                changes += 1
+                if changes > last:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+        sys.addaudithook(count)
+        recover(bag)
+        os._exit(0)
+    _, status = os.wait()
+    print(os.waitstatus_to_exitcode(status))
+"""
+
+
+@both_storages
+def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    """Its changes to folders, one after the other; the last few of these have not so many."""
+    living = unfinished(tmp_path, run, storage, 200)
+    before = content(living)
+    bags = [tmp_path / str(last) / "bag" for last in range(12)]
+    for bag in bags:
+        shutil.copytree(living, bag)
+    command = [sys.executable, "-c", KILLED_ANYWHERE, *map(str, bags)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    ends = [int(line) for line in done.stdout.split()]
+    assert {*ends[:5]} == {-signal.SIGKILL} and ends[-1] == 0
+    gone = 0
+    for bag in bags:
+        gone += not bag.exists()
         twodof.recover(bag)
-    os.close(held)
+        assert {path.name for path in bag.parent.iterdir()} == {"bag", "bag.unfinished"}
+        assert content(bag.with_name("bag.unfinished")) == before
+        kept = assert_consistent(bag, storage)
+        assert read_with_rosbags(bag) == [joint_state(k, sample(run, k)) for k in range(kept)]
+        assert kept > 150
+    assert gone == 1  # between two renames
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+def test_recovery_that_cannot_rename_leaves_the_bag_as_it_was(
+    run: Experiment, tmp_path: Path, failing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 10)
+    before = content(tmp_path)
+    rename, calls = os.rename, []
+
+    def failing_rename(*paths: Path) -> None:
+        calls.append(paths)
+        if len(calls) == failing:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+        rename(*paths)
+
+    monkeypatch.setattr(os, "rename", failing_rename)
+    with pytest.raises(BagError, match="not permitted; nothing is lost"):
+        twodof.recover(bag)
+    assert content(tmp_path) == before
+
+
+def test_bag_that_is_being_recovered_is_left_alone(
+    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By another recovery and by a run that would overwrite it, at any moment."""
+    bag = unfinished(tmp_path, run, "mcap", 10)
+    rename, said = os.rename, []
+
+    def slow_rename(*paths: Path) -> None:
+        for intruder in (twodof.recover, lambda path: twodof.Bag(path, overwrite=True)):
+            if bag.exists() or intruder is twodof.recover:
+                with pytest.raises(BagError) as caught:
+                    intruder(bag)
+                said.append(str(caught.value))
+        rename(*paths)
+
+    monkeypatch.setattr(os, "rename", slow_rename)
     twodof.recover(bag)
+    assert len(said) == 3 and all("being written" in line for line in said)
     assert assert_consistent(bag, "mcap") > 0
-    assert not work.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
+
+
+# --- names ---
+
+
+def renamed(bag: Path, name: bytes) -> Path:
+    """The bag in a folder of this name, and itself of this name."""
+    path = Path(os.fsdecode(os.fsencode(bag.parent) + b"/" + name + b"/" + name))
+    path.parent.mkdir()
+    bag.rename(path)
+    for file in path.iterdir():
+        if file.stem == bag.name:
+            file.rename(file.with_name(path.name + file.suffix))
+    return path
+
+
+@both_storages
+@pytest.mark.parametrize("name", [b"\xff", b"a?b", b"a%41", b"a#b"])
+def test_bag_of_a_name_that_none_would_find_again_is_refused(
+    run: Experiment, tmp_path: Path, storage: str, name: bytes
+) -> None:
+    bag = renamed(unfinished(tmp_path, run, storage, 10), name)
+    before = content(tmp_path)
+    if storage == "mcap" and name != b"\xff":
+        twodof.recover(bag)
+        assert assert_consistent(bag, storage) > 0
+        return
+    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
+        twodof.recover(bag)
+    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
+        twodof.Bag(bag.with_name(f"{bag.name}2"), storage=storage)
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("verb", ["info", "recover", "plot", "view"])
+def test_bag_of_a_name_that_is_not_utf8_is_read(run: Experiment, tmp_path: Path, verb: str) -> None:
+    """As on a terminal that knows UTF-8 alone."""
+    with twodof.Bag(tmp_path / "bag").begin(run) as sink:
+        for k in range(3):
+            sink.write(sample(run, k))
+    bag = renamed(sink.path, b"\xff")
+    options = {"plot": ["-o", "x.svg"], "view": ["--export", "x.html"]}.get(verb, [])
+    done = subprocess.run(
+        [*TWODOF, verb, os.fsencode(bag), *options], cwd=tmp_path, capture_output=True, text=True,
+        check=False, env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_bag_is_recovered_from_within(
+    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 10)
+    monkeypatch.chdir(bag)
+    assert twodof.recover(".").original == tmp_path / "bag.unfinished"
+    assert assert_consistent(bag, "mcap") > 0
 
 
 @both_storages

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from .bag.recovery import recover as recover
     from .bag.writer import Bag as Bag
     from .errors import TwoDofError as TwoDofError
-    from .experiment import Experiment as Experiment
-    from .experiment import experiment as experiment
+    from .experiments import Experiment as Experiment
+    from .experiments import experiment as experiment
     from .export.package import FmuOptions as FmuOptions
     from .export.package import build_fmu as build_fmu
     from .fmu import Fmu as Fmu
@@ -42,7 +42,7 @@ _HOMES = {
     "bag.recovery": ("recover",),
     "bag.writer": ("Bag",),
     "errors": ("TwoDofError",),
-    "experiment": ("Experiment", "experiment"),
+    "experiments": ("Experiment", "experiment"),
     "export.package": ("FmuOptions", "build_fmu"),
     "fmu": ("Fmu", "load_fmu"),
     "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),

@@ -49,6 +49,11 @@ def read_file(path: str | Path, most: int) -> bytes:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
+def shown(path: str | Path) -> str:
+    """A path as text that can be written anywhere: what is no UTF-8 in it as escapes."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
+
+
 def check_archive(path: str | Path) -> None:
     """Refuse a zip archive with more members than can be listed.
 
@@ -119,11 +124,26 @@ def _remove_abandoned(folder: Path) -> None:
             os.close(descriptor)
 
 
-def lock(path: Path) -> int:
-    """Mark a folder as being written until the descriptor is closed or the process dies."""
-    folder = os.open(path, os.O_RDONLY)
-    with suppress(OSError):  # a file system without locks
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+def lock(path: Path, *, wait: bool = False) -> int:
+    """Keep other writers from a folder until the descriptor is closed or the process dies.
+
+    Args:
+        path: the folder.
+        wait: for those that look whether it is being written.
+
+    Raises:
+        BlockingIOError: another process writes it.
+        OSError: it cannot be opened.
+    """
+    folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place would be waited for
+    try:
+        if not _locked(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB)) or (
+            not os.path.samestat(os.fstat(folder), os.stat(path))
+        ):
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process writes it", str(path))
+    except BaseException:
+        os.close(folder)
+        raise
     return folder
 
 
@@ -131,14 +151,19 @@ def is_being_written(path: Path) -> bool:
     """Whether a living process writes the folder."""
     folder = os.open(path, os.O_RDONLY)
     try:
-        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # a file system without locks
-        return False
+        return not _locked(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
     finally:
         os.close(folder)
-    return False
+
+
+def _locked(folder: int, how: int) -> bool:
+    try:
+        fcntl.flock(folder, how)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True
 
 
 def sync(*paths: Path) -> None:

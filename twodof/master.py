@@ -19,7 +19,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .errors import SimulationError
-from .experiment import NANOSECONDS, TIME_TOLERANCE, Experiment, Setting, Value, experiment, resolve
+from .experiments import (
+    NANOSECONDS,
+    TIME_TOLERANCE,
+    Experiment,
+    Setting,
+    Value,
+    experiment,
+    resolve,
+)
 from .fmu import Fmu, Instance, instantiate
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import BagError
-from ..experiment import Changes, Experiment
+from ..experiments import Changes, Experiment
 from ..files import read_file
 from ..fmu import urdf_text
 from ..version import versions

@@ -1,7 +1,7 @@
 """What a bag's file holds, message by message, also where it ends in the middle.
 
 Nothing that a file claims is believed: a length, a table of contents, a size after decompression.
-Memory is bounded by the size of the file and of one chunk, time by the size of the file.
+Memory is bounded by the size of one chunk or message, time by the size of the files.
 rosbags reads no file that lacks its end, and believes the rest.
 """
 
@@ -14,6 +14,8 @@ import struct
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from operator import length_hint
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
@@ -29,14 +31,21 @@ else:
 
 MAX_TOPICS = 1000
 MAX_CHUNK = 256 * 1024**2  # bytes, of a message too; writers cut chunks at 1 to 4 MiB
-LARGE_CHUNK = 32 * 1024**2  # bytes, beyond which compression is not believed that is better than
-MAX_RATIO = 100
+MAX_RATIO = 1000  # of unpacked to packed; an arm at rest reaches 24, one of 50 joints 220
+RECORD = 2000  # bytes that a record counts for; a message takes 3 of the file at least, packed
+TEXT = 100  # bytes that one of a topic's texts counts for, which are kept
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, FOOTER = 3, 4, 5, 6, 2  # opcodes of the MCAP specification
 READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
 HEAD = struct.Struct("<BQ")
-MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # with the record's head: channel, sequence, two times
-COLUMNS = "topic_id, timestamp, data"
+MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # with the record's head: channel, sequence, two times
+PLAIN = ("CREATE TABLE ", "CREATE INDEX ")  # as SQLite begins its records of them
+TABLES = {  # of ROS 2, and their columns; those of older versions end earlier
+    "topics": "id name type serialization_format offered_qos_profiles type_description_hash",
+    "message_definitions": "id topic_type encoding encoded_message_definition",
+    "messages": "id topic_id timestamp data",
+}
+SCHEMA_STEPS = 1000  # of SQLite's machine, for which it reads a hundred of those
 
 
 class Channel(NamedTuple):
@@ -54,47 +63,79 @@ class DamageError(Exception):
     """The file cannot be read from here on; what came before is sound."""
 
 
+@dataclass
+class Allowance:
+    """What a bag's files together may still unpack to, bytes.
+
+    A few bytes can unpack to millions, and to records without end that are all alike. The messages
+    of an honest bag differ in their time stamps at least. So after a large chunk no more is
+    believed than MAX_RATIO times what was read, where each record counts for RECORD bytes more.
+    """
+
+    left: int = MAX_CHUNK
+
+    def spend(self, size: int) -> None:
+        """Take so many bytes off.
+
+        Raises:
+            DamageError: they are not left.
+        """
+        self.left -= size
+        if self.left < 0:
+            raise DamageError(f"it unpacks to more than {MAX_RATIO} times its size")
+
+
 def storage_files(folder: Path) -> list[Path]:
     """The files that hold a bag's messages, in the order in which they were written."""
     found = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
     return sorted(found, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
 
-def read_messages(file: Path) -> Iterator[tuple[Channel, int, bytes]]:
+def read_messages(file: Path, allowance: Allowance) -> Iterator[tuple[Channel, int, bytes]]:
     """Channel, log time in ns and serialised message, in the order of the file.
+
+    Args:
+        file: one of a bag's.
+        allowance: of the bag.
 
     Raises:
         DamageError: where the file ends in the middle or is not sound.
         OSError: it cannot be read.
     """
-    read = _mcap_messages if file.suffix == ".mcap" else _sqlite3_messages
+    mcap = file.suffix == ".mcap"
     try:
-        yield from read(file)
+        yield from _mcap_messages(file, allowance) if mcap else _sqlite3_messages(file)
     except (struct.error, UnicodeDecodeError, KeyError, TypeError) as error:
         raise DamageError(f"'{file.name}' is damaged") from error
 
 
-def _mcap_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
+def _mcap_messages(path: Path, allowance: Allowance) -> Iterator[tuple[Channel, int, bytes]]:
     schemas: dict[int, tuple[str, str]] = {0: ("", "")}
     channels: dict[int, Channel] = {}
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise DamageError(f"'{path.name}' is no MCAP file")
-        for opcode, content in _mcap_records(path, file):
-            chunk = _unpack(path, content) if opcode == CHUNK else content
+        for opcode, content in _mcap_records(path, file, allowance):
+            allowance.left += MAX_RATIO * len(content)
+            chunk = _unpack(path, content, allowance) if opcode == CHUNK else content
             position = 0
             while position < len(chunk):
                 opcode, length = HEAD.unpack_from(chunk, position)
                 end = position + HEAD.size + length
                 if end > len(chunk) or not opcode:
                     raise DamageError(f"'{path.name}' has a damaged chunk")
+                allowance.spend(RECORD)
                 if opcode == MESSAGE:
                     _, _, channel, _, stamp, _ = MESSAGE_HEAD.unpack_from(chunk, position)
+                    if stamp < 0:
+                        raise DamageError(f"'{path.name}' has a stamp beyond 2262")
                     yield channels[channel], stamp, chunk[position + MESSAGE_HEAD.size : end]
                 elif opcode == SCHEMA:
+                    allowance.spend(TEXT * length)
                     number, name, _, text = _fields("Hsss", chunk, position + HEAD.size)
                     schemas[number] = (name, text)
                 elif opcode == CHANNEL:
+                    allowance.spend(TEXT * length)
                     number, channel = _channel(chunk, position + HEAD.size, schemas)
                     channels[number] = channel
                     if len(channels) > MAX_TOPICS:
@@ -102,7 +143,7 @@ def _mcap_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
                 position = end
 
 
-def _mcap_records(path: Path, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[tuple[int, bytes]]:
     """Opcode of each record up to the footer that matters, and the record with its head.
 
     Of a chunk, the content alone.
@@ -114,6 +155,7 @@ def _mcap_records(path: Path, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
         if len(head) < HEAD.size:
             raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
         opcode, length = HEAD.unpack(head)
+        allowance.spend(RECORD)
         position += HEAD.size + length
         if opcode == 0 or position > size:
             raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
@@ -132,13 +174,14 @@ def _mcap_records(path: Path, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             file.seek(length, 1)
 
 
-def _unpack(path: Path, content: bytes) -> bytes:
+def _unpack(path: Path, content: bytes, allowance: Allowance) -> bytes:
     """The records of a chunk."""
     _, _, size, crc, compression = _fields("QQQIs", content, 0)
     start = 28 + 4 + len(compression.encode()) + 8
     packed = content[start : start + struct.unpack_from("<Q", content, start - 8)[0]]
-    if size > min(MAX_CHUNK, LARGE_CHUNK + MAX_RATIO * len(packed)):
+    if size > MAX_CHUNK:
         raise DamageError(f"'{path.name}' has a chunk of {size} bytes")
+    allowance.spend(size)
     try:
         if compression == "zstd":
             packed = zstd.ZstdDecompressor().decompress(packed, max_length=size)
@@ -190,15 +233,10 @@ def _fields(form: str, content: bytes, position: int) -> list[Any]:
 
 
 def _sqlite3_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
-    size = path.stat().st_size
     try:
         with _database(path) as database:
             channels = _sqlite3_channels(path, database)
-            read = 0
-            for topic, stamp, data in database.execute(f"SELECT {COLUMNS} FROM messages"):
-                read += len(data) + 1
-                if read > size:  # pages that are read in a circle
-                    raise DamageError(f"'{path.name}' is damaged")
+            for _, topic, stamp, data in _rows(path, database, "messages"):
                 if not isinstance(stamp, int) or stamp < 0 or not isinstance(data, bytes):
                     raise DamageError(f"'{path.name}' is damaged")
                 yield channels[topic], stamp, data
@@ -208,50 +246,69 @@ def _sqlite3_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
 
 @contextmanager
 def _database(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database without changing it: where a writer died over it, a copy is repaired."""
-    unfinished = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
-    unfinished = [file for file in unfinished if file.is_file() and file.stat().st_size]
+    """Open a database of tables alone, without changing it.
+
+    Where a writer died over it, a copy is repaired. A journal can name that of several databases,
+    which SQLite would look for, anywhere, and delete; a copy that is longer names none.
+    """
+    unfinished = _unfinished(path)
     with temporary_folder(path.absolute().parent.parent if unfinished else None) as folder:
+        uri = path.absolute().as_uri() + "?immutable=1"
         if unfinished:
             for file in (path, *unfinished):
-                shutil.copyfile(file, folder / file.name)
+                copy = shutil.copyfile(file, folder / file.name)
+                if copy.name.endswith("-journal"):
+                    with copy.open("ab") as journal:
+                        journal.write(bytes(8))
             uri = (folder / path.name).as_uri()
-        else:
-            uri = path.absolute().as_uri() + "?immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
-            database.execute("PRAGMA trusted_schema = OFF")
+            database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
+            made = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"))
+            database.set_progress_handler(None, 0)
+            if not made.keys() >= {"topics", "messages"}:
+                raise DamageError(f"'{path.name}' has no messages")
+            if not all(sql.startswith(PLAIN) for sql in made.values()):
+                raise DamageError(f"'{path.name}' has views, triggers or virtual tables")
             yield database
 
 
+def _unfinished(path: Path) -> list[Path]:
+    """The files that a writer which died leaves beside its database."""
+    found = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
+    return [file for file in found if file.is_file() and file.stat().st_size]
+
+
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
-    """Topics by their id; tables that compute what they hold are refused."""
-    columns = {}
-    for table in ("messages", "topics", "message_definitions"):
-        kind = "SELECT count(*) FROM sqlite_master WHERE name = ? AND type = 'table' AND rootpage"
-        (exists,) = database.execute(kind, (table,)).fetchone()
-        rows = database.execute(f"PRAGMA table_xinfo({table})").fetchall() if exists else []
-        columns[table] = {name for _, name, _, _, _, _, hidden in rows if not hidden}
-        if len(columns[table]) < len(rows):
-            raise DamageError(f"'{path.name}' has computed columns")
-    if not columns["messages"].issuperset(COLUMNS.split(", ")):
-        raise DamageError(f"'{path.name}' has no messages")
-    definitions: dict[str, str] = {}
-    if columns["message_definitions"]:
-        query = "SELECT topic_type, encoded_message_definition FROM message_definitions"
-        definitions = dict(database.execute(f"{query} LIMIT {MAX_TOPICS}"))
-    wanted = ["id", "name", "type", "serialization_format"]
-    wanted += [
-        name if name in columns["topics"] else "''"
-        for name in ("offered_qos_profiles", "type_description_hash")
-    ]
-    query = f"SELECT {', '.join(wanted)} FROM topics LIMIT {MAX_TOPICS + 1}"
+    """Topics by their id."""
+    definitions = {row[1]: row[3] for row in _rows(path, database, "message_definitions")}
     channels = {}
-    for number, *texts in database.execute(query):
-        if not all(isinstance(text, str) for text in texts):
-            raise DamageError(f"'{path.name}' is damaged")
-        topic, kind, serialization, qos, digest = texts
+    for number, topic, kind, serialization, qos, digest in _rows(path, database, "topics"):
         definition = definitions.get(kind, "")
-        channels[number] = Channel(topic, kind, serialization, definition, qos, digest)
-    if len(channels) > MAX_TOPICS:
-        raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
+        channel = Channel(topic, kind, serialization, definition, qos or "", digest or "")
+        if not all(isinstance(text, str) for text in channel):
+            raise DamageError(f"'{path.name}' is damaged")
+        channels[number] = channel
+        if len(channels) > MAX_TOPICS:
+            raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
     return channels
+
+
+def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:
+    """The rows of a table of ROS 2, NULL in the columns that it has not or computes.
+
+    No more is believed to lie in them than there is room for in the files: pages can be linked in
+    a circle, or be part of many rows. Nor may there be others before them, to be passed by.
+    """
+    columns = TABLES[table].split()
+    found = database.execute(f"PRAGMA table_xinfo({table})")
+    stored = ["" if computed else name for _, name, *_, computed in found]
+    known = [name for name in columns if name in stored]
+    if stored[: len(known)] != known:
+        raise DamageError(f"'{path.name}' has {table} that are not those of ROS 2")
+    names = ", ".join(name if name in known else "NULL" for name in columns)
+    room = sum(file.stat().st_size for file in (path, *_unfinished(path)))
+    for row in database.execute(f"SELECT {names} FROM {table} NOT INDEXED") if stored else ():
+        room -= len(known) + sum(map(length_hint, row))
+        if room < 0:
+            raise DamageError(f"'{path.name}' is damaged")
+        yield row

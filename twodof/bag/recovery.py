@@ -19,10 +19,10 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..errors import BagError
-from ..files import is_being_written, lock, read_file, sync
+from ..files import lock, read_file, sync
 from . import provenance
-from .records import Channel, DamageError, read_messages, storage_files
-from .storage import KINDS, BagWriter
+from .records import Allowance, Channel, DamageError, read_messages, storage_files
+from .storage import KINDS, BagWriter, check_path
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
 MAX_METADATA = 64 * 1024**2  # bytes
@@ -58,48 +58,57 @@ def recover(path: str | Path) -> Recovered:
     """
     found = Path(path)
     folder = found.resolve()
+    original = folder.with_name(f"{folder.name}.unfinished")
+    work = folder.with_name(f".{folder.name}.recovering")
     try:
-        if not folder.is_dir():
-            raise BagError(f"there is no bag '{found}'")
-        files = storage_files(folder)
-        if not files:
-            raise BagError(f"'{found}' has no .mcap or .db3 file to recover")
-        if len({file.suffix for file in files}) > 1:
-            raise BagError(f"'{found}' has .mcap and .db3 files; leave those of one kind in it")
-        if is_being_written(folder):
-            raise BagError(f"the bag '{found}' is still being written")
-        counts = _counts_if_whole(folder, files)
-        if counts is not None:
-            return Recovered(found, None, counts, "")
-        original = folder.with_name(f"{folder.name}.unfinished")
-        if original.exists():
-            raise BagError(f"'{original}', where the old bag would go, exists; move it away")
-        with _workshop(found, folder) as work:
+        with _held(found, folder, original, work):
+            files = storage_files(folder)
+            if not files:
+                raise BagError(f"'{found}' has no .mcap or .db3 file to recover")
+            if len({file.suffix for file in files}) > 1:
+                raise BagError(f"'{found}' has .mcap and .db3 files; leave those of one kind in it")
+            counts = _counts_if_whole(folder, files)
+            if counts is not None:
+                return Recovered(found, None, counts, "")
+            check_path(folder, KINDS[files[0].suffix])
+            if original.exists():
+                raise BagError(f"'{original}', where the old bag would go, exists; move it away")
+            work.mkdir()
             counts, damage = _copy(folder, files, work / folder.name)
             folder.rename(original)
             (work / folder.name).rename(folder)
             sync(folder.parent)
+    except BlockingIOError as error:
+        raise BagError(f"the bag '{found}' is still being written, or recovered") from error
     except (OSError, sqlite3.Error, WriterError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise BagError(f"cannot recover the bag '{found}': {reason}; it is as it was") from error
-    return Recovered(found, found.with_name(original.name), counts, damage)
+        raise BagError(f"cannot recover the bag '{found}': {reason}; nothing is lost") from error
+    return Recovered(found, original, counts, damage)
 
 
 @contextmanager
-def _workshop(found: Path, folder: Path) -> Iterator[Path]:
-    """A folder beside the bag, gone in the end; one that a killed process left is cleared."""
-    work = folder.with_name(f".{folder.name}.recovering")
-    if work.exists():
-        if is_being_written(work):
-            raise BagError(f"another process recovers the bag '{found}'")
-        shutil.rmtree(work)
-    work.mkdir()
-    held = lock(work)
+def _held(found: Path, folder: Path, original: Path, work: Path) -> Iterator[None]:
+    """Keep others from a bag; what a recovery left that was killed is undone, as is this one's.
+
+    Between its two renames there is nothing in the bag's place: the lock goes with the old one.
+    """
+    between = not folder.exists() and (work / folder.name).is_dir()
+    if not between and not folder.is_dir():
+        raise BagError(f"there is no bag '{found}'")
+    held = lock(original if between else folder)
     try:
-        yield work
+        _undo(folder, original, work)
+        yield
     finally:
-        shutil.rmtree(work)
+        _undo(folder, original, work)
         os.close(held)
+
+
+def _undo(folder: Path, original: Path, work: Path) -> None:
+    if not folder.exists():
+        original.rename(folder)
+    if work.exists():
+        shutil.rmtree(work)
 
 
 def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:
@@ -107,8 +116,9 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
     try:
         metadata = read_file(folder / "metadata.yaml", MAX_METADATA).decode("utf-8", "replace")
         counts: Counter[str] = Counter()
+        allowance = Allowance()
         for file in files:
-            counts.update(channel.topic for channel, _, _ in read_messages(file))
+            counts.update(channel.topic for channel, _, _ in read_messages(file, allowance))
     except (OSError, DamageError):
         return None
     told = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
@@ -118,6 +128,7 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
 def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
     """Write what can be read into a new bag; messages by topic, and what ended the reading."""
     damage = []
+    allowance = Allowance()
     told = folder / provenance.FILE
     others = set()
     writer = BagWriter(new, KINDS[files[0].suffix])
@@ -128,7 +139,7 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
         topics = _Topics(writer)
         for file in files:
             try:
-                for channel, stamp, data in read_messages(file):
+                for channel, stamp, data in read_messages(file, allowance):
                     if channel.serialization != "cdr":
                         others.add(channel.topic)
                         continue

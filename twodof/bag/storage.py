@@ -19,11 +19,14 @@ from rosbags.rosbag2.enums import CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
+from ..errors import BagError
+
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
 REMOVED = "it was removed while it was being written"
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
+OVERHEAD = 64  # bytes that a message takes beside its data until it is flushed
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
 
 
@@ -108,9 +111,16 @@ class BagWriter(Writer):
         self._pending = 0
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Write one message; some hundred KiB are flushed together."""
-        super().write(connection, timestamp, data)
-        self._pending += len(data)
+        """Write one message; some hundred KiB are flushed together.
+
+        rosbags' own would look through all topics first, for each.
+        """
+        assert self.storage is not None
+        self.storage.write(connection, timestamp, data)
+        self.counts[connection.id] += 1
+        self.min_timestamp = min(timestamp, self.min_timestamp)
+        self.max_timestamp = max(timestamp, self.max_timestamp)
+        self._pending += OVERHEAD + len(data)
         if self._pending > BATCH_SIZE:
             self.flush()
 
@@ -125,3 +135,20 @@ class BagWriter(Writer):
             raise FileNotFoundError(errno.ENOENT, REMOVED)
         self.storage.flush(self._fsync)
         self._pending = 0
+
+
+def check_path(path: Path, storage: str) -> None:
+    """Refuse a place where a bag of this storage would not be found again.
+
+    Its name is written into metadata.yaml; rosbags makes a URI of a database's whole path.
+
+    Raises:
+        BagError: another name is needed.
+    """
+    part, text = ("path", str(path)) if storage == "sqlite3" else ("name", path.name)
+    if storage == "sqlite3" and any(c in text for c in "?#%"):
+        raise BagError(f"'{path}': a sqlite3 bag cannot have ?, # or % in its path")
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise BagError(f"'{path}': the {part} of a {storage} bag must be UTF-8") from error

@@ -18,12 +18,12 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
-from ..experiment import Experiment, Value
-from ..files import is_being_written, lock, read_file, sync
+from ..experiments import Experiment, Value
+from ..files import lock, read_file, sync
 from ..master import Sample, Sink
 from ..ros.messages import JOINT_STATES, STORE, Messages, Serialised
 from .provenance import ProvenanceFile, read_provenance
-from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter
+from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, check_path
 
 MAX_METADATA = 64 * 1024**2  # bytes
 PROVENANCE_KEY = "twodof"
@@ -75,8 +75,7 @@ class Bag(Sink):
         self.path = Path(path)
         if storage not in STORAGES:
             raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
-        if storage == "sqlite3" and any(c in str(self.path) for c in "?#%"):
-            raise BagError(f"'{path}': a sqlite3 bag cannot have ?, # or % in its path")
+        check_path(self.path, storage)
         self._storage = storage
         self._overwrite = overwrite
         self._fsync = fsync
@@ -84,6 +83,7 @@ class Bag(Sink):
         self._command_line = command_line
         self._run: Experiment | None = None
         self.count = 0
+        self._lock = -1  # no descriptor yet
         _check_free(self.path, overwrite)
 
     def begin(self, run: Experiment) -> Bag:
@@ -100,10 +100,8 @@ class Bag(Sink):
     def __enter__(self) -> Bag:
         if self._run is None:
             raise BagError("a bag is given its experiment first: 'with bag.begin(experiment):'")
-        _check_free(self.path, self._overwrite)
         try:
-            if self.path.exists():
-                shutil.rmtree(self.path)
+            _check_free(self.path, self._overwrite, clear=True)
             self._writer = BagWriter(self.path, self._storage, fsync=self._fsync)
             self._open(self._run)
         except WriterError as error:  # the folder appeared meanwhile and is not ours
@@ -167,6 +165,7 @@ class Bag(Sink):
         """Create the bag's folder, or leave nothing of it."""
         try:
             self._writer.open()
+            self._lock = lock(self.path, wait=True)  # before it is a bag that others may overwrite
             self._provenance = ProvenanceFile(self.path, run, self._command_line)
             with (self.path / RESERVE).open("wb") as reserve:
                 reserve.write(b"\0" * RESERVE_SIZE)
@@ -181,13 +180,14 @@ class Bag(Sink):
             self._writer.flush()
             if self._fsync:
                 sync(self._provenance.path, self.path, self.path.absolute().parent)
-            self._lock = lock(self.path)
-        except WriterError:
+        except (WriterError, BlockingIOError):  # the folder is another's
             raise
         except BaseException:
             with suppress(OSError, sqlite3.Error):
                 self._writer.abort()
             shutil.rmtree(self.path, ignore_errors=True)
+            with suppress(OSError):
+                os.close(self._lock)
             raise
 
     def _give(self, messages: Iterable[tuple[str, Serialised]], stamp: int) -> None:
@@ -271,18 +271,27 @@ def _reason(error: Exception) -> str:
     return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
-def _check_free(path: Path, overwrite: bool) -> None:
+def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
+    """Refuse what is in a bag's place; with ``clear``, remove what may be overwritten."""
     try:
         if not path.exists():
             return
+        if not overwrite:
+            reason = "exists already; choose another name with -o or use --overwrite"
+            raise BagError(f"'{path}' {reason}")
+        held = lock(path)
+        try:
+            if path.is_symlink() or not _is_bag(path):
+                raise BagError(f"'{path}' is not a bag and is not overwritten")
+            if clear:
+                shutil.rmtree(path)
+        finally:
+            os.close(held)
+    except BlockingIOError as error:
+        reason = "is being written by another process and is not overwritten"
+        raise BagError(f"'{path}' {reason}") from error
     except OSError as error:
         raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
-    if not overwrite:
-        raise BagError(f"'{path}' exists already; choose another name with -o or use --overwrite")
-    if path.is_symlink() or not _is_bag(path):
-        raise BagError(f"'{path}' is not a bag and is not overwritten")
-    if is_being_written(path):
-        raise BagError(f"'{path}' is being written by another process and is not overwritten")
 
 
 def _is_bag(path: Path) -> bool:

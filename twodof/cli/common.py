@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from ..bag.writer import Bag
-    from ..experiment import Experiment, Setting
+    from ..experiments import Experiment, Setting
     from ..fmu import Fmu
     from ..master import RealTime, Summary
 
@@ -88,7 +88,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
 def experiment_of(options: argparse.Namespace, stop_time: float, step: float) -> Experiment:
     """The experiment that the options ask for."""
-    from ..experiment import experiment
+    from ..experiments import experiment
 
     return experiment(
         chosen_fmu(options), stop_time=stop_time, step=step,

@@ -25,9 +25,9 @@ def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     path = options.path
     if path.is_dir():
-        from ..bag.reader import read_bag
+        from ..bag.reader import read_ends
 
-        _print_bag(read_bag(path))
+        _print_bag(*read_ends(path))
     elif path.suffix in (".mcap", ".db3") and path.is_file():
         raise InputError(f"'{path}' is a bag's file; give the bag's folder, '{path.parent}'")
     else:
@@ -81,13 +81,13 @@ def _start(text: str) -> str:
     return "none" if abs(value) > 1e300 else f"{value:g}"
 
 
-def _print_bag(run: Run) -> None:
+def _print_bag(run: Run, count: int) -> None:
     duration = float(run.t[-1])
-    rate = (len(run.t) - 1) / duration if duration else 0.0
+    rate = (count - 1) / duration if duration else 0.0
     rows = [
         ("bag", str(run.path)),
         ("joints", ", ".join(run.joints)),
-        ("duration", f"{duration:g} s, {len(run.t)} joint states, {rate:g} Hz"),
+        ("duration", f"{duration:g} s, {count} joint states, {rate:g} Hz"),
         ("first stamp", f"{run.stamps[0] / 1e9:.9f} s"),
         ("first state", _state(run, 0)),
         ("last state", _state(run, -1)),

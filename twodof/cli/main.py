@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import logging
 import os
 import shlex
@@ -42,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     options = parser().parse_args(arguments)
     options.command_line = shlex.join(["twodof", *arguments])
+    if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
+        sys.stdout.reconfigure(errors="backslashreplace")
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)

@@ -18,7 +18,7 @@ from .common import (
 from .options import add_run_options, add_time_options
 
 if TYPE_CHECKING:
-    from ..experiment import Experiment
+    from ..experiments import Experiment
     from ..master import Sample, Sink
 
 

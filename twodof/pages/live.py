@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..children import Child
 from ..errors import PageError
-from ..experiment import Experiment, Setting, Value, experiment
+from ..experiments import Experiment, Setting, Value, experiment
 from ..fmu import Fmu, load_fmu, read_resource, urdf_text
 from ..plant.urdf import Joint, RobotError, read_urdf
 from .loop import IDLE, Loop, News

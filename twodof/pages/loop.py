@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
-from ..experiment import Experiment, Setting, resolve
+from ..experiments import Experiment, Setting, resolve
 from ..fmu import urdf_text
 from ..master import RealTime, Sample, at_rest, samples
 

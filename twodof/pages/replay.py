@@ -17,7 +17,7 @@ from ..bag.reader import Run, read_bag
 from ..data import data_file
 from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
-from ..files import write_file
+from ..files import shown, write_file
 from ..fmu import load_fmu, read_resource
 from ..plots.track import read_tracks
 from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Page
@@ -307,7 +307,7 @@ def view(
         robot: options of ``Replay``.
     """
     bag = bag if isinstance(bag, Run) else read_bag(bag)
-    with Page(f"twodof - {bag.path.resolve().name}", host, port) as page:
+    with Page(f"twodof - {shown(bag.path.resolve().name)}", host, port) as page:
         replay = Replay(page, bag, **robot)
         replay.add_controls()
         opened(page.url, replay.remarks)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..bag.provenance import KNOWN_UNTIL
 from ..bag.reader import Run, read_bag
 from ..errors import PlotError
-from ..files import read_file
+from ..files import read_file, shown
 from ..kinematics import Kinematics
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, check_axes, read_urdf
 from .closed_form import Held, task_error
@@ -145,7 +145,7 @@ class Track:
     @property
     def name(self) -> str:
         """The bag's name."""
-        return self.run.path.resolve().name
+        return shown(self.run.path.resolve().name)
 
 
 def read_tracks(

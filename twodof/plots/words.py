@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ..files import shown
 from .track import Track, number
 
 TOLD = {
@@ -25,7 +26,7 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     if clear and max(map(len, told)) <= 80:
         return told
     names = [track.name for track in tracks]
-    return names if len(set(names)) == len(names) else [str(track.run.path) for track in tracks]
+    return names if len(set(names)) == len(names) else [shown(track.run.path) for track in tracks]
 
 
 def common_settings(tracks: Sequence[Track]) -> str:

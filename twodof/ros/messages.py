@@ -19,7 +19,7 @@ from rosbags.interfaces import (
 from rosbags.typesys import Stores, get_typestore
 
 from ..errors import BagError
-from ..experiment import NANOSECONDS, Experiment
+from ..experiments import NANOSECONDS, Experiment
 from ..fmu import read_resource, urdf_text
 from ..master import Sample
 from ..plant.urdf import RobotError

@@ -15,7 +15,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from ..errors import PublishError, SimulationError
-from ..experiment import Experiment, Setting
+from ..experiments import Experiment, Setting
 from ..master import Sample, Sink, at_rest
 from .messages import SCENE_TOPICS, STORE, STREAM, Messages, Serialised
 from .network import Network, network, open_domain

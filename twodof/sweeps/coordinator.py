@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..experiment import Setting, experiment
+from ..experiments import Setting, experiment
 from ..files import temporary_folder
 from ..fmu import Fmu, load_fmu
 from ..version import versions

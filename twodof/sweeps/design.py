@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..experiment import Setting, resolve
+from ..experiments import Setting, resolve
 from ..fmu import Fmu
 
 MAX_RUNS = 1_000_000

@@ -76,7 +76,10 @@ class Results:
     def __enter__(self) -> Results:
         if not self._part:
             self._begin()
-        self._lock = lock(self.path)
+        try:
+            self._lock = lock(self.path)
+        except BlockingIOError:
+            raise SweepError(f"'{self.path}' is being written by another process") from None
         self._stored = time.monotonic()
         return self
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SimulationError
-from ..experiment import Experiment, Value, experiment, resolve
+from ..experiments import Experiment, Value, experiment, resolve
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
 from ..master import OUTPUTS, Sample, Sink, simulate
