@@ -486,7 +486,7 @@ def test_read_bag_gives_back_what_was_written(recording: Recording, storage: str
     np.testing.assert_array_equal(found.t, np.arange(501) / 100)
     np.testing.assert_array_equal(found.q, [s.q for s in recording.samples])
     np.testing.assert_array_equal(found.v, [s.v for s in recording.samples])
-    np.testing.assert_array_equal(found.effort, [s.tau for s in recording.samples])
+    np.testing.assert_array_equal(found.tau, [s.tau for s in recording.samples])
     text = (recording.bag(storage, "effort") / "run.json").read_text("utf-8")
     assert found.provenance == json.loads(text)
     assert [(topic.name, topic.type, topic.count) for topic in found.topics] == [
@@ -495,7 +495,7 @@ def test_read_bag_gives_back_what_was_written(recording: Recording, storage: str
 
 
 def test_read_bag_gives_no_effort_where_there_is_none(recording: Recording) -> None:
-    assert twodof.read_bag(recording.bag("mcap")).effort.shape == (501, 0)
+    assert twodof.read_bag(recording.bag("mcap")).tau.shape == (501, 0)
 
 
 def write_elsewhere(

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from bags import START, assert_consistent, both_storages, read_with_rosbags
 
-from twodof import cli
+from twodof.cli import info
 from twodof.cli.main import main
 
 TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
@@ -206,7 +206,7 @@ def test_interrupt_while_a_file_is_closed_is_an_interrupt(
         finally:
             os.close(descriptor)
 
-    monkeypatch.setitem(cli.VERBS, "info", verb)
+    monkeypatch.setattr(info, "call", verb)
     before = signal.getsignal(signal.SIGINT)
     try:
         assert main(["info", "."]) == 130

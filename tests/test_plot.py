@@ -950,7 +950,7 @@ def test_notebooks_show_it(default: Recording) -> None:
 # --- long bags ---
 
 
-def long_run(default: Recording, q: np.ndarray) -> twodof.Run:
+def long_run(default: Recording, q: np.ndarray) -> twodof.Recording:
     """A run of the default arm at 1 kHz that nothing has simulated."""
     run = twodof.read_bag(default.bag)
     stamps = START * 10**9 + np.arange(len(q)) * 10**6

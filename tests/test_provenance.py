@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from multiprocessing import Pipe
 from pathlib import Path
@@ -168,7 +170,48 @@ def test_so_it_is_after_a_kill_up_to_the_last_flush(
     (track,) = read_tracks([bag])
     assert track.task is not None and track.task.departure is not None
     assert track.task.departure <= 1e-9
-    assert len(track.run.provenance["input_changes"]) >= len(track.t) - 1
+    assert len(track.recording.provenance["input_changes"]) >= len(track.t) - 1
+
+
+def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(
+    native_path: Path, tmp_path: Path
+) -> None:
+    """In a bag whose run.json was lost, and where there were more changes than it has room for."""
+    samples = Collector()
+    run = twodof.experiment(native_path, stop_time=STEPS / 100)
+    steps = twodof.samples(run)
+    with twodof.Bag(tmp_path / "bag", scene=True).begin(run) as sink:
+        for sample in steps:
+            samples.append(sample)
+            sink.write(sample)
+            if sample.k in TARGETS:
+                samples.append(steps.send({"x_des": TARGETS[sample.k]}))
+                sink.write(samples[-1])
+    text = (tmp_path / "bag/run.json").read_text().strip()
+    expected = [sample.error for sample in samples]
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(json.loads(text)["urdf"])
+    (tmp_path / "bag/run.json").write_text(f'{text[:-1]},"inputs_known_until":0.6}}')
+    (full,) = read_tracks([tmp_path / "bag"])
+    (tmp_path / "bag/run.json").unlink()
+    (lost,) = read_tracks([tmp_path / "bag"], urdf=urdf, frame="EndEffector")
+    for track in (full, lost):
+        assert track.task is not None
+        np.testing.assert_allclose(track.task.error, expected, atol=1e-12)
+        assert track.task.closed_form is None  # whose gains and changes are not known
+    (other,) = read_tracks([tmp_path / "bag"], urdf=_renamed_root(urdf), frame="EndEffector")
+    assert other.motion is not None and other.task is None  # the points are in another frame
+
+
+def _renamed_root(urdf: Path) -> Path:
+    other = urdf.with_name("other.urdf")
+    root = ET.fromstring(urdf.read_text())
+    children = {child.get("link") for child in root.iter("child")}
+    name = next(
+        str(link.get("name")) for link in root.iter("link") if link.get("name") not in children
+    )
+    other.write_text(urdf.read_text().replace(f'"{name}"', '"elsewhere"'))
+    return other
 
 
 def test_what_is_not_known_is_not_shown(native_path: Path, tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ import zstandard
 from bags import PERIOD, SECOND, START, STORE, sample
 
 import twodof
-from twodof.bag.reader import Run, read_bag, read_ends
+from twodof.bag.reader import read_bag, read_ends
+from twodof.bag.recording import Recording
 from twodof.bag.records import Allowance, DamageError, read_messages
 from twodof.cli.main import main
 
@@ -237,7 +238,7 @@ def test_mcap_of_what_is_at_rest_is_read_at_any_length(
 
 @pytest.mark.parametrize("read", [read_bag, read_ends])
 def test_memory_is_that_of_the_numbers(
-    bag: Path, read: Callable[[Path], Run | tuple[Run, int]]
+    bag: Path, read: Callable[[Path], Recording | tuple[Recording, int]]
 ) -> None:
     n = 200_000
     (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) * n + FOOTER)

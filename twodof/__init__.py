@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from .version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from .bag.reader import Run as Run
     from .bag.reader import read_bag as read_bag
+    from .bag.recording import Recording as Recording
     from .bag.recovery import recover as recover
     from .bag.writer import Bag as Bag
     from .errors import TwoDofError as TwoDofError
@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOMES = {
-    "bag.reader": ("Run", "read_bag"),
+    "bag.reader": ("read_bag",),
+    "bag.recording": ("Recording",),
     "bag.recovery": ("recover",),
     "bag.writer": ("Bag",),
     "errors": ("TwoDofError",),

@@ -6,83 +6,43 @@ import struct
 from array import array
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
-from ..experiments import NANOSECONDS
 from ..files import is_being_written
-from ..ros.messages import JOINT_STATE, JOINT_STATES, STORE, Array, JointStateLayout
+from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, STORE, TARGET, JointStateLayout
 from .provenance import read_provenance
+from .recording import Array, Heard, Recording, Stamps, TopicCount
 from .records import Allowance, Channel, DamageError, read_messages, storage_files
 
 BATCH = 1024**2  # bytes of messages that are decoded at once
 MAX_JOINT_STATE = 1024**2  # bytes; some ten thousand joints
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class TopicCount:
-    """One topic of a bag: its name, message type and number of messages."""
-
-    name: str
-    type: str
-    count: int
-
-
-@dataclass(frozen=True)
-class Run:
-    """A bag read back; N samples of n joints.
-
-    Attributes:
-        path: the bag's folder.
-        topics: all topics of the bag.
-        stamps: time stamps of the joint states, ns since the epoch, N, ascending.
-        joints: joint names.
-        q, v: positions (rad, m) and velocities, N × n.
-        effort: N × n, or N × 0 where the bag has none.
-        provenance: what the logger wrote about the run, {} for a bag from elsewhere.
-    """
-
-    path: Path
-    topics: tuple[TopicCount, ...]
-    stamps: Stamps
-    joints: tuple[str, ...]
-    q: Array
-    v: Array
-    effort: Array
-    provenance: dict[str, Any]
-
-    @property
-    def t(self) -> Array:
-        """Time since the first sample, s, N."""
-        return cast(Array, (self.stamps - self.stamps[0]) / NANOSECONDS)
-
-
-def read_bag(path: str | Path) -> Run:
-    """Joint states of a bag, of this or another writer.
+def read_bag(path: str | Path) -> Recording:
+    """Joint states and targets of a bag, of this or another writer.
 
     Raises:
         BagError: it is no bag, is unfinished or damaged, or has no joint states.
     """
-    return _read(Path(path), _JointStates)[0]
+    return _read(Path(path), _JointStates, _Targets())[0]
 
 
-def read_ends(path: str | Path) -> tuple[Run, int]:
+def read_ends(path: str | Path) -> tuple[Recording, int]:
     """The first and the last joint state of a bag, and how many it has.
 
     Raises:
         BagError: as ``read_bag``.
     """
-    return _read(Path(path), _Ends)
+    return _read(Path(path), _Ends, None)
 
 
-def _read(path: Path, kind: type[_JointStates]) -> tuple[Run, int]:
+def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tuple[Recording, int]:
     """What a kind of reader keeps of a bag's joint states, and how many there are."""
     counts: Counter[Channel] = Counter()
     chosen, states = "", kind(path)
@@ -96,6 +56,8 @@ def _read(path: Path, kind: type[_JointStates]) -> tuple[Run, int]:
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamp, data)
+                elif targets is not None and (channel.topic, channel.type) == (TARGET, POINT):
+                    targets.add(stamp, data)
     except OSError as error:
         raise BagError(f"cannot read the bag '{path}': {error.strerror}") from error
     except DamageError as error:
@@ -108,15 +70,16 @@ def _read(path: Path, kind: type[_JointStates]) -> tuple[Run, int]:
         topics[channel.topic, channel.type] += count
     if not topics[chosen, JOINT_STATE]:
         raise BagError(f"'{path}' has no joint states, no messages of type {JOINT_STATE}")
-    stamps, q, v, effort = states.arrays()
-    return Run(
+    stamps, q, v, tau = states.arrays()
+    return Recording(
         path=path,
         topics=tuple(TopicCount(*topic, count) for topic, count in sorted(topics.items())),
         stamps=stamps,
         joints=states.names,
         q=q,
         v=v,
-        effort=effort,
+        tau=tau,
+        heard=targets.heard(stamps) if targets is not None else None,
         provenance=read_provenance(path),
     ), topics[chosen, JOINT_STATE]
 
@@ -244,6 +207,41 @@ class _Ends(_JointStates):
             self._stamps[0], self._batch[0] = stamp, data
         elif stamp >= self._stamps[1]:
             self._stamps[1], self._batch[1] = stamp, data
+
+
+class _Targets:
+    """The points on /target that were told in one frame."""
+
+    def __init__(self) -> None:
+        self._frame: bytes | None = None
+        self._sound = True
+        self._stamps, self._points = array("q"), array("d")
+
+    def add(self, stamp: int, data: bytes) -> None:
+        """A PointStamped: stamp, frame, padding to 8 bytes, x, y, z."""
+        try:
+            order = "<" if data[1] else ">"
+            end = 16 + int(struct.unpack_from(f"{order}I", data, 12)[0])
+            point = struct.unpack_from(f"{order}3d", data, end + (4 - end) % 8)
+        except (IndexError, struct.error):
+            self._sound = False
+            return
+        frame = data[16:end]
+        self._sound &= self._frame in (None, frame)
+        self._frame = frame
+        self._stamps.append(stamp)
+        self._points.extend(point)
+
+    def heard(self, stamps: Stamps) -> Heard | None:
+        """The latest by each of these stamps; None where there are none, or not of one frame."""
+        if self._frame is None or not self._sound:
+            return None
+        own = np.asarray(self._stamps)
+        order = np.argsort(own, kind="stable")
+        points = np.asarray(self._points).reshape(-1, 3)[order]
+        latest = np.searchsorted(own[order], stamps, side="right") - 1
+        heard = np.where((latest >= 0)[:, None], points[latest], np.nan)
+        return Heard(self._frame.rstrip(b"\0").decode("utf-8", "replace"), heard)
 
 
 def _names(names: Sequence[str], order: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -10,7 +10,7 @@ from ..errors import InputError
 from .common import controlled, print_table
 
 if TYPE_CHECKING:
-    from ..bag.reader import Run
+    from ..bag.recording import Recording
     from ..fmu import Fmu
 
 
@@ -81,7 +81,7 @@ def _start(text: str) -> str:
     return "none" if abs(value) > 1e300 else f"{value:g}"
 
 
-def _print_bag(run: Run, count: int) -> None:
+def _print_bag(run: Recording, count: int) -> None:
     duration = float(run.t[-1])
     rate = (count - 1) / duration if duration else 0.0
     rows = [
@@ -103,7 +103,7 @@ def _print_bag(run: Run, count: int) -> None:
         print(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}")
 
 
-def _state(run: Run, k: int) -> str:
+def _state(run: Recording, k: int) -> str:
     q = ", ".join(f"{value:.6g}" for value in run.q[k])
     v = ", ".join(f"{value:.6g}" for value in run.v[k])
     return f"q = ({q}), v = ({v})"

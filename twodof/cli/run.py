@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
+from ..errors import InputError
 from .common import (
     INTERRUPTED,
     asked_to_stop,
@@ -39,6 +41,10 @@ def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     from ..master import RealTime, simulate
 
+    if options.stop_time == math.inf:
+        raise InputError(
+            "stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C"
+        )
     run = experiment_of(options, options.stop_time, options.step)
     bag = bag_of(options, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
     pace = RealTime() if options.realtime else None

@@ -25,7 +25,7 @@ MOST_ROWS = 10_000  # that wait for a page to ask
 IDLE = 0.05  # s between two looks at whether to go on
 
 
-class Recording:
+class Excerpt:
     """A bag that begins in the midst of a run, with the sample that is at hand.
 
     Its provenance is that of a run which starts there: from the joint positions and velocities and
@@ -110,7 +110,7 @@ class Loop:
         self.recorded: list[Path] = []
         self.pace = RealTime()
         self.steps = 0
-        self._recording: Recording | None = None
+        self._recording: Excerpt | None = None
         self._changes: dict[str, Setting] = {}
         self._notes: list[tuple[str, str]] = []
         self._playing, self._watched, self._singles = True, False, 0
@@ -220,7 +220,7 @@ class Loop:
     def _record(self) -> None:
         path = self._free_name()
         try:
-            self._recording = Recording(path, self._run, self._sample, self._command_line)
+            self._recording = Excerpt(path, self._run, self._sample, self._command_line)
         except BagError as error:
             self._notes.append(("There is no recording", str(error)))
         self.pace.restart()  # opening a bag may wait for the disk: time has stood still

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bag.reader import Run, read_bag
+from ..bag.reader import read_bag
+from ..bag.recording import Recording
 from ..data import data_file
 from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
@@ -57,7 +58,7 @@ class Replay:
     def __init__(
         self,
         page: Page,
-        bag: Run | str | Path,
+        bag: Recording | str | Path,
         *,
         urdf: str | Path | None = None,
         mesh_dir: str | Path | None = None,
@@ -68,16 +69,16 @@ class Replay:
             raise PageError("--mesh-dir has the meshes of a URDF; give that with --urdf")
         if fmu is not None and urdf is not None:
             raise PageError("--fmu has the meshes of the bag's robot; leave it out beside --urdf")
-        run = bag if isinstance(bag, Run) else read_bag(bag)
+        bag = bag if isinstance(bag, Recording) else read_bag(bag)
         self._page = page
-        self._track = track = read_tracks([run], urdf=urdf, frame=frame)[0]
+        self._track = track = read_tracks([bag], urdf=urdf, frame=frame)[0]
         self._t = track.t
         self.remarks: list[str] = []
         self._figure: PageRobot | None = None
         if track.motion is None:
-            self.remarks.append(f"'{run.path}' carries no robot; give one with --urdf")
+            self.remarks.append(f"'{bag.path}' carries no robot; give one with --urdf")
         else:
-            text, read = self._robot(run, urdf, mesh_dir, fmu)
+            text, read = self._robot(bag, urdf, mesh_dir, fmu)
             names = [joint.name for joint in track.joints]
             self._figure = PageRobot(page, text, names, track.motion.frame, read)
             if self._figure.missing:
@@ -86,7 +87,11 @@ class Replay:
         self._set_scene()
 
     def _robot(
-        self, run: Run, urdf: str | Path | None, mesh_dir: str | Path | None, fmu: str | Path | None
+        self,
+        bag: Recording,
+        urdf: str | Path | None,
+        mesh_dir: str | Path | None,
+        fmu: str | Path | None,
     ) -> tuple[str, ReadMesh]:
         """The URDF's text, and where its meshes are from."""
         if urdf is not None:
@@ -100,12 +105,12 @@ class Replay:
                 self.remarks.append(str(error))
                 return text, lambda name: None
             return renamed, files.get
-        text = run.provenance["urdf"]
+        text = bag.provenance["urdf"]
         if fmu is not None:
             given = load_fmu(fmu)
             return text, partial(read_resource, given)
-        made = run.provenance["fmu"]
-        for folder in (Path(), run.path.resolve().parent):
+        made = bag.provenance["fmu"]
+        for folder in (Path(), bag.path.resolve().parent):
             try:
                 found = load_fmu(folder / Path(made["file"]).name)
             except FmuError:
@@ -121,11 +126,11 @@ class Replay:
 
     def _set_scene(self) -> None:
         page, track, motion = self._page, self._track, self._track.motion
-        made = track.run.provenance
+        made = track.recording.provenance
         self._target: Any = None
         self._targets = np.empty((0, 3))
         if motion is not None and self._figure is not None:
-            q = track.run.q
+            q = track.recording.q
             shown = [self._figure.points(q[k]) for k in np.linspace(0, len(q) - 1, 9).astype(int)]
             points = [*shown, motion.path[:: max(1, len(q) // PATH_POINTS)]]
             if track.task is not None:
@@ -167,9 +172,9 @@ class Replay:
         names = [joint.name for joint in track.joints]
         self._readout = Readout(page, names)
         units = " or ".join(dict.fromkeys(j.unit for j in track.joints if j.unit)) or "rad or m"
-        lines = {f"position, {units}": (names, track.run.q)}
-        if track.run.v.shape == track.run.q.shape:
-            lines[f"velocity, {units} per s"] = (names, track.run.v)
+        lines = {f"position, {units}": (names, track.recording.q)}
+        if track.recording.v.shape == track.recording.q.shape:
+            lines[f"velocity, {units} per s"] = (names, track.recording.v)
         if track.task is not None:
             error = np.log10(np.maximum(track.task.error, SMALLEST_ERROR))
             lines["log₁₀ of the distance from the target in m"] = (["error"], error[:, None])
@@ -185,7 +190,7 @@ class Replay:
         track = self._track
         with self._page.atomic():
             if self._figure is not None and track.motion is not None:
-                self._figure.pose(track.run.q[k])
+                self._figure.pose(track.recording.q[k])
                 first = nearest(self._t, self._t[k] - TRAIL_TIME)
                 chosen = np.unique(np.linspace(first, k, TRAIL_POINTS).astype(int))
                 self._trail.show(track.motion.path[chosen])
@@ -289,7 +294,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def view(
-    bag: Run | str | Path,
+    bag: Recording | str | Path,
     stop: Callable[[], bool],
     opened: Callable[[str, Sequence[str]], None] = lambda url, remarks: None,
     *,
@@ -306,7 +311,7 @@ def view(
         host, port: where to listen.
         robot: options of ``Replay``.
     """
-    bag = bag if isinstance(bag, Run) else read_bag(bag)
+    bag = bag if isinstance(bag, Recording) else read_bag(bag)
     with Page(f"twodof - {shown(bag.path.resolve().name)}", host, port) as page:
         replay = Replay(page, bag, **robot)
         replay.add_controls()
@@ -314,7 +319,7 @@ def view(
         replay.play(stop)
 
 
-def export(bag: Run | str | Path, path: str | Path, **robot: Any) -> Sequence[str]:
+def export(bag: Recording | str | Path, path: str | Path, **robot: Any) -> Sequence[str]:
     """Write a replay as one HTML file; what is not as it should be. Options as ``Replay``'s."""
     with Page("twodof", HOST, 0) as page:
         replay = Replay(page, bag, **robot)

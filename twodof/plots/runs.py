@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bag.reader import Run
+from ..bag.recording import Recording
 from .figure import COLOURS, DASHES, GREY, INK, PALE, TICK_STYLE, Drawing, drawn
 from .track import JointTrack, Track, number, read_tracks
 from .words import common_settings, labels, outcome, summary
@@ -54,7 +54,7 @@ MANY_TARGETS = 12
 
 
 def plot_bags(
-    *bags: Run | str | Path, urdf: str | Path | None = None, frame: str | None = None
+    *bags: Recording | str | Path, urdf: str | Path | None = None, frame: str | None = None
 ) -> Figure:
     """A figure of one bag, or of several for comparison.
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
-from math import ceil, inf, isfinite
+from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bag.provenance import KNOWN_UNTIL
-from ..bag.reader import Run, read_bag
+from ..bag.reader import read_bag
+from ..bag.recording import Recording, Schedule
 from ..errors import PlotError
 from ..files import read_file, shown
 from ..kinematics import Kinematics
@@ -22,16 +21,12 @@ from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, check_axes, read_ur
 from .closed_form import Held, task_error
 
 Array = NDArray[np.float64]
-Schedule = list[tuple[int, Mapping[str, Any]]]
-"""Communication points, ascending from 0, and values of inputs and parameters from each on."""
 
 DEFAULT_FRAME = "EndEffector"
-TIME_TOLERANCE = 1e-9  # as the master's, of a communication step
 AT_LIMIT = 1e-9  # of a limit's size
 NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
 LOOKS = 2000  # for singularities, along the way
 MAX_URDF = 8 * 1024**2
-MOST_LOST = 10  # times as many samples as there are
 UNITS = {
     "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
     "gravity": "m/s²", "max_step": "s",
@@ -107,8 +102,8 @@ class Task:
 
     Attributes:
         axes: the task axes, of "xyz".
-        target: position in effect up to each sample, N × m.
-        error: distance from the target, m, N values.
+        target: position in effect up to each sample, N × m; not a number where none was known yet.
+        error: distance from the target, m, N values; likewise.
         closed_form: the same for the closed form; None where the gains are not known.
         departure: the largest distance between the two positions, m; None likewise.
         disturbances: what was at work that the closed form does not have.
@@ -127,7 +122,7 @@ class Track:
     """All that is drawn of one bag.
 
     Attributes:
-        run: the bag.
+        recording: the bag.
         settings: how it was made, as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
         t: time since the first sample, s, N values.
         joints: in the bag's order.
@@ -135,7 +130,7 @@ class Track:
         task: None where the target or the robot is not known.
     """
 
-    run: Run
+    recording: Recording
     settings: Mapping[str, str]
     t: Array
     joints: tuple[JointTrack, ...]
@@ -145,11 +140,11 @@ class Track:
     @property
     def name(self) -> str:
         """The bag's name."""
-        return shown(self.run.path.resolve().name)
+        return shown(self.recording.path.resolve().name)
 
 
 def read_tracks(
-    bags: Sequence[Run | str | Path],
+    bags: Sequence[Recording | str | Path],
     *,
     urdf: str | Path | None = None,
     frame: str | None = None,
@@ -167,8 +162,8 @@ def read_tracks(
         PlotError: the URDF is at fault, does not fit the bag, or there are no positions.
     """
     text = None if urdf is None else _read_urdf(Path(urdf))
-    runs = [bag if isinstance(bag, Run) else read_bag(bag) for bag in bags]
-    return [_track(run, text, str(urdf), frame) for run in runs]
+    recordings = [bag if isinstance(bag, Recording) else read_bag(bag) for bag in bags]
+    return [_track(bag, text, str(urdf), frame) for bag in recordings]
 
 
 def _read_urdf(path: Path) -> str:
@@ -180,43 +175,42 @@ def _read_urdf(path: Path) -> str:
         raise PlotError(f"the URDF '{path}' is not UTF-8 text") from error
 
 
-def _track(run: Run, urdf: str | None, source: str, frame: str | None) -> Track:
-    names = run.joints or tuple(f"joint {i + 1}" for i in range(run.q.shape[1]))
-    if not run.q.size or run.q.shape[1] != len(names):
-        raise PlotError(f"'{run.path}' has {run.q.shape[1]} positions for {len(names)} joints")
+def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> Track:
+    names = bag.joints or tuple(f"joint {i + 1}" for i in range(bag.q.shape[1]))
+    if not bag.q.size or bag.q.shape[1] != len(names):
+        raise PlotError(f"'{bag.path}' has {bag.q.shape[1]} positions for {len(names)} joints")
     if urdf is None:
-        urdf, source = run.provenance.get("urdf"), f"the URDF in '{run.path}'"
+        urdf, source = bag.provenance.get("urdf"), f"the URDF in '{bag.path}'"
     try:
-        return _with_robot(run, names, urdf, source, frame)
+        return _with_robot(bag, names, urdf, source, frame)
     except (KeyError, ValueError, ArithmeticError) as error:
-        if not run.provenance:
+        if not bag.provenance:
             raise
-        raise PlotError(f"the run.json in '{run.path}' does not fit its samples") from error
+        raise PlotError(f"the bag.json in '{bag.path}' does not fit its samples") from error
 
 
 def _with_robot(
-    run: Run, names: Sequence[str], urdf: str | None, source: str, frame: str | None
+    bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None
 ) -> Track:
-    made = run.provenance
-    schedule = _schedule(run)
+    made = bag.provenance
+    schedule = bag.schedule
     robot = None
     if urdf is not None:
         try:
             robot = _load(urdf, frame or made.get("frame") or "", made.get("axes") or "xyz")
         except RobotError as error:
             raise PlotError(f"{source}: {error}") from error
-    joints = _joints(run, names, robot)
+    joints = _joints(bag, names, robot)
     motion = task = None
     if robot is not None:
-        q = _in_robot_order(run, robot, names, run.q)
+        q = _in_robot_order(bag, robot, names, bag.q)
         motion = _motion(robot, q)
-        known = "x_des[1]" in schedule[0][1] and KNOWN_UNTIL not in made
-        if known and made.get("axes") and made["frame"] == robot.frame:
-            v = _in_robot_order(run, robot, names, run.v)
-            task = _task(run, robot, q, v[0], motion.path, schedule)
+        if made.get("frame", robot.frame) == robot.frame and _has_target(bag, robot):
+            v = _in_robot_order(bag, robot, names, bag.v)
+            task = _task(bag, robot, q, v[0], motion.path)
             disturbances = _disturbances(robot, q, joints, task, schedule)
             task = replace(task, disturbances=disturbances)
-    return Track(run, _settings(run, schedule), run.t, joints, motion, task)
+    return Track(bag, _settings(bag, schedule), bag.t, joints, motion, task)
 
 
 # --- the robot ---
@@ -262,8 +256,8 @@ def _load(text: str, frame: str, axes: str) -> _Robot:
     return robot
 
 
-def _joints(run: Run, names: Sequence[str], robot: _Robot | None) -> tuple[JointTrack, ...]:
-    starts = run.provenance.get("start_values", {})
+def _joints(bag: Recording, names: Sequence[str], robot: _Robot | None) -> tuple[JointTrack, ...]:
+    starts = bag.provenance.get("start_values", {})
     joints = []
     for i, name in enumerate(names):
         unit = ""
@@ -279,14 +273,14 @@ def _joints(run: Run, names: Sequence[str], robot: _Robot | None) -> tuple[Joint
                 unit,
                 None if low is None or low <= -UNBOUNDED else low,
                 None if high is None or high >= UNBOUNDED else high,
-                run.q[:, i],
-                run.v[:, i] if run.v.shape == run.q.shape else np.empty(0),
+                bag.q[:, i],
+                bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0),
             )
         )
     return tuple(joints)
 
 
-def _in_robot_order(run: Run, robot: _Robot, names: Sequence[str], values: Array) -> Array:
+def _in_robot_order(bag: Recording, robot: _Robot, names: Sequence[str], values: Array) -> Array:
     """Columns of a bag's q or v for the robot's joints; 0 for those that do not move the frame.
 
     Raises:
@@ -296,11 +290,11 @@ def _in_robot_order(run: Run, robot: _Robot, names: Sequence[str], values: Array
     needed = robot.chain
     for j, joint in enumerate(robot.moving):
         if joint.name in names:
-            if values.shape == run.q.shape:
+            if values.shape == bag.q.shape:
                 ordered[:, j] = values[:, names.index(joint.name)]
         elif joint in needed:
             raise PlotError(
-                f"'{run.path}' has no joint '{joint.name}', which the robot '{robot.urdf.name}'"
+                f"'{bag.path}' has no joint '{joint.name}', which the robot '{robot.urdf.name}'"
                 f" needs to move '{robot.frame}'; its joints are: {', '.join(names)}"
             )
     return ordered
@@ -354,57 +348,31 @@ def _reach(robot: _Robot) -> Reach | None:
 # --- the task ---
 
 
-def _schedule(run: Run) -> Schedule:
-    """The inputs and parameters that held, each from its communication point on."""
-    made = run.provenance
-    starts = made.get("start_values", {})
-    changes = made.get("input_changes", [])
-    if not all(map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))):
-        raise ValueError("values are not finite")
-    schedule: Schedule = [(0, ChainMap({}, starts))]
-    changed: dict[str, Any] = {}
-    for time, values in changes:
-        steps = (time - made["start_time"]) / made["step"]
-        k = max(0, ceil(steps - TIME_TOLERANCE))
-        changed = {**changed, **values}
-        if k == schedule[-1][0]:
-            schedule.pop()
-        schedule.append((k, ChainMap(changed, starts)))
-    last = _steps(run)[-1] if made else 0
-    return [(k, values) for k, values in schedule if k < last or k == 0]
+def _has_target(bag: Recording, robot: _Robot) -> bool:
+    """Whether the target is known, at the end at least, in the robot's root frame."""
+    if not bag.target.size or np.isnan(bag.target[-1]).any():
+        return False
+    return bool(bag.provenance) or (bag.heard is not None and bag.heard.frame == robot.urdf.root)
 
 
-def _steps(run: Run) -> NDArray[np.int64]:
-    """Number of communication steps before each sample; a recovered bag may have gaps."""
-    step = run.provenance["step"]
-    least = run.t[-1] / (MOST_LOST * len(run.t))
-    if not (0.0 < step < inf and least <= step):
-        raise ValueError(f"samples are not steps of {step} s apart")
-    steps: NDArray[np.int64] = np.rint(run.t / step).astype(np.int64)
-    return steps
-
-
-def _task(run: Run, robot: _Robot, q: Array, v0: Array, path: Array, schedule: Schedule) -> Task:
+def _task(bag: Recording, robot: _Robot, q: Array, v0: Array, path: Array) -> Task:
     axes = ["xyz".index(axis) for axis in robot.axes]
-    x, steps = path[:, axes], _steps(run)
+    x, target = path[:, axes], bag.target
 
     def vector(values: Mapping[str, Any], group: str) -> tuple[float, ...]:
         return tuple(float(values[f"{group}[{i + 1}]"]) for i in range(len(axes)))
 
-    begins = np.array([k for k, _ in schedule])
-    targets = np.array([vector(values, "x_des") for _, values in schedule])
-    # at its own communication point a change has not been at work yet
-    target = targets[np.maximum(np.searchsorted(begins, steps) - 1, 0)]
     closed_form = departure = None
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.linalg.norm(x - target, axis=1)
-        if not np.isfinite(error).all():
+        if not np.isfinite(x).all() or np.isinf(error).any():
             raise ValueError("positions or targets are beyond all bounds")
-        if all(f"{group}[1]" in schedule[0][1] for group in Held._fields):
-            held = [(k, Held(*(vector(values, g) for g in Held._fields))) for k, values in schedule]
-            step = run.provenance["step"]
+        inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
+        if inputs_known and all(f"{g}[1]" in bag.schedule[0][1] for g in Held._fields):
+            held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
+            step, last = bag.provenance["step"], int(bag.steps[-1])
             xd0 = (robot.kinematics.jacobian(robot.frame, q[:1])[0] @ v0)[axes]
-            e = task_error(x[0].tolist(), xd0.tolist(), held, step, int(steps[-1]))[steps]
+            e = task_error(x[0].tolist(), xd0.tolist(), held, step, last)[bag.steps]
             closed_form = np.linalg.norm(e, axis=1)
             departure = float(np.linalg.norm(x - target - e, axis=1).max())
     return Task(
@@ -442,9 +410,9 @@ def _is_singular(robot: _Robot, q: Array, rcond: float) -> bool:
     return sigma.shape[1] < len(axes) or bool((sigma[:, -1] <= rcond * sigma[:, 0]).any())
 
 
-def _settings(run: Run, schedule: Schedule) -> dict[str, str]:
+def _settings(bag: Recording, schedule: Schedule) -> dict[str, str]:
     """What the run was told, vectors and scalars by group."""
-    made = run.provenance
+    made = bag.provenance
     if not made:
         return {}
     settings = {

@@ -26,7 +26,11 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     if clear and max(map(len, told)) <= 80:
         return told
     names = [track.name for track in tracks]
-    return names if len(set(names)) == len(names) else [shown(track.run.path) for track in tracks]
+    return (
+        names
+        if len(set(names)) == len(names)
+        else [shown(track.recording.path) for track in tracks]
+    )
 
 
 def common_settings(tracks: Sequence[Track]) -> str:

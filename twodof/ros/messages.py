@@ -28,6 +28,8 @@ from .scene import Scene, Transform
 Array = NDArray[np.float64]
 JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
+TARGET = "/target"
+POINT = "geometry_msgs/msg/PointStamped"
 FOREVER = QosTime(9223372036, 854775807)
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -62,8 +64,8 @@ SCENE_TOPICS = {
     "/robot_description": Topic("std_msgs/msg/String", LATCHED),
     "/tf_static": Topic("tf2_msgs/msg/TFMessage", LATCHED),
     "/tf": Topic("tf2_msgs/msg/TFMessage", _qos(100, QosDurability.VOLATILE)),
-    "/target": Topic("geometry_msgs/msg/PointStamped", STREAM),
-    "/end_effector": Topic("geometry_msgs/msg/PointStamped", STREAM),
+    TARGET: Topic(POINT, STREAM),
+    "/end_effector": Topic(POINT, STREAM),
 }
 
 
@@ -180,7 +182,7 @@ class Messages:
         target = list(end_effector)  # the target leaves an axis that is not controlled as it is
         for axis, value in zip(self._axes, sample.target or ()):
             target["xyz".index(axis)] = value
-        yield "/target", _point(stamp, self._root, target)
+        yield TARGET, _point(stamp, self._root, target)
         yield "/end_effector", _point(stamp, self._root, end_effector)
 
 
@@ -210,7 +212,7 @@ def _header(stamp: int, frame: str) -> Any:
 def _point(stamp: int, frame: str, xyz: Sequence[float]) -> Any:
     x, y, z = xyz
     point = Message["geometry_msgs/msg/Point"](x=x, y=y, z=z)
-    return Message["geometry_msgs/msg/PointStamped"](header=_header(stamp, frame), point=point)
+    return Message[POINT](header=_header(stamp, frame), point=point)
 
 
 def _tf_message(stamp: int, transforms: Sequence[Transform]) -> Any:

@@ -17,14 +17,13 @@ from rosbags.interfaces import Nodetype, Qos, QosDurability
 from ..errors import PublishError, SimulationError
 from ..experiments import Experiment, Setting
 from ..master import Sample, Sink, at_rest
-from .messages import SCENE_TOPICS, STORE, STREAM, Messages, Serialised
+from .messages import POINT, STORE, STREAM, Messages, Serialised
 from .network import Network, network, open_domain
 
 # isort: split
 from cyclonedds import core, domain, idl, pub, qos, sub, topic  # where missing, network says so
 
 LOG = logging.getLogger(__name__)
-POINT = SCENE_TOPICS["/target"].type
 COMMANDS = ("/target_command", "/clicked_point")
 LONGEST_NAME = 80  # of a frame, that is told
 

@@ -1,0 +1,199 @@
+"""A bag read back: arrays over the samples, and what its provenance says of them."""
+
+from __future__ import annotations
+
+from collections import ChainMap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from math import ceil, inf, isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import BagError
+from ..experiments import NANOSECONDS, TIME_TOLERANCE
+from ..kinematics import Kinematics
+from ..plant.urdf import RobotError, Urdf, read_urdf
+from .provenance import KNOWN_UNTIL
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+Schedule = list[tuple[int, Mapping[str, Any]]]
+"""Communication points, ascending from 0, and values of inputs and parameters from each on."""
+
+MOST_LOST = 10  # times as many samples as there are
+
+
+@dataclass(frozen=True)
+class TopicCount:
+    """One topic of a bag: its name, message type and number of messages."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Heard:
+    """The points on a bag's /target: of each sample the latest by then.
+
+    Attributes:
+        frame: that they are expressed in.
+        points: m, N × 3; not a number before the first.
+    """
+
+    frame: str
+    points: Array
+
+
+@dataclass(frozen=True, repr=False)
+class Recording:
+    """A bag read back; N samples of n joints, m task axes.
+
+    Attributes:
+        path: the bag's folder.
+        topics: all topics of the bag.
+        stamps: time stamps of the joint states, ns since the epoch, N, ascending.
+        joints: joint names.
+        q, v: positions (rad, m) and velocities, N × n.
+        tau: efforts (N·m, N), N × n, or N × 0 where the bag has none.
+        heard: what /target said; None where the bag has no such points.
+        provenance: what the logger wrote about the run, {} for a bag from elsewhere.
+    """
+
+    path: Path
+    topics: tuple[TopicCount, ...]
+    stamps: Stamps
+    joints: tuple[str, ...]
+    q: Array
+    v: Array
+    tau: Array
+    heard: Heard | None
+    provenance: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return (
+            f"<Recording '{self.path}': {len(self.stamps)} samples in {self.t[-1]:g} s"
+            f" of {', '.join(self.joints)}>"
+        )
+
+    @property
+    def t(self) -> Array:
+        """Time since the first sample, s, N."""
+        return cast(Array, (self.stamps - self.stamps[0]) / NANOSECONDS)
+
+    @property
+    def axes(self) -> str:
+        """The task axes, of "xyz"; "" where the provenance does not know them."""
+        return str(self.provenance.get("axes") or "")
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """The inputs and parameters that held, each from its communication point on.
+
+        Raises:
+            BagError: the provenance does not fit the samples.
+        """
+        try:
+            return self._schedule()
+        except (KeyError, ValueError, ArithmeticError) as error:
+            raise BagError(f"the run.json in '{self.path}' does not fit its samples") from error
+
+    @cached_property
+    def steps(self) -> NDArray[np.int64]:
+        """Number of communication steps before each sample; a recovered bag may have gaps.
+
+        Raises:
+            BagError: the bag has no provenance, or one that does not fit the samples.
+        """
+        step = self.provenance.get("step", 0.0)
+        least = self.t[-1] / (MOST_LOST * len(self.t))
+        if not (0.0 < step < inf and least <= step):
+            raise BagError(f"the run.json in '{self.path}' does not fit its samples")
+        steps: NDArray[np.int64] = np.rint(self.t / step).astype(np.int64)
+        return steps
+
+    @property
+    def target(self) -> Array:
+        """Target position in effect up to each sample, along the task axes, m, N × m.
+
+        As the provenance has it, or else the bag's /target in the robot's root frame, which is
+        then all of x, y, z where the task axes are not known. N × 0 where neither knows it.
+
+        Raises:
+            BagError: the provenance does not fit the samples.
+        """
+        if self.axes and "x_des[1]" in self.schedule[0][1] and KNOWN_UNTIL not in self.provenance:
+            m = range(1, len(self.axes) + 1)
+            begins = np.array([k for k, _ in self.schedule])
+            targets = np.array(
+                [[float(held[f"x_des[{i}]"]) for i in m] for _, held in self.schedule]
+            )
+            # at its own communication point a change has not been at work yet
+            return cast(Array, targets[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
+        root = self.provenance.get("root")
+        if self.heard is None or root not in (None, self.heard.frame):
+            return np.empty((len(self.stamps), 0))
+        return self.heard.points[:, ["xyz".index(axis) for axis in self.axes or "xyz"]]
+
+    @cached_property
+    def x(self) -> Array:
+        """End effector position along the task axes, m, N × m; N × 0 where the robot is not known.
+
+        Raises:
+            BagError: the robot in the provenance does not fit the samples.
+        """
+        text = self.provenance.get("urdf")
+        if text is None or not self.axes:
+            return np.empty((len(self.stamps), 0))
+        try:
+            robot: Urdf = read_urdf(text)
+            kinematics = Kinematics(robot, self.joints)
+            path = kinematics.path(self.provenance["frame"], self.q)
+        except (RobotError, KeyError) as error:
+            raise BagError(f"the robot in '{self.path}' does not fit its samples") from error
+        return path[:, ["xyz".index(axis) for axis in self.axes]]
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row a sample: q, v, and tau, x and target where known; index t in s.
+
+        Columns are named as the FMU's variables, "q[1]" of the first joint.
+
+        Raises:
+            BagError: pandas is missing, or as ``x`` and ``target``.
+        """
+        try:
+            import pandas as pd
+        except ImportError as missing:
+            raise BagError(f"{missing}; pip install pandas") from missing
+        parts = {"q": self.q, "v": self.v, "tau": self.tau, "x": self.x, "x_des": self.target}
+        columns = {
+            f"{group}[{i + 1}]": part[:, i]
+            for group, part in parts.items()
+            for i in range(part.shape[1])
+        }
+        return pd.DataFrame(columns, index=pd.Index(self.t, name="t"))
+
+    def _schedule(self) -> Schedule:
+        starts = self.provenance.get("start_values", {})
+        changes: Sequence[Any] = self.provenance.get("input_changes", [])
+        if not all(map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))):
+            raise ValueError("values are not finite")
+        schedule: Schedule = [(0, ChainMap({}, starts))]
+        changed: dict[str, Any] = {}
+        for time, values in changes:
+            steps = (time - self.provenance["start_time"]) / self.provenance["step"]
+            k = max(0, ceil(steps - TIME_TOLERANCE))
+            changed = {**changed, **values}
+            if k == schedule[-1][0]:
+                schedule.pop()
+            schedule.append((k, ChainMap(changed, starts)))
+        last = self.steps[-1] if self.provenance else 0
+        return [(k, values) for k, values in schedule if k < last or k == 0]
