@@ -6,6 +6,8 @@ Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
 from __future__ import annotations
 
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +30,53 @@ START = 1_700_000_000  # s since the epoch
 SECOND = 1_000_000_000  # ns
 PERIOD = 10_000_000  # ns, the default communication step
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+LOGGER = """
+import mmap, sys
+import twodof
+
+fmu, bag, storage, made, start = sys.argv[1:]
+
+class Made(twodof.Sink):
+    \"""How many samples there are, where it outlives the process.\"""
+
+    def __enter__(self):
+        with open(made, "r+b") as file:
+            self.map = mmap.mmap(file.fileno(), 8)
+        return self
+
+    def write(self, sample):
+        self.map[:] = (sample.k + 1).to_bytes(8, "little")
+
+try:
+    twodof.simulate(
+        fmu, twodof.Bag(bag, storage=storage), Made(), pace=twodof.RealTime(),
+        stop_time=1e5, stamp_start=int(start),
+    )
+except twodof.TwoDofError as error:
+    raise SystemExit(str(error))
+"""
+
+
+class Logging(NamedTuple):
+    """A run in real time, in a process of its own, that counts its samples."""
+
+    process: subprocess.Popen[str]
+    count: Path
+
+    @property
+    def made(self) -> int:
+        """How many samples there are or were."""
+        return int.from_bytes(self.count.read_bytes(), "little")
+
+
+def logging(fmu: Path, bag: Path, storage: str) -> Logging:
+    """Begin a run that has no end."""
+    count = bag.with_name(f"{bag.name}.count")
+    count.write_bytes(bytes(8))
+    command = [sys.executable, "-c", LOGGER, *map(str, (fmu, bag, storage, count, START))]
+    return Logging(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), count)
 
 
 class JointState(NamedTuple):
