@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 import twodof  # noqa: E402
 from twodof.plots.figure import drawn  # noqa: E402
-from twodof.plots.runs import plot_bags  # noqa: E402
+from twodof.plots.runs import plot  # noqa: E402
 from twodof.plots.sweeps import drawing  # noqa: E402
 
 LINK = 0.15  # m
@@ -206,7 +206,7 @@ def draw_plot(fmu: Path, path: Path) -> None:
     for gain, bag in zip(GAINS, bags, strict=True):
         run = twodof.experiment(fmu, settings={"Kp": gain})
         twodof.simulate(run, twodof.Bag(bag))
-    figure = plot_bags(*bags)
+    figure = plot(*bags)
     figure.savefig(path, dpi=135, pil_kwargs={"optimize": True}, metadata={"Software": None})
 
 

@@ -38,7 +38,7 @@ from twodof.cli.main import main
 from twodof.errors import PlotError, TwoDofError
 from twodof.master import Sample
 from twodof.plots.figure import file_kind, save
-from twodof.plots.runs import drawing, plot_bags
+from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
 from twodof.plots.words import labels
 
@@ -221,7 +221,7 @@ def notes(axes: Axes) -> list[str]:
 
 
 def test_joints_are_drawn_as_the_fmu_gave_them(default: Recording) -> None:
-    figure = panels(plot_bags(default.bag))
+    figure = panels(plot(default.bag))
     assert len(figure.q) == len(figure.v) == 2
     for i in range(2):
         for axes, values in ((figure.q[i], default.q), (figure.v[i], default.v)):
@@ -234,7 +234,7 @@ def test_joints_are_drawn_as_the_fmu_gave_them(default: Recording) -> None:
 
 
 def test_units_and_settings_are_told(default: Recording) -> None:
-    figure = plot_bags(default.bag)
+    figure = plot(default.bag)
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad"
     assert found.v[0].get_title("left") == "Velocity in rad/s"
@@ -255,7 +255,7 @@ def test_units_and_settings_are_told(default: Recording) -> None:
 
 
 def test_path_and_arm_are_those_of_the_closed_form(default: Recording) -> None:
-    (view,) = panels(plot_bags(default.bag)).views
+    (view,) = panels(plot(default.bag)).views
     q = default.q
     path = only(view, "path")
     np.testing.assert_allclose(path, oracles.position(q), rtol=0.0, atol=1e-14)
@@ -271,7 +271,7 @@ def test_path_and_arm_are_those_of_the_closed_form(default: Recording) -> None:
 
 
 def test_a_metre_is_as_long_up_as_across(default: Recording) -> None:
-    figure = plot_bags(default.bag)
+    figure = plot(default.bag)
     (view,) = panels(figure).views
     limits = view.get_xlim(), view.get_ylim()
     FigureCanvasAgg(figure).draw()
@@ -286,7 +286,7 @@ def test_a_metre_is_as_long_up_as_across(default: Recording) -> None:
 
 
 def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default: Recording) -> None:
-    error = panels(plot_bags(default.bag)).error
+    error = panels(plot(default.bag)).error
     assert error is not None
     assert error.get_yscale() == "log"
     target = np.array([0.2, 0.05])
@@ -304,7 +304,7 @@ def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default: R
 
 def test_what_came_out_is_told(default: Recording) -> None:
     left = np.linalg.norm(default.x[-1] - (0.2, 0.05))
-    (told,) = [text for text in texts(plot_bags(default.bag)) if "at the end;" in text]
+    (told,) = [text for text in texts(plot(default.bag)) if "at the end;" in text]
     found = re.fullmatch(
         r"(\S+) m from its target at the end; at most (\S+) m off the closed form", told
     )
@@ -324,7 +324,7 @@ def test_limits_are_lines_that_are_in_view_where_they_are_near(
         tmp_path / "bag", fmu_path, settings={"q_max": (0.9, 1.2), "x_des": (-0.1, 0.2)}
     )
     assert recording.q[-1, 1] == 1.2
-    found = panels(plot_bags(recording.bag))
+    found = panels(plot(recording.bag))
     second = found.q[1]
     assert sorted(line.get_ydata()[0] for line in lines(second, "limit")) == [-math.pi, 1.2]
     low, high = second.get_ylim()
@@ -338,7 +338,7 @@ def test_limits_are_lines_that_are_in_view_where_they_are_near(
 
 
 def test_equal_limits_are_told_once(default: Recording) -> None:
-    first = panels(plot_bags(default.bag)).q[0]
+    first = panels(plot(default.bag)).q[0]
     assert sorted(line.get_ydata()[0] for line in lines(first, "limit")) == [-math.pi, math.pi]
     assert notes(first) == ["limits ±3.14"]
     low, high = first.get_ylim()
@@ -362,7 +362,7 @@ def changing(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Record
 
 def test_changes_are_where_the_master_makes_them(changing: Recording) -> None:
     """Distances by the FMU's own x and the inputs of its samples; the closed form by its x."""
-    found = panels(plot_bags(changing.bag))
+    found = panels(plot(changing.bag))
     assert found.error is not None
     targets = np.array([[s.inputs[f"x_des[{k}]"] for k in (1, 2)] for s in changing.samples])
     assert len(np.unique(targets, axis=0)) == 3
@@ -380,7 +380,7 @@ def test_what_does_not_change_remains(fmu_path: Path, tmp_path: Path) -> None:
     changes = [(0.1, {"x_des[1]": 0.15}), (0.2, {"Kp[2]": 90.0}), (0.3, {"x_des[2]": 0.1})]
     run, samples = replace(run, changes=changes), Collector()
     twodof.simulate(run, samples, twodof.Bag(tmp_path / "bag"))
-    error = panels(plot_bags(tmp_path / "bag")).error
+    error = panels(plot(tmp_path / "bag")).error
     assert error is not None
     targets = np.array([[s.inputs[f"x_des[{k}]"] for k in (1, 2)] for s in samples])
     distance = np.linalg.norm(Recording(tmp_path, samples).x - targets, axis=1)
@@ -389,7 +389,7 @@ def test_what_does_not_change_remains(fmu_path: Path, tmp_path: Path) -> None:
 
 
 def test_settings_that_change_are_told_so(changing: Recording) -> None:
-    (told,) = [text for text in texts(plot_bags(changing.bag)) if "step" in text]
+    (told,) = [text for text in texts(plot(changing.bag)) if "step" in text]
     assert told == (
         "x_des varied, xdd_des varied, Kp varied, Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu, bag bag"
     )
@@ -401,7 +401,7 @@ def test_a_target_on_a_path_is_drawn_as_a_path(fmu_path: Path, tmp_path: Path) -
     rows = "".join(f"{a},{x!r},{y!r}\n" for a, (x, y) in zip(t.tolist(), circle.tolist()))
     (tmp_path / "in.csv").write_text("time,x_des[1],x_des[2]\n" + rows)
     recording = record(tmp_path / "bag", fmu_path, stop_time=1.0, input_file=tmp_path / "in.csv")
-    (view,) = panels(plot_bags(recording.bag)).views
+    (view,) = panels(plot(recording.bag)).views
     (line,) = lines(view, "target")
     assert line.get_linestyle() == "-"
     np.testing.assert_array_equal(points(line), circle)
@@ -435,7 +435,7 @@ def test_the_closed_form_says_what_it_leaves_out(
     fmu = build(tmp_path, urdf, axes="xy", q_start=start, native=len(start) == 1)
     settings = {"x_des": (0.3, 0.6), **settings}
     recording = record(tmp_path / "bag", fmu, stop_time=0.5, settings=settings)
-    error = panels(plot_bags(recording.bag)).error
+    error = panels(plot(recording.bag)).error
     assert error is not None
     closed = only(error, label)
     away = recording.x[0] - settings["x_des"]
@@ -454,7 +454,7 @@ def test_a_controller_without_a_gain_is_drawn(
         tmp_path / "bag", fmu_path, stop_time=0.3,
         settings={"Kp": Kp, "Kd": Kd, "v_start": (0.1, 0.2), "xd_des": (0.01, 0.0)},
     )  # fmt: skip
-    error = panels(plot_bags(recording.bag)).error
+    error = panels(plot(recording.bag)).error
     assert error is not None
     distance = np.linalg.norm(recording.x - (0.2, 0.05), axis=1)
     np.testing.assert_allclose(only(error, "closed form")[:, 1], distance, rtol=0.0, atol=1e-9)
@@ -465,7 +465,7 @@ def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: P
     recording = record(
         tmp_path / "bag", fmu_path, stop_time=0.1, settings={"x_des": tuple(at_rest)}
     )
-    figure = plot_bags(recording.bag)
+    figure = plot(recording.bag)
     FigureCanvasAgg(figure).draw()
     error = panels(figure).error
     assert error is not None
@@ -477,7 +477,7 @@ def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: P
 
 
 def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Recording]) -> None:
-    figure = plot_bags(*(recording.bag for recording in gains.values()))
+    figure = plot(*(recording.bag for recording in gains.values()))
     names = ["Kp = 20 s⁻²", "Kp = 50 s⁻²", "Kp = 400 s⁻²"]
     assert key(figure) == names
     assert "x_des = (0.2, 0.05) m, Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu" in texts(figure)
@@ -498,7 +498,7 @@ def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Record
 
 
 def test_each_track_has_one_look_in_all_panels(gains: dict[int, Recording]) -> None:
-    figure = plot_bags(*(recording.bag for recording in gains.values()))
+    figure = plot(*(recording.bag for recording in gains.values()))
     found = panels(figure)
     assert found.error is not None
     (legend,) = figure.legends
@@ -514,7 +514,7 @@ def test_each_track_has_one_look_in_all_panels(gains: dict[int, Recording]) -> N
 
 def looks(count: int, bag: Path) -> list[tuple[str, Any]]:
     """Colour and dashes of each of that many tracks."""
-    figure = plot_bags(*[bag] * count)
+    figure = plot(*[bag] * count)
     found = panels(figure).q[0].get_lines()
     return [
         (line.get_color(), tuple(line._unscaled_dash_pattern[1] or ()))
@@ -592,7 +592,7 @@ def test_bags_of_one_name_are_told_by_their_paths(tmp_path: Path) -> None:
 def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_path: Path) -> None:
     fmu = build(tmp_path, bare(ur5), frame="tool0", q_start=oracles.REST["ur5"])
     recording = record(tmp_path / "bag", fmu, stop_time=0.3, settings={"x_des": (0.3, 0.35, 0.5)})
-    found = panels(plot_bags(recording.bag))
+    found = panels(plot(recording.bag))
     names = list(pin.buildModelFromXML(bare(ur5)).names)[1:]
     path = kinematics(bare(ur5), "tool0", names, recording.q)
     assert [(v.get_xlabel(), v.get_ylabel()) for v in found.views] == [
@@ -619,7 +619,7 @@ def test_links_of_an_arm_are_as_long_as_they_are(panda: str, tmp_path: Path) -> 
     """Joints' places by Pinocchio; distances in space from the two views together."""
     fmu = build(tmp_path, bare(panda), frame="panda_hand_tcp", q_start=oracles.REST["panda"])
     recording = record(tmp_path / "bag", fmu, stop_time=0.05)
-    above, beside = panels(plot_bags(recording.bag)).views
+    above, beside = panels(plot(recording.bag)).views
     model = pin.buildModelFromXML(bare(panda))
     data = model.createData()
     pin.framesForwardKinematics(model, data, recording.q[0])
@@ -635,7 +635,7 @@ def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> N
     """The target is a height; across, the end effector may be anywhere."""
     fmu = build(tmp_path, chain_urdf("z"), axes="y", q_start=(-0.3,), native=True)
     recording = record(tmp_path / "bag", fmu, stop_time=1.0, settings={"x_des": 0.2})
-    figure = plot_bags(recording.bag)
+    figure = plot(recording.bag)
     found = panels(figure)
     (above,), (below,) = found.q, found.v
     assert above.get_position().y0 > below.get_position().y1
@@ -656,7 +656,7 @@ def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> N
 def test_joints_that_slide_have_metres(tmp_path: Path) -> None:
     fmu = build(tmp_path, chain_urdf("zX", low=0.0), axes="xy", q_start=(0.3, 0.1))
     recording = record(tmp_path / "bag", fmu, stop_time=0.05)
-    figure = plot_bags(recording.bag)
+    figure = plot(recording.bag)
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad or m"
     assert found.v[0].get_title("left") == "Velocity in rad/s or m/s"
@@ -679,7 +679,7 @@ def test_motion_in_a_plane_is_seen_in_that_plane(
     t, q, v = waves(len(axes))
     names = [f"j{i + 1}" for i in range(len(axes))]
     bag = elsewhere(tmp_path / "bag", names, t, q, v)
-    (view,) = panels(plot_bags(bag, urdf=tmp_path / "robot.urdf")).views
+    (view,) = panels(plot(bag, urdf=tmp_path / "robot.urdf")).views
     plane, reach = expected
     assert view.get_xlabel()[0] + view.get_ylabel()[0] == plane
     circles = [line for line in view.get_lines() if "reach" in str(line.get_label())]
@@ -695,7 +695,7 @@ def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path: Path) -> None
     urdf = chain_urdf("zz").replace('<origin xyz="0.4 0 0"/>', '<origin xyz="0.24 0.32 0.1"/>')
     (tmp_path / "robot.urdf").write_text(urdf)
     bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
-    above, beside = panels(plot_bags(bag, urdf=tmp_path / "robot.urdf")).views
+    above, beside = panels(plot(bag, urdf=tmp_path / "robot.urdf")).views
     np.testing.assert_allclose(np.hypot(*only(above, "reach 0.8 m").T), 0.8)
     assert not lines(beside, "reach 0.8 m")
     assert "reach 0.8 m" in [text.get_text() for text in beside.get_legend().get_texts()]
@@ -705,7 +705,7 @@ def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path: Path) -> None
     urdf = chain_urdf("zz").replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0.1 1"/>', 1)
     (tmp_path / "robot.urdf").write_text(urdf)
     bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
-    figure = plot_bags(bag, urdf=tmp_path / "robot.urdf")
+    figure = plot(bag, urdf=tmp_path / "robot.urdf")
     assert len(panels(figure).views) == 2
     assert not [text for text in texts(figure) if "reach" in text]
 
@@ -715,7 +715,7 @@ def test_sixteen_joints_fit_on_a_page(tmp_path: Path) -> None:
     urdf.write_text(chain_urdf("zy" * 8, length=0.1))
     t, q, v = waves(16)
     names = [f"j{i + 1}" for i in range(16)]
-    figure = plot_bags(elsewhere(tmp_path / "bag", names, t, q, v), urdf=urdf)
+    figure = plot(elsewhere(tmp_path / "bag", names, t, q, v), urdf=urdf)
     width, height = figure.get_size_inches()
     assert height / width < math.sqrt(2.0)
     assert len(panels(figure).q) == len(panels(figure).v) == 16
@@ -732,7 +732,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign: Path) -> None:
     t, q, v = waves(6)
-    figure = plot_bags(foreign)
+    figure = plot(foreign)
     found = panels(figure)
     assert (len(found.q), len(found.v), found.error, found.views) == (6, 6, None, [])
     for i in range(6):
@@ -746,7 +746,7 @@ def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign: Path) -> None:
 
 def test_with_a_urdf_it_has_limits_path_and_arm(foreign: Path, ur5: str, tmp_path: Path) -> None:
     (tmp_path / "ur5.urdf").write_text(ur5)
-    found = panels(plot_bags(foreign, urdf=tmp_path / "ur5.urdf"))
+    found = panels(plot(foreign, urdf=tmp_path / "ur5.urdf"))
     assert found.error is None
     path = kinematics(bare(ur5), "tool0", UR5_JOINTS, waves(6)[1])
     for view in found.views:
@@ -767,7 +767,7 @@ def test_another_frame_needs_only_the_joints_that_move_it(
     names = UR5_JOINTS[:4]  # those up to the forearm and one more
     bag = elsewhere(tmp_path / "bag", names, t, q[:, :4], v[:, :4])
     (tmp_path / "ur5.urdf").write_text(ur5)
-    figure = plot_bags(bag, urdf=tmp_path / "ur5.urdf", frame="forearm_link")
+    figure = plot(bag, urdf=tmp_path / "ur5.urdf", frame="forearm_link")
     path = kinematics(bare(ur5), "forearm_link", names, q[:, :4])
     view = panels(figure).views[0]
     np.testing.assert_allclose(only(view, "path"), path[:, :2], rtol=0.0, atol=1e-12)
@@ -784,7 +784,7 @@ def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots: Path, tmp_path: Pa
     ]
     t, q, v = waves(9)
     bag = elsewhere(tmp_path / "bag", names, t, q, v)
-    figure = plot_bags(bag, urdf=tmp_path / "panda.urdf", frame="panda_rightfinger")
+    figure = plot(bag, urdf=tmp_path / "panda.urdf", frame="panda_rightfinger")
     alone = re.sub("<mimic[^>]*/>", "", urdf)
     path = kinematics(alone, "panda_rightfinger", names, q)
     np.testing.assert_allclose(
@@ -797,7 +797,7 @@ def test_bags_without_velocities_or_with_gaps(tmp_path: Path) -> None:
     q[10:20, 0] = math.nan
     q[:, 1] = math.nan
     q[3, 1] = math.inf
-    figure = plot_bags(elsewhere(tmp_path / "bag", ["a", "b"], t, q, None))
+    figure = plot(elsewhere(tmp_path / "bag", ["a", "b"], t, q, None))
     found = panels(figure)
     assert (len(found.q), found.v) == (2, [])
     drawn = only(found.q[0], "bag")[:, 1]
@@ -809,7 +809,7 @@ def test_a_bag_of_one_sample_is_a_point(foreign: Path, ur5: str, tmp_path: Path)
     t, q, v = waves(6, 2)
     bag = elsewhere(tmp_path / "bag", UR5_JOINTS, t[:1], q[:1], v[:1])
     (tmp_path / "ur5.urdf").write_text(ur5)
-    figure = plot_bags(bag, urdf=tmp_path / "ur5.urdf")
+    figure = plot(bag, urdf=tmp_path / "ur5.urdf")
     (line,) = lines(panels(figure).q[0], "bag")
     assert line.get_marker() == "o"
     FigureCanvasAgg(figure).draw()
@@ -820,7 +820,7 @@ def test_a_urdf_may_replace_that_of_the_bag(default: Recording, tmp_path: Path) 
     urdf = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text()
     longer = urdf.replace('<origin xyz="0.15 0 0"', '<origin xyz="0.3 0 0"')
     (tmp_path / "longer.urdf").write_text(longer.replace("3.141592653589793", "1.5"))
-    found = panels(plot_bags(default.bag, urdf=tmp_path / "longer.urdf"))
+    found = panels(plot(default.bag, urdf=tmp_path / "longer.urdf"))
     path = only(found.views[0], "path")
     np.testing.assert_allclose(path, 2 * oracles.position(default.q), rtol=0.0, atol=1e-14)
     assert {line.get_ydata()[0] for line in lines(found.q[0], "limit")} == {-math.pi, math.pi}
@@ -830,7 +830,7 @@ def test_a_urdf_may_replace_that_of_the_bag(default: Recording, tmp_path: Path) 
 
 
 def test_for_another_frame_there_is_no_target(default: Recording) -> None:
-    found = panels(plot_bags(default.bag, frame="link2"))
+    found = panels(plot(default.bag, frame="link2"))
     assert found.error is None
     elbow = LINK * np.column_stack([np.cos(default.q[:, 0]), np.sin(default.q[:, 0])])
     np.testing.assert_allclose(only(found.views[0], "path"), elbow, rtol=0.0, atol=1e-14)
@@ -841,7 +841,7 @@ def test_a_recovered_bag_with_a_gap(default: Recording) -> None:
     run = twodof.read_bag(default.bag)
     kept = np.r_[0:100, 200:501]
     short = replace(run, stamps=run.stamps[kept], q=run.q[kept], v=run.v[kept])
-    error = panels(plot_bags(short)).error
+    error = panels(plot(short)).error
     assert error is not None
     found, closed = only(error, "Kp50"), only(error, "closed form")
     np.testing.assert_allclose(found[:, 0], default.t[kept], rtol=0.0, atol=1e-9)
@@ -903,17 +903,17 @@ def test_figures_are_legible(
     chain = elsewhere(tmp_path / "chain", names, *waves(16))
     long = [f"left_front_{part}_of_the_gripper_joint" for part in ("upper", "lower", "middle")]
     for figure in (
-        plot_bags(gains[50].bag),
-        plot_bags(*(recording.bag for recording in gains.values())),
-        plot_bags(changing.bag, gains[50].bag),
-        plot_bags(foreign),
-        plot_bags(foreign, urdf=tmp_path / "ur5.urdf"),
-        plot_bags(chain, urdf=tmp_path / "chain.urdf"),
-        plot_bags(elsewhere(tmp_path / "long", long, *waves(3))),
-        plot_bags(elsewhere(tmp_path / "one", ["a"], *waves(1))),
-        plot_bags(*[foreign] * 9),
-        plot_bags(*(elsewhere(tmp_path / (c * 140), ["a"], *waves(1)) for c in "abc")),
-        plot_bags(elsewhere(tmp_path / ("d" * 200), ["a"], *waves(1))),
+        plot(gains[50].bag),
+        plot(*(recording.bag for recording in gains.values())),
+        plot(changing.bag, gains[50].bag),
+        plot(foreign),
+        plot(foreign, urdf=tmp_path / "ur5.urdf"),
+        plot(chain, urdf=tmp_path / "chain.urdf"),
+        plot(elsewhere(tmp_path / "long", long, *waves(3))),
+        plot(elsewhere(tmp_path / "one", ["a"], *waves(1))),
+        plot(*[foreign] * 9),
+        plot(*(elsewhere(tmp_path / (c * 140), ["a"], *waves(1)) for c in "abc")),
+        plot(elsewhere(tmp_path / ("d" * 200), ["a"], *waves(1))),
     ):
         assert_legible(figure)
 
@@ -921,7 +921,7 @@ def test_figures_are_legible(
 def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     """A dollar sign would begin a formula."""
     bag = elsewhere(tmp_path / "a$b$_c^", ["$q$", "x_{1}"], *waves(2))
-    figure = plot_bags(bag)
+    figure = plot(bag)
     FigureCanvasAgg(figure).draw()
     named = [text for text in figure.findobj(Text) if "$" in text.get_text()]
     assert {text.get_text() for text in named} == {"a$b$_c^", "$q$"}
@@ -935,14 +935,14 @@ def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Pat
     ):
         found = save(drawing(read_tracks([default.bag])), tmp_path / "b.svg").read_bytes()
         assert matplotlib.rcParams["lines.linewidth"] == 9.0
-        figure = plot_bags(default.bag)
+        figure = plot(default.bag)
         FigureCanvasAgg(figure).draw()  # as windows and notebooks do
     assert found == expected
     assert max(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) == 11.0
 
 
 def test_notebooks_show_it(default: Recording) -> None:
-    figure = plot_bags(twodof.read_bag(default.bag))
+    figure = plot(twodof.read_bag(default.bag))
     assert isinstance(figure, Figure)
     assert figure._repr_png_().startswith(b"\x89PNG")
 
@@ -967,7 +967,7 @@ def test_noise_in_a_long_bag_keeps_its_extremes(default: Recording, tmp_path: Pa
     run = long_run(default, q)
     run.v[[777, 778, 150_000], 1] = math.inf, 0.9, math.nan
     tracks = read_tracks([run])
-    found = panels(plot_bags(run))
+    found = panels(plot(run))
     for axes, values in ((found.q[0], q[:, 0]), (found.v[1], run.v[:, 1])):
         line = only(axes, "Kp50")
         assert len(line) <= 4000
@@ -996,7 +996,7 @@ def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> No
     elbow = np.arccos(distance**2 / (2 * LINK**2) - 1.0)
     q = np.column_stack([np.arctan2(x[:, 1], x[:, 0]) - elbow / 2, elbow])
     run = long_run(default, q)
-    path = only(panels(plot_bags(run)).views[0], "path")
+    path = only(panels(plot(run)).views[0], "path")
     for corner in corners:
         assert np.hypot(*(path - corner).T).min() < 1e-12
     svg = save(drawing(read_tracks([run])), tmp_path / "long.svg")
@@ -1014,7 +1014,7 @@ def test_each_kind_of_file_opens(gains: dict[int, Recording], tmp_path: Path) ->
     with Image.open(png) as image:
         image.load()
         assert image.format == "PNG"
-        across = plot_bags(gains[50].bag, gains[20].bag).get_size_inches()[0]
+        across = plot(gains[50].bag, gains[20].bag).get_size_inches()[0]
         assert image.size[0] == pytest.approx(200 * across, abs=1)
     root = ET.parse(svg).getroot()
     assert root.tag == "{http://www.w3.org/2000/svg}svg"
@@ -1212,7 +1212,7 @@ def test_a_urdf_that_is_wrong_is_named(
     path.write_bytes(urdf if isinstance(urdf, bytes) else urdf.encode())
     bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
     with pytest.raises(PlotError, match=message) as caught:
-        plot_bags(bag, urdf=path, **options)
+        plot(bag, urdf=path, **options)
     assert "\n" not in str(caught.value)
 
 
@@ -1245,7 +1245,7 @@ def test_a_bag_whose_provenance_makes_no_sense_is_refused(
     made = copy.deepcopy(run.provenance)
     spoil(made)
     with pytest.raises(PlotError, match=r"^the run.json in '.*Kp50' does not fit its samples$"):
-        plot_bags(replace(run, provenance=made))
+        plot(replace(run, provenance=made))
 
 
 def test_a_bag_whose_robot_makes_no_sense_is_refused(default: Recording) -> None:
@@ -1256,7 +1256,7 @@ def test_a_bag_whose_robot_makes_no_sense_is_refused(default: Recording) -> None
         ({"frame": "hand"}, "the URDF in '.*Kp50': no frame 'hand'"),
     ):
         with pytest.raises(PlotError, match=message):
-            plot_bags(replace(run, provenance={**run.provenance, **spoilt}))
+            plot(replace(run, provenance={**run.provenance, **spoilt}))
 
 
 def test_what_else_is_wrong_is_named(
@@ -1278,12 +1278,12 @@ def test_what_else_is_wrong_is_named(
             save(drawing(tracks), output)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
     with pytest.raises(PlotError, match=r"^cannot read the URDF 'gone\.urdf': No such file"):
-        plot_bags(default.bag, urdf="gone.urdf")
+        plot(default.bag, urdf="gone.urdf")
     none = elsewhere(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
     with pytest.raises(PlotError, match=r"'.*bag' has 0 positions for 1 joints"):
-        plot_bags(none)
+        plot(none)
     with pytest.raises(TwoDofError, match="gone"):
-        plot_bags("gone")
+        plot("gone")
     assert file_kind("x/y.HTML") == "html"
 
 

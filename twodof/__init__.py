@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from .master import simulate as simulate
     from .pages.live import live as live
     from .pages.replay import view as view
-    from .plots.runs import plot_bags as plot_bags
+    from .plots.runs import plot as plot
     from .ros.publisher import Publisher as Publisher
+    from .ros.publisher import publish as publish
     from .sweeps.coordinator import sweep as sweep
     from .sweeps.results import read_sweep as read_sweep
 
@@ -49,8 +50,8 @@ _HOMES = {
     "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
     "pages.live": ("live",),
     "pages.replay": ("view",),
-    "plots.runs": ("plot_bags",),
-    "ros.publisher": ("Publisher",),
+    "plots.runs": ("plot",),
+    "ros.publisher": ("Publisher", "publish"),
     "sweeps.coordinator": ("sweep",),
     "sweeps.results": ("read_sweep",),
 }

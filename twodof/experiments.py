@@ -31,7 +31,7 @@ NANOSECONDS = 1_000_000_000
 LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Experiment:
     """One run of an FMU, checked before anything is instantiated; made by ``experiment``.
 
@@ -53,6 +53,13 @@ class Experiment:
     given: Mapping[str, Value]
     changes: Changes
     stamp_start: float | None
+
+    def __repr__(self) -> str:
+        end = "without end" if self.steps == inf else f"to {self.time(self.steps):g} s"
+        return (
+            f"<Experiment: {self.fmu.path.name} from {self.start_time:g} s {end}"
+            f" in steps of {self.step:g} s>"
+        )
 
     def time(self, k: float) -> float:
         """Time after k steps, s; never accumulated."""
@@ -200,6 +207,7 @@ def _nearest(name: str, known: list[str]) -> list[str]:
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     """Inputs over time from a CSV in FMPy's form: a column ``time`` and one for each input.
 
+    Columns are named as in settings: that of a vector sets all of its elements.
     A row's values hold from its time until the next row's; before the first row the start
     values hold.
 
@@ -213,17 +221,11 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     header = [cell.strip() for cell in names]
     if "time" not in header:
         raise InputError(f"'{path}' has no column 'time'")
+    elements = {name: _inputs(fmu, path, name) for name in header if name != "time"}
     for i, name in enumerate(header):
-        if name in header[:i]:
-            raise InputError(f"'{path}' has two columns '{name:.50}'")
-        if name == "time":
-            continue
-        if name not in fmu.variables:
-            known = [element for group in fmu.groups("input").values() for element in group]
-            suggestion = _suggestion(name, known)
-            raise InputError(f"'{path}': there is no variable '{name:.50}'{suggestion}")
-        if fmu.variables[name].causality != "input":
-            raise InputError(f"'{path}': {name} is not an input")
+        for element in elements.get(name, ["time"]):
+            if any(element in elements.get(other, ["time"]) for other in header[:i]):
+                raise InputError(f"'{path}' has two columns for '{element:.50}'")
     changes: Changes = []
     for number, row in rows:
         if len(row) != len(header):
@@ -241,10 +243,23 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
         time = values.pop("time")
         if changes and time < changes[-1][0]:
             raise InputError(f"'{path}' row {number}: time {time:g} is before the row above")
-        changes.append((time, values))
+        spread = {element: v for name, v in values.items() for element in elements[name]}
+        changes.append((time, spread))
     if not changes:
         raise InputError(f"'{path}' has no rows")
     return changes
+
+
+def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
+    """The inputs that a column sets: one, or all elements of a vector."""
+    elements = [name] if name in fmu.variables else fmu.vector(name)
+    if not elements:
+        groups = fmu.groups("input")
+        known = [*groups, *(element for group in groups.values() for element in group)]
+        raise InputError(f"'{path}': there is no variable '{name:.50}'{_suggestion(name, known)}")
+    if any(fmu.variables[element].causality != "input" for element in elements):
+        raise InputError(f"'{path}': {name} is not an input")
+    return elements
 
 
 def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:

@@ -38,7 +38,7 @@ MAX_WRAPPER = 16 * 1024**2  # it has 0.3 MiB
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fmu:
     """An FMI 2.0 co-simulation FMU with outputs q[i] and v[i].
 
@@ -62,6 +62,9 @@ class Fmu:
     frame: str
     root: str
     axes: str
+
+    def __repr__(self) -> str:
+        return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"
 
     @property
     def name(self) -> str:

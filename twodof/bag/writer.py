@@ -277,7 +277,7 @@ def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
         if not path.exists():
             return
         if not overwrite:
-            reason = "exists already; choose another name with -o or use --overwrite"
+            reason = "exists already; choose another with `path` or give `overwrite=True`"
             raise BagError(f"'{path}' {reason}")
         held = lock(path)
         try:

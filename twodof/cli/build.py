@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,7 @@ def call(options: argparse.Namespace) -> int:
         native=options.native,
         platforms=_platforms(options.platforms),
     )
+    logging.getLogger("twodof.export").setLevel(logging.INFO)  # other platforms take minutes
     path = build_fmu(options.output, chosen)
     from ..fmu import load_fmu
 

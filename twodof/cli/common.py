@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
+import re
 import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..errors import BuildError, InputError, SimulationError
 
@@ -28,6 +31,20 @@ SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name)
 PATIENCE = 5.0  # s for what is under way to end when it was asked to
 
 
+ARGUMENT = re.compile(r"`(\w+)(?:=True)?`")
+OPTIONS = {"path": "-o", "output": "-o", "platforms": "--platform"}
+"""Options that are not called as the argument of the library which they give."""
+
+
+class CommandLineError(InputError):
+    """An option is wrong, or does not go with another."""
+
+
+def in_options(text: str) -> str:
+    """A message of the library, which has its arguments in backticks, for the command line."""
+    return ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text)
+
+
 def parse_settings(texts: Iterable[str]) -> dict[str, Setting]:
     """NAME=VALUE texts of a command line: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
     settings: dict[str, Setting] = {}
@@ -35,9 +52,9 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Setting]:
         name, equals, value = text.partition("=")
         name = name.strip()
         if not equals or not name:
-            raise InputError(f"--set {text}: expected NAME=VALUE")
+            raise CommandLineError(f"--set {text}: expected NAME=VALUE")
         if name in settings:
-            raise InputError(f"--set {name} is given twice")
+            raise CommandLineError(f"--set {name} is given twice")
         settings[name] = _parse_value(name, value.strip())
     return settings
 
@@ -48,7 +65,7 @@ def _parse_value(name: str, text: str) -> Setting:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"--set {name}={text}: '{text}' is not a number") from None
+        raise CommandLineError(f"--set {name}={text}: '{text}' is not a number") from None
     return numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -114,10 +131,10 @@ def bag_of(options: argparse.Namespace, path: str) -> Bag:
 
 def fast_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else the default arm's, native where it can be built."""
-    from ..export.package import FmuOptions, build_fmu
-
     if options.fmu:
         return Path(options.fmu)
+    from ..export.package import FmuOptions, build_fmu
+
     try:
         return build_fmu(None, FmuOptions(native=True))
     except BuildError as error:
@@ -127,13 +144,15 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else the default arm's, built if need be."""
+    if options.fmu:
+        if options.native:
+            raise CommandLineError(
+                "--native builds the default arm's FMU; leave it out beside an FMU"
+            )
+        return Path(options.fmu)
     from ..export.compiler import host_platform
     from ..export.package import FmuOptions, build_fmu
 
-    if options.fmu:
-        if options.native:
-            raise InputError("--native builds the default arm's FMU; leave it out beside an FMU")
-        return Path(options.fmu)
     native = options.native or host_platform() != "linux64"
     if native and not options.native:
         print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
@@ -141,14 +160,36 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
 
 
 def print_summary(
-    run: Experiment, bag: Bag | None, storage: str, summary: Summary, pace: RealTime | None
+    options: argparse.Namespace,
+    run: Experiment,
+    bag: Bag | None,
+    summary: Summary,
+    pace: RealTime | None,
 ) -> None:
     """How a run went."""
     last = summary.last
     simulated = last.k * run.step
+    if options.json:
+        print_json(
+            fmu=str(run.fmu.path),
+            bag=None if bag is None else str(bag.path),
+            joint_states=last.k + 1,
+            end_time=last.t,
+            stopped=summary.stopped,
+            q=last.q, v=last.v, x=last.x, x_des=last.target, error=summary.error,
+            wall_time=summary.wall_time,
+            missed=None if pace is None else pace.missed,
+            worst=None if pace is None else pace.worst,
+        )  # fmt: skip
+        return
     rows = [("FMU", f"{run.fmu.path}")]
+    for name, value in parse_settings(options.settings).items():
+        elements = run.fmu.vector(name)
+        if len(elements) > 1 and isinstance(value, int | float):
+            rows.append((f"{name}", f"{value:g}, all {len(elements)} elements"))
     if bag is not None:
-        rows.append(("bag", f"{bag.path} ({last.k + 1} messages on /joint_states, {storage})"))
+        messages = f"{last.k + 1} messages on /joint_states, {options.storage}"
+        rows.append(("bag", f"{bag.path} ({messages})"))
     if summary.error is not None:
         target = ", ".join(f"{value:g}" for value in last.target or ())
         rows.append(("end effector", f"{length(summary.error)} from its target ({target}) m"))
@@ -184,7 +225,7 @@ def open_page(
 ) -> None:
     """Tell where the page is, and open it where there is a display."""
     for remark in remarks:
-        print(f"WARNING: {remark}", file=sys.stderr)
+        print(f"WARNING: {in_options(remark)}", file=sys.stderr)
     what = f"{fmu}; " if fmu is not None else ""
     print(f"open  {url} ({what}Ctrl-C ends)", flush=True)
     if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
@@ -193,25 +234,44 @@ def open_page(
         webbrowser.open(url)
 
 
-def print_best(table: DataFrame) -> None:
-    """The first few runs by settling time, effort and final error."""
-    from ..sweeps.metrics import METRICS
+def best_runs(table: DataFrame) -> DataFrame:
+    """The first few runs by settling time, effort and final error: variables and metrics."""
     from ..sweeps.results import ranked
 
     best = ranked(table).head(5)
     columns = [*best.columns]
-    columns = columns[: columns.index("end_time")]
-    units = [METRICS[name].unit if name in METRICS else "" for name in columns]
-    rows = [[f"{row[name]:.4g}" for name in columns] for row in best.to_dict("records")]
-    widths = [max(map(len, cells)) for cells in zip(columns, units, *rows)]
+    return best[columns[: columns.index("end_time")]]
+
+
+def print_best(table: DataFrame) -> None:
+    """The best runs, with units."""
+    from ..sweeps.metrics import METRICS
+
+    best = best_runs(table)
+    units = [METRICS[name].unit if name in METRICS else "" for name in best.columns]
+    rows = [[f"{value:.4g}" for value in row] for row in best.to_numpy()]
+    widths = [max(map(len, cells)) for cells in zip(best.columns, units, *rows)]
     print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
-    for cells in [columns, units, *rows] if rows else []:
+    for cells in [best.columns, units, *rows] if rows else []:
         print("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
 
 
 def quote(path: Path) -> str:
     """A path as a shell takes it."""
     return shlex.quote(str(path))
+
+
+def print_json(**facts: object) -> None:
+    """Facts for another program, in SI units; null where there is no finite number."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    print(json.dumps(plain(facts), indent=2))
 
 
 def print_table(*rows: tuple[str, str]) -> None:

@@ -3,38 +3,114 @@
 from __future__ import annotations
 
 import argparse
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from .common import controlled, print_table
+from .common import best_runs, controlled, print_best, print_json, print_table
+from .options import add_json_option
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from ..bag.recording import Recording
     from ..fmu import Fmu
 
 
 def add(verbs: Any) -> None:
     """Add the verb and its options."""
-    info = verbs.add_parser("info", help="show what is in an FMU or a bag")
-    info.add_argument("path", metavar="FMU|BAG", type=Path)
+    info = verbs.add_parser("info", help="show what is in an FMU, a bag or a sweep")
+    info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path)
+    add_json_option(info)
     info.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     path = options.path
-    if path.is_dir():
+    if path.is_dir() and any(path.glob("*.parquet")):
+        from ..sweeps.results import read_sweep
+
+        (_print_sweep_json if options.json else _print_sweep)(path, *read_sweep(path))
+    elif path.is_dir():
         from ..bag.reader import read_ends
 
-        _print_bag(*read_ends(path))
-    elif path.suffix in (".mcap", ".db3") and path.is_file():
-        raise InputError(f"'{path}' is a bag's file; give the bag's folder, '{path.parent}'")
+        (_print_bag_json if options.json else _print_bag)(*read_ends(path))
+    elif path.suffix in (".mcap", ".db3", ".parquet") and path.is_file():
+        what = "sweep" if path.suffix == ".parquet" else "bag"
+        raise InputError(f"'{path}' is a {what}'s file; give the {what}'s folder, '{path.parent}'")
+    elif path.suffix != ".fmu" and path.is_file() and not zipfile.is_zipfile(path):
+        raise InputError(f"'{path}' is neither an FMU nor the folder of a bag or a sweep")
     else:
         from ..fmu import load_fmu
 
-        _print_fmu(load_fmu(path))
+        (_print_fmu_json if options.json else _print_fmu)(load_fmu(path))
     return 0
+
+
+def _print_fmu_json(fmu: Fmu) -> None:
+    print_json(
+        kind="FMU",
+        path=str(fmu.path),
+        name=fmu.name,
+        guid=fmu.guid,
+        tool=fmu.description.generationTool,
+        platforms=fmu.platforms,
+        robot=fmu.robot,
+        joints=fmu.joints,
+        frame=fmu.frame,
+        root=fmu.root,
+        axes=fmu.axes,
+        variables=[
+            {"name": v.name, "causality": v.causality, "type": v.type, "unit": v.unit,
+             "start": v.start}
+            for v in fmu.variables.values()
+        ],
+    )  # fmt: skip
+
+
+def _print_bag_json(bag: Recording, count: int) -> None:
+    print_json(
+        kind="bag",
+        path=str(bag.path),
+        joints=bag.joints,
+        joint_states=count,
+        first_stamp=int(bag.stamps[0]),
+        last_stamp=int(bag.stamps[-1]),
+        q=[bag.q[0].tolist(), bag.q[-1].tolist()],
+        v=[bag.v[0].tolist(), bag.v[-1].tolist()],
+        topics=[{"name": t.name, "type": t.type, "count": t.count} for t in bag.topics],
+        fmu=bag.provenance.get("fmu"),
+        command_line=bag.provenance.get("command_line"),
+    )
+
+
+def _print_sweep_json(path: Path, table: DataFrame, provenance: dict[str, Any]) -> None:
+    print_json(
+        kind="sweep",
+        path=str(path),
+        runs=len(table),
+        outcomes=table["outcome"].value_counts().to_dict(),
+        best=best_runs(table).to_dict("records"),
+        **{key: provenance[key] for key in ("fmu", "design", "options")},
+        command_line=provenance.get("command_line"),
+    )
+
+
+def _print_sweep(path: Path, table: DataFrame, provenance: dict[str, Any]) -> None:
+    counts = table["outcome"].value_counts()
+    fmu, times = provenance["fmu"], provenance["options"]
+    varied = [*table.columns[1 : [*table.columns].index("settling_time")]]
+    print_table(
+        ("sweep", str(path)),
+        ("runs", ", ".join(f"{count} {outcome}" for outcome, count in counts.items()) or "none"),
+        *((name, f"{table[name].min():g} to {table[name].max():g}") for name in varied),
+        ("of", f"{times['stop_time']:g} s in steps of {times['step']:g} s"),
+        ("FMU", f"{fmu['file']} ({fmu['name']}, {fmu['guid']})"),
+        ("made by", provenance.get("command_line") or "the Python API"),
+    )
+    print_best(table)
 
 
 def _print_fmu(fmu: Fmu) -> None:

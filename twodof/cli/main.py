@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The command line: calls the function behind each verb, and prints.
 
 Imports are inside the verbs, so that ``twodof --help`` is instant.
@@ -14,19 +15,27 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from ..errors import TwoDofError
 from ..version import __version__
 from . import build, info, live, plot, publish, recover, run, sweep, view
-from .common import INTERRUPTED
+from .common import INTERRUPTED, CommandLineError, in_options
 
 VERBS = (build, run, publish, info, plot, view, live, sweep, recover)
 LONGEST_LINE = 2000
 
 
+class _Parser(argparse.ArgumentParser):
+    """Takes options in full alone: what is short today is ambiguous tomorrow."""
+
+    def __init__(self, **named: Any) -> None:
+        super().__init__(allow_abbrev=False, **named)
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser; what it gives has the verb's name as ``verb``."""
-    program = argparse.ArgumentParser(
+    program = _Parser(
         prog="twodof",
         description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
         epilog="'twodof run' alone builds the default arm's FMU, runs it for 5 s and leaves a bag.",
@@ -35,13 +44,30 @@ def parser() -> argparse.ArgumentParser:
     verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb in VERBS:
         verb.add(verbs)
+    _add_help(program, verbs)
     return program
+
+
+def _add_help(program: argparse.ArgumentParser, verbs: Any) -> None:
+    helped = verbs.add_parser("help", help="show this, or the options of a verb")
+    helped.add_argument("about", nargs="?", metavar="VERB", choices=[*verbs.choices])
+
+    def call(options: argparse.Namespace) -> int:
+        verbs.choices.get(options.about, program).print_help()
+        return 0
+
+    helped.set_defaults(call=call)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    options = parser().parse_args(arguments)
+    program = parser()
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(program)
+    options = program.parse_args(arguments)
     options.command_line = shlex.join(["twodof", *arguments])
     if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -58,8 +84,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return _fail("interrupted", INTERRUPTED)
+    except CommandLineError as error:
+        return _fail(str(error), 2)
     except TwoDofError as error:
-        return _fail(str(error))
+        return _fail(in_options(str(error)))
     except BrokenPipeError:  # the reader of our output has left: nothing more to say
         _silence()
         return 1

@@ -26,6 +26,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
+    add_json_option(parser)
     parser.add_argument(
         "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
     )
@@ -50,6 +51,11 @@ def add_set_option(parser: argparse.ArgumentParser) -> None:
         "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
     )  # fmt: skip
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Facts for another program."""
+    parser.add_argument("--json", action="store_true", help="print the facts as JSON, SI units")
 
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:

@@ -7,8 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
-from .common import print_best, print_table
+from .common import CommandLineError, print_best, print_table
 from .options import add_robot_options
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def call(options: argparse.Namespace) -> int:
     if not sweeps:
         return _plot_bags(options)
     if len(options.bags) > 1:
-        raise InputError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
+        raise CommandLineError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
     return _plot_sweep(options, Path(sweeps[0]))
 
 

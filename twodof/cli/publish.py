@@ -7,12 +7,13 @@ import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
 from .common import (
     INTERRUPTED,
+    CommandLineError,
     asked_to_stop,
     bag_of,
     experiment_of,
+    in_options,
     print_next,
     print_summary,
     print_table,
@@ -21,7 +22,6 @@ from .common import (
 from .options import add_run_options
 
 if TYPE_CHECKING:
-    from ..master import Sink
     from ..ros.publisher import Publisher
 
 
@@ -48,27 +48,26 @@ def add(verbs: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
-    from ..master import RealTime, simulate
+    from ..master import RealTime
     from ..ros.network import network
-    from ..ros.publisher import Publisher
+    from ..ros.publisher import publish
 
     if not 0.0 < options.rate < math.inf:
-        raise InputError(f"--rate {options.rate:g}: not a number of steps a second")
+        raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")
     if options.output is None and (options.overwrite or options.fsync):
-        raise InputError("--overwrite and --fsync are for a bag; name it with -o")
+        raise CommandLineError("--overwrite and --fsync are for a bag; name it with -o")
     place = network(subnet=options.subnet)
     endless = options.stop_time is None
     run = experiment_of(options, math.inf if endless else options.stop_time, 1.0 / options.rate)
     bag = bag_of(options, options.output) if options.output else None
-    wire = Publisher(place, scene=options.scene, effort=options.effort, opened=_print_network)
-    sinks: list[Sink] = [wire] if bag is None else [wire, bag]
     pace = RealTime()
     with asked_to_stop() as asked:
-        summary = simulate(
-            run, *sinks, pace=pace, stop=asked, steer=wire.command, resume=wire.resume
-        )
-    print_summary(run, bag, options.storage, summary, pace)
-    if bag is not None:
+        summary = publish(
+            run, *filter(None, [bag]), place=place, scene=options.scene, effort=options.effort,
+            opened=_print_network, pace=pace, stop=asked,
+        )  # fmt: skip
+    print_summary(options, run, bag, summary, pace)
+    if bag is not None and not options.json:
         print_next(f"twodof plot {quote(bag.path)}", f"ros2 bag play {quote(bag.path)}")
     return INTERRUPTED if summary.stopped else 0
 
@@ -77,7 +76,7 @@ def _print_network(wire: Publisher) -> None:
     place = wire.place
     print_table(
         ("topics", ", ".join(wire.topics)),
-        ("network", f"DDS domain {place.domain} on {wire.interface}, {place.reach}"),
+        ("network", f"DDS domain {place.domain} on {wire.interface}, {in_options(place.reach)}"),
         ("targets", f"from {', '.join(wire.commands)}" if wire.commands else "fixed"),
         ("end", "Ctrl-C"),
     )

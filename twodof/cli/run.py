@@ -7,9 +7,9 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
 from .common import (
     INTERRUPTED,
+    CommandLineError,
     asked_to_stop,
     bag_of,
     experiment_of,
@@ -42,7 +42,7 @@ def call(options: argparse.Namespace) -> int:
     from ..master import RealTime, simulate
 
     if options.stop_time == math.inf:
-        raise InputError(
+        raise CommandLineError(
             "stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C"
         )
     run = experiment_of(options, options.stop_time, options.step)
@@ -50,14 +50,13 @@ def call(options: argparse.Namespace) -> int:
     pace = RealTime() if options.realtime else None
     with asked_to_stop() as asked:
         summary = simulate(run, bag, progress(), pace=pace, stop=asked)
-    print_summary(run, bag, options.storage, summary, pace)
-    file = bag.path / f"{bag.path.name}.{'mcap' if options.storage == 'mcap' else 'db3'}"
-    viewer = "Foxglove: open" if options.storage == "mcap" else "RViz: play"
-    print_next(
-        f"twodof info {quote(bag.path)}",
-        f"ros2 bag play {quote(bag.path)}",
-        f"{viewer} {quote(file)}",
-    )
+    print_summary(options, run, bag, summary, pace)
+    if not options.json:
+        print_next(
+            f"twodof plot {quote(bag.path)}",
+            f"twodof view {quote(bag.path)}",
+            f"ros2 bag play {quote(bag.path)}",
+        )
     return INTERRUPTED if summary.stopped else 0
 
 

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterable
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
 from .common import (
     INTERRUPTED,
+    CommandLineError,
     asked_to_stop,
+    best_runs,
     fast_fmu,
     parse_settings,
     print_best,
+    print_json,
     print_next,
     print_table,
     quote,
 )  # fmt: skip
-from .options import add_set_option, add_time_options
+from .options import add_json_option, add_set_option, add_time_options
 
 
 def add(verbs: Any) -> None:
@@ -50,6 +54,7 @@ def add(verbs: Any) -> None:
     sweep.add_argument("--bags", action="store_true", help="keep a bag of each run in OUT/bags")
     sweep.add_argument("--workers", type=int, metavar="N", help="local processes (one for a core)")
     sweep.add_argument("--scheduler", metavar="tcp://…", help="of a Dask cluster to use instead")
+    add_json_option(sweep)
     sweep.set_defaults(call=call)
 
 
@@ -58,10 +63,9 @@ def call(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..sweeps.coordinator import sweep
-    from ..sweeps.design import parse_grids, parse_ranges
 
     if options.resume and not options.output:
-        raise InputError("--resume needs the sweep to go on with: -o OUT")
+        raise CommandLineError("--resume needs the sweep to go on with: -o OUT")
     grid, ranges = parse_grids(options.grids), parse_ranges(options.ranges)
     settings = parse_settings(options.settings)
     fmu = fast_fmu(options)
@@ -90,6 +94,12 @@ def call(options: argparse.Namespace) -> int:
     stopped = len(table) < total
     counts = table["outcome"].value_counts()
     outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    if options.json:
+        print_json(
+            fmu=str(fmu), sweep=str(output), runs=total, done=len(table),
+            outcomes=counts.to_dict(), best=best_runs(table).to_dict("records"),
+        )  # fmt: skip
+        return INTERRUPTED if stopped else 0
     print_table(
         ("FMU", f"{fmu}"),
         ("sweep", f"{output} ({len(table)} of {total} runs{outcomes and f': {outcomes}'})"),
@@ -100,3 +110,49 @@ def call(options: argparse.Namespace) -> int:
     again += "" if options.output else f" -o {quote(output)}"
     print_next(*([again] if stopped else []), f"twodof plot {quote(output)}")
     return INTERRUPTED if stopped else 0
+
+
+def parse_grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
+    """NAME=LOW:HIGH:COUNT texts of a command line: evenly spaced values, both ends included."""
+    import numpy as np
+
+    from ..sweeps.design import MAX_RUNS
+
+    grids: dict[str, tuple[float, ...]] = {}
+    for text in texts:
+        name, (low, high, number) = _parse("--grid", text, "NAME=LOW:HIGH:COUNT", grids)
+        if number != int(number) or number < 2:
+            raise CommandLineError(f"--grid {text}: COUNT {number:g} is no whole number from 2 on")
+        if number > MAX_RUNS:
+            raise CommandLineError(f"--grid {text}: COUNT must be at most {MAX_RUNS}")
+        if not low < high:
+            raise CommandLineError(f"--grid {text}: LOW {low:g} must be below HIGH {high:g}")
+        grids[name] = tuple(np.linspace(low, high, int(number)).tolist())
+    return grids
+
+
+def parse_ranges(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """NAME=LOW:HIGH texts of a command line."""
+    ranges: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, (low, high) = _parse("--range", text, "NAME=LOW:HIGH", ranges)
+        if not low < high:
+            raise CommandLineError(f"--range {text}: LOW {low:g} must be below HIGH {high:g}")
+        ranges[name] = (low, high)
+    return ranges
+
+
+def _parse(option: str, text: str, form: str, before: Iterable[str]) -> tuple[str, list[float]]:
+    name, equals, value = text.partition("=")
+    name = name.strip()
+    try:
+        numbers = [float(part) for part in value.split(":")]
+    except ValueError:
+        numbers = []
+    if not equals or not name or len(numbers) != form.count(":") + 1:
+        raise CommandLineError(f"{option} {text}: expected {form}")
+    if not all(map(isfinite, numbers)):
+        raise CommandLineError(f"{option} {text}: its numbers must be finite")
+    if name in before:
+        raise CommandLineError(f"{option} {name} is given twice")
+    return name, numbers

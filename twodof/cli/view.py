@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from .common import asked_to_stop, open_page
+from .common import asked_to_stop, in_options, open_page
 from .options import add_page_options, add_robot_options
 
 
@@ -35,7 +35,7 @@ def call(options: argparse.Namespace) -> int:
     robot = {name: getattr(options, name) for name in ("urdf", "mesh_dir", "frame", "fmu")}
     if options.export:
         for remark in export(options.bag, options.export, **robot):
-            print(f"WARNING: {remark}", file=sys.stderr)
+            print(f"WARNING: {in_options(remark)}", file=sys.stderr)
         print(f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:

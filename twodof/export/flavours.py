@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import site
 import sysconfig
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,8 @@ from ..plant.robot import Robot
 from ..plant.variables import Variable
 from .compiler import EXTENSIONS, compile_library
 from .native import model_header
+
+LOG = logging.getLogger(__name__)
 
 Files = dict[str, bytes]
 """Contents by path inside the FMU."""
@@ -100,6 +103,7 @@ def native_flavour(
     def finish(guid: str) -> Files:
         files = {f"sources/{path}": content for path, content in header(guid).items()}
         for platform in platforms:
+            LOG.info("compiling for %s", platform)
             library = compile_library({**sources, **header(guid)}, platform, name)
             files[f"binaries/{platform}/{name}{EXTENSIONS[platform]}"] = library
         return files

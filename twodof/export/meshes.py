@@ -73,7 +73,7 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
     where = " or ".join(f"'{place}'" for place in dict.fromkeys(places))
     raise BuildError(
         f"mesh '{uri}' not found in {where}, and it may come from nowhere else; give the folder of"
-        " the meshes, or of their packages, with --mesh-dir"
+        " the meshes, or of their packages, with `mesh_dir`"
     )
 
 

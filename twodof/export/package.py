@@ -139,13 +139,13 @@ def _flavour(
 ) -> Flavour:
     if not options.native:
         if options.platforms:
-            raise BuildError("platforms can be chosen for the native flavour only (--native)")
+            raise BuildError("platforms can be chosen for the native flavour only, `native=True`")
         return python_flavour(robot, urdf, starts, options.name, options.link_environment)
     if options.link_environment:
-        raise BuildError("a native FMU needs no environment to link (--link-environment)")
+        raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
     platforms = options.platforms or (host_platform(),)
     if platforms == ("",):
-        raise BuildError("this machine is none of the FMI platforms; choose one with --platform")
+        raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
     return native_flavour(robot, table, options.name, platforms)
 
 

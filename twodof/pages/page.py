@@ -322,5 +322,5 @@ def _text(text: str) -> str:
 
 def _in_use(host: str, port: int) -> PageError:
     return PageError(
-        f"port {port} of {host} is in use; choose another with --port, or 0 for any that is free"
+        f"port {port} of {host} is in use; choose another with `port`, or 0 for any that is free"
     )

@@ -66,9 +66,9 @@ class Replay:
         fmu: str | Path | None = None,
     ) -> None:
         if mesh_dir is not None and urdf is None:
-            raise PageError("--mesh-dir has the meshes of a URDF; give that with --urdf")
+            raise PageError("`mesh_dir` has the meshes of a URDF; give that with `urdf`")
         if fmu is not None and urdf is not None:
-            raise PageError("--fmu has the meshes of the bag's robot; leave it out beside --urdf")
+            raise PageError("`fmu` has the meshes of the bag's robot; leave it out beside `urdf`")
         bag = bag if isinstance(bag, Recording) else read_bag(bag)
         self._page = page
         self._track = track = read_tracks([bag], urdf=urdf, frame=frame)[0]
@@ -76,14 +76,14 @@ class Replay:
         self.remarks: list[str] = []
         self._figure: PageRobot | None = None
         if track.motion is None:
-            self.remarks.append(f"'{bag.path}' carries no robot; give one with --urdf")
+            self.remarks.append(f"'{bag.path}' carries no robot; give one with `urdf`")
         else:
             text, read = self._robot(bag, urdf, mesh_dir, fmu)
             names = [joint.name for joint in track.joints]
             self._figure = PageRobot(page, text, names, track.motion.frame, read)
             if self._figure.missing:
                 missing = ", ".join(self._figure.missing[:3])
-                self.remarks.append(f"without the meshes {missing}; give them with --fmu or --urdf")
+                self.remarks.append(f"without the meshes {missing}; give them with `fmu` or `urdf`")
         self._set_scene()
 
     def _robot(

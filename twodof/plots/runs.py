@@ -53,7 +53,7 @@ SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 MANY_TARGETS = 12
 
 
-def plot_bags(
+def plot(
     *bags: Recording | str | Path, urdf: str | Path | None = None, frame: str | None = None
 ) -> Figure:
     """A figure of one bag, or of several for comparison.

@@ -57,7 +57,7 @@ class Network(NamedTuple):
         """Who can hear, in words."""
         if self.loopback:
             return "loopback alone (ROS_LOCALHOST_ONLY)"
-        words = {"LOCALHOST": "this host alone; --subnet opens it", "OFF": "nobody"}
+        words = {"LOCALHOST": "this host alone; `subnet=True` opens it", "OFF": "nobody"}
         return f"range {self.range} ({words.get(self.range, 'other hosts too')})"
 
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:

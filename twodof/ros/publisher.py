@@ -9,14 +9,16 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable, Mapping
-from math import isfinite
+from math import inf, isfinite
+from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from ..errors import PublishError, SimulationError
-from ..experiments import Experiment, Setting
-from ..master import Sample, Sink, at_rest
+from ..experiments import Experiment, Setting, experiment
+from ..fmu import Fmu
+from ..master import RealTime, Sample, Sink, Summary, at_rest, simulate
 from .messages import POINT, STORE, STREAM, Messages, Serialised
 from .network import Network, network, open_domain
 
@@ -215,3 +217,36 @@ class Publisher(Sink):
     def __exit__(self, *exception: object) -> None:
         # entities are deleted with their last reference, writers after waiting for readers
         del self._readers, self._writers, self._participant, self._domain
+
+
+def publish(
+    run: Experiment | Fmu | str | Path,
+    *sinks: Sink,
+    place: Network | None = None,
+    scene: bool = False,
+    effort: bool = False,
+    opened: Callable[[Publisher], None] = lambda publisher: None,
+    pace: RealTime | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> Summary:
+    """Step an FMU in real time on a ROS 2 network, until it is asked to stop.
+
+    Args:
+        run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
+            a stop time it has no end.
+        sinks: what consumes the samples too, a bag for instance.
+        place, scene, effort, opened: as of ``Publisher``.
+        pace, stop: as of ``simulate``.
+
+    Raises:
+        FmuError, InputError, PublishError: before the first sample.
+        SimulationError: the FMU refused or failed a call.
+    """
+    if not isinstance(run, Experiment):
+        run = experiment(run, **{"stop_time": inf, **options})
+    wire = Publisher(place, scene=scene, effort=effort, opened=opened)
+    return simulate(
+        run, wire, *sinks, pace=pace or RealTime(), stop=stop, steer=wire.command,
+        resume=wire.resume,
+    )  # fmt: skip

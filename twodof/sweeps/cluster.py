@@ -125,7 +125,7 @@ class Cluster:
             now = time.monotonic()
             seen = now if workers else seen
             if now - seen > NO_WORKER:
-                raise SweepError("no worker is left; go on with --resume")
+                raise SweepError("no worker is left; go on with `resume=True`")
             width = IN_HAND * max(1, workers)
             # a worker's death is blamed on all that it had in hand
             while len(tasks) < width and (batch := batches.next(alone=not tasks)):
@@ -144,7 +144,7 @@ def _result(future: Future, batch: list[Point], batches: Batches) -> list[Row]:
     except TwoDofError:
         raise
     except CancelledError as error:
-        raise SweepError("the scheduler is gone; go on with --resume") from error
+        raise SweepError("the scheduler is gone; go on with `resume=True`") from error
     except Exception as error:
         raise SweepError(f"a worker failed: {error!r:.300}") from error
 

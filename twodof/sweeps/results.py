@@ -103,7 +103,7 @@ class Results:
 
     def _taken(self) -> SweepError:
         return SweepError(
-            f"'{self.path}' exists; resume it with --resume, or choose another with -o"
+            f"'{self.path}' exists; resume it with `resume=True`, or choose another `output`"
         )
 
     def _resume(self, provenance: dict[str, Any]) -> None:
@@ -228,7 +228,7 @@ def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> No
             other = {"fmu": f"of another FMU ({found['fmu']['file']}, {found['fmu']['guid']})"}
             raise SweepError(
                 f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(found[key]):.300}')};"
-                " resume it with those, or choose another folder with -o"
+                " resume it with those, or choose another `output`"
             )
     if found["versions"]["twodof"] != wanted["versions"]["twodof"]:
         raise SweepError(

@@ -1,0 +1,251 @@
+"""What a user of the package sees: names, types, one-line reprs, and what is missing when."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+
+import twodof
+from twodof.cli.main import main
+
+PROGRAM = """
+import twodof
+
+fmu = twodof.load_fmu("TwoDof.fmu")
+run: twodof.Experiment = twodof.experiment(fmu, stop_time=1.0)
+summary = twodof.simulate(run, twodof.Bag("my_bag"))
+error: float | None = summary.error
+bag = twodof.read_bag("my_bag")
+count: int = bag.q.shape[0]
+reveal_type(bag.x)
+reveal_type(summary.last.target)
+twodof.simulate(run, stop_tim=2)
+bag.positions
+"""
+
+WITHOUT = """
+import sys
+for name in {names!r}:
+    sys.modules[name] = None
+from pathlib import Path
+import twodof
+from twodof.cli.main import main
+"""
+
+RUN = """
+fmu, = sys.argv[1:]
+for line in (
+    f"run {fmu} -o bag --scene --stop-time 0.1", "info bag", f"info {fmu}", "plot bag -o p.svg",
+    "view bag --export v.html", f"sweep {fmu} --grid Kp=20:80:2 --stop-time 0.1 -o s",
+    "plot s -o s.svg", "info s",
+):
+    assert main(line.split()) == 0, line
+assert not [name for name in sys.modules if name.startswith("pinocchio.")]
+"""
+
+
+def test_names_are_the_public_ones_and_no_module_takes_their_place() -> None:
+    for module in pkgutil.walk_packages(twodof.__path__, "twodof."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    assert dir(twodof) == sorted(twodof.__all__)
+    for name in twodof.__all__:
+        value = getattr(twodof, name)
+        assert isinstance(value, str) if name == "__version__" else callable(value)
+        assert name == "__version__" or value.__name__ == name
+
+
+def test_a_users_program_is_checked_by_its_types(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    command = [sys.executable, "-m", "mypy", "--strict", "program.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    lines = [line.split(": ", 1)[1] for line in done.stdout.splitlines()[:-1]]
+    assert [line[:50] for line in lines if line.startswith("error")] == [
+        'error: "Recording" has no attribute "positions"  ['
+    ]
+    assert any("ndarray" in line for line in lines)
+    assert any("tuple[float, ...] | None" in line for line in lines)
+
+
+def test_reprs_are_one_line(native_path: Path, tmp_path: Path) -> None:
+    run = twodof.experiment(native_path, stop_time=0.05)
+    twodof.simulate(run, twodof.Bag(tmp_path / "bag"))
+    bag = twodof.read_bag(tmp_path / "bag")
+    assert repr(run.fmu) == f"<Fmu '{native_path}': TwoDof, joints joint1, joint2>"
+    assert repr(run) == f"<Experiment: {native_path.name} from 0 s to 0.05 s in steps of 0.01 s>"
+    assert repr(bag) == f"<Recording '{tmp_path / 'bag'}': 6 samples in 0.05 s of joint1, joint2>"
+
+
+def test_recording_has_what_the_samples_had(native_path: Path, tmp_path: Path) -> None:
+    samples = []
+    run = twodof.experiment(native_path, stop_time=0.5)
+    steps = twodof.samples(run)
+    with twodof.Bag(tmp_path / "bag", effort=True).begin(run) as sink:
+        for sample in steps:
+            samples.append(sample)
+            sink.write(sample)
+            if sample.k == 20:
+                samples.append(steps.send({"x_des": (0.1, 0.2)}))
+                sink.write(samples[-1])
+    bag = twodof.read_bag(tmp_path / "bag")
+    np.testing.assert_allclose(bag.x, [s.x for s in samples], atol=1e-14)
+    np.testing.assert_array_equal(bag.target, [s.target for s in samples])
+    np.testing.assert_array_equal(bag.tau, [s.tau for s in samples])
+    table = bag.to_pandas()
+    assert isinstance(table, pandas.DataFrame) and table.index.name == "t"
+    assert [*table.columns] == [
+        f"{group}[{i}]" for group in ("q", "v", "tau", "x", "x_des") for i in (1, 2)
+    ]
+    np.testing.assert_array_equal(table[["q[1]", "q[2]"]], bag.q)
+    np.testing.assert_allclose(table.index, [s.t for s in samples], atol=1e-12)
+
+
+def program(names: list[str], code: str, folder: Path, *arguments: object) -> str:
+    """Run code where these modules cannot be imported; what it says."""
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT.format(names=names) + code, *map(str, arguments)],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_nothing_but_building_needs_pinocchio(native_path: Path, tmp_path: Path) -> None:
+    """A sweep's children inherit no modules: they find the same nothing on their path."""
+    for name in ("pinocchio", "coal", "pythonfmu"):
+        (tmp_path / "absent").mkdir(exist_ok=True)
+        (tmp_path / f"absent/{name}.py").write_text("raise ImportError('not here')")
+    program(["pinocchio", "coal", "pythonfmu"], RUN, tmp_path, native_path)
+    code = "print(main(['build', '-o', 'x.fmu']))"
+    assert program(["pinocchio"], code, tmp_path) == "1\n"
+
+
+@pytest.mark.parametrize(
+    ("names", "code", "extra"),
+    [
+        (["viser"], "twodof.view('bag')", "view"),
+        (["viser"], "twodof.live('x.fmu')", "view"),
+        (["matplotlib"], "twodof.plot('bag')", "view"),
+        (["pyarrow"], "twodof.sweep('x.fmu', grid={'Kp': [1.0]})", "sweep"),
+        (["cyclonedds"], "twodof.publish('x.fmu')", "ros"),
+    ],
+)
+def test_what_needs_an_extra_says_so_when_it_is_used(
+    tmp_path: Path, names: list[str], code: str, extra: str
+) -> None:
+    said = program(
+        names,
+        f"{code.split('(')[0]}\n"
+        f"try:\n    {code}\nexcept twodof.TwoDofError as error:\n    print(error)",
+        tmp_path,
+    )
+    assert f"extra '{extra}'" in said
+
+
+# --- the command line ---
+
+
+def test_help_of_a_verb_is_its_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["help", "run"]) == 0
+    told = capsys.readouterr().out
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "--help"])
+    assert ended.value.code == 0 and capsys.readouterr().out == told
+    assert main(["help"]) == 0
+    assert "recover" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "--nativ"], ["run", "--set", "Kp"], ["run", "--set", "Kp=high"], ["nothing"],
+        ["sweep", "--grid", "Kp=1"], ["sweep", "--resume"], ["plot"], ["help", "nothing"],
+        ["publish", "--rate", "0"], ["run", "x.fmu", "--native"], ["run", "--stop-time", "inf"],
+    ],
+)  # fmt: skip
+def test_a_wrong_command_line_is_status_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    try:
+        status: object = main(arguments)
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    assert "twodof" in capsys.readouterr().err
+    assert not [path for path in tmp_path.iterdir() if path.suffix != ".fmu"]
+
+
+def test_facts_as_json(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def facts(*arguments: object) -> dict[str, object]:
+        assert main([*map(str, arguments), "--json"]) == 0
+        told: dict[str, object] = json.loads(capsys.readouterr().out)
+        return told
+
+    bag, table = tmp_path / "bag", tmp_path / "sweep"
+    run = facts("run", native_path, "-o", bag, "--stop-time", 0.5, "--scene")
+    (last,) = (twodof.samples(native_path, stop_time=0.5),)
+    *_, sample = last
+    assert (run["joint_states"], run["q"], run["error"]) == (51, [*sample.q], sample.error)
+    info = facts("info", bag)
+    assert (info["kind"], info["joint_states"]) == ("bag", 51)
+    assert {topic["name"] for topic in info["topics"]} >= {"/tf", "/target"}  # type: ignore[attr-defined]
+    assert facts("info", native_path)["guid"] == twodof.load_fmu(native_path).guid
+    swept = facts("sweep", native_path, "--grid", "Kp=20:60:3", "--stop-time", 0.2, "-o", table)
+    assert (swept["runs"], swept["outcomes"]) == (3, {"finished": 3})
+    assert facts("info", table)["best"] == swept["best"]
+
+
+def test_messages_name_arguments_in_python_and_options_on_the_command_line(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.01)
+    with pytest.raises(twodof.TwoDofError, match=r"`path` or give `overwrite=True`"):
+        twodof.Bag(tmp_path / "bag")
+    assert main(["run", str(native_path), "-o", str(tmp_path / "bag")]) == 1
+    assert "choose another with -o or give --overwrite" in capsys.readouterr().err
+
+
+def test_one_value_for_a_vector_says_that_it_was_spread(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--set", "Kp=60"]
+    assert main(["run", str(native_path), *options]) == 0
+    assert "Kp            60, all 2 elements\n" in capsys.readouterr().out
+    given = twodof.read_bag(tmp_path / "bag").provenance["start_values"]
+    assert given["Kp[1]"] == given["Kp[2]"] == 60.0
+
+
+def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path: Path) -> None:
+    (tmp_path / "in.csv").write_text("time,Kp,x_des[1]\n0,50,0.2\n0.05,80,0.1\n")
+    run = twodof.experiment(native_path, stop_time=0.1, input_file=tmp_path / "in.csv")
+    assert run.changes[1] == (0.05, {"Kp[1]": 80.0, "Kp[2]": 80.0, "x_des[1]": 0.1})
+    (tmp_path / "in.csv").write_text("time,Kp,Kp[2]\n0,50,60\n")
+    with pytest.raises(twodof.TwoDofError, match=r"two columns for 'Kp\[2\]'"):
+        twodof.experiment(native_path, input_file=tmp_path / "in.csv")
+
+
+def test_the_shell_completes_verbs_and_options(tmp_path: Path) -> None:
+    answer = tmp_path / "answer"
+    for line, expected in (("twodof pu", "publish"), ("twodof run --stor", "--storage")):
+        subprocess.run(
+            [sys.executable, "-m", "twodof"],
+            env={
+                **os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
+                "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "COMP_TYPE": "9",
+            },
+            check=True,
+        )  # fmt: skip
+        assert expected in answer.read_text()
