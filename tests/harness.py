@@ -107,7 +107,12 @@ def children_of(process):
     for children in Path(f"/proc/{process}/task").glob("*/children"):
         with contextlib.suppress(OSError):
             found += map(int, children.read_text().split())
-    return list(filter(lives, found))
+    return [child for child in found if lives(child) and not _tracks(child)]
+
+
+def _tracks(process):
+    """Whether it is the one that multiprocessing starts once and leaves until the end."""
+    return b"resource_tracker" in Path(f"/proc/{process}/cmdline").read_bytes()
 
 
 def lives(process):

@@ -356,10 +356,10 @@ BAD: dict[str, Case] = {
         a_linked_bag,
         [*RUN, "-o", "link", "--overwrite"], "'link'",
     ),
-    "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "first stamp, -1 s"),
+    "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "stamp_start = -1 s"),
     "stamp NaN": (nothing, [*RUN, "--stamp-start", "nan"], "stamp.*nan"),
     "stamp infinite": (nothing, [*RUN, "--stamp-start", "inf"], "stamp.*inf"),
-    "stamp too late": (nothing, [*RUN, "--stamp-start", "2147483648"], "first stamp"),
+    "stamp too late": (nothing, [*RUN, "--stamp-start", "2147483648"], "stamp_start = 2"),
     "stamp too late at the end": (
         nothing, [*RUN, "--stamp-start", "2147483647", "--stop-time", "2"], "stamp",
     ),

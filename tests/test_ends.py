@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from bags import START, assert_consistent, both_storages, logging, read_with_rosbags
 
+from twodof.bag.records import Allowance, DamageError, read_messages, storage_files
 from twodof.cli import info
 from twodof.cli.main import main
 
@@ -27,11 +28,21 @@ def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
     """A run that has written its first sample."""
     command = [*TWODOF, "run", str(fmu), "-o", str(bag), *ENDLESS, *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while not (bag / "reserve").exists():
+    while not has_samples(bag):
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
     time.sleep(0.3)
     return process
+
+
+def has_samples(bag: Path) -> bool:
+    """Whether the first sample of a run is in its bag, beside which the reserve is then."""
+    try:
+        return (bag / "reserve").exists() and any(
+            any(read_messages(file, Allowance())) for file in storage_files(bag)
+        )
+    except (OSError, DamageError):
+        return False
 
 
 def whole(fmu: Path, folder: Path, n: int) -> list[object]:

@@ -1244,7 +1244,7 @@ def test_a_bag_whose_provenance_makes_no_sense_is_refused(
     run = twodof.read_bag(default.bag)
     made = copy.deepcopy(run.provenance)
     spoil(made)
-    with pytest.raises(PlotError, match=r"^the run.json in '.*Kp50' does not fit its samples$"):
+    with pytest.raises(TwoDofError, match=r"^the run.json in '.*Kp50' does not fit its samples$"):
         plot(replace(run, provenance=made))
 
 
@@ -1303,7 +1303,7 @@ def test_figures_alone_import_matplotlib() -> None:
         for path in (Path(twodof.__file__).parent).rglob("*.py")
         if re.search(r"^\s*(import|from) matplotlib", path.read_text("utf-8"), re.MULTILINE)
     ]
-    assert sorted(importing) == ["figure.py", "map.py", "plot.py"]
+    assert sorted(importing) == ["figure.py", "runs.py", "sweeps.py"]
 
 
 # --- the command ---

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ..errors import BagError
 from ..experiments import NANOSECONDS, TIME_TOLERANCE
-from ..kinematics import Kinematics
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .provenance import KNOWN_UNTIL
 
@@ -153,6 +152,8 @@ class Recording:
         text = self.provenance.get("urdf")
         if text is None or not self.axes:
             return np.empty((len(self.stamps), 0))
+        from ..kinematics import Kinematics  # SciPy takes half a second to import
+
         try:
             robot: Urdf = read_urdf(text)
             kinematics = Kinematics(robot, self.joints)

@@ -186,7 +186,7 @@ def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> 
     except (KeyError, ValueError, ArithmeticError) as error:
         if not bag.provenance:
             raise
-        raise PlotError(f"the bag.json in '{bag.path}' does not fit its samples") from error
+        raise PlotError(f"the run.json in '{bag.path}' does not fit its samples") from error
 
 
 def _with_robot(

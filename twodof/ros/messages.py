@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from ..experiments import NANOSECONDS, Experiment
 from ..fmu import read_resource, urdf_text
 from ..master import Sample
 from ..plant.urdf import RobotError
-from .scene import Scene, Transform
+
+if TYPE_CHECKING:
+    from .scene import Scene, Transform
 
 Array = NDArray[np.float64]
 JOINT_STATES = "/joint_states"
@@ -190,6 +192,8 @@ def _load_scene(run: Experiment) -> Scene:
     urdf = urdf_text(run.fmu)
     if urdf is None or not run.fmu.axes:
         raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which a scene shows")
+    from .scene import Scene  # SciPy takes half a second to import
+
     try:
         return Scene(urdf, run.fmu.joints, run.fmu.frame, lambda name: read_resource(run.fmu, name))
     except RobotError as error:
