@@ -75,8 +75,8 @@ class TwoDofSlave(fmi.Fmi2Slave):
         )
         starts = {k: tuple(v) if isinstance(v, list) else v for k, v in config["starts"].items()}
         variables = importlib.import_module(f"{PACKAGE}.plant.variables")
-        self._table = variables.variable_table(robot, starts)
-        self._plant = self._plant_module.Plant(robot, self._table)
+        self._table = variables.variable_table(robot, starts, config["control"])
+        self._plant = self._plant_module.Plant(robot, self._table, config["control"])
         self._identity = config["identity"]
         self._phase = INSTANTIATED
         self._time = 0.0
@@ -252,7 +252,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             raise ValueError("the state is not one of this FMU")
         if not (alike(state, self._get_fmu_state()) and state["phase"] in PHASES):
             raise ValueError(UNSOUND)
-        plant = self._plant_module.Plant(self._plant.robot, self._table)
+        plant = self._plant_module.Plant(self._plant.robot, self._table, self._plant.control)
         vars(plant).update(deepcopy(state["plant"]))
         plant.prepare()
         if state["phase"] in (STEP, TERMINATED):  # before, it is checked when the run begins

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twodof.plant.controller import apply_pseudo_inverse
+from twodof.plant.pseudo_inverse import apply_pseudo_inverse
 
 RCOND = 0.01
 

@@ -5,9 +5,15 @@ import pytest
 from scipy.integrate import RK45
 
 from twodof.plant import integrator
-from twodof.plant.integrator import StepError, advance
+from twodof.plant.integrator import StepError
+from twodof.plant.stops import Stops
 
 FREE = [(-np.inf, np.inf)]
+
+
+def advance(acceleration, q, v, h, limits, *tolerances):
+    """A step with stops that have no reaction."""
+    return integrator.advance(acceleration, q, v, h, Stops(limits, None), *tolerances)
 
 
 def smooth(acceleration):

@@ -12,6 +12,7 @@ from oracles import LINK, REST, TwoLinkArm, drift, jacobian, position, task_erro
 
 from twodof.data import data_file
 from twodof.export.package import DEFAULT_ARM
+from twodof.plant import task_control
 from twodof.plant.plant import DiscardError, ParameterError, Plant
 from twodof.plant.robot import load_robot
 from twodof.plant.variables import variable_table
@@ -166,8 +167,7 @@ def test_jacobian_and_drift_against_finite_differences(name, request):
         plant.q, plant.v, plant.Kn = q.tolist(), v.tolist(), 0.0
         plant.x_des, plant.rcond = x(q).tolist(), 0.0
         plant.q = q.tolist()
-        plant._hold_inputs()
-        qdd, _ = plant._commanded_acceleration(q, v)
+        qdd, _ = task_control.command(plant)(q, v)
         found = -KD * jacobian_of(q) @ v - jacobian_of(q) @ qdd
         expected = central(lambda p: jacobian_of(p) @ v, q, v, 1e-6)  # noqa: B023
         assert np.abs(found - expected).max() <= 1e-6
@@ -188,7 +188,7 @@ def test_mass_matrix_and_nonlinear_effects_against_mujoco(name, request):
         mujoco.mj_forward(model, data)
         plant.q, plant.v = q.tolist(), v.tolist()
         tau = np.array(plant.tau)
-        qdd = np.array(plant._commanded_acceleration(q, v)[0])
+        qdd = np.array(task_control.command(plant)(q, v)[0])
         M = np.zeros((n, n))
         mujoco.mj_fullM(model, data, M)
         expected = M @ qdd + data.qfrc_bias

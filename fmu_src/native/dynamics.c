@@ -5,6 +5,33 @@
 
 #include "vector.h"
 
+/* total += a point mass at d from the point that the inertia is about */
+static void add_point(double inertia[3][3], double mass, const double d[3])
+{
+    for (int r = 0; r < 3; r++)
+        for (int k = 0; k < 3; k++)
+            inertia[r][k] += mass * ((r == k ? dot3(d, d) : 0.0) - d[r] * d[k]);
+}
+
+void load_carrier(double payload, const double place[3], Carrier *carrier)
+{
+    carrier->mass = MASS[CARRIER];
+    memcpy(carrier->com, COM[CARRIER], sizeof carrier->com);
+    memcpy(carrier->inertia, INERTIA[CARRIER], sizeof carrier->inertia);
+    if (payload == 0.0)
+        return;
+    double from_body[3], from_load[3];
+    carrier->mass += payload;
+    for (int k = 0; k < 3; k++) {
+        const double at = FRAME_P[k] + dot3(FRAME_R[k], place);
+        carrier->com[k] = (MASS[CARRIER] * COM[CARRIER][k] + payload * at) / carrier->mass;
+        from_body[k] = COM[CARRIER][k] - carrier->com[k];
+        from_load[k] = at - carrier->com[k];
+    }
+    add_point(carrier->inertia, MASS[CARRIER], from_body);
+    add_point(carrier->inertia, payload, from_load);
+}
+
 /* Newton–Euler, outwards the motion and inwards the forces, f and n at the joint's origin:
 
        f = m (a + α × c + ω × (ω × c)),   n = c × f + I α + ω × I ω
@@ -12,7 +39,7 @@
    Gravity enters as an acceleration of the root upwards.
    Source: Luh, Walker & Paul, "On-line computational scheme for mechanical manipulators",
    ASME J. Dyn. Sys. 102(2), 1980. */
-void inverse_dynamics(Placement joint[N_JOINTS], const double v[N_JOINTS],
+void inverse_dynamics(Placement joint[N_JOINTS], const Carrier *carrier, const double v[N_JOINTS],
                       const double a[N_JOINTS], const double gravity[3], double tau[N_JOINTS])
 {
     const double still[3] = {0.0, 0.0, 0.0};
@@ -41,16 +68,19 @@ void inverse_dynamics(Placement joint[N_JOINTS], const double v[N_JOINTS],
             alpha[i][2] += a[i];
             omega[i][2] += v[i];
         }
+        const double *com = i == CARRIER ? carrier->com : COM[i];
+        const double mass = i == CARRIER ? carrier->mass : MASS[i];
         memcpy(f[i], acc[i], sizeof f[i]);
-        add_cross(f[i], alpha[i], COM[i]);
-        add_centripetal(f[i], omega[i], COM[i]);
+        add_cross(f[i], alpha[i], com);
+        add_centripetal(f[i], omega[i], com);
         for (int k = 0; k < 3; k++) {
-            f[i][k] *= MASS[i];
-            n[i][k] = dot3(INERTIA[i][k], alpha[i]);
-            momentum[k] = dot3(INERTIA[i][k], omega[i]);
+            const double *row = i == CARRIER ? carrier->inertia[k] : INERTIA[i][k];
+            f[i][k] *= mass;
+            n[i][k] = dot3(row, alpha[i]);
+            momentum[k] = dot3(row, omega[i]);
         }
         add_cross(n[i], omega[i], momentum);
-        add_cross(n[i], COM[i], f[i]);
+        add_cross(n[i], com, f[i]);
     }
     for (int i = N_JOINTS - 1; i >= 0; i--) {
         const int parent = PARENT[i];
@@ -72,15 +102,17 @@ typedef struct {
 } Inertia;
 
 /* The inertia of body i: A = I − m [c]×², B = m [c]×, C = m 1. */
-static void body_inertia(int i, Inertia *inertia)
+static void body_inertia(int i, const Carrier *carrier, Inertia *inertia)
 {
-    const double m = MASS[i], *c = COM[i], square = m * dot3(c, c);
+    const double m = i == CARRIER ? carrier->mass : MASS[i];
+    const double *c = i == CARRIER ? carrier->com : COM[i], square = m * dot3(c, c);
     const double B[3][3] = {
         {0.0, -m * c[2], m * c[1]}, {m * c[2], 0.0, -m * c[0]}, {-m * c[1], m * c[0], 0.0}};
     for (int r = 0; r < 3; r++)
         for (int k = 0; k < 3; k++) {
             const double one = r == k ? 1.0 : 0.0;
-            inertia->A[r][k] = INERTIA[i][r][k] + one * square - m * c[r] * c[k];
+            inertia->A[r][k] = (i == CARRIER ? carrier->inertia[r][k] : INERTIA[i][r][k])
+                               + one * square - m * c[r] * c[k];
             inertia->B[r][k] = B[r][k];
             inertia->C[r][k] = one * m;
         }
@@ -143,15 +175,15 @@ static void add_child(Inertia *total, Inertia *child, Placement *placement)
 
    outwards the accelerations q̈ = (u − Uᵀ a)/D.
    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 7.3. */
-void acceleration_of_effort(Placement joint[N_JOINTS], const double tau[N_JOINTS],
-                            double a[N_JOINTS])
+void acceleration_of_effort(Placement joint[N_JOINTS], const Carrier *carrier,
+                            const double tau[N_JOINTS], double a[N_JOINTS])
 {
     Inertia body[N_JOINTS];
     double bias[N_JOINTS][2][3], U[N_JOINTS][2][3], motion[N_JOINTS][2][3]; /* angular, linear */
     double D_inverse[N_JOINTS], u[N_JOINTS];
     memset(bias, 0, sizeof bias);
     for (int i = 0; i < N_JOINTS; i++)
-        body_inertia(i, &body[i]);
+        body_inertia(i, carrier, &body[i]);
     for (int i = N_JOINTS - 1; i >= 0; i--) {
         Inertia *inertia = &body[i];
         for (int k = 0; k < 3; k++) {

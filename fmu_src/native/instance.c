@@ -103,8 +103,12 @@ fmi2Status check_parameters(Instance *instance)
         if (!(value[positive[i]] > 0.0))
             return report(instance, fmi2Error, "%s = %g must be > 0", VARIABLE_NAME[positive[i]],
                           value[positive[i]]);
+    if (!(value[PAYLOAD] >= 0.0))
+        return report(instance, fmi2Error, "payload = %g must be >= 0", value[PAYLOAD]);
+#ifdef HAS_RCOND
     if (!(value[RCOND] >= 0.0 && value[RCOND] < 1.0))
         return report(instance, fmi2Error, "rcond = %g must be in [0, 1)", value[RCOND]);
+#endif
     for (int i = 0; i < N_JOINTS; i++)
         if (value[Q_MIN + i] > value[Q_MAX + i])
             return report(instance, fmi2Error, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",

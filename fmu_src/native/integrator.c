@@ -1,9 +1,7 @@
 /* Dormand–Prince 5(4) over one communication step, with located joint-limit stops. The rules are
    those of plant/integrator.py, which are SciPy's RK45 with stops.
 
-   Every communication step begins afresh with the step min(max_step, h). A joint limit is a
-   plastic stop: a joint that reaches it is set onto it with v = 0 and held there while its
-   acceleration points into it.
+   Every communication step begins afresh with the step min(max_step, h).
 
    Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986;
    Hairer, Nørsett & Wanner, "Solving ODEs I", II.4. */
@@ -11,6 +9,8 @@
 
 #include <math.h>
 #include <string.h>
+
+#include "stops.h"
 
 enum { N_STATES = 2 * N_JOINTS }; /* y = (q, v) */
 
@@ -57,9 +57,7 @@ typedef struct {
     int rank[STAGES + 1];       /* of J⁺ there */
     long evaluations;           /* of the equations of motion so far */
     double Q[N_STATES][4];      /* coefficients of the dense output */
-    int held[N_JOINTS];         /* joints that rest at a limit */
-    int watched[N_JOINTS];      /* those of them that may leave it when they are drawn */
-    int any_watched;
+    Stops stops;
     int stopped[N_JOINTS];      /* joints that reached a limit at the end of the step */
 } Step;
 
@@ -70,25 +68,13 @@ static int evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS])
     return acceleration(step->plant, y, y + N_JOINTS, a);
 }
 
-/* Set out at y: take the velocity that points into a limit, find the joints that rest there. */
-static void hold(Step *step, const int kept[N_JOINTS])
+/* Set out at y, where joints may rest at a limit. */
+static void set_out(Step *step, const int kept[N_JOINTS])
 {
-    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
-    double *q = step->y, *v = step->y + N_JOINTS, *a = step->K[0] + N_JOINTS;
-    for (int i = 0; i < N_JOINTS; i++)
-        if ((q[i] >= high[i] && v[i] > 0.0) || (q[i] <= low[i] && v[i] < 0.0))
-            v[i] = 0.0;
-    step->rank[0] = evaluate(step, step->y, a);
-    step->any_watched = 0;
-    for (int i = 0; i < N_JOINTS; i++) {
-        const int into = (q[i] >= high[i] && a[i] >= 0.0) || (q[i] <= low[i] && a[i] <= 0.0);
-        step->held[i] = (into || kept[i]) && v[i] == 0.0;
-        step->watched[i] = step->held[i] && !kept[i];
-        step->any_watched |= step->watched[i];
-        if (step->held[i])
-            a[i] = 0.0;
-        step->K[0][i] = v[i];
-    }
+    impact(step->plant, step->y);
+    step->rank[0] = evaluate(step, step->y, step->K[0] + N_JOINTS);
+    hold(step->plant, step->y, step->K[0] + N_JOINTS, kept, &step->stops);
+    memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
 }
 
 /* Fill y_new and K[1…6] from y and K[0]; the norm of the error, which passes where below 1. */
@@ -108,9 +94,10 @@ static double dormand_prince(Step *step)
         }
         memcpy(step->K[stage], y_new + N_JOINTS, N_JOINTS * sizeof *y_new);
         step->rank[stage] = evaluate(step, y_new, a);
-        for (int i = 0; i < N_JOINTS; i++)
-            if (step->held[i])
-                a[i] = 0.0;
+        if (step->stops.any_held) {
+            double pressed[N_JOINTS];
+            restrain(step->plant, &step->stops, y_new, a, pressed);
+        }
     }
     for (int i = 0; i < N_STATES; i++) {
         double error = 0.0;
@@ -135,21 +122,22 @@ static void dense_output(const Step *step, double passed, double y[N_STATES])
     }
 }
 
-/* Mark the free joints that are past a limit and the watched joints that leave theirs, at y;
-   whether there are any. */
+/* Mark the free joints that are past a limit and the watched joints that are let go, at y; whether there are any. */
 static int events(Step *step, const double y[N_STATES], int found[N_JOINTS])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
     const double *q = y, *v = y + N_JOINTS;
-    double a[N_JOINTS];
+    double a[N_JOINTS], pressed[N_JOINTS];
     int any = 0;
-    if (step->any_watched)
+    if (step->stops.any_watched) {
         evaluate(step, y, a);
+        restrain(step->plant, &step->stops, q, a, pressed);
+    }
     for (int i = 0; i < N_JOINTS; i++) {
         found[i] = (q[i] >= high[i] && (q[i] > high[i] || v[i] > 0.0))
                    || (q[i] <= low[i] && (q[i] < low[i] || v[i] < 0.0));
-        if (step->watched[i] && low[i] < high[i])
-            found[i] |= q[i] >= high[i] ? a[i] < 0.0 : a[i] > 0.0;
+        if (step->stops.watched[i])
+            found[i] |= pressed[i] < 0.0;
         any |= found[i];
     }
     return any;
@@ -235,11 +223,9 @@ static double first_event(Step *step)
     dense_output(step, latest, reached);
     events(step, reached, found);
     for (int i = 0; i < N_JOINTS; i++) {
-        step->stopped[i] = found[i] && !step->held[i];
-        if (step->stopped[i]) {
+        step->stopped[i] = found[i] && !step->stops.held[i];
+        if (step->stopped[i])
             reached[i] = fmin(fmax(reached[i], low[i]), high[i]);
-            reached[N_JOINTS + i] = 0.0;
-        }
     }
     memcpy(step->y_new, reached, sizeof reached);
     return latest;
@@ -355,9 +341,9 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
             if (kept[i])
                 end = fmin(end, until[i]);
         }
-        hold(&step, kept);
+        set_out(&step, kept);
         for (int i = 0; i < N_JOINTS; i++)
-            if (!step.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
+            if (!step.stops.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
                 left[i] = t;
         t = until_event(&step, t, end, obstacle);
         for (int i = 0; i < N_JOINTS; i++)
@@ -366,6 +352,7 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     }
     if (isnan(t))
         return 0;
+    impact(plant, step.y);
     memcpy(&plant->value[Q], step.y, N_JOINTS * sizeof *step.y);
     memcpy(&plant->value[V], step.y + N_JOINTS, N_JOINTS * sizeof *step.y);
     return 1;

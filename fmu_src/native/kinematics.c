@@ -78,16 +78,22 @@ void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *
             }
         }
     }
-    memset(task->J, 0, sizeof task->J);
+    memset(task->column, 0, sizeof task->column);
     for (int k = 0; k < N_PATH; k++) {
-        double column[3] = {0.0, 0.0, 0.0};
+        double *column = task->column[PATH[k]];
         const double arm[3] = {x[0] - origin[k][0], x[1] - origin[k][1], x[2] - origin[k][2]};
-        add_cross(column, axis[k], arm);
-        for (int d = 0; d < N_AXES; d++)
-            task->J[d][PATH[k]] = PRISMATIC[PATH[k]] ? axis[k][AXIS[d]] : column[AXIS[d]];
+        if (PRISMATIC[PATH[k]])
+            memcpy(column, axis[k], sizeof axis[k]);
+        else
+            add_cross(column, axis[k], arm);
     }
     for (int d = 0; d < N_AXES; d++) {
         task->x[d] = x[AXIS[d]];
+        task->xd[d] = 0.0;
         task->drift[d] = a[AXIS[d]];
+        for (int i = 0; i < N_JOINTS; i++) {
+            task->J[d][i] = task->column[i][AXIS[d]];
+            task->xd[d] += task->J[d][i] * v[i];
+        }
     }
 }

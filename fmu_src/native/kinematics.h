@@ -15,8 +15,10 @@ typedef struct {
 /* The task frame, in the root's axes and along the task axes only. */
 typedef struct {
     double x[N_AXES];               /* position, m */
+    double xd[N_AXES];              /* velocity, m/s */
     double J[N_AXES][N_JOINTS];     /* Jacobian, so that ẋ = J v */
     double drift[N_AXES];           /* J̇ v, the acceleration where q̈ = 0, m/s2 */
+    double column[N_JOINTS][3];     /* of the Jacobian of all three axes */
 } TaskFrame;
 
 /* Placements of all joints at the position q. */

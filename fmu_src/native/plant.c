@@ -1,70 +1,119 @@
-/* Operational-space control by resolved acceleration, and the motion that it causes:
+/* The motion that a control law causes:
 
-       a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)
-       q̈_cmd = J⁺ (a_cmd − J̇ v + Kn J v) − Kn v
-       τ     = M(q) q̈_cmd + h(q, v)
-       q̈     = M(q)⁻¹ (sat(τ) + tau_ext − D v − h(q, v))
-             = q̈_cmd + M(q)⁻¹ (sat(τ) − τ + tau_ext − D v)
+       τ = M̂(q) q̈_cmd + ĥ(q, v), or as the law gives it
+       q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v))
+         = a + M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − (M(q) a + h(q, v)))
 
-   In the last form the dynamics cancel where nothing acts but an unlimited τ.
-   Source: Luh, Walker & Paul, IEEE TAC 25(3), 1980; Khatib, IEEE J-RA 3(1), 1987. */
+   for any a. With a = q̈_cmd the dynamics cancel where nothing acts but an unlimited τ, and where
+   M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ where it is known. */
 #include "plant.h"
 
-#include "dynamics.h"
-#include "kinematics.h"
-#include "pseudo_inverse.h"
+#include <string.h>
 
-static int commanded_acceleration(const double value[N_VARIABLES], Placement joint[N_JOINTS],
-                                  const double v[N_JOINTS], double a[N_JOINTS])
-{
-    TaskFrame task;
-    double command[N_AXES];
-    const double Kn = value[KN];
-    task_frame(joint, v, &task);
-    for (int k = 0; k < N_AXES; k++) {
-        double xd = 0.0;
-        for (int i = 0; i < N_JOINTS; i++)
-            xd += task.J[k][i] * v[i];
-        command[k] = value[XDD_DES + k] + value[KD + k] * (value[XD_DES + k] - xd)
-                     + value[KP + k] * (value[X_DES + k] - task.x[k]) - task.drift[k] + Kn * xd;
-    }
-    const int rank = apply_pseudo_inverse(task.J, command, value[RCOND], a);
-    for (int i = 0; i < N_JOINTS; i++)
-        a[i] -= Kn * v[i];
-    return rank;
-}
+#include "control.h"
+#include "dynamics.h"
 
 static double saturated(double tau, double limit)
 {
     return tau > limit ? limit : tau < -limit ? -limit : tau;
 }
 
+/* The robot as it is, or as its control law knows it. */
+static void body(const double value[N_VARIABLES], int as_known, Carrier *carrier)
+{
+    double payload = value[PAYLOAD];
+#if COMMANDS_ACCELERATION
+    if (as_known && value[PAYLOAD_KNOWN] == 0.0)
+        payload = 0.0;
+#else
+    (void)as_known;
+#endif
+    load_carrier(payload, &value[PAYLOAD_COM], carrier);
+}
+
+/* τ of what the law gave, limited where it is to be. */
+static void control_effort(const double value[N_VARIABLES], Placement joint[N_JOINTS],
+                           const double v[N_JOINTS], const double given[N_JOINTS],
+                           double tau[N_JOINTS])
+{
+#if COMMANDS_ACCELERATION
+    Carrier known;
+    body(value, 1, &known);
+    inverse_dynamics(joint, &known, v, given, &value[GRAVITY], tau);
+#else
+    (void)joint, (void)v;
+    memcpy(tau, given, N_JOINTS * sizeof *tau);
+#endif
+    for (int i = 0; i < N_JOINTS && value[LIMIT_EFFORT] != 0.0; i++)
+        tau[i] = saturated(tau[i], EFFORT[i]);
+}
+
+/* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 where a was commanded and is what comes. */
+static void add_excess(const double value[N_VARIABLES], Placement joint[N_JOINTS],
+                       const Carrier *carrier, const double v[N_JOINTS],
+                       const double given[N_JOINTS], const double a[N_JOINTS],
+                       double sum[N_JOINTS])
+{
+    double tau[N_JOINTS], needed[N_JOINTS];
+    control_effort(value, joint, v, given, tau);
+    inverse_dynamics(joint, carrier, v, a, &value[GRAVITY], needed);
+    for (int i = 0; i < N_JOINTS; i++)
+        sum[i] += tau[i] - needed[i];
+}
+
 int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                  double a[N_JOINTS])
 {
-    const double *value = plant->value;
+    const double *value = plant->value, *force = &value[F_EXT];
     Placement joint[N_JOINTS];
-    double excess[N_JOINTS]; /* sat(τ) − τ + tau_ext − D v */
+    Carrier carrier;
+    double given[N_JOINTS], excess[N_JOINTS];
     int acts = 0;
     place_joints(q, joint);
-    const int rank = commanded_acceleration(value, joint, v, a);
-    for (int i = 0; i < N_JOINTS; i++)
+    body(value, 0, &carrier);
+    const int rank = command(value, joint, q, v, given);
+    for (int i = 0; i < N_JOINTS; i++) {
+        a[i] = COMMANDS_ACCELERATION ? given[i] : 0.0;
         excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
-    if (value[LIMIT_EFFORT] != 0.0) {
-        double tau[N_JOINTS];
-        inverse_dynamics(joint, v, a, &value[GRAVITY], tau);
-        for (int i = 0; i < N_JOINTS; i++)
-            excess[i] += saturated(tau[i], EFFORT[i]) - tau[i];
     }
+    if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
+        TaskFrame task;
+        task_frame(joint, v, &task);
+        for (int i = 0; i < N_JOINTS; i++)
+            for (int k = 0; k < 3; k++)
+                excess[i] += task.column[i][k] * force[k];
+    }
+#if COMMANDS_ACCELERATION
+    const int exact = value[LIMIT_EFFORT] == 0.0
+                      && (value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0);
+#else
+    const int exact = 0;
+#endif
+    if (!exact)
+        add_excess(value, joint, &carrier, v, given, a, excess);
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
         double further[N_JOINTS];
-        acceleration_of_effort(joint, excess, further);
+        acceleration_of_effort(joint, &carrier, excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
     return rank;
+}
+
+void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
+                  const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS])
+{
+    Placement joint[N_JOINTS];
+    Carrier carrier;
+    place_joints(q, joint);
+    body(plant->value, 0, &carrier);
+    for (int k = 0; k < count; k++) {
+        double unit[N_JOINTS] = {0};
+        unit[joints[k]] = 1.0;
+        acceleration_of_effort(joint, &carrier, unit, columns[k]);
+    }
 }
 
 void compute_position(Plant *plant)
@@ -73,18 +122,15 @@ void compute_position(Plant *plant)
     TaskFrame task;
     place_joints(&plant->value[Q], joint);
     task_frame(joint, &plant->value[V], &task);
-    for (int k = 0; k < N_AXES; k++)
-        plant->value[X + k] = task.x[k];
+    memcpy(&plant->value[X], task.x, sizeof task.x);
+    memcpy(&plant->value[XD], task.xd, sizeof task.xd);
 }
 
 void compute_effort(Plant *plant)
 {
-    double *value = plant->value, *tau = &value[TAU];
+    double *value = plant->value, given[N_JOINTS];
     Placement joint[N_JOINTS];
-    double a[N_JOINTS];
     place_joints(&value[Q], joint);
-    commanded_acceleration(value, joint, &value[V], a);
-    inverse_dynamics(joint, &value[V], a, &value[GRAVITY], tau);
-    for (int i = 0; i < N_JOINTS && value[LIMIT_EFFORT] != 0.0; i++)
-        tau[i] = saturated(tau[i], EFFORT[i]);
+    command(value, joint, &value[Q], &value[V], given);
+    control_effort(value, joint, &value[V], given, &value[TAU]);
 }

@@ -1,4 +1,4 @@
-/* The plant: the robot under operational-space control. */
+/* The plant: the robot under its control law. */
 #ifndef PLANT_H
 #define PLANT_H
 
@@ -16,8 +16,12 @@ typedef struct {
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                           double a[N_JOINTS]);
 
-/* The output x at the plant's state. */
+/* The outputs x and xd at the plant's state. */
 INTERNAL void compute_position(Plant *plant);
+
+/* Columns of M(q)⁻¹, of so many joints: what an effort of 1 there does to all. */
+INTERNAL void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
+                           const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS]);
 
 /* The output tau, the control effort applied, at the plant's state and inputs. */
 INTERNAL void compute_effort(Plant *plant);

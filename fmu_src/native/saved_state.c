@@ -33,6 +33,15 @@ static uint64_t checksum(const void *bytes)
 
 enum { SERIALIZED_SIZE = sizeof(State) + sizeof(uint64_t) };
 
+/* Whether all truth values are 0 or 1. */
+static int are_booleans(const double value[])
+{
+    for (int i = 0; i < N_VARIABLES - FIRST_BOOLEAN; i++)
+        if (value[i] != 0.0 && value[i] != 1.0)
+            return 0;
+    return 1;
+}
+
 /* Take over a state from bytes that may be anybody's, with whatever checksum: each field is checked,
    and what follows from others is computed anew. A refusal is logged. */
 static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
@@ -41,8 +50,7 @@ static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
     const double *value = state->plant.value;
     memcpy(state, bytes, sizeof *state);
     int sound = state->phase >= 0 && state->phase < N_PHASES && isfinite(state->time)
-                && state->stop_time > -HUGE_VAL
-                && (value[LIMIT_EFFORT] == 0.0 || value[LIMIT_EFFORT] == 1.0);
+                && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN]);
     const int runs = state->phase >= STEP; /* before, what is wrong is told where it begins */
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));

@@ -22,7 +22,7 @@ static int known(Instance *instance, Call call, Type type, const fmi2ValueRefere
                    call_name(call), vr[i]);
             return 0;
         }
-        const Type actual = vr[i] == LIMIT_EFFORT ? BOOLEAN : REAL;
+        const Type actual = vr[i] >= FIRST_BOOLEAN ? BOOLEAN : REAL;
         if (actual != type) {
             report(instance, fmi2Error, "%s: %s is of type %s", call_name(call),
                    VARIABLE_NAME[vr[i]], TYPE_NAME[actual]);

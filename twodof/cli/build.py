@@ -28,6 +28,11 @@ def add(verbs: Any) -> None:
     build.add_argument(
         "--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m"
     )
+    build.add_argument(
+        "--control", choices=("task", "joint", "effort"), default="task",
+        help="what drives the robot: a target of the frame, one for each joint, or efforts"
+        " (%(default)s)",
+    )  # fmt: skip
     build.add_argument("--name", default="TwoDof", help="name of the model (%(default)s)")
     build.add_argument(
         "--link-environment", action="store_true",
@@ -55,6 +60,7 @@ def call(options: argparse.Namespace) -> int:
         axes=options.axes,
         gravity=gravity,
         q_start=None if options.q_start is None else tuple(options.q_start),
+        control=options.control,
         name=options.name,
         link_environment=options.link_environment,
         native=options.native,

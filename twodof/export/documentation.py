@@ -10,13 +10,25 @@ from string import Template
 
 from ..data import data_file
 from ..plant.robot import Robot
-from ..plant.variables import Variable
+from ..plant.variables import CONTROLS, Variable
 from .flavours import Files, Flavour
+
+LAWS = {
+    "task": """x, J    position and Jacobian of $frame, rows of the task axes, LOCAL_WORLD_ALIGNED
+a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)          task-space PD
+q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v     J⁺ drops singular values up to rcond·σ_max
+τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
+    "joint": """q̈_cmd = a_des + Kd ∘ (v_des − v) + Kp ∘ (q_des − q)               joint-space PD
+τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
+    "effort": "τ     = tau_cmd",
+}
+"""The equations of the control laws."""
 
 
 def documentation(
     robot: Robot,
     table: Sequence[Variable],
+    control: str,
     flavour: Flavour,
     *,
     name: str,
@@ -27,7 +39,7 @@ def documentation(
     """Files of the folder by their path in the FMU.
 
     Args:
-        robot, table: the robot and its variables.
+        robot, table, control: the robot, its variables, and the name of its control law.
         flavour: says what the FMU depends on, cannot do, and whose code it contains.
         name, guid, version: of the model description.
         urdf: text of resources/robot.urdf.
@@ -42,6 +54,8 @@ def documentation(
         robot=html.escape(robot.name),
         frame=html.escape(robot.frame),
         axes=", ".join(robot.axes),
+        control=CONTROLS[control].title.format(frame=html.escape(robot.frame)),
+        law=LAWS[control].replace("$frame", html.escape(robot.frame)),
         root=html.escape(robot.root),
         variables=rows,
         limitations=flavour.limitations,

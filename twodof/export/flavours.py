@@ -17,7 +17,7 @@ import pythonfmu
 
 from ..data import data_file
 from ..plant.robot import Robot
-from ..plant.variables import Variable
+from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, compile_library
 from .native import model_header
 
@@ -58,12 +58,18 @@ class Flavour:
 
 
 def python_flavour(
-    robot: Robot, urdf: str, starts: Mapping[str, Any], name: str, link_environment: bool
+    robot: Robot,
+    control: str,
+    urdf: str,
+    starts: Mapping[str, Any],
+    name: str,
+    link_environment: bool,
 ) -> Flavour:
     """The plant as Python code behind pythonfmu's wrapper, for linux64."""
     config: dict[str, Any] = {
         "frame": robot.frame,
         "axes": robot.axes,
+        "control": control,
         "starts": starts,
         "site_packages": _site_packages() if link_environment else [],
     }
@@ -88,17 +94,23 @@ def python_flavour(
 
 
 def native_flavour(
-    robot: Robot, table: Sequence[Variable], name: str, platforms: Sequence[str]
+    robot: Robot, control: str, table: Sequence[Variable], name: str, platforms: Sequence[str]
 ) -> Flavour:
     """The plant as C99 sources, compiled for the platforms."""
     fmpy = find_spec("fmpy")  # it comes with the headers of the standard
     assert fmpy is not None and fmpy.origin is not None
     headers = Path(fmpy.origin).parent / "c-code"
-    sources = {path.name: path.read_bytes() for path in data_file("fmu_src", "native").iterdir()}
+    left_out = {f"{other}_control.c" for other in CONTROLS if other != control}
+    left_out |= set() if control == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
+    sources = {
+        path.name: path.read_bytes()
+        for path in data_file("fmu_src", "native").iterdir()
+        if path.name not in left_out
+    }
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
 
     def header(guid: str) -> Files:
-        return {"model.h": model_header(robot, table, guid).encode()}
+        return {"model.h": model_header(robot, table, CONTROLS[control], guid).encode()}
 
     def finish(guid: str) -> Files:
         files = {f"sources/{path}": content for path, content in header(guid).items()}

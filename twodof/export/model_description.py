@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
 from ..plant.robot import Robot
-from ..plant.variables import Variable
+from ..plant.variables import Control, Variable
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
@@ -19,6 +19,8 @@ UNITS: dict[str, dict[str, int]] = {
     "s": {"s": 1},
     "1/s": {"s": -1},
     "1/s2": {"s": -2},
+    "rad/s2": {"rad": 1, "s": -2},
+    "kg": {"kg": 1},
 }
 """Exponents of the SI base units; all factors are 1."""
 
@@ -32,7 +34,6 @@ LOG_CATEGORIES = {
 DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
 VENDOR = "twodof"
 
-CONTROL_INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn")
 START = ("q_start", "q_min", "q_max")
 """What q depends on at the start; v depends on v_start too."""
 
@@ -40,6 +41,7 @@ START = ("q_start", "q_min", "q_max")
 def model_description(
     robot: Robot,
     table: Sequence[Variable],
+    control: Control,
     *,
     name: str,
     guid: str,
@@ -50,7 +52,7 @@ def model_description(
     """The XML text.
 
     Args:
-        robot, table: the robot and its variables.
+        robot, table, control: the robot, its variables, and what drives it.
         name: model name and model identifier.
         guid: as it shall stand in the file; "" while it is being computed.
         version: version of this package.
@@ -62,8 +64,8 @@ def model_description(
         fmiVersion="2.0",
         modelName=name,
         guid=guid,
-        description=f"Robot '{robot.name}' with {len(robot.joints)} joints under operational-space"
-        f" control of {robot.frame}",
+        description=f"Robot '{robot.name}' with {len(robot.joints)} joints under"
+        f" {control.title.format(frame=robot.frame)}",
         version=version,
         license="BSD-3-Clause",
         generationTool=f"{VENDOR} {version}",
@@ -95,7 +97,7 @@ def model_description(
     )
     _vendor_annotation(root, robot)
     _variables(root, table)
-    _structure(root, robot, table)
+    _structure(root, robot, table, control)
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
@@ -144,7 +146,7 @@ def _variables(root: ET.Element, table: Sequence[Variable]) -> None:
             typed.set("start", str(variable.start).lower() if boolean else repr(variable.start))
 
 
-def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable]) -> None:
+def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], control: Control) -> None:
     moves = robot.moves_frame()
 
     def known(groups: Sequence[str], joint: int | None = None, of_frame: bool = False) -> str:
@@ -153,7 +155,7 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable]) -> Non
             str(i)
             for i, variable in enumerate(table, start=1)
             if variable.group in groups
-            and (joint is None or variable.index == joint)
+            and (joint is None or variable.index in (joint, None))
             and (not of_frame or (variable.index is not None and moves[variable.index]))
         )
 
@@ -164,13 +166,20 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable]) -> Non
             return known((*START, "v_start"), joint=variable.index)
         if variable.group == "x":
             return known(START, of_frame=True)
-        return known((*START, "v_start", "gravity", "rcond", "limit_effort", *CONTROL_INPUTS))
+        if variable.group == "xd":
+            return known((*START, "v_start"), of_frame=True)
+        if control.commands == "effort":
+            return known(("limit_effort", *control.inputs), joint=variable.index)
+        load = ("payload", "payload_com")
+        mechanics = (*START, "v_start", "gravity", *load, *control.parameters)
+        return known((*mechanics, "limit_effort", *control.inputs))
 
     structure = ET.SubElement(root, "ModelStructure")
     outputs = ET.SubElement(structure, "Outputs")
     initial = ET.SubElement(structure, "InitialUnknowns")
     for i, variable in enumerate(table, start=1):
         if variable.causality == "output":
-            now = known(CONTROL_INPUTS) if variable.group == "tau" else ""
+            own = variable.index if control.commands == "effort" else None
+            now = known(control.inputs, joint=own) if variable.group == "tau" else ""
             ET.SubElement(outputs, "Unknown", index=str(i), dependencies=now)
             ET.SubElement(initial, "Unknown", index=str(i), dependencies=at_the_start(variable))

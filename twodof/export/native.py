@@ -14,23 +14,17 @@ from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
-from ..plant.variables import Variable
+from ..plant.variables import Control, Variable
 
 Array = NDArray[np.float64]
 
 MAX_JOINTS = 128
 """The engine's working memory is on the stack: 0.2 MB at this number."""
-GROUPS = (
-    "x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "Kn",
-    "q", "v", "x", "tau",
-    "q_start", "v_start", "q_min", "q_max", "gravity",
-    "rcond", "rtol", "atol", "max_step", "limit_effort",
-)  # fmt: skip
-"""The order of variables that the engine relies on: inputs, outputs, parameters."""
-FIRST_OUTPUT, FIRST_PARAMETER = "q", "q_start"
+FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "limit_effort"}
+"""Where the table's parts begin: inputs, outputs, parameters, truth values among these."""
 
 
-def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
+def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid: str) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
 
     Names from the URDF, which may be anybody's, are string literals and nothing else.
@@ -38,6 +32,7 @@ def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
     Args:
         robot: the robot, n joints in Pinocchio's order.
         table: its variables; a variable's place is its value reference.
+        control: what drives it.
         guid: as the modelDescription has it.
 
     Raises:
@@ -47,7 +42,6 @@ def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
     if n > MAX_JOINTS:
         raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
     groups = [variable.group for variable in table]
-    assert tuple(dict.fromkeys(groups)) == GROUPS
     model = robot.model
     to_z = [_rotation_to_z(_axis(joint)) for joint in list(model.joints)[1:]]
     turned = [np.eye(3), *to_z]  # by Pinocchio's joint index, 0 the root
@@ -63,6 +57,8 @@ def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
         f"#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n}\n#define N_AXES {m}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
+        f"#define COMMANDS_ACCELERATION {int(control.commands == 'acceleration')}\n"
+        + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
         _value_references(groups),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
@@ -81,7 +77,10 @@ def model_header(robot: Robot, table: Sequence[Variable], guid: str) -> str:
             "double JOINT_P", (turned[p].T @ M.translation for p, M in zip(parents, placements))
         ),
         f"static const double FRAME_P[3] = "
-        f"{_literal(turned[frame.parentJoint].T @ frame.placement.translation)};\n",
+        f"{_literal(turned[frame.parentJoint].T @ frame.placement.translation)};\n"
+        f"static const double FRAME_R[3][3] = "
+        f"{_literal(turned[frame.parentJoint].T @ frame.placement.rotation)};\n"
+        f"enum {{ CARRIER = {int(frame.parentJoint) - 1} }}; /* the joint that carries it */\n",
         "/* Bodies: mass, centre of mass, inertia about it, in the joint's frame. */\n"
         + _table("double MASS", (inertia.mass for inertia in inertias)),
         _table("double COM", (R.T @ inertia.lever for R, inertia in zip(to_z, inertias))),
@@ -113,10 +112,9 @@ def _rotation_to_z(axis: Array) -> Array:
 
 
 def _value_references(groups: Sequence[str]) -> str:
-    lines = [f"    {group.upper()} = {groups.index(group)}," for group in GROUPS]
+    lines = [f"    {group.upper()} = {groups.index(group)}," for group in dict.fromkeys(groups)]
     lines.append(f"    N_VARIABLES = {len(groups)},")
-    for constant, group in (("FIRST_OUTPUT", FIRST_OUTPUT), ("FIRST_PARAMETER", FIRST_PARAMETER)):
-        lines.append(f"    {constant} = {group.upper()},")
+    lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
     body = "\n".join(lines)
     return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
 

@@ -18,7 +18,7 @@ from ..files import check_archive, read_file, write_file
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError
-from ..plant.variables import Variable, variable_table
+from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
 from .compiler import host_platform
 from .documentation import documentation
@@ -49,6 +49,7 @@ class FmuOptions:
             (0, 0, −9.81).
         q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
             else 0 where the limits allow and their middle where not.
+        control: what drives the robot, a key of ``CONTROLS``: "task", "joint" or "effort".
         name: model name and identifier.
         link_environment: remember the folders of this Python's packages in the FMU; not for the
             native flavour, which needs none.
@@ -62,6 +63,7 @@ class FmuOptions:
     axes: str | None = None
     gravity: tuple[float, float, float] | None = None
     q_start: tuple[float, ...] | None = None
+    control: str = "task"
     name: str = "TwoDof"
     link_environment: bool = False
     native: bool = False
@@ -96,6 +98,8 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     """The flavour, the GUID, and all files of the FMU but those that the flavour finishes."""
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
+    if options.control not in CONTROLS:
+        raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
     path = options.urdf or data_file("urdf", "2dof.urdf")
     text = _read_urdf(path)
     robot, table, starts = _model(options, text)
@@ -109,6 +113,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
         return model_description(
             robot,
             table,
+            CONTROLS[options.control],
             name=options.name,
             guid=guid,
             version=__version__,
@@ -124,7 +129,14 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     files["model.png"] = data_file("fmu_src", "model.png").read_bytes()
     files.update(
         documentation(
-            robot, table, flavour, name=options.name, guid=guid, version=__version__, urdf=urdf
+            robot,
+            table,
+            options.control,
+            flavour,
+            name=options.name,
+            guid=guid,
+            version=__version__,
+            urdf=urdf,
         )
     )
     return flavour, guid, files
@@ -140,13 +152,15 @@ def _flavour(
     if not options.native:
         if options.platforms:
             raise BuildError("platforms can be chosen for the native flavour only, `native=True`")
-        return python_flavour(robot, urdf, starts, options.name, options.link_environment)
+        return python_flavour(
+            robot, options.control, urdf, starts, options.name, options.link_environment
+        )
     if options.link_environment:
         raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
     platforms = options.platforms or (host_platform(),)
     if platforms == ("",):
         raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
-    return native_flavour(robot, table, options.name, platforms)
+    return native_flavour(robot, options.control, table, options.name, platforms)
 
 
 def _read_urdf(path: Path) -> str:
@@ -186,14 +200,15 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
             f"q_start has {len(starts['q_start'])} values, the robot has {len(robot.joints)}"
             f" joints: {', '.join(robot.joints)}"
         )
-    starts.setdefault("x_des", (0.0,) * len(axes))
-    if not shipped:
-        plant = Plant(robot, variable_table(robot, starts))
+    if shipped and axes != "xy":
+        raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
+    if options.control != "task":
+        starts.pop("x_des", None)
+    elif not shipped:
+        plant = Plant(robot, variable_table(robot, {**starts, "x_des": (0.0,) * len(axes)}))
         plant.initialise()
         starts["x_des"] = tuple(plant.x)
-    elif axes != "xy":
-        raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
-    return robot, variable_table(robot, starts), starts
+    return robot, variable_table(robot, starts, options.control), starts
 
 
 def _rest(robot: Robot) -> tuple[float, ...]:

@@ -5,20 +5,19 @@ dense output (Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math.
 Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every communication step begins afresh with
 the step min(max_step, h), so that no integrator state outlives it.
 
-A joint limit is a plastic stop: a joint that reaches it is set onto it with v = 0 and held there
-while its acceleration points into it. It takes that joint's velocity and exerts no reaction on
-the others, whose accelerations stay those of the equations of motion.
+A joint that reaches a limit is set onto it and stays there until it is released (``stops``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import chain, product
 from math import inf, isfinite, sqrt, ulp
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .stops import Limits, Stops
 
 Array = NDArray[np.float64]
 State = list[float]
@@ -26,8 +25,6 @@ State = list[float]
 Acceleration = Callable[[Array, Array], tuple[Sequence[float], int]]
 """At (q, v), joint limits left out: q̈ of the equations of motion, n values, and the rank that J⁺
 was given, the number of its singular values that were not dropped."""
-Limits = Sequence[tuple[float, float]]
-"""Per joint (q_min, q_max)."""
 
 A = (
     (1 / 5,),
@@ -99,21 +96,12 @@ class _Equations:
         return list(a), rank
 
 
-@dataclass
-class _Stops:
-    """Joints at rest at a limit: all of them, and those that may leave it when they are drawn."""
-
-    limits: Limits
-    held: list[int]
-    watched: list[int]
-
-
 def advance(
     acceleration: Acceleration,
     q: Sequence[float],
     v: Sequence[float],
     h: float,
-    limits: Limits,
+    stops: Stops,
     rtol: float,
     atol: float,
     max_step: float,
@@ -124,7 +112,7 @@ def advance(
         acceleration: q̈(q, v); autonomous, as inputs are held over the step.
         q, v: state at the beginning, n each; q within the limits.
         h: communication step, s, > 0.
-        limits: per joint (q_min, q_max).
+        stops: at the joints' limits.
         rtol, atol: tolerances of the error test on the state (q, v).
         max_step: largest integration step, s.
 
@@ -135,6 +123,7 @@ def advance(
         FloatingPointError: the equations gave a value that is not finite.
         StepError: they change too fast.
     """
+    limits = stops.limits
     equations = _Equations(acceleration, len(limits))
     y = [*q, *v]
     t = 0.0
@@ -143,7 +132,9 @@ def advance(
     kept = [0.0] * len(limits)  # until when each joint is kept at its limit
     while t < h:
         end = min((until for until in kept if until > t), default=h)
-        stops, y, f, rank = _hold(equations, y, limits, [until > t for until in kept])
+        stops.impact(y)
+        f, rank = equations.acceleration(y)
+        stops.hold(y, f, [until > t for until in kept])
         for i, (low, high) in enumerate(limits):
             if i not in stops.held and not low < y[i] < high:
                 left[i] = t
@@ -153,6 +144,7 @@ def advance(
         for i in stopped:
             if t - left[i] < patience:
                 kept[i] = t + patience
+    stops.impact(y)
     return y[: len(q)], y[len(q) :]
 
 
@@ -163,7 +155,7 @@ def _until_event(
     rank: int,
     t: float,
     end: float,
-    stops: _Stops,
+    stops: Stops,
     rtol: float,
     atol: float,
     max_step: float,
@@ -182,7 +174,7 @@ def _until_event(
         small = step <= jump_step  # also where it is stretched to the end
         if last:
             step = end - t
-        y_new, K, ranks = _dormand_prince(equations, y, step, stops.held, rates, rank)
+        y_new, K, ranks = _dormand_prince(equations, y, step, stops, rates, rank)
         norm = _error_norm(K, y, y_new, step, rtol, atol)
         factor = MIN_FACTOR
         if isfinite(norm):
@@ -213,15 +205,15 @@ def _until_event(
 
 
 def _dormand_prince(
-    equations: _Equations, y: State, step: float, held: list[int], k1: State, rank: int
+    equations: _Equations, y: State, step: float, stops: Stops, k1: State, rank: int
 ) -> tuple[State, list[State], list[int]]:
     """One step from y, where the derivative is k1: y_new, the stages' derivatives and ranks."""
     n, ranks = equations.n, [rank]
 
     def rates(y: State) -> State:
         a, rank = equations.acceleration(y)
-        for i in held:
-            a[i] = 0.0
+        if stops.held:
+            stops.restrain(y, a)
         ranks.append(rank)
         return y[n:] + a
 
@@ -278,30 +270,8 @@ def _too_fast(equations: _Equations, y: State, *, too_fine: bool) -> StepError:
     return StepError(too_fine=too_fine, joint=joint, rate=rate)
 
 
-def _hold(
-    equations: _Equations, y: State, limits: Limits, kept: list[bool]
-) -> tuple[_Stops, State, list[float], int]:
-    """Joints that rest at a limit; y with the velocity into it taken; what acceleration is left.
-
-    That is of the rank that is the last value.
-    """
-    n = len(limits)
-    y = y.copy()
-    for i, (low, high) in enumerate(limits):
-        if (y[i] >= high and y[n + i] > 0.0) or (y[i] <= low and y[n + i] < 0.0):
-            y[n + i] = 0.0
-    a, rank = equations.acceleration(y)
-    held = []
-    for i, (low, high) in enumerate(limits):
-        into = (y[i] >= high and a[i] >= 0.0) or (y[i] <= low and a[i] <= 0.0)
-        if (into or kept[i]) and y[n + i] == 0.0:
-            held.append(i)
-            a[i] = 0.0
-    return _Stops(limits, held, [i for i in held if not kept[i]]), y, a, rank
-
-
 def _first_event(
-    equations: _Equations, y: State, y_new: State, step: float, stops: _Stops, K: list[State]
+    equations: _Equations, y: State, y_new: State, step: float, stops: Stops, K: list[State]
 ) -> tuple[float, State, list[int]] | None:
     """First time in (0, step] at which a limit is reached or left.
 
@@ -332,23 +302,18 @@ def _first_event(
     for i in stopped:
         low, high = stops.limits[i]
         y[i] = min(max(y[i], low), high)
-        y[n + i] = 0.0
     return latest, y, stopped
 
 
-def _events(equations: _Equations, y: State, stops: _Stops) -> list[int]:
-    """Free joints that are past a limit and watched joints that leave theirs, at y."""
+def _events(equations: _Equations, y: State, stops: Stops) -> list[int]:
+    """Free joints that are past a limit and watched joints that are let go, at y."""
     events = []
     for i, ((low, high), q, v) in enumerate(zip(stops.limits, y, y[equations.n :])):
         if (q >= high and (q > high or v > 0.0)) or (q <= low and (q < low or v < 0.0)):
             events.append(i)
     if stops.watched:
         a, _ = equations.acceleration(y)
-        for i in stops.watched:
-            low, high = stops.limits[i]
-            leaves = a[i] < 0.0 if y[i] >= high else a[i] > 0.0
-            if leaves and low < high:
-                events.append(i)
+        events += stops.released(y, a)
     return events
 
 

@@ -1,28 +1,31 @@
-"""The plant: a robot under operational-space control, with its state, inputs and parameters.
+"""The plant: a robot under a control law, with its state, inputs and parameters.
 
-    τ = M(q) q̈_cmd + h(q, v)                          inverse dynamics (RNEA)
-    q̈ = M(q)⁻¹ (sat(τ) + tau_ext − D v − h(q, v))      forward dynamics (ABA)
+    τ = M(q) q̈_cmd + h(q, v)                                    inverse dynamics (RNEA)
+    q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v))     forward dynamics (ABA)
+
+or τ itself, as the law gives it. M and h of the second have the payload, those of the first where
+``payload_known``.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; here Pinocchio's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from operator import mul
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from .controller import apply_pseudo_inverse
+from . import effort_control, joint_control, task_control
 from .integrator import BUDGET, STAGES, Acceleration, Array, StepError, advance
 from .robot import Robot
-from .variables import Variable
+from .stops import Stops
+from .variables import CONTROLS, Variable
 
-# looked up once: an attribute of the module costs as much as a call's arithmetic
-forward_kinematics = pin.forwardKinematics
-frame_jacobian = pin.computeFrameJacobian
-frame_acceleration = pin.getFrameClassicalAcceleration
+LAWS = {"task": task_control, "joint": joint_control, "effort": effort_control}
+Command = Callable[[Array, Array], tuple[list[float], int]]
+"""What a control law makes of a state: q̈_cmd or τ, n values, and the rank of its J⁺, if any."""
+
 WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -35,33 +38,51 @@ class DiscardError(ArithmeticError):
 
 
 class Plant:
-    """A robot and its controller as a system with inputs, parameters, state and outputs.
+    """A robot and its control law as a system with inputs, parameters, state and outputs.
 
     Every variable of the table is an attribute of its group's name: lists of floats for vectors
-    (SI units; task vectors in the root frame), floats and a bool for scalars. ``q`` and ``v`` are
-    the state; ``x`` and ``tau`` are computed when read.
+    (SI units; task vectors in the root frame), floats and bools for scalars. ``q`` and ``v`` are
+    the state; ``x``, ``xd`` and ``tau`` are computed when read.
+
+    Args:
+        robot: the robot.
+        table: its variables.
+        control: the law, a key of ``CONTROLS``.
+
+    Attributes:
+        model, data: Pinocchio's, as the control law knows the robot.
     """
 
     x_des: list[float]
     xd_des: list[float]
     xdd_des: list[float]
+    q_des: list[float]
+    v_des: list[float]
+    a_des: list[float]
     Kp: list[float]
     Kd: list[float]
+    tau_cmd: list[float]
     tau_ext: list[float]
+    f_ext: list[float]
     Kn: float
     q_start: list[float]
     v_start: list[float]
     q_min: list[float]
     q_max: list[float]
     gravity: list[float]
+    payload: float
+    payload_com: list[float]
+    payload_known: bool
     rcond: float
     rtol: float
     atol: float
     max_step: float
     limit_effort: bool
+    rigid_stops: bool
 
-    def __init__(self, robot: Robot, table: Sequence[Variable]) -> None:
-        self.robot = robot
+    def __init__(self, robot: Robot, table: Sequence[Variable], control: str = "task") -> None:
+        self.robot, self.control = robot, control
+        self._law, self._commands = LAWS[control].command, CONTROLS[control].commands
         for variable in table:
             if variable.causality == "output":
                 continue
@@ -73,12 +94,8 @@ class Plant:
                 getattr(self, variable.group).append(variable.start)
         self.q = list(self.q_start)
         self.v = list(self.v_start)
-        self._model = robot.model.copy()
-        self._data = self._model.createData()
-        self._still = np.zeros(len(robot.joints))
         self._axes = ["xyz".index(axis) for axis in robot.axes]
-        # a view: it follows what Pinocchio computes
-        self._position = self._data.oMf[robot.frame_id].translation
+        self.prepare()
 
     def initialise(self) -> list[str]:
         """Check the parameters and set the state to its start; what was clamped, a line each.
@@ -106,7 +123,13 @@ class Plant:
 
     def prepare(self) -> None:
         """Take over parameters that were set directly, as after restoring a state."""
-        self._model.gravity.linear = np.array(self.gravity)
+        self._model = _loaded(self.robot, self.gravity, self.payload, self.payload_com)
+        self._data = self._model.createData()
+        if self.payload and not getattr(self, "payload_known", False):
+            self.model = _loaded(self.robot, self.gravity, 0.0, self.payload_com)
+            self.data = self.model.createData()
+        else:
+            self.model, self.data = self._model, self._data
 
     def step(self, h: float) -> None:
         """Advance the state by one communication step of h seconds, inputs held.
@@ -120,12 +143,13 @@ class Plant:
                 f"max_step = {self.max_step:g} s divides a step of {h:g} s into more than"
                 f" {BUDGET // STAGES} integration steps; enlarge max_step or shorten the step"
             )
-        self._hold_inputs()
-        limits = list(zip(self.q_min, self.q_max))
+        stops = Stops(
+            list(zip(self.q_min, self.q_max)), self._inverse_mass if self.rigid_stops else None
+        )
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # an exception tells it
                 self.q, self.v = advance(
-                    self._equations_of_motion(), self.q, self.v, h, limits,
+                    self._equations_of_motion(), self.q, self.v, h, stops,
                     self.rtol, self.atol, self.max_step,
                 )  # fmt: skip
         except FloatingPointError as error:
@@ -143,58 +167,56 @@ class Plant:
     @property
     def x(self) -> list[float]:
         """Position of the task frame along the task axes, m, root frame."""
-        q = np.array(self.q)
-        pin.framesForwardKinematics(self._model, self._data, q)
-        position: list[float] = self._position.tolist()
+        pin.framesForwardKinematics(self._model, self._data, np.array(self.q))
+        position: list[float] = self._data.oMf[self.robot.frame_id].translation.tolist()
         return [position[axis] for axis in self._axes]
+
+    @property
+    def xd(self) -> list[float]:
+        """Velocity of the task frame along the task axes, m/s, root frame."""
+        velocity: list[float] = (self._jacobian(np.array(self.q)) @ self.v).tolist()
+        return [velocity[axis] for axis in self._axes]
 
     @property
     def tau(self) -> list[float]:
         """Control effort applied at the current state and inputs, N·m or N."""
-        self._hold_inputs()
-        tau: list[float] = self._control_effort(np.array(self.q), np.array(self.v))[0].tolist()
+        effort, _ = self._control_effort(self._law(self), np.array(self.q), np.array(self.v))
+        tau: list[float] = effort.tolist()
         return tau
 
-    def _hold_inputs(self) -> None:
-        self._task = list(zip(self._axes, self.x_des, self.xd_des, self.xdd_des, self.Kp, self.Kd))
+    def _jacobian(self, q: Array) -> Array:
+        """Of the task frame's position in the root's axes, 3 × n."""
+        frame = self.robot.frame_id
+        jacobian = pin.computeFrameJacobian(self._model, self._data, q, frame, WORLD_ALIGNED)
+        return np.asarray(jacobian).reshape(6, -1)[:3]
 
-    def _commanded_acceleration(self, q: Array, v: Array) -> tuple[list[float], int]:
-        """q̈_cmd of the controller at a state, n values, and the rank of its J⁺."""
-        model, data, frame = self._model, self._data, self.robot.frame_id
-        forward_kinematics(model, data, q, v, self._still)
-        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).tolist()
-        # with q̈ = 0 the frame's acceleration is the drift J̇v
-        drift = frame_acceleration(model, data, frame, WORLD_ALIGNED).linear.tolist()
-        x = self._position.tolist()
-        velocity = v.tolist()
-        Kn, several = self.Kn, len(velocity) > 1
-        rows, command = [], []
-        for axis, x_des, xd_des, xdd_des, Kp, Kd in self._task:
-            row = jacobian[axis] if several else [jacobian[axis]]
-            xd = sum(map(mul, row, velocity))
-            rows.append(row)
-            command.append(
-                xdd_des + Kd * (xd_des - xd) + Kp * (x_des - x[axis]) - drift[axis] + Kn * xd
-            )
-        qdd, rank = apply_pseudo_inverse(rows, command, self.rcond)
-        return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd, rank
+    def _inverse_mass(self, q: Sequence[float]) -> Array:
+        inverse = pin.computeMinverse(self._model, self._data, np.array(q))
+        return np.asarray(np.triu(inverse) + np.triu(inverse, 1).T)
 
-    def _control_effort(self, q: Array, v: Array) -> tuple[Array, int]:
-        command, rank = self._commanded_acceleration(q, v)
-        tau: Array = pin.rnea(self._model, self._data, q, v, np.array(command))
+    def _control_effort(self, command: Command, q: Array, v: Array) -> tuple[Array, int]:
+        given, rank = command(q, v)
+        tau: Array = np.array(given)
+        if self._commands == "acceleration":
+            tau = pin.rnea(self.model, self.data, q, v, tau)
         if self.limit_effort:
             tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
         return tau, rank
 
     def _equations_of_motion(self) -> Acceleration:
-        damping = np.array(self.robot.damping)
-        external = np.array(self.tau_ext)
-        if not (self.limit_effort or damping.any() or external.any()):
-            return self._commanded_acceleration  # M⁻¹(M q̈_cmd + h − h)
+        command: Command = self._law(self)
+        damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
+        force = np.array(self.f_ext)
+        # where none of these is there, q̈ = M⁻¹(M q̈_cmd + h − h)
+        acts = damping.any() or external.any() or force.any() or self.limit_effort
+        if self._commands == "acceleration" and self.model is self._model and not acts:
+            return command
 
         def acceleration(q: Array, v: Array) -> tuple[list[float], int]:
-            tau, rank = self._control_effort(q, v)
+            tau, rank = self._control_effort(command, q, v)
             effort = tau + external - damping * v
+            if force.any():
+                effort += force @ self._jacobian(q)
             return pin.aba(self._model, self._data, q, v, effort).tolist(), rank
 
         return acceleration
@@ -203,7 +225,9 @@ class Plant:
         for name in ("rtol", "atol", "max_step"):
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} = {getattr(self, name):g} must be > 0")
-        if not 0.0 <= self.rcond < 1.0:
+        if not self.payload >= 0.0:
+            raise ParameterError(f"payload = {self.payload:g} must be >= 0")
+        if self.control == "task" and not 0.0 <= self.rcond < 1.0:
             raise ParameterError(f"rcond = {self.rcond:g} must be in [0, 1)")
         for i, (low, high) in enumerate(zip(self.q_min, self.q_max)):
             if low > high:
@@ -211,3 +235,16 @@ class Plant:
                     f"q_min[{i + 1}] = {low:g} > q_max[{i + 1}] = {high:g}"
                     f" (joint '{self.robot.joints[i]}')"
                 )
+
+
+def _loaded(
+    robot: Robot, gravity: Sequence[float], payload: float, place: Sequence[float]
+) -> pin.Model:
+    """The robot's model with a gravity, and with a point mass in its task frame."""
+    model = robot.model.copy()
+    model.gravity.linear = np.array(gravity)
+    if payload:
+        frame = model.frames[robot.frame_id]
+        mass = pin.Inertia(payload, frame.placement.act(np.array(place)), np.zeros((3, 3)))
+        model.inertias[frame.parentJoint] += mass
+    return model

@@ -47,71 +47,136 @@ class Variable:
         return "Boolean" if isinstance(self.start, bool) else "Real"
 
 
-def variable_table(robot: Robot, starts: Mapping[str, Value | tuple[float, ...]]) -> list[Variable]:
+@dataclass(frozen=True)
+class Control:
+    """A control law: what drives the robot.
+
+    Attributes:
+        title: in words, for "{frame}".
+        inputs: groups of variables that it has, in the table's order; τ depends on them directly.
+        parameters: groups of its parameters.
+        commands: what the law gives, "acceleration" (q̈_cmd, by inverse dynamics) or "effort" (τ).
+        rigid_stops: whether stops have a reaction, where nothing else is said.
+    """
+
+    title: str
+    inputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    commands: str
+    rigid_stops: bool
+
+
+CONTROLS = {
+    "task": Control(
+        "operational-space control of {frame}",
+        ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn"), ("rcond", "payload_known"),
+        "acceleration", False,
+    ),
+    "joint": Control(
+        "joint-space control",
+        ("q_des", "v_des", "a_des", "Kp", "Kd"), ("payload_known",), "acceleration", True,
+    ),
+    "effort": Control("effort control, the bare plant", ("tau_cmd",), (), "effort", True),
+}  # fmt: skip
+"""By name. The law is in the file <name>_control, of Python here and of C in the native engine."""
+
+Row = tuple[str, str, list[str], list[str], str]
+Starts = Mapping[str, Value | tuple[float, ...]]
+
+
+def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[Variable]:
     """The variables of a robot's FMU, in value-reference order.
 
     Args:
         robot: the robot; n joints and m task axes give the vectors' lengths.
-        starts: start values that differ from the defaults, by group; needs "x_des" (m values)
-            and "q_start" (n values), which have no default that suits every robot.
+        starts: start values that differ from the defaults, by group; needs "q_start" (n values),
+            and "x_des" (m values) where there is one: no default suits every robot.
+        control: the control law, a key of ``CONTROLS``.
     """
+    law = CONTROLS[control]
+    default = _defaults(robot, control)
+    default.update(starts)
+    if "q_des" in law.inputs:
+        default.setdefault("q_des", default["q_start"])
+    table: list[Variable] = []
+    for group, causality, size, units, text in _rows(robot, control):
+        if causality != "input" or group in (*law.inputs, "tau_ext", "f_ext"):
+            start = default.get(group) if causality != "output" else None
+            for i, (unit, owner) in enumerate(zip(units, size)):
+                value = start[i] if isinstance(start, tuple) else None
+                table.append(Variable(group, i, causality, unit, value, f"{text}, {owner}"))
+            if not size:
+                assert not isinstance(start, tuple)
+                table.append(Variable(group, None, causality, units[0], start, text))
+    return table
+
+
+def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]]:
     n, m = len(robot.joints), len(robot.axes)
-    position = ["m" if prismatic else "rad" for prismatic in robot.prismatic]
-    velocity = ["m/s" if prismatic else "rad/s" for prismatic in robot.prismatic]
-    effort = ["N" if prismatic else "N.m" for prismatic in robot.prismatic]
+    controlled = m if control == "task" else n
+    return {
+        "xd_des": (0.0,) * m, "xdd_des": (0.0,) * m, "v_des": (0.0,) * n, "a_des": (0.0,) * n,
+        "Kp": (50.0,) * controlled, "Kd": (40.0,) * controlled, "Kn": 10.0 if n > m else 0.0,
+        "tau_cmd": (0.0,) * n, "tau_ext": (0.0,) * n, "f_ext": (0.0,) * 3,
+        "v_start": (0.0,) * n, "q_min": robot.q_min, "q_max": robot.q_max,
+        "gravity": (0.0, 0.0, -9.81), "payload": 0.0, "payload_com": (0.0,) * 3,
+        "rcond": 0.01, "rtol": 1e-3, "atol": 1e-6, "max_step": 1e-3,
+        "limit_effort": False, "rigid_stops": CONTROLS[control].rigid_stops,
+        "payload_known": False,
+    }  # fmt: skip
+
+
+def _rows(robot: Robot, control: str) -> list[Row]:
+    """Group, causality, owners of its elements (none of a scalar), their units, description."""
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
-    default: dict[str, Value | tuple[float, ...]] = {
-        "xd_des": (0.0,) * m,
-        "xdd_des": (0.0,) * m,
-        "Kp": (50.0,) * m,
-        "Kd": (40.0,) * m,
-        "tau_ext": (0.0,) * n,
-        "Kn": 10.0 if n > m else 0.0,
-        "v_start": (0.0,) * n,
-        "q_min": robot.q_min,
-        "q_max": robot.q_max,
-        "gravity": (0.0, 0.0, -9.81),
-        "rcond": 0.01,
-        "rtol": 1e-3,
-        "atol": 1e-6,
-        "max_step": 1e-3,
-        "limit_effort": False,
-    }
-    default.update(starts)
-    table: list[Variable] = []
-
-    def vector(group: str, causality: str, units: list[str], text: str, of: list[str]) -> None:
-        start = default.get(group)
-        for i, (unit, owner) in enumerate(zip(units, of, strict=True)):
-            value = start[i] if isinstance(start, tuple) else None
-            table.append(Variable(group, i, causality, unit, value, f"{text}, {owner}"))
-
-    def scalar(group: str, causality: str, unit: str, text: str) -> None:
-        start = default[group]
-        assert not isinstance(start, tuple)
-        table.append(Variable(group, None, causality, unit, start, text))
-
-    vector("x_des", "input", ["m"] * m, "target position", axis)
-    vector("xd_des", "input", ["m/s"] * m, "target velocity", axis)
-    vector("xdd_des", "input", ["m/s2"] * m, "target acceleration", axis)
-    vector("Kp", "input", ["1/s2"] * m, "proportional gain", axis)
-    vector("Kd", "input", ["1/s"] * m, "derivative gain", axis)
-    vector("tau_ext", "input", effort, "external effort", joint)
-    scalar("Kn", "input", "1/s", "damping of the motion that does not move the end effector")
-    vector("q", "output", position, "position", joint)
-    vector("v", "output", velocity, "velocity", joint)
-    vector("x", "output", ["m"] * m, "position", axis)
-    vector("tau", "output", effort, "control effort applied", joint)
-    vector("q_start", "parameter", position, "position at the start", joint)
-    vector("v_start", "parameter", velocity, "velocity at the start", joint)
-    vector("q_min", "parameter", position, "lower limit", joint)
-    vector("q_max", "parameter", position, "upper limit", joint)
     root = [f"axis {letter} of {robot.root}" for letter in "xyz"]
-    vector("gravity", "parameter", ["m/s2"] * 3, "gravity", root)
-    scalar("rcond", "parameter", "", "singular values up to rcond times the largest are dropped")
-    scalar("rtol", "parameter", "", "relative tolerance of the integrator")
-    scalar("atol", "parameter", "", "absolute tolerance of the integrator")
-    scalar("max_step", "parameter", "s", "largest step of the integrator")
-    scalar("limit_effort", "parameter", "", "limit the control effort to the URDF's effort limits")
-    return table
+    frame = [f"axis {letter} of {robot.frame}" for letter in "xyz"]
+    gained = axis if control == "task" else joint
+
+    def units(sliding: str, turning: str) -> list[str]:
+        return [sliding if prismatic else turning for prismatic in robot.prismatic]
+
+    position, velocity = units("m", "rad"), units("m/s", "rad/s")
+    acceleration, effort = units("m/s2", "rad/s2"), units("N", "N.m")
+    known: Row = ("payload_known", "parameter", [], [""], "the controller knows the payload")
+    rcond: Row = (
+        "rcond", "parameter", [], [""], "singular values up to rcond times the largest are dropped",
+    )  # fmt: skip
+    parameters = CONTROLS[control].parameters
+    return [
+        ("x_des", "input", axis, ["m"] * 3, "target position"),
+        ("xd_des", "input", axis, ["m/s"] * 3, "target velocity"),
+        ("xdd_des", "input", axis, ["m/s2"] * 3, "target acceleration"),
+        ("q_des", "input", joint, position, "target position"),
+        ("v_des", "input", joint, velocity, "target velocity"),
+        ("a_des", "input", joint, acceleration, "target acceleration"),
+        ("Kp", "input", gained, ["1/s2"] * len(gained), "proportional gain"),
+        ("Kd", "input", gained, ["1/s"] * len(gained), "derivative gain"),
+        ("tau_cmd", "input", joint, effort, "effort of the controller"),
+        ("tau_ext", "input", joint, effort, "external effort"),
+        ("f_ext", "input", root, ["N"] * 3, f"external force at {robot.frame}"),
+        ("Kn", "input", [], ["1/s"], "damping of the motion that does not move the end effector"),
+        ("q", "output", joint, position, "position"),
+        ("v", "output", joint, velocity, "velocity"),
+        ("x", "output", axis, ["m"] * 3, "position"),
+        ("xd", "output", axis, ["m/s"] * 3, "velocity"),
+        ("tau", "output", joint, effort, "control effort applied"),
+        ("q_start", "parameter", joint, position, "position at the start"),
+        ("v_start", "parameter", joint, velocity, "velocity at the start"),
+        ("q_min", "parameter", joint, position, "lower limit"),
+        ("q_max", "parameter", joint, position, "upper limit"),
+        ("gravity", "parameter", root, ["m/s2"] * 3, "gravity"),
+        ("payload", "parameter", [], ["kg"], f"point mass at {robot.frame}"),
+        ("payload_com", "parameter", frame, ["m"] * 3, "where the payload is"),
+        *([rcond] if "rcond" in parameters else []),
+        ("rtol", "parameter", [], [""], "relative tolerance of the integrator"),
+        ("atol", "parameter", [], [""], "absolute tolerance of the integrator"),
+        ("max_step", "parameter", [], ["s"], "largest step of the integrator"),
+        (
+            "limit_effort", "parameter", [], [""],
+            "limit the control effort to the URDF's effort limits",
+        ),
+        ("rigid_stops", "parameter", [], [""], "joint stops act on the other joints too"),
+        *([known] if "payload_known" in parameters else []),
+    ]  # fmt: skip

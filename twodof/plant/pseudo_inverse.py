@@ -1,11 +1,4 @@
-"""Operational-space control by resolved acceleration.
-
-    a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)
-    q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v
-          = J⁺ (a_cmd − J̇ v + Kn J v) − Kn v
-
-Source: Luh, Walker & Paul, "Resolved-acceleration control of mechanical manipulators",
-IEEE TAC 25(3), 1980; the damped self-motion is that of Khatib, IEEE J-RA 3(1), 1987.
+"""The truncated pseudo-inverse of a task Jacobian.
 
 J has at most three rows here. At that size a call into a linear-algebra library costs more than
 the arithmetic, so rows are plain lists of floats.

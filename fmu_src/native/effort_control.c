@@ -1,0 +1,12 @@
+/* No control: joint efforts are inputs, for a controller of the user's own. */
+#include "control.h"
+
+#include <string.h>
+
+int command(const double value[N_VARIABLES], Placement joint[N_JOINTS], const double q[N_JOINTS],
+            const double v[N_JOINTS], double given[N_JOINTS])
+{
+    (void)joint, (void)q, (void)v;
+    memcpy(given, &value[TAU_CMD], N_JOINTS * sizeof *given);
+    return 0;
+}

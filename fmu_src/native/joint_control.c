@@ -1,0 +1,13 @@
+/* Joint-space control: q̈_cmd = a_des + Kd ∘ (v_des − v) + Kp ∘ (q_des − q).
+   Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2. */
+#include "control.h"
+
+int command(const double value[N_VARIABLES], Placement joint[N_JOINTS], const double q[N_JOINTS],
+            const double v[N_JOINTS], double given[N_JOINTS])
+{
+    (void)joint;
+    for (int i = 0; i < N_JOINTS; i++)
+        given[i] = value[A_DES + i] + value[KD + i] * (value[V_DES + i] - v[i])
+                   + value[KP + i] * (value[Q_DES + i] - q[i]);
+    return 0;
+}

@@ -1,0 +1,26 @@
+/* Joint-limit stops. */
+#ifndef STOPS_H
+#define STOPS_H
+
+#include "internal.h"
+#include "plant.h"
+
+/* Joints at rest at a limit, and those of them that leave it when they are no longer pressed. */
+typedef struct {
+    int held[N_JOINTS], watched[N_JOINTS];
+    int any_held, any_watched;
+} Stops;
+
+/* Take the velocity that points into a limit, from the state y = (q, v). */
+INTERNAL void impact(const Plant *plant, double y[2 * N_JOINTS]);
+
+/* Find the joints that rest at y, after an impact; a, q̈ without stops, becomes that with them. Those
+   in kept stay whether they are pressed or not. */
+INTERNAL void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
+                   const int kept[N_JOINTS], Stops *stops);
+
+/* Make the acceleration of held joints 0; how each is pressed into its limit. */
+INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
+                       double a[N_JOINTS], double pressed[N_JOINTS]);
+
+#endif

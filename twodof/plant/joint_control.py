@@ -1,0 +1,26 @@
+"""Joint-space control: inverse dynamics with a PD law for each joint.
+
+    q̈_cmd = a_des + Kd ∘ (v_des − v) + Kp ∘ (q_des − q)
+
+Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .integrator import Array
+
+if TYPE_CHECKING:
+    from .plant import Command, Plant
+
+
+def command(plant: Plant) -> Command:
+    """q̈_cmd as a function of the state, n values; inputs held."""
+    law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
+
+    def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
+        state = zip(law, q.tolist(), v.tolist())
+        return [a + Kd * (vd - vi) + Kp * (qd - qi) for (a, vd, qd, Kd, Kp), qi, vi in state], 0
+
+    return commanded_acceleration

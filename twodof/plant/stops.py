@@ -1,0 +1,154 @@
+"""Joint-limit stops: which joints rest at a limit, what a stop does, and when it lets go.
+
+A stop is plastic and unilateral: a joint that reaches it loses its velocity there, and rests there
+while it is pressed into it. Without a reaction, as a clamp, that is all: it is pressed while its
+own acceleration points into the limit, and the other joints move as if it were not there. Rigid
+stops act on all joints. With E the unit vectors of joints at a limit, into the range,
+
+    v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0          at an impact
+    q̈ = q̈_free + M⁻¹E λ,      0 ≤ λ ⟂ Eᵀq̈ ≥ 0           while at rest
+
+Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Limits = Sequence[tuple[float, float]]
+"""Per joint (q_min, q_max)."""
+InverseMass = Callable[[Sequence[float]], Array]
+"""M(q)⁻¹, n × n."""
+
+MOST_PIVOTS = 100
+
+
+class Stops:
+    """The stops of a robot, and the joints that rest there.
+
+    Args:
+        limits: of the joints.
+        inverse_mass: of rigid stops; None: of stops without a reaction.
+
+    Attributes:
+        held: joints at rest at a limit.
+        watched: those of them that leave it when they are no longer pressed.
+    """
+
+    def __init__(self, limits: Limits, inverse_mass: InverseMass | None) -> None:
+        self.limits, self._inverse_mass = limits, inverse_mass
+        self.held: list[int] = []
+        self.watched: list[int] = []
+
+    def impact(self, y: list[float]) -> None:
+        """Take the velocity that points into a limit, from the state (q, v)."""
+        n = len(self.limits)
+        contacts = self._contacts(y)
+        into = [
+            i
+            for i, side in contacts
+            if side * y[n + i] < 0.0 or (self._has_no_range(i) and y[n + i])
+        ]
+        if not into:
+            return
+        if self._inverse_mass is None:
+            stopped = into
+        else:
+            W = self._inverse_mass(y[:n])
+            impulse = self._complementary(W, contacts, y[n:], [])
+            y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
+            stopped = [i for i, _ in contacts if impulse[i]]
+        for i in stopped:
+            y[n + i] = 0.0
+
+    def hold(self, y: Sequence[float], a: list[float], kept: Sequence[bool]) -> None:
+        """Find the joints that rest, at (q, v) after an impact; makes their acceleration 0.
+
+        Args:
+            y: the state.
+            a: q̈ without stops; changed to that with them.
+            kept: joints that stay whether they are pressed or not.
+        """
+        n = len(self.limits)
+        contacts = [(i, side) for i, side in self._contacts(y) if y[n + i] == 0.0]
+        forced = [i for i, _ in contacts if kept[i]]
+        if self._inverse_mass is None:
+            self.held = [
+                i for i, side in contacts if kept[i] or self._has_no_range(i) or side * a[i] <= 0.0
+            ]
+        elif contacts:
+            W = self._inverse_mass(y[:n])
+            reaction = self._complementary(W, contacts, a, forced)
+            self.held = [
+                i for i, _ in contacts if reaction[i] or a[i] == 0.0 or self._has_no_range(i)
+            ]
+        else:
+            self.held = []
+        self.watched = [i for i in self.held if not kept[i] and not self._has_no_range(i)]
+        self.restrain(y, a)
+
+    def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:
+        """Make the acceleration of held joints 0; how each is pressed into its limit."""
+        pressed = [0.0] * len(a)
+        if not self.held:
+            return pressed
+        if self._inverse_mass is None:
+            for i in self.held:
+                pressed[i], a[i] = a[i] * self._outwards(y, i), 0.0
+            return pressed
+        W = self._inverse_mass(y[: len(a)])[:, self.held]
+        reaction = np.linalg.solve(W[self.held], [-a[i] for i in self.held])
+        a[:] = (np.array(a) + W @ reaction).tolist()
+        for i, force in zip(self.held, reaction.tolist()):
+            pressed[i], a[i] = -force * self._outwards(y, i), 0.0
+        return pressed
+
+    def released(self, y: Sequence[float], a: list[float]) -> list[int]:
+        """Watched joints that are no longer pressed, where q̈ would be a without stops."""
+        pressed = self.restrain(y, a)
+        return [i for i in self.watched if pressed[i] < 0.0]
+
+    def _has_no_range(self, i: int) -> bool:
+        low, high = self.limits[i]
+        return low == high
+
+    def _outwards(self, y: Sequence[float], i: int) -> float:
+        return 1.0 if y[i] >= self.limits[i][1] else -1.0
+
+    def _contacts(self, y: Sequence[float]) -> list[tuple[int, float]]:
+        """Joints at a limit, and the sign of the way back into the range."""
+        return [
+            (i, -1.0 if q >= high else 1.0)
+            for i, ((low, high), q) in enumerate(zip(self.limits, y))
+            if q >= high or q <= low
+        ]
+
+    def _complementary(
+        self, W: Array, contacts: Sequence[tuple[int, float]], b: Sequence[float], both: list[int]
+    ) -> Array:
+        """z of n values: 0 ≤ E z ⟂ E (b + W z) ≥ 0 at the contacts, 0 elsewhere.
+
+        By least-index pivoting, which ends for every positive definite W. A joint in ``both`` or
+        without a range keeps b + W z = 0, whichever way z points. Source: Murty, Opsearch 11, 1974.
+        """
+        fixed = {i for i, _ in contacts if i in both or self._has_no_range(i)}
+        active = {i for i, side in contacts if i in fixed or side * b[i] < 0.0}
+        z = np.zeros(len(b))
+        for _ in range(MOST_PIVOTS):
+            z[:] = 0.0
+            chosen = sorted(active)
+            if chosen:
+                z[chosen] = np.linalg.solve(W[np.ix_(chosen, chosen)], [-b[i] for i in chosen])
+            w = W @ z + b
+            wrong = [
+                i for i, side in contacts
+                if i not in fixed and side * (z[i] if i in active else w[i]) < 0.0
+            ]  # fmt: skip
+            if not wrong:
+                break
+            active ^= {wrong[0]}
+        return z

@@ -1,0 +1,59 @@
+"""Operational-space control by resolved acceleration.
+
+    a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)
+    q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v
+          = J⁺ (a_cmd − J̇ v + Kn J v) − Kn v
+
+Source: Luh, Walker & Paul, "Resolved-acceleration control of mechanical manipulators",
+IEEE TAC 25(3), 1980; the damped self-motion is that of Khatib, IEEE J-RA 3(1), 1987.
+"""
+
+from __future__ import annotations
+
+from operator import mul
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from .integrator import Array
+from .pseudo_inverse import apply_pseudo_inverse
+
+if TYPE_CHECKING:
+    from .plant import Command, Plant
+
+# looked up once: an attribute of the module costs as much as a call's arithmetic
+forward_kinematics = pin.forwardKinematics
+frame_jacobian = pin.computeFrameJacobian
+frame_acceleration = pin.getFrameClassicalAcceleration
+WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+def command(plant: Plant) -> Command:
+    """q̈_cmd as a function of the state, n values, and the rank of its J⁺; inputs held."""
+    model, data, frame = plant.model, plant.data, plant.robot.frame_id
+    still = np.zeros(model.nv)
+    axes = ["xyz".index(axis) for axis in plant.robot.axes]
+    task = list(zip(axes, plant.x_des, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))
+    Kn, rcond, several = plant.Kn, plant.rcond, model.nv > 1
+    position = data.oMf[frame].translation  # a view: it follows what Pinocchio computes
+
+    def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
+        forward_kinematics(model, data, q, v, still)
+        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).tolist()
+        # with q̈ = 0 the frame's acceleration is the drift J̇v
+        drift = frame_acceleration(model, data, frame, WORLD_ALIGNED).linear.tolist()
+        x = position.tolist()
+        velocity = v.tolist()
+        rows, command = [], []
+        for axis, x_des, xd_des, xdd_des, Kp, Kd in task:
+            row = jacobian[axis] if several else [jacobian[axis]]
+            xd = sum(map(mul, row, velocity))
+            rows.append(row)
+            command.append(
+                xdd_des + Kd * (xd_des - xd) + Kp * (x_des - x[axis]) - drift[axis] + Kn * xd
+            )
+        qdd, rank = apply_pseudo_inverse(rows, command, rcond)
+        return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd, rank
+
+    return commanded_acceleration
