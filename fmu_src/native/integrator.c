@@ -71,7 +71,7 @@ static int evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS])
 /* Set out at y, where joints may rest at a limit. */
 static void set_out(Step *step, const int kept[N_JOINTS])
 {
-    impact(step->plant, step->y);
+    impact(step->plant, step->y, kept);
     step->rank[0] = evaluate(step, step->y, step->K[0] + N_JOINTS);
     hold(step->plant, step->y, step->K[0] + N_JOINTS, kept, &step->stops);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
@@ -321,6 +321,7 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
     double left[N_JOINTS];       /* when each joint last left its limit */
     double until[N_JOINTS] = {0}; /* until when each joint is kept at its limit */
+    int kept[N_JOINTS];
     Step step;
     double t = 0.0;
     if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
@@ -335,7 +336,6 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
         left[i] = -HUGE_VAL;
     while (t < h) {
         double end = h;
-        int kept[N_JOINTS];
         for (int i = 0; i < N_JOINTS; i++) {
             kept[i] = until[i] > t;
             if (kept[i])
@@ -352,7 +352,9 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     }
     if (isnan(t))
         return 0;
-    impact(plant, step.y);
+    for (int i = 0; i < N_JOINTS; i++)
+        kept[i] = until[i] > h;
+    impact(plant, step.y, kept);
     memcpy(&plant->value[Q], step.y, N_JOINTS * sizeof *step.y);
     memcpy(&plant->value[V], step.y + N_JOINTS, N_JOINTS * sizeof *step.y);
     return 1;

@@ -95,7 +95,7 @@ static void add_reaction(const Contacts *contacts, double columns[N_JOINTS][N_JO
             sum[i] += columns[k][i] * z[k];
 }
 
-void impact(const Plant *plant, double y[2 * N_JOINTS])
+void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[N_JOINTS])
 {
     Contacts contacts;
     double *v = y + N_JOINTS, z[N_JOINTS], columns[N_JOINTS][N_JOINTS];
@@ -106,6 +106,7 @@ void impact(const Plant *plant, double y[2 * N_JOINTS])
         fixed[k] = contacts.side[k] == 0.0;
         into[k] = fixed[k] ? speed != 0.0 : contacts.side[k] * speed < 0.0;
         any |= into[k];
+        fixed[k] |= kept[contacts.joint[k]];
     }
     if (!any)
         return;

@@ -11,8 +11,10 @@ typedef struct {
     int any_held, any_watched;
 } Stops;
 
-/* Take the velocity that points into a limit, from the state y = (q, v). */
-INTERNAL void impact(const Plant *plant, double y[2 * N_JOINTS]);
+/* Take the velocity that points into a limit, from the state y = (q, v). Joints in kept are not driven
+   off by the impact of another: where two in turn drive off each other, as the feet of a rocking
+   block, impacts would else not end in finite time. */
+INTERNAL void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[N_JOINTS]);
 
 /* Find the joints that rest at y, after an impact; a, q̈ without stops, becomes that with them. Those
    in kept stay whether they are pressed or not. */

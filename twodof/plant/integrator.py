@@ -132,9 +132,10 @@ def advance(
     kept = [0.0] * len(limits)  # until when each joint is kept at its limit
     while t < h:
         end = min((until for until in kept if until > t), default=h)
-        stops.impact(y)
+        keep = [until > t for until in kept]
+        stops.impact(y, keep)
         f, rank = equations.acceleration(y)
-        stops.hold(y, f, [until > t for until in kept])
+        stops.hold(y, f, keep)
         for i, (low, high) in enumerate(limits):
             if i not in stops.held and not low < y[i] < high:
                 left[i] = t
@@ -144,7 +145,7 @@ def advance(
         for i in stopped:
             if t - left[i] < patience:
                 kept[i] = t + patience
-    stops.impact(y)
+    stops.impact(y, [until > h for until in kept])
     return y[: len(q)], y[len(q) :]
 
 

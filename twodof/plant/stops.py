@@ -44,8 +44,14 @@ class Stops:
         self.held: list[int] = []
         self.watched: list[int] = []
 
-    def impact(self, y: list[float]) -> None:
-        """Take the velocity that points into a limit, from the state (q, v)."""
+    def impact(self, y: list[float], kept: Sequence[bool]) -> None:
+        """Take the velocity that points into a limit, from the state (q, v).
+
+        Args:
+            y: the state; changed.
+            kept: joints that no impact of another drives off: where two in turn drive off each
+                other, as the feet of a rocking block, impacts would else not end in finite time.
+        """
         n = len(self.limits)
         contacts = self._contacts(y)
         into = [
@@ -59,7 +65,8 @@ class Stops:
             stopped = into
         else:
             W = self._inverse_mass(y[:n])
-            impulse = self._complementary(W, contacts, y[n:], [])
+            forced = [i for i, _ in contacts if kept[i]]
+            impulse = self._complementary(W, contacts, y[n:], forced)
             y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
             stopped = [i for i, _ in contacts if impulse[i]]
         for i in stopped:
