@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import shutil
 import stat
@@ -14,10 +15,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from .errors import TwoDofError
+
 MAX_ARCHIVE = 2 * 1024**3
 MAX_DIRECTORY = 4 * 1024**2  # of a zip: some 50,000 members
 TEMPORARY = ".twodof."
 """Prefix of folders whose process has died, or holds their lock."""
+
+
+@contextmanager
+def refusing(kind: type[TwoDofError], what: str) -> Iterator[None]:
+    """Raise ``kind`` where the operating system refuses ``what``."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"cannot {what}: {error.strerror}") from error
 
 
 def check_file(path: str | Path, most: int) -> None:
@@ -64,10 +76,17 @@ def check_archive(path: str | Path) -> None:
         zipfile.BadZipFile: it is damaged.
     """
     check_file(path, MAX_ARCHIVE)
-    with open(path, "rb") as file:
-        end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
-    if end is not None and end[zipfile._ECD_SIZE] > MAX_DIRECTORY:  # type: ignore[attr-defined]
-        raise OSError(errno.EFBIG, "Too many members", str(path))
+    with _Archive(path) as file, zipfile.ZipFile(file):
+        pass
+
+
+class _Archive(io.FileIO):
+    """A zip archive, of which the list of members is by far the most that is read at once."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > MAX_DIRECTORY:
+            raise OSError(errno.EFBIG, "Too many members")
+        return super().read(size)
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -18,7 +18,7 @@ from ..bag.recording import Recording
 from ..data import data_file
 from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
-from ..files import shown, write_file
+from ..files import refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
 from ..plots.track import read_tracks
 from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Page
@@ -267,7 +267,8 @@ class Replay:
             PageError: it cannot be written.
         """
         content = self._page.recording(self._frames(), f"{self._track.name} - twodof")
-        _write(path, content)
+        with refusing(PageError, f"write '{path}'"):
+            write_file(path, content)
 
     def _frames(self) -> Iterator[float]:
         duration = float(self._t[-1])
@@ -284,13 +285,6 @@ def nearest(t: Array, time: float) -> int:
     if k == 0:
         return 0
     return k - 1 if k == len(t) or time - t[k - 1] <= t[k] - time else k
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_file(path, content)
-    except OSError as error:
-        raise PageError(f"cannot write '{path}': {error.strerror}") from error
 
 
 def view(

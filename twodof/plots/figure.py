@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import PlotError
-from ..files import write_file
+from ..files import refusing, write_file
 from ..version import __version__
 
 try:
@@ -89,7 +89,9 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     path = Path(output) if output is not None else _free_name(drawing.name)
     kind = file_kind(path)
     figure = drawn(drawing)
-    _write(path, _html(figure, drawing) if kind == "html" else _rendered(figure, kind))
+    content = _html(figure, drawing) if kind == "html" else _rendered(figure, kind)
+    with refusing(PlotError, f"write '{path}'"):
+        write_file(path, content)
     return path
 
 
@@ -175,13 +177,6 @@ tr {{ border-top: 1px solid {HAIR}; }}
 </body>
 </html>
 """.encode()
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_file(path, content)
-    except OSError as error:
-        raise PlotError(f"cannot write '{path}': {error.strerror}") from error
 
 
 def _free_name(name: str) -> Path:

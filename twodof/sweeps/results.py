@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SweepError
-from ..files import is_being_written, lock, write_file
+from ..files import is_being_written, lock, refusing, write_file
 from .metrics import METRICS
 from .runner import Row
 
@@ -239,7 +239,5 @@ def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> No
 def _write(path: Path, table: pa.Table) -> None:
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink)
-    try:
+    with refusing(SweepError, f"write '{path}'"):
         write_file(path, sink.getvalue().to_pybytes())
-    except OSError as error:
-        raise SweepError(f"cannot write '{path}': {error.strerror}") from error
