@@ -20,6 +20,7 @@ from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
 from ..files import refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
+from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks
 from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Page
 from .robot import PageRobot, ReadMesh
@@ -33,7 +34,6 @@ SLIDER_RATE = 4.0  # Hz: a slider that moves more often is hard to use in a slow
 TRAIL_TIME = 1.5  # s
 TRAIL_POINTS, PATH_POINTS = 60, 1500
 MOST_FRAMES = 2000
-SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
 class Replay:

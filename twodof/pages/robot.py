@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from ..errors import PageError
 from ..kinematics import Kinematics
 from ..plant.urdf import Joint, RobotError, Urdf, read_urdf
+from ..plots.scales import COLOURS
 from ..ros.scene import floats, load_mesh, origin
-from .page import COLOURS, Page
+from .page import Page
 
 Array = NDArray[np.float64]
 ReadMesh = Callable[[str], bytes | None]

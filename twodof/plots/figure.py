@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from ..errors import PlotError
 from ..files import refusing, write_file
 from ..version import __version__
+from .scales import GREY, HAIR, INK
 
 try:
     import matplotlib.style
@@ -26,11 +27,8 @@ except ImportError as missing:
         f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
     ) from missing
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of Okabe & Ito, "Color universal design", 2008, without their yellow, too pale on paper."""
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (7, 1.5, 1, 1.5)), (0, (1.5, 1)))
 """With the colours, whose number this does not divide, 28 tracks look different."""
-INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
 STYLE = {
     "font.size": 8.0, "axes.titlesize": 8.5, "axes.labelsize": 8.0, "axes.titlelocation": "left",
     "text.color": INK, "text.parse_math": False, "axes.labelcolor": INK, "axes.edgecolor": GREY,

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ..errors import PlotError
 from ..sweeps.metrics import METRICS
 from ..sweeps.results import RANKED, ranked
-from .figure import COLOURS, GREY, INK, PALE, TICK_STYLE, Drawing
+from .figure import TICK_STYLE, Drawing
+from .scales import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
@@ -48,14 +49,11 @@ BEST: dict[str, Any] = {
 }
 CRITICAL: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
 MISSING: dict[str, Any] = {
-    "facecolor": "#e6e9ec",
+    "facecolor": HAIR,
     "hatch": "////",
     "edgecolor": "#c3cad1",
     "linewidth": 0.0,
 }
-
-
-SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
 class _Panel(NamedTuple):
