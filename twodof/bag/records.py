@@ -132,7 +132,7 @@ def _mcap_messages(path: Path, allowance: Allowance) -> Iterator[tuple[Channel, 
                     yield channels[channel], stamp, chunk[position + MESSAGE_HEAD.size : end]
                 elif opcode == SCHEMA:
                     allowance.spend(TEXT * length)
-                    number, name, _, text = _fields("Hsss", chunk, position + HEAD.size)
+                    number, name, _, text, _ = _fields("Hsss", chunk, position + HEAD.size)
                     schemas[number] = (name, text)
                 elif opcode == CHANNEL:
                     allowance.spend(TEXT * length)
@@ -176,9 +176,8 @@ def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[
 
 def _unpack(path: Path, content: bytes, allowance: Allowance) -> bytes:
     """The records of a chunk."""
-    _, _, size, crc, compression = _fields("QQQIs", content, 0)
-    start = 28 + 4 + len(compression.encode()) + 8
-    packed = content[start : start + struct.unpack_from("<Q", content, start - 8)[0]]
+    _, _, size, crc, compression, length, start = _fields("QQQIsQ", content, 0)
+    packed = content[start : start + length]
     if size > MAX_CHUNK:
         raise DamageError(f"'{path.name}' has a chunk of {size} bytes")
     allowance.spend(size)
@@ -199,15 +198,12 @@ def _unpack(path: Path, content: bytes, allowance: Allowance) -> bytes:
 def _channel(
     content: bytes, position: int, schemas: dict[int, tuple[str, str]]
 ) -> tuple[int, Channel]:
-    number, schema, topic, encoding = _fields("HHss", content, position)
-    position += 4 + 4 + len(topic.encode()) + 4 + len(encoding.encode())
-    (length,) = struct.unpack_from("<I", content, position)
-    metadata = content[position + 4 : position + 4 + length]
+    number, schema, topic, encoding, length, position = _fields("HHssI", content, position)
+    metadata = content[position : position + length]
     entries, position = {}, 0
     while position < len(metadata):
-        key, value = _fields("ss", metadata, position)
+        key, value, position = _fields("ss", metadata, position)
         entries[key] = value
-        position += 8 + len(key.encode()) + len(value.encode())
     name, definition = schemas[schema]
     qos = entries.get("offered_qos_profiles", "")
     return number, Channel(
@@ -216,20 +212,20 @@ def _channel(
 
 
 def _fields(form: str, content: bytes, position: int) -> list[Any]:
-    """Fields of a record: struct's letters, and s for a text with its length before it."""
-    found: list[Any] = []
+    """Fields of a record, and where they end; struct's letters, and s for a text and its length."""
+    values: list[Any] = []
     for letter in form:
         if letter == "s":
             (length,) = struct.unpack_from("<I", content, position)
             position += 4
             if position + length > len(content):
                 raise struct.error
-            found.append(content[position : position + length].decode())
+            values.append(content[position : position + length].decode())
             position += length
         else:
-            found += struct.unpack_from(f"<{letter}", content, position)
+            values += struct.unpack_from(f"<{letter}", content, position)
             position += struct.calcsize(f"<{letter}")
-    return found
+    return [*values, position]
 
 
 def _sqlite3_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:

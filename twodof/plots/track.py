@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +53,10 @@ class JointTrack:
     @property
     def at_limit(self) -> bool:
         """Whether it has been at one of its limits."""
-        found = [limit for limit in (self.low, self.high) if limit is not None]
         return any(
             bool((np.abs(self.q - limit) <= AT_LIMIT * max(1.0, abs(limit))).any())
-            for limit in found
+            for limit in (self.low, self.high)
+            if limit is not None
         )
 
 
@@ -156,12 +156,11 @@ def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> 
 def _with_robot(
     bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None
 ) -> Track:
-    made = bag.provenance
-    schedule = bag.schedule
+    run = bag.provenance
     robot = None
     if urdf is not None:
         try:
-            robot = load_robot(urdf, frame or made.get("frame") or "", made.get("axes") or "xyz")
+            robot = load_robot(urdf, frame or run.get("frame") or "", run.get("axes") or "xyz")
         except RobotError as error:
             raise PlotError(f"{source}: {error}") from error
     joints = _joints(bag, names, robot)
@@ -169,12 +168,10 @@ def _with_robot(
     if robot is not None:
         q = _in_robot_order(bag, robot, names, bag.q)
         motion = motion_of(robot, q)
-        if made.get("frame", robot.frame) == robot.frame and _has_target(bag, robot):
+        if run.get("frame", robot.frame) == robot.frame and _has_target(bag, robot):
             v = _in_robot_order(bag, robot, names, bag.v)
-            task = _task(bag, robot, q, v[0], motion.path)
-            disturbances = _disturbances(robot, q, joints, task, schedule)
-            task = replace(task, disturbances=disturbances)
-    return Track(bag, _settings(bag, schedule), bag.t, joints, motion, task)
+            task = _task(bag, robot, joints, q, v[0], motion.path)
+    return Track(bag, _settings(bag), bag.t, joints, motion, task)
 
 
 def _joints(bag: Recording, names: Sequence[str], robot: Robot | None) -> tuple[JointTrack, ...]:
@@ -188,16 +185,10 @@ def _joints(bag: Recording, names: Sequence[str], robot: Robot | None) -> tuple[
             unit = "m" if joint.prismatic else "rad"
             low = joint.low if low is None else low
             high = joint.high if high is None else high
-        joints.append(
-            JointTrack(
-                name,
-                unit,
-                None if low is None or low <= -UNBOUNDED else low,
-                None if high is None or high >= UNBOUNDED else high,
-                bag.q[:, i],
-                bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0),
-            )
-        )
+        low = None if low is None or low <= -UNBOUNDED else low
+        high = None if high is None or high >= UNBOUNDED else high
+        v = bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0)
+        joints.append(JointTrack(name, unit, low, high, bag.q[:, i], v))
     return tuple(joints)
 
 
@@ -231,7 +222,9 @@ def _has_target(bag: Recording, robot: Robot) -> bool:
     return bool(bag.provenance) or (bag.heard is not None and bag.heard.frame == robot.urdf.root)
 
 
-def _task(bag: Recording, robot: Robot, q: Array, v0: Array, path: Array) -> Task:
+def _task(
+    bag: Recording, robot: Robot, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array
+) -> Task:
     axes = ["xyz".index(axis) for axis in robot.axes]
     x, target = path[:, axes], bag.target
 
@@ -251,46 +244,37 @@ def _task(bag: Recording, robot: Robot, q: Array, v0: Array, path: Array) -> Tas
             e = task_error(x[0].tolist(), xd0.tolist(), held, step, last)[bag.steps]
             closed_form = np.linalg.norm(e, axis=1)
             departure = float(np.linalg.norm(x - target - e, axis=1).max())
-    return Task(
-        axes=robot.axes,
-        target=target,
-        error=error,
-        closed_form=closed_form,
-        departure=departure,
-        disturbances=(),
-    )
+    astray = departure is not None and departure > NOTABLE
+    disturbances = _disturbances(bag.schedule, robot, joints, q, astray)
+    return Task(robot.axes, target, error, closed_form, departure, disturbances)
 
 
 def _disturbances(
-    robot: Robot, q: Array, joints: Sequence[JointTrack], task: Task, schedule: Schedule
+    schedule: Schedule, robot: Robot, joints: Sequence[JointTrack], q: Array, astray: bool
 ) -> tuple[str, ...]:
-    """What moves, brakes or stops the arm and is not in the closed form."""
+    """What moves, brakes or stops the arm and is not in the closed form, which it is off or not."""
     first = schedule[0][1]
-    astray = task.departure is not None and task.departure > NOTABLE
     external = [name for name in first if name.startswith("tau_ext[")]
-    found = {
+    at_work = {
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
         "singularities": astray and is_singular(robot, q, float(first.get("rcond", 0.0))),
         "damping": any(joint.damping for joint in robot.moving),
         "external torque": any(values[name] for _, values in schedule for name in external),
     }
-    return tuple(name for name, present in found.items() if present)
+    return tuple(name for name, present in at_work.items() if present)
 
 
-def _settings(bag: Recording, schedule: Schedule) -> dict[str, str]:
+def _settings(bag: Recording) -> dict[str, str]:
     """What the run was told, vectors and scalars by group."""
-    made = bag.provenance
-    if not made:
+    run = bag.provenance
+    if not run:
         return {}
-    settings = {
-        "FMU": made["fmu"]["file"],
-        "robot": made["robot"],
-        "step": f"{1e3 * made['step']:g} ms",
-    }
-    first = schedule[0][1]
-    given = {name for _, values in made["input_changes"] for name in values}
-    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in schedule[1:])}
+    step = f"{1e3 * run['step']:g} ms"
+    settings = {"FMU": run["fmu"]["file"], "robot": run["robot"], "step": step}
+    (_, first), *later = bag.schedule
+    given = {name for _, values in run["input_changes"] for name in values}
+    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
     groups: dict[str, list[Any]] = {}
     for name, value in first.items():
         groups.setdefault(_group(name), []).append(value)
