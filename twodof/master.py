@@ -167,9 +167,7 @@ def samples(
     """
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
-    declared = run.fmu.variables
-    inputs = {n: v for n, v in run.start_values.items() if declared[n].causality == "input"}
-    due = deque(run.changes)
+    inputs, due = _inputs(run), deque(run.changes)
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
         first = _changes_until(run.start_time, due, run)
         inputs.update(first)
@@ -191,10 +189,17 @@ def samples(
                     inputs, since = {**inputs, **latest}, sample.t
                 instance.step(sample.t, run.step)
             except SimulationError as error:
-                values = _resumed(run, sample, error, resume)
-                inputs = {name: values.get(name, value) for name, value in inputs.items()}
+                again = _resumed(run, sample, error, resume)
+                inputs = {name: again.get(name, value) for name, value in inputs.items()}
                 since = sample.t
-                _start_again(instance, run, sample.t, {**inputs, **values})
+                instance.reset()
+                instance.initialise(since, run.time(run.steps), {**run.given, **inputs, **again})
+                instance.step(since, run.step)
+
+
+def _inputs(run: Experiment) -> dict[str, Value]:
+    variables = run.fmu.variables
+    return {n: v for n, v in run.start_values.items() if variables[n].causality == "input"}
 
 
 def _changes_until(
@@ -239,15 +244,6 @@ def _resumed(
     if settings is None:
         raise failure from error
     return resolve(run.fmu, settings)
-
-
-def _start_again(
-    instance: Instance, run: Experiment, t: float, values: Mapping[str, Value]
-) -> None:
-    """Initialise the FMU anew at t, and do the step from there."""
-    instance.reset()
-    instance.initialise(t, run.time(run.steps), {**run.given, **values})
-    instance.step(t, run.step)
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:

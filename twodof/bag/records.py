@@ -87,8 +87,8 @@ class Allowance:
 
 def storage_files(folder: Path) -> list[Path]:
     """The files that hold a bag's messages, in the order in which they were written."""
-    found = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
-    return sorted(found, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
+    files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
+    return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
 
 def read_messages(file: Path, allowance: Allowance) -> Iterator[tuple[Channel, int, bytes]]:
@@ -259,19 +259,20 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
             uri = (folder / path.name).as_uri()
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
-            made = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"))
+            tables = "SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"
+            schema = dict(database.execute(tables))
             database.set_progress_handler(None, 0)
-            if not made.keys() >= {"topics", "messages"}:
+            if not schema.keys() >= {"topics", "messages"}:
                 raise DamageError(f"'{path.name}' has no messages")
-            if not all(sql.startswith(PLAIN) for sql in made.values()):
+            if not all(sql.startswith(PLAIN) for sql in schema.values()):
                 raise DamageError(f"'{path.name}' has views, triggers or virtual tables")
             yield database
 
 
 def _unfinished(path: Path) -> list[Path]:
     """The files that a writer which died leaves beside its database."""
-    found = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
-    return [file for file in found if file.is_file() and file.stat().st_size]
+    files = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
+    return [file for file in files if file.is_file() and file.stat().st_size]
 
 
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
@@ -296,8 +297,8 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
     a circle, or be part of many rows. Nor may there be others before them, to be passed by.
     """
     columns = TABLES[table].split()
-    found = database.execute(f"PRAGMA table_xinfo({table})")
-    stored = ["" if computed else name for _, name, *_, computed in found]
+    infos = database.execute(f"PRAGMA table_xinfo({table})")
+    stored = ["" if computed else name for _, name, *_, computed in infos]
     known = [name for name in columns if name in stored]
     if stored[: len(known)] != known:
         raise DamageError(f"'{path.name}' has {table} that are not those of ROS 2")

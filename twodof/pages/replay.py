@@ -107,16 +107,15 @@ class Replay:
             return renamed, files.get
         text = bag.provenance["urdf"]
         if fmu is not None:
-            given = load_fmu(fmu)
-            return text, partial(read_resource, given)
-        made = bag.provenance["fmu"]
+            return text, partial(read_resource, load_fmu(fmu))
+        maker = bag.provenance["fmu"]
         for folder in (Path(), bag.path.resolve().parent):
             try:
-                found = load_fmu(folder / Path(made["file"]).name)
+                candidate = load_fmu(folder / Path(maker["file"]).name)
             except FmuError:
                 continue
-            if found.guid == made["guid"]:
-                return text, partial(read_resource, found)
+            if candidate.guid == maker["guid"]:
+                return text, partial(read_resource, candidate)
         shipped = data_file("urdf", "2dof.urdf")
         meshes = data_file("meshes")
         renamed, files = collect_meshes(shipped.read_text("utf-8"), shipped.parent, meshes)
@@ -126,7 +125,7 @@ class Replay:
 
     def _set_scene(self) -> None:
         page, track, motion = self._page, self._track, self._track.motion
-        made = track.recording.provenance
+        starts = track.recording.provenance.get("start_values", {})
         self._target: Any = None
         self._targets = np.empty((0, 3))
         if motion is not None and self._figure is not None:
@@ -138,7 +137,7 @@ class Replay:
                 for k, axis in enumerate(track.task.axes):
                     self._targets[:, "xyz".index(axis)] = track.task.target[:, k]
                 points.append(self._targets[:: max(1, len(q) // PATH_POINTS)])
-            gravity = [-made.get("start_values", {}).get(f"gravity[{i}]", 0.0) for i in (1, 2, 3)]
+            gravity = [-starts.get(f"gravity[{i}]", 0.0) for i in (1, 2, 3)]
             up = gravity if any(gravity) else (0.0, 0.0, 1.0)
             size = page.frame(np.vstack(points), track.task.axes if track.task else "", up)
             if track.task is not None:

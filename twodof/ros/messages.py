@@ -96,10 +96,10 @@ class Messages:
         """Topics and messages of one sample."""
         effort = sample.tau if self._effort else ()
         state = self._joint_state.pack(sample.stamp, sample.q, sample.v, effort)
-        found: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
+        messages: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
         if self._scene is not None:
-            found += map(_serialise, self._of_scene(self._scene, sample))
-        return found
+            messages += map(_serialise, self._of_scene(self._scene, sample))
+        return messages
 
     def latched(self, stamp: int) -> list[tuple[str, Serialised]]:
         """Topics and messages that hold for the whole run: robot description, fixed transforms.

@@ -110,11 +110,11 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
             key = (mesh.get("filename", ""), mesh.get("scale", "1 1 1"))
             if key not in fitted:
                 fitted[key] = _fit(key[0], floats(mesh, "scale", "1 1 1"), read)
-            found = fitted[key]
-            if found is None:
+            fit = fitted[key]
+            if fit is None:
                 link.remove(part)
                 continue
-            shape, placement = found
+            shape, placement = fit
             geometry.remove(mesh)
             geometry.append(shape)
             _place(part, origin(part.find("origin")) * placement)

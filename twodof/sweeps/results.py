@@ -215,24 +215,24 @@ def _read(file: Path) -> pa.Table:
 
 def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
     try:
-        found = json.loads((schema.metadata or {})[KEY])
-        assert isinstance(found, dict) and {*COMPARED, "versions"} <= {*found}
+        provenance = json.loads((schema.metadata or {})[KEY])
+        assert isinstance(provenance, dict) and {*COMPARED, "versions"} <= {*provenance}
     except (KeyError, ValueError, AssertionError):
         raise SweepError(f"'{file}' was not written by twodof") from None
-    return found
+    return provenance
 
 
-def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
     for key in COMPARED:
-        if found[key] != wanted[key]:
-            other = {"fmu": f"of another FMU ({found['fmu']['file']}, {found['fmu']['guid']})"}
+        if there[key] != wanted[key]:
+            other = {"fmu": f"of another FMU ({there['fmu']['file']}, {there['fmu']['guid']})"}
             raise SweepError(
-                f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(found[key]):.300}')};"
+                f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(there[key]):.300}')};"
                 " resume it with those, or choose another folder with -o"
             )
-    if found["versions"]["twodof"] != wanted["versions"]["twodof"]:
+    if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
         raise SweepError(
-            f"'{path}' was begun by twodof {found['versions']['twodof']}; go on with that version"
+            f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version"
         )
 
 
