@@ -18,7 +18,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..children import Child
 from ..errors import PageError
@@ -26,11 +25,9 @@ from ..experiments import Experiment, Setting, Value, experiment
 from ..fmu import Fmu, load_fmu, read_resource, urdf_text
 from ..plant.urdf import Joint, RobotError, read_urdf
 from .loop import IDLE, Loop, News
-from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Page
+from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
 from .robot import PageRobot
 from .widgets import Plot, Readout, Switch
-
-Array = NDArray[np.float64]
 
 PLOTTED = 10.0  # s
 PLOT_POINTS = 250  # while it plays: drawing holds a browser up

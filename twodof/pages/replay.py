@@ -11,7 +11,6 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag.reader import read_bag
 from ..bag.recording import Recording
@@ -22,11 +21,9 @@ from ..files import refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
 from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks
-from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Page
+from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
 from .robot import PageRobot, ReadMesh
 from .widgets import Plot, Readout, Switch
-
-Array = NDArray[np.float64]
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}
 SETTLING = 0.3  # s after which scrubbing is over

@@ -8,12 +8,10 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..plots.scales import COLOURS, GREY, SMALLEST_RANGE
-from .page import Page
+from .page import Array, Page
 
-Array = NDArray[np.float64]
 BUCKETS = 400
 """Parts of a long line over time that each keep their extremes; a plot is as many pixels wide."""
 

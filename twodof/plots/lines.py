@@ -6,8 +6,8 @@ from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .closed_form import Array
 from .scales import SMALLEST_RANGE
 from .track import number
 
@@ -15,8 +15,6 @@ from .track import number
 from matplotlib.axis import Axis  # where it is missing, twodof.figure says so
 from matplotlib.path import Path as Polyline
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-
-Array = NDArray[np.float64]
 
 STEPS = (1, 2, 2.5, 5, 10)  # of ticks
 CHUNKS = 1000

@@ -7,12 +7,9 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..kinematics import Kinematics
+from ..kinematics import Array, Kinematics
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
-
-Array = NDArray[np.float64]
 
 DEFAULT_FRAME = "EndEffector"
 LOOKS = 2000  # for singularities, along the way

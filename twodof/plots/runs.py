@@ -14,9 +14,9 @@ from math import ceil, floor, log10
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag.recording import Recording
+from .closed_form import Array
 from .figure import DASHES, TICK_STYLE, Drawing, drawn
 from .lines import SIDE, Look, outline, set_ticks
 from .scales import COLOURS, GREY, INK, PALE, SMALLEST_ERROR, SMALLEST_RANGE
@@ -29,8 +29,6 @@ from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
-
-Array = NDArray[np.float64]
 
 NAMES, TICKS, PANEL, GAP, MARGIN = 0.65, 0.5, 1.75, 0.6, 0.15
 """Widths: joints' names, ticks' numbers, joints' panels and between them, margin."""

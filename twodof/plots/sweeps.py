@@ -61,7 +61,7 @@ class _Panel(NamedTuple):
 
     metric: str
     x: str
-    y: str | None
+    y: str | None = None
 
 
 def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -> Drawing:
@@ -147,9 +147,7 @@ def _panels(table: pandas.DataFrame, varied: Sequence[str]) -> tuple[list[_Panel
     telling = [metric for metric in METRICS if table[metric].nunique() > 1]
     if not telling:
         telling = [metric for metric in METRICS if table[metric].notna().any()]
-    if len(varied) == 1:
-        return [_Panel(metric, varied[0], None) for metric in telling], 3
-    if len(varied) == 2:
+    if len(varied) <= 2:
         return [_Panel(metric, *varied) for metric in telling], 3
     chosen = [metric for metric in PAIRED if metric in telling] or telling[:1]
     pairs = list(combinations(varied, 2))[:MOST_PAIRS]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag.provenance import KNOWN_UNTIL
 from ..bag.reader import read_bag
@@ -16,10 +15,8 @@ from ..bag.recording import Recording, Schedule
 from ..errors import PlotError
 from ..files import read_file, shown
 from ..plant.urdf import UNBOUNDED, RobotError
-from .closed_form import Held, task_error
+from .closed_form import Array, Held, task_error
 from .robot import Motion, Robot, is_singular, load_robot, motion_of
-
-Array = NDArray[np.float64]
 
 AT_LIMIT = 1e-9  # of a limit's size
 NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's

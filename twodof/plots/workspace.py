@@ -8,8 +8,8 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .closed_form import Array
 from .lines import Look, drawable, set_ticks
 from .scales import GREY, INK, PALE, SMALLEST_RANGE
 from .track import Track
@@ -17,8 +17,6 @@ from .track import Track
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
 from matplotlib.lines import Line2D
-
-Array = NDArray[np.float64]
 
 MANY_TARGETS = 12
 

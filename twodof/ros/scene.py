@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..files import temporary_folder
-from ..kinematics import Kinematics, Placement
+from ..kinematics import Array, Kinematics, Placement
 from ..plant.urdf import Joint, RobotError, read_urdf
 
-Array = NDArray[np.float64]
 LARGEST = 1e6  # m
 MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
 """Those whose geometry is in the file itself; others, as glTF, name files to read it from."""

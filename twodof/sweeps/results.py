@@ -99,7 +99,7 @@ class Results:
             raise self._taken() from None
         except OSError as error:
             raise SweepError(f"cannot make '{self.path}': {error.strerror}") from error
-        self._write(self._table([]))
+        self._write_part([])
 
     def _taken(self) -> SweepError:
         return SweepError(
@@ -132,18 +132,16 @@ class Results:
     def _store(self) -> None:
         rows, self._rows = self._rows, []
         if rows:
-            self._write(self._table(rows))
+            self._write_part(rows)
         self._stored = time.monotonic()
 
-    def _table(self, rows: Sequence[Row]) -> pa.Table:
+    def _write_part(self, rows: Sequence[Row]) -> None:
         columns = list(zip(*rows)) or [()] * len(self._schema)
         arrays = [
             pa.array(column, field.type, from_pandas=True)  # NaN is null
             for column, field in zip(columns, self._schema, strict=True)
         ]
-        return pa.table(arrays, schema=self._schema)
-
-    def _write(self, table: pa.Table) -> None:
+        table = pa.table(arrays, schema=self._schema)
         _write(self.path / f"part-{self._part:06d}.parquet", table)
         self._part += 1
 
@@ -153,7 +151,8 @@ class Results:
         if parts:
             tables = [table for file in parts if len(table := _read(file))]
             _write(self.path / WHOLE, pa.concat_tables(tables).sort_by("run").combine_chunks())
-        _remove_parts(self.path)
+        for file in filter(_is_part, self.path.iterdir()):
+            file.unlink()
 
 
 def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
@@ -197,13 +196,11 @@ def _files(path: Path) -> list[Path]:
     """The whole table; the parts where there is none."""
     if (path / WHOLE).exists():
         return [path / WHOLE]
-    return sorted(file for file in path.iterdir() if PART.fullmatch(file.name))
+    return sorted(filter(_is_part, path.iterdir()))
 
 
-def _remove_parts(path: Path) -> None:
-    for file in path.iterdir():
-        if PART.fullmatch(file.name):
-            file.unlink()
+def _is_part(file: Path) -> bool:
+    return PART.fullmatch(file.name) is not None
 
 
 def _read(file: Path) -> pa.Table:
