@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,10 +137,16 @@ class _JointStates:
 
     def _decode(self) -> None:
         batch, self._batch, self._held = self._batch, [], 0
+        largest = max(map(len, batch))
+        if largest > MAX_JOINT_STATE:
+            raise BagError(f"'{self._path}' has a joint state of {largest} bytes")
         try:
-            numbers = self._decoded(batch)
-        except BagError:
-            raise
+            if self._layout is None:
+                first: Any = STORE.deserialize_cdr(batch[0], JOINT_STATE)
+                sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
+                self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
+                self.names = tuple(first.name)
+            numbers = self._layout.unpack(batch)
         except MixtureError as error:
             raise BagError(f"'{self._path}' has joint states of different {error}") from error
         except Exception as error:  # rosbags raises anything where a message is no JointState
@@ -150,17 +155,6 @@ class _JointStates:
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
         for stored, part in zip(self._numbers, numbers, strict=True):
             stored.frombytes(part.tobytes())
-
-    def _decoded(self, batch: Sequence[bytes]) -> list[Array]:
-        largest = max(map(len, batch))
-        if largest > MAX_JOINT_STATE:
-            raise BagError(f"'{self._path}' has a joint state of {largest} bytes")
-        if self._layout is None:
-            first: Any = STORE.deserialize_cdr(batch[0], JOINT_STATE)
-            sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
-            self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
-            self.names = tuple(first.name)
-        return self._layout.unpack(batch)
 
 
 class _Ends(_JointStates):
