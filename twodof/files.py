@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import shutil
 import stat
@@ -12,12 +13,30 @@ import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+
+from .errors import TwoDofError
 
 MAX_ARCHIVE = 2 * 1024**3
 MAX_DIRECTORY = 4 * 1024**2  # of a zip: some 50,000 members
+MAX_UNZIPPED = 2 * 1024**3
+MAX_DEPTH = 50  # of folders in folders
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
 TEMPORARY = ".twodof."
 """Prefix of folders whose process has died, or holds their lock."""
+
+
+class UnsafeArchiveError(zipfile.BadZipFile):
+    """A zip archive that must not be unzipped."""
+
+
+@contextmanager
+def refusing(kind: type[TwoDofError], what: str) -> Iterator[None]:
+    """Raise ``kind`` where the operating system refuses ``what``."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"cannot {what}: {error.strerror}") from error
 
 
 def check_file(path: str | Path, most: int) -> None:
@@ -55,19 +74,61 @@ def shown(path: str | Path) -> str:
 
 
 def check_archive(path: str | Path) -> None:
-    """Refuse a zip archive with more members than can be listed.
+    """Refuse a zip archive that cannot be unzipped safely, or has more members than can be listed.
 
     zipfile reads the whole list before it can be asked how long it is.
 
     Raises:
         OSError: with the reason in ``strerror``.
+        UnsafeArchiveError: saying why.
         zipfile.BadZipFile: it is damaged.
     """
     check_file(path, MAX_ARCHIVE)
-    with open(path, "rb") as file:
-        end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
-    if end is not None and end[zipfile._ECD_SIZE] > MAX_DIRECTORY:  # type: ignore[attr-defined]
-        raise OSError(errno.EFBIG, "Too many members", str(path))
+    with _Archive(path) as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+    for member in members:
+        _check_member(member)
+    if sum(member.file_size for member in members) > MAX_UNZIPPED:
+        raise UnsafeArchiveError(f"it is unsafe: unzipped it exceeds {MAX_UNZIPPED} bytes")
+
+
+def _check_member(member: zipfile.ZipInfo) -> None:
+    name = PurePosixPath(member.filename)
+    link = stat.S_ISLNK(member.external_attr >> 16)
+    outside = name.is_absolute() or ".." in name.parts or "\\" in member.filename
+    if link or outside or not member.filename:
+        raise UnsafeArchiveError(f"it is unsafe: its member '{name}' leaves its folder")
+    if len(name.parts) > MAX_DEPTH:
+        raise UnsafeArchiveError(f"it is unsafe: its folders are nested deeper than {MAX_DEPTH}")
+    if member.compress_type not in METHODS:
+        raise UnsafeArchiveError(
+            f"its member '{name}' is compressed by method {member.compress_type};"
+            " FMI allows to store and to deflate"
+        )
+
+
+def read_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    """A member of an archive, of at most ``most`` bytes.
+
+    Raises:
+        KeyError: there is none.
+        UnsafeArchiveError: it is larger.
+        OSError, zipfile.BadZipFile, …: it is damaged.
+    """
+    member = archive.getinfo(name)
+    if member.file_size > most:
+        raise UnsafeArchiveError(f"its member '{name}' is larger than {most} bytes")
+    with archive.open(member) as file:  # gives no more than the list of members says
+        return file.read(member.file_size)
+
+
+class _Archive(io.FileIO):
+    """A zip archive, of which the list of members is by far the most that is read at once."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > MAX_DIRECTORY:
+            raise OSError(errno.EFBIG, "Too many members")
+        return super().read(size)
 
 
 def write_file(path: Path, content: bytes) -> None:

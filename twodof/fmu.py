@@ -6,14 +6,14 @@ import codecs
 import logging
 import os
 import re
-import stat
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from ctypes import byref, c_double, c_uint
 from dataclasses import dataclass
+from itertools import count, takewhile
 from math import inf
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -24,18 +24,15 @@ from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ModelDescription, ScalarVariable
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
-from .files import check_archive, temporary_folder
+from .files import UnsafeArchiveError, check_archive, read_member, temporary_folder
 
 logger = logging.getLogger(__name__)
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 
-MAX_UNZIPPED = 2 * 1024**3
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
 MAX_RESOURCE = 256 * 1024**2
-MAX_DEPTH = 50  # of folders in folders
 MAX_WRAPPER = 16 * 1024**2  # it has 0.3 MiB
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
 
 
 @dataclass(frozen=True, repr=False)
@@ -85,18 +82,16 @@ class Fmu:
         """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
         if group in self.variables:
             return [group]
-        names: list[str] = []
-        while (name := f"{group}[{len(names) + 1}]") in self.variables:
-            names.append(name)
-        return names
+        names = (f"{group}[{i}]" for i in count(1))
+        return list(takewhile(self.variables.__contains__, names))
 
     def groups(self, causality: str) -> dict[str, list[str]]:
         """Vectors and scalars of one causality by group name."""
-        found: dict[str, list[str]] = {}
+        groups: dict[str, list[str]] = {}
         for name, variable in self.variables.items():
             if variable.causality == causality:
-                found.setdefault(name.partition("[")[0], []).append(name)
-        return found
+                groups.setdefault(name.partition("[")[0], []).append(name)
+        return groups
 
 
 def load_fmu(path: str | Path) -> Fmu:
@@ -116,9 +111,8 @@ def load_fmu(path: str | Path) -> Fmu:
         raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
     if description.fmiVersion != "2.0" or description.coSimulation is None:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
-        raise FmuError(
-            f"'{path}' is FMI {description.fmiVersion} {kind}; FMI 2.0 co-simulation is needed"
-        )
+        form = f"FMI {description.fmiVersion} {kind}"
+        raise FmuError(f"'{path}' is {form}; FMI 2.0 co-simulation is needed")
     fmu = Fmu(
         path=path,
         description=description,
@@ -128,8 +122,8 @@ def load_fmu(path: str | Path) -> Fmu:
     )
     n = len(fmu.vector("q"))
     logged = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
-    real = all(v.causality == "output" and v.type == "Real" for v in logged)
-    if n == 0 or len(logged) != 2 * n or not real:
+    kinds = {(variable.causality, variable.type) for variable in logged}
+    if len(logged) != 2 * n or kinds != {("output", "Real")}:
         raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
     if len(fmu.joints) != n:
         raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
@@ -184,9 +178,9 @@ class Instance:
 
     def set(self, values: Mapping[str, float | bool]) -> None:
         """Set variables by name."""
+        variables = [self._fmu.variables[name] for name in values]
         for kind, setter in (("Real", self._slave.setReal), ("Boolean", self._slave.setBoolean)):
-            chosen = [self._fmu.variables[name] for name in values]
-            chosen = [variable for variable in chosen if variable.type == kind]
+            chosen = [variable for variable in variables if variable.type == kind]
             if chosen:
                 references = [variable.valueReference for variable in chosen]
                 self._accept(setter, references, [values[variable.name] for variable in chosen])
@@ -248,10 +242,9 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
         FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
     """
     if not fmu.runs_here:
-        raise FmuError(
-            f"'{fmu.path}' has no binary for this platform ({fmpy.platform}),"
-            f" only for: {', '.join(fmu.platforms) or 'none'}"
-        )
+        there = ", ".join(fmu.platforms) or "none"
+        reason = f"has no binary for this platform ({fmpy.platform}), only for: {there}"
+        raise FmuError(f"'{fmu.path}' {reason}")
     with temporary_folder() as folder:
         try:
             with zipfile.ZipFile(fmu.path) as archive:
@@ -278,23 +271,19 @@ def _check_python_wrapper(fmu: Fmu, folder: Path) -> None:
             f"the temporary folder '{folder.parent}' has characters that the FMU's Python wrapper"
             " cannot read; set TMPDIR to a folder with a plain name"
         )
-    if not _names_a_module(folder / "resources"):
-        raise FmuError(f"'{fmu.path}': resources/slavemodule.txt does not name a module beside it")
-
-
-def _names_a_module(resources: Path) -> bool:
-    try:
+    resources = folder / "resources"
+    with suppress(OSError, ValueError):
         name = (resources / "slavemodule.txt").read_text("utf-8").partition("\n")[0]
-        return "/" not in name and (resources / f"{name}.py").is_file()
-    except (OSError, ValueError):
-        return False
+        if "/" not in name and (resources / f"{name}.py").is_file():
+            return
+    raise FmuError(f"'{fmu.path}': resources/slavemodule.txt does not name a module beside it")
 
 
 def read_resource(fmu: Fmu, name: str) -> bytes | None:
     """A file of the FMU's resources/ folder, None where it has no such file."""
     try:
         with zipfile.ZipFile(fmu.path) as archive:
-            return _content(archive, f"resources/{name}", MAX_RESOURCE)
+            return read_member(archive, f"resources/{name}", MAX_RESOURCE)
     except KeyError:
         return None
     except ZIP_ERRORS as error:
@@ -315,69 +304,40 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            for member in members:
-                _check_member(path, member)
-            if sum(member.file_size for member in members) > MAX_UNZIPPED:
-                raise FmuError(f"'{path}' is unsafe: unzipped it exceeds {MAX_UNZIPPED} bytes")
-            xml = _content(archive, "modelDescription.xml", MAX_DESCRIPTION)
+            xml = read_member(archive, "modelDescription.xml", MAX_DESCRIPTION)
     except FileNotFoundError as error:
         raise FmuError(f"there is no FMU '{path}'; build one with 'twodof build'") from error
     except OSError as error:
         raise FmuError(f"cannot read '{path}': {error.strerror}") from error
     except KeyError as error:
         raise FmuError(f"'{path}' is no FMU: it has no modelDescription.xml") from error
+    except UnsafeArchiveError as error:
+        raise FmuError(f"'{path}': {error}") from error
     except ZIP_ERRORS as error:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
     if not _is_plain(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
-    return xml, [member.filename for member in members]
+    return xml, archive.namelist()
 
 
 def _is_plain(xml: bytes) -> bool:
     """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
     text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
     declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
-    encoding = declared[1] if declared else b"utf-8"
-    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding.lower())
+    encoding = declared[1].lower() if declared else b"utf-8"
+    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
     entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
     return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
 
 
-def _check_member(path: Path, member: zipfile.ZipInfo) -> None:
-    name = PurePosixPath(member.filename)
-    link = stat.S_ISLNK(member.external_attr >> 16)
-    outside = name.is_absolute() or ".." in name.parts or "\\" in member.filename
-    if link or outside or not member.filename:
-        raise FmuError(f"'{path}' is unsafe: its member '{name}' leaves its folder")
-    if len(name.parts) > MAX_DEPTH:
-        raise FmuError(f"'{path}' is unsafe: its folders are nested deeper than {MAX_DEPTH}")
-    if member.compress_type not in METHODS:
-        raise FmuError(
-            f"'{path}': its member '{name}' is compressed by method {member.compress_type};"
-            " FMI allows to store and to deflate"
-        )
-
-
-def _content(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
-    """A member, of which no more is unzipped than the directory says that there is."""
-    member = archive.getinfo(name)
-    if member.file_size > most:
-        raise FmuError(f"'{archive.filename}': {name} is larger than {most} bytes")
-    with archive.open(member) as file:
-        return file.read(member.file_size)
-
-
 def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
     suffixes = {"linux": ".so", "win": ".dll", "darwin": ".dylib"}
-    found = set()
-    for member in members:
-        parts = PurePosixPath(member).parts
-        if not member.endswith("/") and len(parts) == 3 and parts[0] == "binaries":
-            suffix = suffixes.get(parts[1].rstrip("0123456789"), "")
-            if parts[2] == identifier + suffix:
-                found.add(parts[1])
-    return tuple(sorted(found))
+    platforms = set()
+    for folder, platform, name in (m.split("/") for m in members if m.count("/") == 2):
+        suffix = suffixes.get(platform.rstrip("0123456789"), "")
+        if folder == "binaries" and name == identifier + suffix:
+            platforms.add(platform)
+    return tuple(sorted(platforms))
 
 
 def _vendor_annotation(root: ET.Element, description: ModelDescription) -> dict[str, Any]:

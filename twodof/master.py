@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
-from itertools import accumulate, count
+from itertools import accumulate, chain, count
 from math import dist, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -167,60 +167,83 @@ def samples(
     """
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
-    fmu = run.fmu
-    names = [name for group in OUTPUTS for name in fmu.vector(group)]
-    ends = list(accumulate(len(fmu.vector(group)) for group in OUTPUTS))
-    slices = [slice(a, b) for a, b in zip([0, *ends], ends)]
-    inputs = {n: v for n, v in run.start_values.items() if fmu.variables[n].causality == "input"}
-    due = deque(run.changes)
-
-    def changes_until(t: float) -> dict[str, Value]:
-        latest: dict[str, Value] = {}
-        while due and due[0][0] <= t + TIME_TOLERANCE * run.step:
-            latest.update(due.popleft()[1])
-        return latest
-
-    with instantiate(fmu) if instance is None else nullcontext(instance) as instance:
-        first = changes_until(run.start_time)
+    inputs, due = _inputs(run), deque(run.changes)
+    with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
+        first = _changes_until(run.start_time, due, run)
         inputs.update(first)
         instance.initialise(run.start_time, run.time(run.steps), {**run.given, **first})
-        read = instance.reader(names)
         ready()
-        first_stamp, since = run.first_stamp(), run.start_time
+        take, since = _sampler(instance, run), run.start_time
         for k in count():
-            t = run.time(k)
-            values = read()
-            if not all(map(isfinite, values)):
-                text = f"the FMU gave a value that is not finite at t = {t:g} s"
-                raise SimulationError(text, k, "diverged")
+            sample = take(k, inputs, since)
             if pace is not None:
-                pace.wait(t - run.start_time, stop)
-            q, v, x, tau = (values[part] for part in slices)
-            stamp = first_stamp + round(k * run.step * NANOSECONDS)
-            sample = Sample(k, t, q, v, x, tau, inputs, since, stamp)
+                pace.wait(sample.t - run.start_time, stop)
             answer = yield sample
             if k == run.steps or stop():
                 return
-            asked = {**changes_until(t), **(resolve(fmu, answer) if answer else {})}
+            asked = {**_changes_until(sample.t, due, run), **resolve(run.fmu, answer or {})}
             latest = {name: value for name, value in asked.items() if value != inputs.get(name)}
             try:
                 if latest:
                     instance.set(latest)
-                    inputs, since = {**inputs, **latest}, t
-                instance.step(t, run.step)
+                    inputs, since = {**inputs, **latest}, sample.t
+                instance.step(sample.t, run.step)
             except SimulationError as error:
-                text = f"step {k + 1} at t = {t:g} s: {error}"
-                failure = SimulationError(text, k, error.outcome)
-                again = resume(sample, failure) if error.outcome == "discarded" else None
-                if again is None:
-                    raise failure from error
-                values_again = resolve(fmu, again)
-                kept = {n: v for n, v in values_again.items() if n in inputs}
-                inputs, since = {**inputs, **kept}, t
+                again = _resumed(run, sample, error, resume)
+                inputs = {name: again.get(name, value) for name, value in inputs.items()}
+                since = sample.t
                 instance.reset()
-                end = run.time(run.steps)
-                instance.initialise(t, end, {**run.given, **inputs, **values_again})
-                instance.step(t, run.step)
+                instance.initialise(since, run.time(run.steps), {**run.given, **inputs, **again})
+                instance.step(since, run.step)
+
+
+def _inputs(run: Experiment) -> dict[str, Value]:
+    variables = run.fmu.variables
+    return {n: v for n, v in run.start_values.items() if variables[n].causality == "input"}
+
+
+def _changes_until(
+    t: float, due: deque[tuple[float, dict[str, Value]]], run: Experiment
+) -> dict[str, Value]:
+    """What the changes that are due by t set; they are due no more."""
+    latest: dict[str, Value] = {}
+    while due and due[0][0] <= t + TIME_TOLERANCE * run.step:
+        latest.update(due.popleft()[1])
+    return latest
+
+
+def _sampler(
+    instance: Instance, run: Experiment
+) -> Callable[[int, Mapping[str, Value], float], Sample]:
+    """A function that reads the outputs after k steps, with the inputs and since when they hold."""
+    groups = [run.fmu.vector(group) for group in OUTPUTS]
+    ends = list(accumulate(map(len, groups)))
+    slices = [slice(a, b) for a, b in zip([0, *ends], ends)]
+    read = instance.reader([*chain(*groups)])
+    first_stamp = run.first_stamp()
+
+    def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
+        t, values = run.time(k), read()
+        if not all(map(isfinite, values)):
+            text = f"the FMU gave a value that is not finite at t = {t:g} s"
+            raise SimulationError(text, k, "diverged")
+        q, v, x, tau = (values[part] for part in slices)
+        stamp = first_stamp + round(k * run.step * NANOSECONDS)
+        return Sample(k, t, q, v, x, tau, inputs, since, stamp)
+
+    return take
+
+
+def _resumed(
+    run: Experiment, sample: Sample, error: SimulationError, resume: Resume
+) -> dict[str, Value]:
+    """Start values to go on with after a step that failed; where there are none, its failure."""
+    text = f"step {sample.k + 1} at t = {sample.t:g} s: {error}"
+    failure = SimulationError(text, sample.k, error.outcome)
+    settings = resume(sample, failure) if error.outcome == "discarded" else None
+    if settings is None:
+        raise failure from error
+    return resolve(run.fmu, settings)
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:

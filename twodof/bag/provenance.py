@@ -21,6 +21,21 @@ KNOWN_UNTIL = "inputs_known_until"
 MAX_SIZE = 64 * 1024**2
 PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
 
+NUMBER = int | float
+VALUES = {str: NUMBER}
+SHAPE = {
+    "fmu": {"name": str, "guid": str, "file": str},
+    "robot": str, "frame": str, "root": str, "axes": str,
+    "joints": [str],
+    "start_time": NUMBER, "step": NUMBER,
+    "start_values": VALUES,
+    "versions": dict,
+    "command_line": str,
+    "urdf": str | None,
+    "input_changes": [(NUMBER, VALUES)],
+}  # fmt: skip
+"""Of what is read back. [x]: any number of x; (x, y): these two; {str: x}: x by any name."""
+
 
 class ProvenanceFile:
     """run.json of a bag that is being written: whole at any moment, with the changes so far.
@@ -101,47 +116,30 @@ def read_provenance(path: Path) -> dict[str, Any]:
     """
     file = path / FILE
     try:
-        content = read_file(file, MAX_SIZE)
-        if content.count(b"{") + content.count(b"[") > len(content) // 8 + 1000:
-            # an empty one takes 24 times as much memory
-            raise ValueError("it is damaged")
-        found = json.loads(content.decode("utf-8"))
+        text = read_file(file, MAX_SIZE)
+        if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
+            raise ValueError("it is damaged")  # an empty one takes 24 times as much memory
+        content = json.loads(text.decode("utf-8"))
+        if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
+            if not _fits(content, SHAPE):
+                raise ValueError("it is damaged")
+            return content
     except (FileNotFoundError, NotADirectoryError):
-        return {}
+        pass
     except (OSError, ValueError, RecursionError) as error:
         raise BagError(f"cannot read '{file}': {error}") from error
-    if not isinstance(found, dict) or found.get("format") != FORMAT or "fmu" not in found:
-        return {}
-    if not _is_sound(found):
-        raise BagError(f"cannot read '{file}': it is damaged")
-    return found
+    return {}
 
 
-def _is_sound(found: dict[str, Any]) -> bool:
-    texts = [found.get(key) for key in ("robot", "frame", "root", "axes", "command_line")]
-    numbers = [found.get(key) for key in ("start_time", "step")]
-    fmu, joints = found["fmu"], found.get("joints")
-    starts, changes = found.get("start_values"), found.get("input_changes")
-    return (
-        isinstance(fmu, dict)
-        and isinstance(joints, list)
-        and isinstance(changes, list)
-        and isinstance(found.get("versions"), dict)
-        and all(isinstance(text, str) for text in texts)
-        and all(isinstance(fmu.get(key), str) for key in ("name", "guid", "file"))
-        and all(isinstance(joint, str) for joint in joints)
-        and isinstance(found.get("urdf"), str | None)
-        and all(isinstance(number, int | float) for number in numbers)
-        and _are_values(starts)
-        and all(
-            isinstance(change, list)
-            and len(change) == 2
-            and isinstance(change[0], int | float)
-            and _are_values(change[1])
-            for change in changes
+def _fits(content: Any, shape: Any) -> bool:
+    if isinstance(shape, list):
+        return isinstance(content, list) and all(_fits(element, shape[0]) for element in content)
+    if isinstance(shape, tuple):
+        same = isinstance(content, list) and len(content) == len(shape)
+        return same and all(map(_fits, content, shape))
+    if isinstance(shape, dict):
+        keys = content if str in shape else shape
+        return isinstance(content, dict) and all(
+            _fits(content.get(key), shape.get(key, shape.get(str))) for key in keys
         )
-    )
-
-
-def _are_values(found: object) -> bool:
-    return isinstance(found, dict) and all(isinstance(v, int | float) for v in found.values())
+    return isinstance(content, shape)

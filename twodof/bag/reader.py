@@ -5,16 +5,15 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import BagError
 from ..files import is_being_written
-from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, STORE, TARGET, JointStateLayout
+from ..ros.cdr import JointStateLayout, MixtureError, unpack_point
+from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, STORE, TARGET
 from .provenance import read_provenance
 from .recording import Array, Heard, Recording, Stamps, TopicCount
 from .records import Allowance, Channel, DamageError, read_messages, storage_files
@@ -113,10 +112,8 @@ class _JointStates:
         self.names: tuple[str, ...] = ()
         self._path = path
         self._layout: JointStateLayout | None = None
-        self._names: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = {}
         self._stamps = array("q")
         self._numbers = [array("d") for _ in range(3)]
-        self._sizes: list[int] = []
         self._batch: list[bytes] = []
         self._held = 0  # bytes in the batch
 
@@ -140,61 +137,24 @@ class _JointStates:
 
     def _decode(self) -> None:
         batch, self._batch, self._held = self._batch, [], 0
+        largest = max(map(len, batch))
+        if largest > MAX_JOINT_STATE:
+            raise BagError(f"'{self._path}' has a joint state of {largest} bytes")
         try:
-            numbers = self._decoded(batch)
-        except BagError:
-            raise
+            if self._layout is None:
+                first: Any = STORE.deserialize_cdr(batch[0], JOINT_STATE)
+                sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
+                self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
+                self.names = tuple(first.name)
+            numbers = self._layout.unpack(batch)
+        except MixtureError as error:
+            raise BagError(f"'{self._path}' has joint states of different {error}") from error
         except Exception as error:  # rosbags raises anything where a message is no JointState
             packed = batch[0].startswith(ZSTD_MAGIC)
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
-        sizes = [part.shape[1] for part in numbers]
-        if sizes != (self._sizes or sizes):
-            raise BagError(f"'{self._path}' has joint states of different sizes")
-        self._sizes = sizes
         for stored, part in zip(self._numbers, numbers, strict=True):
             stored.frombytes(part.tobytes())
-
-    def _decoded(self, batch: Sequence[bytes]) -> list[Array]:
-        largest = max(map(len, batch))
-        if largest > MAX_JOINT_STATE:
-            raise BagError(f"'{self._path}' has a joint state of {largest} bytes")
-        if self._layout is None:
-            first: Any = STORE.deserialize_cdr(batch[0], JOINT_STATE)
-            sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
-            self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
-            self.names = tuple(first.name)
-            self._names = {order: _names(first.name, order) for order in "<>"}
-        return self._layout.unpack(batch) or self._decoded_each(batch)
-
-    def _decoded_each(self, batch: Sequence[bytes]) -> list[Array]:
-        """Of messages in another frame, or with other bytes in the gaps that CDR leaves."""
-        rows = [self._decoded_one(data) for data in batch]
-        try:
-            return [np.array(part, dtype=np.float64) for part in zip(*rows, strict=True)]
-        except ValueError as error:
-            raise BagError(f"'{self._path}' has joint states of different sizes") from error
-
-    def _decoded_one(self, data: bytes) -> list[Array]:
-        """Positions, velocities, efforts; rosbags would take seconds a megabyte for the names."""
-        order = "<" if data[1] else ">"
-        number = struct.Struct(f"{order}I")
-        expected, told = self._names[order]
-        start = 16 + number.unpack_from(data, 12)[0]  # after the header's frame
-        start += -start % 4
-        end = start + len(expected)
-        if ((np.frombuffer(data[start:end], np.uint8) ^ expected) & told).any():
-            raise BagError(f"'{self._path}' has joint states of different joints")
-        parts = []
-        for _ in range(3):
-            (size,) = number.unpack_from(data, end)
-            end += 4
-            end += (4 - end) % 8 if size else 0
-            parts.append(np.frombuffer(data, f"{order}f8", size, end))
-            end += 8 * size
-        if len(data) - end > 3:
-            raise ValueError
-        return parts
 
 
 class _Ends(_JointStates):
@@ -218,15 +178,12 @@ class _Targets:
         self._stamps, self._points = array("q"), array("d")
 
     def add(self, stamp: int, data: bytes) -> None:
-        """A PointStamped: stamp, frame, padding to 8 bytes, x, y, z."""
+        """Take a PointStamped."""
         try:
-            order = "<" if data[1] else ">"
-            end = 16 + int(struct.unpack_from(f"{order}I", data, 12)[0])
-            point = struct.unpack_from(f"{order}3d", data, end + (4 - end) % 8)
+            frame, point = unpack_point(data)
         except (IndexError, struct.error):
             self._sound = False
             return
-        frame = data[16:end]
         self._sound &= self._frame in (None, frame)
         self._frame = frame
         self._stamps.append(stamp)
@@ -241,15 +198,4 @@ class _Targets:
         points = np.asarray(self._points).reshape(-1, 3)[order]
         latest = np.searchsorted(own[order], stamps, side="right") - 1
         heard = np.where((latest >= 0)[:, None], points[latest], np.nan)
-        return Heard(self._frame.rstrip(b"\0").decode("utf-8", "replace"), heard)
-
-
-def _names(names: Sequence[str], order: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """A list of names in CDR, and 255 where its bytes say something, 0 in the gaps."""
-    expected, told = bytearray(struct.pack(f"{order}I", len(names))), bytearray(b"\xff" * 4)
-    for name in names:
-        text = name.encode() + b"\0"
-        gap = bytes(-len(text) % 4)
-        expected += struct.pack(f"{order}I", len(text)) + text + gap
-        told += b"\xff" * (4 + len(text)) + gap
-    return np.frombuffer(expected, np.uint8), np.frombuffer(told, np.uint8)
+        return Heard(self._frame.decode("utf-8", "replace"), heard)

@@ -87,8 +87,8 @@ class Allowance:
 
 def storage_files(folder: Path) -> list[Path]:
     """The files that hold a bag's messages, in the order in which they were written."""
-    found = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
-    return sorted(found, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
+    files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
+    return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
 
 def read_messages(file: Path, allowance: Allowance) -> Iterator[tuple[Channel, int, bytes]]:
@@ -132,7 +132,7 @@ def _mcap_messages(path: Path, allowance: Allowance) -> Iterator[tuple[Channel, 
                     yield channels[channel], stamp, chunk[position + MESSAGE_HEAD.size : end]
                 elif opcode == SCHEMA:
                     allowance.spend(TEXT * length)
-                    number, name, _, text = _fields("Hsss", chunk, position + HEAD.size)
+                    number, name, _, text, _ = _fields("Hsss", chunk, position + HEAD.size)
                     schemas[number] = (name, text)
                 elif opcode == CHANNEL:
                     allowance.spend(TEXT * length)
@@ -176,9 +176,8 @@ def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[
 
 def _unpack(path: Path, content: bytes, allowance: Allowance) -> bytes:
     """The records of a chunk."""
-    _, _, size, crc, compression = _fields("QQQIs", content, 0)
-    start = 28 + 4 + len(compression.encode()) + 8
-    packed = content[start : start + struct.unpack_from("<Q", content, start - 8)[0]]
+    _, _, size, crc, compression, length, start = _fields("QQQIsQ", content, 0)
+    packed = content[start : start + length]
     if size > MAX_CHUNK:
         raise DamageError(f"'{path.name}' has a chunk of {size} bytes")
     allowance.spend(size)
@@ -199,15 +198,12 @@ def _unpack(path: Path, content: bytes, allowance: Allowance) -> bytes:
 def _channel(
     content: bytes, position: int, schemas: dict[int, tuple[str, str]]
 ) -> tuple[int, Channel]:
-    number, schema, topic, encoding = _fields("HHss", content, position)
-    position += 4 + 4 + len(topic.encode()) + 4 + len(encoding.encode())
-    (length,) = struct.unpack_from("<I", content, position)
-    metadata = content[position + 4 : position + 4 + length]
+    number, schema, topic, encoding, length, position = _fields("HHssI", content, position)
+    metadata = content[position : position + length]
     entries, position = {}, 0
     while position < len(metadata):
-        key, value = _fields("ss", metadata, position)
+        key, value, position = _fields("ss", metadata, position)
         entries[key] = value
-        position += 8 + len(key.encode()) + len(value.encode())
     name, definition = schemas[schema]
     qos = entries.get("offered_qos_profiles", "")
     return number, Channel(
@@ -216,20 +212,20 @@ def _channel(
 
 
 def _fields(form: str, content: bytes, position: int) -> list[Any]:
-    """Fields of a record: struct's letters, and s for a text with its length before it."""
-    found: list[Any] = []
+    """Fields of a record, and where they end; struct's letters, and s for a text and its length."""
+    values: list[Any] = []
     for letter in form:
         if letter == "s":
             (length,) = struct.unpack_from("<I", content, position)
             position += 4
             if position + length > len(content):
                 raise struct.error
-            found.append(content[position : position + length].decode())
+            values.append(content[position : position + length].decode())
             position += length
         else:
-            found += struct.unpack_from(f"<{letter}", content, position)
+            values += struct.unpack_from(f"<{letter}", content, position)
             position += struct.calcsize(f"<{letter}")
-    return found
+    return [*values, position]
 
 
 def _sqlite3_messages(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
@@ -263,19 +259,20 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
             uri = (folder / path.name).as_uri()
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
-            made = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"))
+            tables = "SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"
+            schema = dict(database.execute(tables))
             database.set_progress_handler(None, 0)
-            if not made.keys() >= {"topics", "messages"}:
+            if not schema.keys() >= {"topics", "messages"}:
                 raise DamageError(f"'{path.name}' has no messages")
-            if not all(sql.startswith(PLAIN) for sql in made.values()):
+            if not all(sql.startswith(PLAIN) for sql in schema.values()):
                 raise DamageError(f"'{path.name}' has views, triggers or virtual tables")
             yield database
 
 
 def _unfinished(path: Path) -> list[Path]:
     """The files that a writer which died leaves beside its database."""
-    found = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
-    return [file for file in found if file.is_file() and file.stat().st_size]
+    files = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
+    return [file for file in files if file.is_file() and file.stat().st_size]
 
 
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
@@ -300,8 +297,8 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
     a circle, or be part of many rows. Nor may there be others before them, to be passed by.
     """
     columns = TABLES[table].split()
-    found = database.execute(f"PRAGMA table_xinfo({table})")
-    stored = ["" if computed else name for _, name, *_, computed in found]
+    infos = database.execute(f"PRAGMA table_xinfo({table})")
+    stored = ["" if computed else name for _, name, *_, computed in infos]
     known = [name for name in columns if name in stored]
     if stored[: len(known)] != known:
         raise DamageError(f"'{path.name}' has {table} that are not those of ROS 2")

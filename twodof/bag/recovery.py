@@ -22,10 +22,9 @@ from ..errors import BagError
 from ..files import lock, read_file, sync
 from . import provenance
 from .records import Allowance, Channel, DamageError, read_messages, storage_files
-from .storage import KINDS, BagWriter, check_path
+from .storage import KINDS, MAX_METADATA, PROVENANCE_KEY, BagWriter, check_path
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
-MAX_METADATA = 64 * 1024**2  # bytes
 MAX_DEFINITION = 64 * 1024  # bytes
 NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
 
@@ -56,20 +55,20 @@ def recover(path: str | Path) -> Recovered:
     Raises:
         BagError: there is nothing to recover, the bag is being written, or the new one cannot be.
     """
-    found = Path(path)
-    folder = found.resolve()
+    bag = Path(path)
+    folder = bag.resolve()
     original = folder.with_name(f"{folder.name}.unfinished")
     work = folder.with_name(f".{folder.name}.recovering")
     try:
-        with _held(found, folder, original, work):
+        with _held(bag, folder, original, work):
             files = storage_files(folder)
             if not files:
-                raise BagError(f"'{found}' has no .mcap or .db3 file to recover")
+                raise BagError(f"'{bag}' has no .mcap or .db3 file to recover")
             if len({file.suffix for file in files}) > 1:
-                raise BagError(f"'{found}' has .mcap and .db3 files; leave those of one kind in it")
+                raise BagError(f"'{bag}' has .mcap and .db3 files; leave those of one kind in it")
             counts = _counts_if_whole(folder, files)
             if counts is not None:
-                return Recovered(found, None, counts, "")
+                return Recovered(bag, None, counts, "")
             check_path(folder, KINDS[files[0].suffix])
             if original.exists():
                 raise BagError(f"'{original}', where the old bag would go, exists; move it away")
@@ -79,22 +78,22 @@ def recover(path: str | Path) -> Recovered:
             (work / folder.name).rename(folder)
             sync(folder.parent)
     except BlockingIOError as error:
-        raise BagError(f"the bag '{found}' is still being written, or recovered") from error
+        raise BagError(f"the bag '{bag}' is still being written, or recovered") from error
     except (OSError, sqlite3.Error, WriterError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise BagError(f"cannot recover the bag '{found}': {reason}; nothing is lost") from error
-    return Recovered(found, original, counts, damage)
+        raise BagError(f"cannot recover the bag '{bag}': {reason}; nothing is lost") from error
+    return Recovered(bag, original, counts, damage)
 
 
 @contextmanager
-def _held(found: Path, folder: Path, original: Path, work: Path) -> Iterator[None]:
+def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]:
     """Keep others from a bag; what a recovery left that was killed is undone, as is this one's.
 
     Between its two renames there is nothing in the bag's place: the lock goes with the old one.
     """
     between = not folder.exists() and (work / folder.name).is_dir()
     if not between and not folder.is_dir():
-        raise BagError(f"there is no bag '{found}'")
+        raise BagError(f"there is no bag '{bag}'")
     held = lock(original if between else folder)
     try:
         _undo(folder, original, work)
@@ -121,20 +120,20 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
             counts.update(channel.topic for channel, _, _ in read_messages(file, allowance))
     except (OSError, DamageError):
         return None
-    told = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
-    return dict(counts) if told and int(told[1]) == counts.total() else None
+    stated = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
+    return dict(counts) if stated and int(stated[1]) == counts.total() else None
 
 
 def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
     """Write what can be read into a new bag; messages by topic, and what ended the reading."""
     damage = []
     allowance = Allowance()
-    told = folder / provenance.FILE
+    run_file = folder / provenance.FILE
     others = set()
     writer = BagWriter(new, KINDS[files[0].suffix])
     with suppress(BagError):  # damaged: the messages are worth saving without it
         if provenance.read_provenance(folder):
-            writer.set_custom_data("twodof", told.read_text("utf-8").strip())
+            writer.set_custom_data(PROVENANCE_KEY, run_file.read_text("utf-8").strip())
     with writer:
         topics = _Topics(writer)
         for file in files:
@@ -148,8 +147,8 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
                 damage.append(str(error))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
-    if told.is_file():
-        shutil.copyfile(told, new / told.name)
+    if run_file.is_file():
+        shutil.copyfile(run_file, new / run_file.name)
     with Reader(new) as reader:  # whole is what another reader opens
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     sync(*new.iterdir(), new)

@@ -23,10 +23,16 @@ from ..files import lock, read_file, sync
 from ..master import Sample, Sink
 from ..ros.messages import JOINT_STATES, STORE, Messages, Serialised
 from .provenance import ProvenanceFile, read_provenance
-from .storage import BATCH_SIZE, REMOVED, STORAGES, BagWriter, check_path
+from .storage import (
+    BATCH_SIZE,
+    MAX_METADATA,
+    PROVENANCE_KEY,
+    REMOVED,
+    STORAGES,
+    BagWriter,
+    check_path,
+)
 
-MAX_METADATA = 64 * 1024**2  # bytes
-PROVENANCE_KEY = "twodof"
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time

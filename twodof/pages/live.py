@@ -18,7 +18,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..children import Child
 from ..errors import PageError
@@ -26,14 +25,9 @@ from ..experiments import Experiment, Setting, Value, experiment
 from ..fmu import Fmu, load_fmu, read_resource, urdf_text
 from ..plant.urdf import Joint, RobotError, read_urdf
 from .loop import IDLE, Loop, News
-from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Page
+from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
 from .robot import PageRobot
 from .widgets import Plot, Readout, Switch
-
-Array = NDArray[np.float64]
-
-Change = Callable[[dict[str, Setting]], None]
-"""Asks for inputs by name."""
 
 PLOTTED = 10.0  # s
 PLOT_POINTS = 250  # while it plays: drawing holds a browser up
@@ -77,9 +71,11 @@ class Controls:
         self._set_scene()
         self._add_controls(joints)
 
+    def _change(self, values: dict[str, Setting]) -> None:
+        self._changed = time.perf_counter()
+        self._tell("change", values)
+
     def _tell(self, order: str, value: Any = None) -> None:
-        if order == "change":
-            self._changed = time.perf_counter()
         with self._sending:
             self._loop.send((order, value))
 
@@ -143,21 +139,17 @@ class Controls:
         tell = self._tell
         self._play = Switch(page, "Play", "Pause", partial(tell, "play"), True)
         others = gui.add_button_group("", ("Single step", "Reset"))
-        others.on_click(
-            lambda event: self._tell("step" if others.value == "Single step" else "reset")
-        )
-        self._record = Switch(
-            page, "Record", "Stop recording", partial(tell, "record"), False, color="red"
-        )
+        others.on_click(lambda event: tell("step" if others.value == "Single step" else "reset"))
+        record = partial(tell, "record")
+        self._record = Switch(page, "Record", "Stop recording", record, False, color="red")
         self._readout = Readout(page, fmu.joints)
 
-        change = partial(self._tell, "change")
-        self._add_target_fields(change)
+        self._add_target_fields()
         with gui.add_folder("Gains"):
             for group, unit in (("Kp", "s⁻²"), ("Kd", "s⁻¹")):
-                self._add_gain(group, unit, change)
+                self._add_gain(group, unit)
         if fmu.vector("tau_ext"):
-            self._add_disturbance(joints, change)
+            self._add_disturbance(joints)
         self._units = ["m" if joint.prismatic else "rad" for joint in joints]
         units = " or ".join(dict.fromkeys(self._units))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
@@ -167,7 +159,7 @@ class Controls:
             Plot(page, error, ["error"], age, rows[:, -1:], marked=False),
         )
 
-    def _add_target_fields(self, change: Change) -> None:
+    def _add_target_fields(self) -> None:
         """Numbers that go with the marker in the scene."""
         target, gui = self._target, self._page.gui
         axes = {axis: "xyz".index(axis) for axis in self._fmu.axes}
@@ -180,7 +172,7 @@ class Controls:
         moving = Lock()  # viser calls from several threads
 
         def move(place: Array) -> None:
-            change({"x_des": tuple(float(place[k]) for k in axes.values())})
+            self._change({"x_des": tuple(float(place[k]) for k in axes.values())})
 
         def dragged(event: Any) -> None:
             with moving:
@@ -201,7 +193,7 @@ class Controls:
         for axis, k in axes.items():
             fields[axis].on_update(partial(typed, k))
 
-    def _add_disturbance(self, joints: Sequence[Joint], change: Change) -> None:
+    def _add_disturbance(self, joints: Sequence[Joint]) -> None:
         names, starts = self._fmu.vector("tau_ext"), self._starts
         sliders = {}
         with self._page.gui.add_folder("Disturbance", expand_by_default=len(names) <= 3):
@@ -218,7 +210,7 @@ class Controls:
             release = self._page.gui.add_button("No disturbance")
 
         def pushed(event: Any) -> None:
-            change({name: float(slider.value) for name, slider in sliders.items()})
+            self._change({name: float(slider.value) for name, slider in sliders.items()})
 
         def released(event: Any) -> None:
             for slider in sliders.values():
@@ -228,14 +220,14 @@ class Controls:
             slider.on_update(pushed)
         release.on_click(released)
 
-    def _add_gain(self, group: str, unit: str, change: Change) -> None:
+    def _add_gain(self, group: str, unit: str) -> None:
         names = self._fmu.vector(group)
         if not names:
             return
         start = float(self._starts[names[0]])
         most = max(4 * start, 200.0 if group == "Kp" else 100.0)
         slider = self._page.gui.add_slider(f"{group}, {unit}", 0.0, most, most / 400, start)
-        slider.on_update(lambda event: change({group: float(slider.value)}))
+        slider.on_update(lambda event: self._change({group: float(slider.value)}))
 
     def _show_numbers(self, now: float) -> None:
         news, sample = self._news, self._news.sample

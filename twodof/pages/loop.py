@@ -25,7 +25,7 @@ MOST_ROWS = 10_000  # that wait for a page to ask
 IDLE = 0.05  # s between two looks at whether to go on
 
 
-class Excerpt:
+class Excerpt(Bag):
     """A bag that begins in the midst of a run, with the sample that is at hand.
 
     Its provenance is that of a run which starts there: from the joint positions and velocities and
@@ -33,6 +33,7 @@ class Excerpt:
     """
 
     def __init__(self, path: Path, run: Experiment, first: Sample, command_line: str) -> None:
+        super().__init__(path, scene=True, effort=bool(first.tau), command_line=command_line)
         state = {
             name: value
             for group, values in (("q_start", first.q), ("v_start", first.v))
@@ -41,23 +42,12 @@ class Excerpt:
         starts = {**run.start_values, **first.inputs, **state}
         run = replace(run, start_time=first.t, start_values=starts, changes=[])
         self._later = run.first_stamp() - first.stamp
-        bag = Bag(path, scene=True, effort=bool(first.tau), command_line=command_line)
-        self._bag = bag.begin(run).__enter__()
-        self.path = path
+        self.begin(run).__enter__()
         self.write(first)
 
     def write(self, sample: Sample) -> None:
         """Write one sample."""
-        self._bag.write(sample._replace(stamp=sample.stamp + self._later))
-
-    @property
-    def count(self) -> int:
-        """Number of samples so far."""
-        return self._bag.count
-
-    def close(self) -> None:
-        """Close the bag."""
-        self._bag.__exit__(None, None, None)
+        super().write(sample._replace(stamp=sample.stamp + self._later))
 
 
 class News(NamedTuple):
@@ -230,7 +220,7 @@ class Loop:
         if recording is None:
             return
         try:
-            recording.close()
+            recording.__exit__(None, None, None)
             self.recorded.append(recording.path)
             self._notes.append(("Recorded", f"{recording.path}, {recording.count} samples"))
         except BagError as error:

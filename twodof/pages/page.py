@@ -37,8 +37,6 @@ Array = NDArray[np.float64]
 HOST, PORT = "127.0.0.1", 8080
 RATE = 30.0  # Hz, of what moves
 PLOT_RATE = 4.0  # Hz, of what is drawn anew
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of Okabe & Ito, "Color universal design", 2008, as in the plots."""
 TARGET, TRAIL, PATH = (213, 94, 0), (0, 114, 178), (170, 180, 190)
 FIELD_OF_VIEW = 0.6  # rad, vertical
 LOOPBACK = ("127.0.0.1", "::1", "localhost")

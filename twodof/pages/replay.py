@@ -11,21 +11,19 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag.reader import read_bag
 from ..bag.recording import Recording
 from ..data import data_file
 from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
-from ..files import shown, write_file
+from ..files import refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
+from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks
-from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Page
+from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
 from .robot import PageRobot, ReadMesh
 from .widgets import Plot, Readout, Switch
-
-Array = NDArray[np.float64]
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}
 SETTLING = 0.3  # s after which scrubbing is over
@@ -33,7 +31,6 @@ SLIDER_RATE = 4.0  # Hz: a slider that moves more often is hard to use in a slow
 TRAIL_TIME = 1.5  # s
 TRAIL_POINTS, PATH_POINTS = 60, 1500
 MOST_FRAMES = 2000
-SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
 class Replay:
@@ -107,16 +104,15 @@ class Replay:
             return renamed, files.get
         text = bag.provenance["urdf"]
         if fmu is not None:
-            given = load_fmu(fmu)
-            return text, partial(read_resource, given)
-        made = bag.provenance["fmu"]
+            return text, partial(read_resource, load_fmu(fmu))
+        maker = bag.provenance["fmu"]
         for folder in (Path(), bag.path.resolve().parent):
             try:
-                found = load_fmu(folder / Path(made["file"]).name)
+                candidate = load_fmu(folder / Path(maker["file"]).name)
             except FmuError:
                 continue
-            if found.guid == made["guid"]:
-                return text, partial(read_resource, found)
+            if candidate.guid == maker["guid"]:
+                return text, partial(read_resource, candidate)
         shipped = data_file("urdf", "2dof.urdf")
         meshes = data_file("meshes")
         renamed, files = collect_meshes(shipped.read_text("utf-8"), shipped.parent, meshes)
@@ -126,7 +122,7 @@ class Replay:
 
     def _set_scene(self) -> None:
         page, track, motion = self._page, self._track, self._track.motion
-        made = track.recording.provenance
+        starts = track.recording.provenance.get("start_values", {})
         self._target: Any = None
         self._targets = np.empty((0, 3))
         if motion is not None and self._figure is not None:
@@ -138,7 +134,7 @@ class Replay:
                 for k, axis in enumerate(track.task.axes):
                     self._targets[:, "xyz".index(axis)] = track.task.target[:, k]
                 points.append(self._targets[:: max(1, len(q) // PATH_POINTS)])
-            gravity = [-made.get("start_values", {}).get(f"gravity[{i}]", 0.0) for i in (1, 2, 3)]
+            gravity = [-starts.get(f"gravity[{i}]", 0.0) for i in (1, 2, 3)]
             up = gravity if any(gravity) else (0.0, 0.0, 1.0)
             size = page.frame(np.vstack(points), track.task.axes if track.task else "", up)
             if track.task is not None:
@@ -267,7 +263,8 @@ class Replay:
             PageError: it cannot be written.
         """
         content = self._page.recording(self._frames(), f"{self._track.name} - twodof")
-        _write(path, content)
+        with refusing(PageError, f"write '{path}'"):
+            write_file(path, content)
 
     def _frames(self) -> Iterator[float]:
         duration = float(self._t[-1])
@@ -284,13 +281,6 @@ def nearest(t: Array, time: float) -> int:
     if k == 0:
         return 0
     return k - 1 if k == len(t) or time - t[k - 1] <= t[k] - time else k
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_file(path, content)
-    except OSError as error:
-        raise PageError(f"cannot write '{path}': {error.strerror}") from error
 
 
 def view(

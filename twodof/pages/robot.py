@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import PageError
-from ..kinematics import Kinematics
+from ..kinematics import Array, Kinematics
 from ..plant.urdf import Joint, RobotError, Urdf, read_urdf
+from ..plots.scales import COLOURS
 from ..ros.scene import floats, load_mesh, origin
-from .page import COLOURS, Page
+from .page import Page
 
-Array = NDArray[np.float64]
 ReadMesh = Callable[[str], bytes | None]
 """The bytes of a mesh by its name ``meshes/…``, None where it is missing."""
 

@@ -8,12 +8,10 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .page import COLOURS, Page
+from ..plots.scales import COLOURS, GREY, SMALLEST_RANGE
+from .page import Array, Page
 
-Array = NDArray[np.float64]
-SMALLEST_RANGE = 1e-3  # of values in a plot
 BUCKETS = 400
 """Parts of a long line over time that each keep their extremes; a plot is as many pixels wide."""
 
@@ -63,7 +61,7 @@ class Readout:
     def show(self, rows: Mapping[str, str]) -> None:
         """Show values by their names."""
         lines = "".join(
-            f'<tr><td style="color:{self._colours.get(name, "#5b6570")};padding:1px 10px 1px 0">'
+            f'<tr><td style="color:{self._colours.get(name, GREY)};padding:1px 10px 1px 0">'
             f"{html.escape(name)}</td>"
             f'<td data-value="{html.escape(name)}">{html.escape(value)}</td></tr>'
             for name, value in rows.items()

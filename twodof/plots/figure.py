@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import PlotError
-from ..files import write_file
+from ..files import refusing, write_file
 from ..version import __version__
+from .scales import GREY, HAIR, INK
 
 try:
     import matplotlib.style
@@ -26,11 +27,8 @@ except ImportError as missing:
         f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
     ) from missing
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of Okabe & Ito, "Color universal design", 2008, without their yellow, too pale on paper."""
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (7, 1.5, 1, 1.5)), (0, (1.5, 1)))
 """With the colours, whose number this does not divide, 28 tracks look different."""
-INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
 STYLE = {
     "font.size": 8.0, "axes.titlesize": 8.5, "axes.labelsize": 8.0, "axes.titlelocation": "left",
     "text.color": INK, "text.parse_math": False, "axes.labelcolor": INK, "axes.edgecolor": GREY,
@@ -89,7 +87,9 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     path = Path(output) if output is not None else _free_name(drawing.name)
     kind = file_kind(path)
     figure = drawn(drawing)
-    _write(path, _html(figure, drawing) if kind == "html" else _rendered(figure, kind))
+    content = _html(figure, drawing) if kind == "html" else _rendered(figure, kind)
+    with refusing(PlotError, f"write '{path}'"):
+        write_file(path, content)
     return path
 
 
@@ -175,13 +175,6 @@ tr {{ border-top: 1px solid {HAIR}; }}
 </body>
 </html>
 """.encode()
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        write_file(path, content)
-    except OSError as error:
-        raise PlotError(f"cannot write '{path}': {error.strerror}") from error
 
 
 def _free_name(name: str) -> Path:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ..errors import PlotError
 from ..sweeps.metrics import METRICS
 from ..sweeps.results import RANKED, ranked
-from .figure import COLOURS, GREY, INK, PALE, TICK_STYLE, Drawing
+from .figure import TICK_STYLE, Drawing
+from .scales import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
@@ -48,14 +49,11 @@ BEST: dict[str, Any] = {
 }
 CRITICAL: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
 MISSING: dict[str, Any] = {
-    "facecolor": "#e6e9ec",
+    "facecolor": HAIR,
     "hatch": "////",
     "edgecolor": "#c3cad1",
     "linewidth": 0.0,
 }
-
-
-SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
 class _Panel(NamedTuple):
@@ -63,7 +61,7 @@ class _Panel(NamedTuple):
 
     metric: str
     x: str
-    y: str | None
+    y: str | None = None
 
 
 def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -> Drawing:
@@ -149,9 +147,7 @@ def _panels(table: pandas.DataFrame, varied: Sequence[str]) -> tuple[list[_Panel
     telling = [metric for metric in METRICS if table[metric].nunique() > 1]
     if not telling:
         telling = [metric for metric in METRICS if table[metric].notna().any()]
-    if len(varied) == 1:
-        return [_Panel(metric, varied[0], None) for metric in telling], 3
-    if len(varied) == 2:
+    if len(varied) <= 2:
         return [_Panel(metric, *varied) for metric in telling], 3
     chosen = [metric for metric in PAIRED if metric in telling] or telling[:1]
     pairs = list(combinations(varied, 2))[:MOST_PAIRS]

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from math import ceil
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..bag.provenance import KNOWN_UNTIL
 from ..bag.reader import read_bag
 from ..bag.recording import Recording, Schedule
 from ..errors import PlotError
 from ..files import read_file, shown
-from ..kinematics import Kinematics
-from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, check_axes, read_urdf
-from .closed_form import Held, task_error
+from ..plant.urdf import UNBOUNDED, RobotError
+from .closed_form import Array, Held, task_error
+from .robot import Motion, Robot, is_singular, load_robot, motion_of
 
-Array = NDArray[np.float64]
-
-DEFAULT_FRAME = "EndEffector"
 AT_LIMIT = 1e-9  # of a limit's size
 NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
-LOOKS = 2000  # for singularities, along the way
 MAX_URDF = 8 * 1024**2
 UNITS = {
     "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
@@ -56,44 +50,11 @@ class JointTrack:
     @property
     def at_limit(self) -> bool:
         """Whether it has been at one of its limits."""
-        found = [limit for limit in (self.low, self.high) if limit is not None]
         return any(
             bool((np.abs(self.q - limit) <= AT_LIMIT * max(1.0, abs(limit))).any())
-            for limit in found
+            for limit in (self.low, self.high)
+            if limit is not None
         )
-
-
-@dataclass(frozen=True)
-class Reach:
-    """The circle that a planar arm cannot leave: centre (3 values) and radius, m, and its normal.
-
-    ``normal`` is 0, 1 or 2 for the root's x, y or z.
-    """
-
-    centre: Array
-    radius: float
-    normal: int
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What the robot's geometry makes of the joints' motion; points in the root frame, m.
-
-    Attributes:
-        robot: the robot's name.
-        frame, root: the end effector's link, and the link that points are expressed in.
-        path: the end effector's, N × 3.
-        start, end: the arm at the first and the last sample: root, joints and end effector, × 3.
-        reach: None where the arm does not move in a plane of two of the root's axes.
-    """
-
-    robot: str
-    frame: str
-    root: str
-    path: Array
-    start: Array
-    end: Array
-    reach: Reach | None
 
 
 @dataclass(frozen=True)
@@ -192,71 +153,25 @@ def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> 
 def _with_robot(
     bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None
 ) -> Track:
-    made = bag.provenance
-    schedule = bag.schedule
+    run = bag.provenance
     robot = None
     if urdf is not None:
         try:
-            robot = _load(urdf, frame or made.get("frame") or "", made.get("axes") or "xyz")
+            robot = load_robot(urdf, frame or run.get("frame") or "", run.get("axes") or "xyz")
         except RobotError as error:
             raise PlotError(f"{source}: {error}") from error
     joints = _joints(bag, names, robot)
     motion = task = None
     if robot is not None:
         q = _in_robot_order(bag, robot, names, bag.q)
-        motion = _motion(robot, q)
-        if made.get("frame", robot.frame) == robot.frame and _has_target(bag, robot):
+        motion = motion_of(robot, q)
+        if run.get("frame", robot.frame) == robot.frame and _has_target(bag, robot):
             v = _in_robot_order(bag, robot, names, bag.v)
-            task = _task(bag, robot, q, v[0], motion.path)
-            disturbances = _disturbances(robot, q, joints, task, schedule)
-            task = replace(task, disturbances=disturbances)
-    return Track(bag, _settings(bag, schedule), bag.t, joints, motion, task)
+            task = _task(bag, robot, joints, q, v[0], motion.path)
+    return Track(bag, _settings(bag), bag.t, joints, motion, task)
 
 
-# --- the robot ---
-
-
-class _Robot(NamedTuple):
-    """What a picture needs of a robot: geometry, limits and damping.
-
-    Attributes:
-        urdf: the robot; its masses need not make sense.
-        kinematics: of the joints in ``moving``.
-        moving: all joints that move, mimic joints too, which move on their own in a bag.
-        frame: the end effector's link.
-        axes: the task's, of "xyz".
-    """
-
-    urdf: Urdf
-    kinematics: Kinematics
-    moving: tuple[Joint, ...]
-    frame: str
-    axes: str
-
-    @property
-    def chain(self) -> list[Joint]:
-        """The joints that move the frame, from the root on."""
-        return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
-
-
-def _load(text: str, frame: str, axes: str) -> _Robot:
-    check_axes(axes)
-    urdf = read_urdf(text)
-    moving = tuple(joint for joint in urdf.joints.values() if joint.moves)
-    if not frame:
-        depths = {link: sum(j.moves for j in urdf.chain(link)) for link in urdf.links}
-        last = max(enumerate(urdf.links), key=lambda link: (depths[link[1]], link[0]))[1]
-        frame = DEFAULT_FRAME if DEFAULT_FRAME in urdf.links else last
-    if frame not in urdf.links:
-        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
-    kinematics = Kinematics(urdf, [joint.name for joint in moving])
-    robot = _Robot(urdf, kinematics, moving, frame, axes)
-    if not robot.chain:
-        raise RobotError(f"no joint moves the frame '{frame}'")
-    return robot
-
-
-def _joints(bag: Recording, names: Sequence[str], robot: _Robot | None) -> tuple[JointTrack, ...]:
+def _joints(bag: Recording, names: Sequence[str], robot: Robot | None) -> tuple[JointTrack, ...]:
     starts = bag.provenance.get("start_values", {})
     joints = []
     for i, name in enumerate(names):
@@ -267,20 +182,14 @@ def _joints(bag: Recording, names: Sequence[str], robot: _Robot | None) -> tuple
             unit = "m" if joint.prismatic else "rad"
             low = joint.low if low is None else low
             high = joint.high if high is None else high
-        joints.append(
-            JointTrack(
-                name,
-                unit,
-                None if low is None or low <= -UNBOUNDED else low,
-                None if high is None or high >= UNBOUNDED else high,
-                bag.q[:, i],
-                bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0),
-            )
-        )
+        low = None if low is None or low <= -UNBOUNDED else low
+        high = None if high is None or high >= UNBOUNDED else high
+        v = bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0)
+        joints.append(JointTrack(name, unit, low, high, bag.q[:, i], v))
     return tuple(joints)
 
 
-def _in_robot_order(bag: Recording, robot: _Robot, names: Sequence[str], values: Array) -> Array:
+def _in_robot_order(bag: Recording, robot: Robot, names: Sequence[str], values: Array) -> Array:
     """Columns of a bag's q or v for the robot's joints; 0 for those that do not move the frame.
 
     Raises:
@@ -300,62 +209,19 @@ def _in_robot_order(bag: Recording, robot: _Robot, names: Sequence[str], values:
     return ordered
 
 
-def _motion(robot: _Robot, q: Array) -> Motion:
-    start, end = _skeletons(robot, q[[0, -1]])
-    return Motion(
-        robot=robot.urdf.name,
-        frame=robot.frame,
-        root=robot.urdf.root,
-        path=robot.kinematics.path(robot.frame, q),
-        start=start,
-        end=end,
-        reach=_reach(robot),
-    )
-
-
-def _skeletons(robot: _Robot, q: Array) -> Array:
-    """Origins of the root, of the joints that move the frame, and of the frame; N × points × 3."""
-    chain = robot.urdf.chain(robot.frame)
-    places = robot.kinematics.along(chain, q)
-    shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), -1]
-    return np.stack([places[i].translation for i in shown], axis=1)
-
-
-def _reach(robot: _Robot) -> Reach | None:
-    """The circle, where all joints turn about one of the root's axes.
-
-    Distances between neighbouring joints do not change, so no point is farther than their sum; in
-    a plane the stretched arm is that long. For arms in space the sum would be too large.
-    """
-    at_zero = np.zeros((1, len(robot.moving)))
-    chain = robot.urdf.chain(robot.frame)
-    places = robot.kinematics.along(chain, at_zero)[1:]
-    turns = np.abs(
-        [
-            place.rotation.apply(joint.axis)[0] * (not joint.prismatic)
-            for joint, place in zip(chain, places)
-            if joint.moves
-        ]
-    )
-    normal = int(np.argmax(turns[0]))
-    if (turns[:, normal] < 1.0 - 1e-9).any():
-        return None
-    points = _skeletons(robot, at_zero)[0, 1:]
-    links = np.delete(np.diff(points, axis=0), normal, axis=1)
-    return Reach(points[0], float(np.linalg.norm(links, axis=1).sum()), normal)
-
-
 # --- the task ---
 
 
-def _has_target(bag: Recording, robot: _Robot) -> bool:
+def _has_target(bag: Recording, robot: Robot) -> bool:
     """Whether the target is known, at the end at least, in the robot's root frame."""
     if not bag.target.size or np.isnan(bag.target[-1]).any():
         return False
     return bool(bag.provenance) or (bag.heard is not None and bag.heard.frame == robot.urdf.root)
 
 
-def _task(bag: Recording, robot: _Robot, q: Array, v0: Array, path: Array) -> Task:
+def _task(
+    bag: Recording, robot: Robot, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array
+) -> Task:
     axes = ["xyz".index(axis) for axis in robot.axes]
     x, target = path[:, axes], bag.target
 
@@ -375,54 +241,37 @@ def _task(bag: Recording, robot: _Robot, q: Array, v0: Array, path: Array) -> Ta
             e = task_error(x[0].tolist(), xd0.tolist(), held, step, last)[bag.steps]
             closed_form = np.linalg.norm(e, axis=1)
             departure = float(np.linalg.norm(x - target - e, axis=1).max())
-    return Task(
-        axes=robot.axes,
-        target=target,
-        error=error,
-        closed_form=closed_form,
-        departure=departure,
-        disturbances=(),
-    )
+    astray = departure is not None and departure > NOTABLE
+    disturbances = _disturbances(bag.schedule, robot, joints, q, astray)
+    return Task(robot.axes, target, error, closed_form, departure, disturbances)
 
 
 def _disturbances(
-    robot: _Robot, q: Array, joints: Sequence[JointTrack], task: Task, schedule: Schedule
+    schedule: Schedule, robot: Robot, joints: Sequence[JointTrack], q: Array, astray: bool
 ) -> tuple[str, ...]:
-    """What moves, brakes or stops the arm and is not in the closed form."""
+    """What moves, brakes or stops the arm and is not in the closed form, which it is off or not."""
     first = schedule[0][1]
-    astray = task.departure is not None and task.departure > NOTABLE
     external = [name for name in first if name.startswith("tau_ext[")]
-    found = {
+    at_work = {
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
-        "singularities": astray and _is_singular(robot, q, float(first.get("rcond", 0.0))),
+        "singularities": astray and is_singular(robot, q, float(first.get("rcond", 0.0))),
         "damping": any(joint.damping for joint in robot.moving),
         "external torque": any(values[name] for _, values in schedule for name in external),
     }
-    return tuple(name for name, present in found.items() if present)
+    return tuple(name for name, present in at_work.items() if present)
 
 
-def _is_singular(robot: _Robot, q: Array, rcond: float) -> bool:
-    """Whether the arm has been where it cannot follow any command: σ_min ≤ rcond·σ_max of J."""
-    axes = ["xyz".index(axis) for axis in robot.axes]
-    J = robot.kinematics.jacobian(robot.frame, q[:: ceil(len(q) / LOOKS)])[:, axes]
-    sigma = np.linalg.svd(J, compute_uv=False)
-    return sigma.shape[1] < len(axes) or bool((sigma[:, -1] <= rcond * sigma[:, 0]).any())
-
-
-def _settings(bag: Recording, schedule: Schedule) -> dict[str, str]:
+def _settings(bag: Recording) -> dict[str, str]:
     """What the run was told, vectors and scalars by group."""
-    made = bag.provenance
-    if not made:
+    run = bag.provenance
+    if not run:
         return {}
-    settings = {
-        "FMU": made["fmu"]["file"],
-        "robot": made["robot"],
-        "step": f"{1e3 * made['step']:g} ms",
-    }
-    first = schedule[0][1]
-    given = {name for _, values in made["input_changes"] for name in values}
-    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in schedule[1:])}
+    step = f"{1e3 * run['step']:g} ms"
+    settings = {"FMU": run["fmu"]["file"], "robot": run["robot"], "step": step}
+    (_, first), *later = bag.schedule
+    given = {name for _, values in run["input_changes"] for name in values}
+    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
     groups: dict[str, list[Any]] = {}
     for name, value in first.items():
         groups.setdefault(_group(name), []).append(value)

@@ -18,13 +18,13 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     """What tells each track from the others: up to three settings, or else the bag's name."""
     every = list(dict.fromkeys(key for track in tracks for key in track.settings))
     differing = [key for key in every if len({track.settings.get(key) for track in tracks}) > 1]
-    told = [
+    words = [
         ", ".join(_setting(key, track.settings[key]) for key in differing if key in track.settings)
         for track in tracks
     ]
-    clear = 0 < len(differing) <= 3 and all(told) and len(set(told)) == len(told)
-    if clear and max(map(len, told)) <= 80:
-        return told
+    clear = 0 < len(differing) <= 3 and all(words) and len(set(words)) == len(words)
+    if clear and max(map(len, words)) <= 80:
+        return words
     names = [track.name for track in tracks]
     return (
         names
@@ -35,14 +35,14 @@ def labels(tracks: Sequence[Track]) -> list[str]:
 
 def common_settings(tracks: Sequence[Track]) -> str:
     """What tracks have in common and a reader wants to know."""
-    told = []
+    words = []
     for key, silent in TOLD.items():
         values = {track.settings.get(key, silent) for track in tracks}
         if len(values) == 1 and values != {silent}:
-            told.append(_setting(key, values.pop()))
+            words.append(_setting(key, values.pop()))
     if len(tracks) == 1 and tracks[0].motion:  # else it is the title
-        told.append(f"bag {tracks[0].name}")
-    return ", ".join(told)
+        words.append(f"bag {tracks[0].name}")
+    return ", ".join(words)
 
 
 def _setting(key: str, text: str) -> str:
@@ -63,7 +63,7 @@ def outcome(track: Track) -> str:
 
 def summary(track: Track) -> dict[str, str]:
     """The main numbers of a run in words, by what they are."""
-    made = {
+    settings = {
         key: track.settings[key] for key in ("FMU", "step", "x_des", "Kp", "Kd") if track.settings
     }
     stopped = [joint.name for joint in track.joints if joint.at_limit]
@@ -72,7 +72,7 @@ def summary(track: Track) -> dict[str, str]:
         "robot": track.motion.robot if track.motion else "",
         "end effector": track.motion.frame if track.motion else "",
         "duration": f"{number(float(track.t[-1]))} s, {len(track.t)} samples",
-        **made,
+        **settings,
         "at a limit": ", ".join(stopped) or "no joint",
     }
     if track.task:

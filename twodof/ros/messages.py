@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -23,11 +20,11 @@ from ..experiments import NANOSECONDS, Experiment
 from ..fmu import read_resource, urdf_text
 from ..master import Sample
 from ..plant.urdf import RobotError
+from .cdr import JointStateLayout
 
 if TYPE_CHECKING:
     from .scene import Scene, Transform
 
-Array = NDArray[np.float64]
 JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TARGET = "/target"
@@ -71,66 +68,6 @@ SCENE_TOPICS = {
 }
 
 
-class JointStateLayout:
-    """Serialised JointStates that differ in stamp and numbers alone, as all of a run do.
-
-    Writing and reading them so is several times faster than one by one. Where the numbers lie is
-    found by serialising some with rosbags.
-
-    Args:
-        names: joint names.
-        frame: frame_id of the header.
-        sizes: how many positions, velocities and efforts there are.
-    """
-
-    def __init__(self, names: Sequence[str], frame: str, sizes: Sequence[int]) -> None:
-        def serialised(fill: Sequence[int]) -> bytes:
-            arrays = [
-                np.full(8 * size, value, np.uint8).view(np.float64)
-                for size, value in zip(sizes, fill, strict=True)
-            ]
-            message = Message[JOINT_STATE](_header(0, frame), list(names), *arrays)
-            return bytes(STORE.serialize_cdr(message, JOINT_STATE))
-
-        plain = serialised((0, 0, 0))
-        self._sizes = sizes
-        form, end, self._between = "<4sII", 12, [plain[:4]]
-        for i, size in enumerate(sizes):
-            marked = serialised([0xFF * (i == j) for j in range(3)])
-            differing = [k for k, (a, b) in enumerate(zip(plain, marked, strict=True)) if a != b]
-            start = differing[0] if differing else end
-            self._between.append(plain[end:start])
-            form += f"{start - end}s{size}d"
-            end = start + 8 * size
-        self._between.append(plain[end:])
-        self._struct = struct.Struct(f"{form}{len(plain) - end}s")
-
-    def pack(
-        self, stamp: int, q: Sequence[float], v: Sequence[float], effort: Sequence[float]
-    ) -> bytes:
-        """One message, with its stamp in ns."""
-        head, before_q, before_v, before_effort, tail = self._between
-        seconds, rest = divmod(stamp, NANOSECONDS)
-        return self._struct.pack(
-            head, seconds, rest, before_q, *q, before_v, *v, before_effort, *effort, tail
-        )
-
-    def unpack(self, messages: Sequence[bytes]) -> list[Array] | None:
-        """Positions, velocities, efforts of N messages, N × size; None if one differs in kind."""
-        if any(len(message) != self._struct.size for message in messages):
-            return None
-        head, *fixed = self._between
-        fields: list[Any] = [("head", "u1", 4), ("stamp", "u1", 8)]
-        for i, size in enumerate(self._sizes):
-            fields += [(f"fixed{i}", "u1", len(fixed[i])), (f"numbers{i}", "<f8", size)]
-        fields.append(("fixed3", "u1", len(fixed[3])))
-        rows = np.frombuffer(b"".join(messages), np.dtype(fields))
-        expected = {"head": head, **{f"fixed{i}": text for i, text in enumerate(fixed)}}
-        if any((rows[name] != np.frombuffer(text, "u1")).any() for name, text in expected.items()):
-            return None
-        return [np.array(rows[f"numbers{i}"], dtype=np.float64) for i in range(3)]
-
-
 class Messages:
     """The messages of a run, serialised.
 
@@ -161,10 +98,10 @@ class Messages:
         """Topics and messages of one sample."""
         effort = sample.tau if self._effort else ()
         state = self._joint_state.pack(sample.stamp, sample.q, sample.v, effort)
-        found: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
+        messages: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
         if self._scene is not None:
-            found += map(_serialise, self._of_scene(self._scene, sample))
-        return found
+            messages += map(_serialise, self._of_scene(self._scene, sample))
+        return messages
 
     def latched(self, stamp: int) -> list[tuple[str, Serialised]]:
         """Topics and messages that hold for the whole run: robot description, fixed transforms.

@@ -58,12 +58,12 @@ def dds_type(name: str) -> Any:
     """The DDS type of a ROS 2 message type, with the names that rosidl_generator_dds_idl gives."""
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in STORE.fielddefs[name][1]}
-    made = idl.make_idl_struct(
+    struct = idl.make_idl_struct(
         f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False
     )
     for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
-        setattr(made, method, vars(Carrier)[method])  # a base would be part of the type
-    return made
+        setattr(struct, method, vars(Carrier)[method])  # a base would be part of the type
+    return struct
 
 
 def _field_type(node: Nodetype, of: Any) -> Any:

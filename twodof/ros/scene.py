@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..files import temporary_folder
-from ..kinematics import Kinematics, Placement
+from ..kinematics import Array, Kinematics, Placement
 from ..plant.urdf import Joint, RobotError, read_urdf
 
-Array = NDArray[np.float64]
 LARGEST = 1e6  # m
 MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
 """Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
@@ -110,11 +108,11 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
             key = (mesh.get("filename", ""), mesh.get("scale", "1 1 1"))
             if key not in fitted:
                 fitted[key] = _fit(key[0], floats(mesh, "scale", "1 1 1"), read)
-            found = fitted[key]
-            if found is None:
+            fit = fitted[key]
+            if fit is None:
                 link.remove(part)
                 continue
-            shape, placement = found
+            shape, placement = fit
             geometry.remove(mesh)
             geometry.append(shape)
             _place(part, origin(part.find("origin")) * placement)

@@ -5,21 +5,22 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..experiments import Setting, experiment
 from ..files import temporary_folder
-from ..fmu import Fmu, load_fmu
+from ..fmu import Fmu
 from ..version import versions
 from .batches import Batches
-from .design import make_design
+from .design import Design, make_design
 from .pool import Pool
 from .results import Results, read_sweep
-from .runner import Job, Point, Row
+from .runner import Job, Row
 
 if TYPE_CHECKING:
     import pandas
@@ -75,54 +76,61 @@ def sweep(
         ChildError: a worker failed for another reason.
         BagError: a bag cannot be written.
     """
-    fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
     run = experiment(fmu, stop_time=stop_time, step=step, settings=settings)
     options = {"stop_time": stop_time, "step": step, "settings": dict(run.given)}
-    design = make_design(fmu, grid or {}, ranges or {}, random, seed, run.given)
-    content = fmu.path.read_bytes()
-    provenance = {
+    design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
+    units = [_unit(run.fmu, name) for name in design.names]
+    with _folder(output) as path:
+        folder = str(path.resolve() / "bags") if bags else None
+        job = Job(run.fmu.path.read_bytes(), run.fmu.path.name, design.names, options, folder)
+        provenance = _provenance(run.fmu, design, job, command_line)
+        results = Results(path, design.names, units, len(design), provenance, resume=resume)
+        runs = _runs(job, design, ~results.done, workers, scheduler, stop)
+        _collect(runs, results, lambda: progress(int(results.done.sum()), len(design)))
+        return read_sweep(path)[0]
+
+
+def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
+    return {
         "fmu": {
             "file": fmu.path.name, "name": fmu.name, "guid": fmu.guid,
-            "sha256": hashlib.sha256(content).hexdigest(),
+            "sha256": hashlib.sha256(job.content).hexdigest(),
         },
         "design": design.record(),
-        "options": options,
-        "bags": bags,
+        "options": job.options,
+        "bags": job.bags is not None,
         "versions": versions(*PACKAGES),
         "command_line": command_line,
     }  # fmt: skip
-    units = [_unit(fmu, name) for name in design.names]
-    with _folder(output) as path:
-        folder = str(path.resolve() / "bags") if bags else None
-        job = Job(content, fmu.path.name, design.names, options, folder)
-        results = Results(path, design.names, units, len(design), provenance, resume=resume)
-        progress(int(results.done.sum()), len(design))
-        missing = np.flatnonzero(~results.done)
-        with ExitStack() as stack:
-            batches = Batches(_points(missing, design.points()), len(missing))
-            runs = _runs(job, batches, workers, scheduler, stop)
-            news = stack.enter_context(runs) if len(missing) else iter(())
-            stack.enter_context(results)  # writes nothing before the workers are there
-            for rows in news:
-                results.add(rows)
-                progress(int(results.done.sum()), len(design))
-        table, _ = read_sweep(path)
-    return table
+
+
+def _collect(
+    runs: AbstractContextManager[Iterable[list[Row]]],
+    results: Results,
+    progress: Callable[[], None],
+) -> None:
+    """Store rows as they come; nothing is written before the workers are there."""
+    progress()
+    with runs as news, results:
+        for rows in news:
+            results.add(rows)
+            progress()
 
 
 def _runs(
-    job: Job, batches: Batches, count: int | None, scheduler: str | None, stop: Callable[[], bool]
-) -> AbstractContextManager[Iterator[list[Row]]]:
+    job: Job, design: Design, missing: NDArray[np.bool_],
+    count: int | None, scheduler: str | None, stop: Callable[[], bool],
+) -> AbstractContextManager[Iterable[list[Row]]]:  # fmt: skip
     """Workers, as a context of the rows that come from them."""
+    numbers, values = np.flatnonzero(missing).tolist(), design.points()
+    if not numbers:
+        return nullcontext(())
+    batches = Batches(((k, tuple(values[k].tolist())) for k in numbers), len(numbers))
     if scheduler is None:
         return Pool(job, batches, os.cpu_count() or 1 if count is None else count, stop)
     from .cluster import Cluster  # Dask takes a second to import
 
     return Cluster(job, batches, scheduler, stop)
-
-
-def _points(numbers: Iterable[int], values: Any) -> Iterator[Point]:
-    return ((int(number), tuple(values[number].tolist())) for number in numbers)
 
 
 def _unit(fmu: Fmu, name: str) -> str:

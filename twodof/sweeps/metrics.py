@@ -77,22 +77,22 @@ def measure(
         target: m values, m; NaN where there is none.
         q_min, q_max: n values; NaN where there is none.
     """
-    found = dict.fromkeys(METRICS, nan)
-    found["peak_velocity"] = float(np.abs(v).max())
+    metrics = dict.fromkeys(METRICS, nan)
+    metrics["peak_velocity"] = float(np.abs(v).max())
     if tau.size:
-        found["peak_effort"] = float(np.abs(tau).max())
+        metrics["peak_effort"] = float(np.abs(tau).max())
     if not np.isnan(q_min).any() and not np.isnan(q_max).any():
         at_limit = np.any((q <= q_min + AT_LIMIT) | (q >= q_max - AT_LIMIT), axis=1)
-        found["time_at_limits"] = float(at_limit[1:].sum() * (t[-1] - t[0]) / (len(t) - 1))
+        metrics["time_at_limits"] = float(at_limit[1:].sum() * (t[-1] - t[0]) / (len(t) - 1))
     if not x.size or np.isnan(target).any():
-        return found
+        return metrics
     e = target - x
     error = np.linalg.norm(e, axis=1)
-    found["final_error"] = float(error[-1])
-    found["rms_error"] = float(np.sqrt(np.mean(error**2)))
+    metrics["final_error"] = float(error[-1])
+    metrics["rms_error"] = float(np.sqrt(np.mean(error**2)))
     if error[0] >= SMALLEST_MOVE:
-        found["overshoot"] = max(0.0, float((-e @ e[0]).max()) / float(error[0]) ** 2)
+        metrics["overshoot"] = max(0.0, float((-e @ e[0]).max()) / float(error[0]) ** 2)
         outside = np.flatnonzero(error > BAND * error[0])  # the first sample is
         if outside[-1] < len(t) - 1:
-            found["settling_time"] = float(t[outside[-1] + 1] - t[0])
-    return found
+            metrics["settling_time"] = float(t[outside[-1] + 1] - t[0])
+    return metrics

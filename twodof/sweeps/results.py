@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SweepError
-from ..files import is_being_written, lock, write_file
+from ..files import is_being_written, lock, refusing, write_file
 from .metrics import METRICS
 from .runner import Row
 
@@ -99,7 +99,7 @@ class Results:
             raise self._taken() from None
         except OSError as error:
             raise SweepError(f"cannot make '{self.path}': {error.strerror}") from error
-        self._write(self._table([]))
+        self._write_part([])
 
     def _taken(self) -> SweepError:
         return SweepError(
@@ -132,18 +132,16 @@ class Results:
     def _store(self) -> None:
         rows, self._rows = self._rows, []
         if rows:
-            self._write(self._table(rows))
+            self._write_part(rows)
         self._stored = time.monotonic()
 
-    def _table(self, rows: Sequence[Row]) -> pa.Table:
+    def _write_part(self, rows: Sequence[Row]) -> None:
         columns = list(zip(*rows)) or [()] * len(self._schema)
         arrays = [
             pa.array(column, field.type, from_pandas=True)  # NaN is null
             for column, field in zip(columns, self._schema, strict=True)
         ]
-        return pa.table(arrays, schema=self._schema)
-
-    def _write(self, table: pa.Table) -> None:
+        table = pa.table(arrays, schema=self._schema)
         _write(self.path / f"part-{self._part:06d}.parquet", table)
         self._part += 1
 
@@ -153,7 +151,8 @@ class Results:
         if parts:
             tables = [table for file in parts if len(table := _read(file))]
             _write(self.path / WHOLE, pa.concat_tables(tables).sort_by("run").combine_chunks())
-        _remove_parts(self.path)
+        for file in filter(_is_part, self.path.iterdir()):
+            file.unlink()
 
 
 def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
@@ -197,13 +196,11 @@ def _files(path: Path) -> list[Path]:
     """The whole table; the parts where there is none."""
     if (path / WHOLE).exists():
         return [path / WHOLE]
-    return sorted(file for file in path.iterdir() if PART.fullmatch(file.name))
+    return sorted(filter(_is_part, path.iterdir()))
 
 
-def _remove_parts(path: Path) -> None:
-    for file in path.iterdir():
-        if PART.fullmatch(file.name):
-            file.unlink()
+def _is_part(file: Path) -> bool:
+    return PART.fullmatch(file.name) is not None
 
 
 def _read(file: Path) -> pa.Table:
@@ -215,31 +212,29 @@ def _read(file: Path) -> pa.Table:
 
 def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
     try:
-        found = json.loads((schema.metadata or {})[KEY])
-        assert isinstance(found, dict) and {*COMPARED, "versions"} <= {*found}
+        provenance = json.loads((schema.metadata or {})[KEY])
+        assert isinstance(provenance, dict) and {*COMPARED, "versions"} <= {*provenance}
     except (KeyError, ValueError, AssertionError):
         raise SweepError(f"'{file}' was not written by twodof") from None
-    return found
+    return provenance
 
 
-def _check_same(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
     for key in COMPARED:
-        if found[key] != wanted[key]:
-            other = {"fmu": f"of another FMU ({found['fmu']['file']}, {found['fmu']['guid']})"}
+        if there[key] != wanted[key]:
+            other = {"fmu": f"of another FMU ({there['fmu']['file']}, {there['fmu']['guid']})"}
             raise SweepError(
-                f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(found[key]):.300}')};"
+                f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(there[key]):.300}')};"
                 " resume it with those, or choose another `output`"
             )
-    if found["versions"]["twodof"] != wanted["versions"]["twodof"]:
+    if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
         raise SweepError(
-            f"'{path}' was begun by twodof {found['versions']['twodof']}; go on with that version"
+            f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version"
         )
 
 
 def _write(path: Path, table: pa.Table) -> None:
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink)
-    try:
+    with refusing(SweepError, f"write '{path}'"):
         write_file(path, sink.getvalue().to_pybytes())
-    except OSError as error:
-        raise SweepError(f"cannot write '{path}': {error.strerror}") from error

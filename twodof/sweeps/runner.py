@@ -94,9 +94,8 @@ class Runner:
             self._drop()  # whatever state it is in
             nothing = [nan] * len(METRICS)
             return (number, *values, *nothing, run.time(error.k), error.outcome, str(error))
-        metrics = trace.metrics()
-        found = [metrics[name] for name in METRICS]
-        return (number, *values, *found, run.time(run.steps), "finished", None)
+        metrics = trace.metrics().values()  # in the order of METRICS
+        return (number, *values, *metrics, run.time(run.steps), "finished", None)
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
         """Rows of some points, and the time they took, s; errors as of ``run``."""

@@ -1,0 +1,128 @@
+"""The rooms of the package: who imports whom, which library is where, and how long things are."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PYTHON = {
+    path.relative_to(ROOT): ast.parse(path.read_text("utf-8"))
+    for folder in ("twodof", "fmu_src", "meshes")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+}
+
+ROOMS = {
+    "errors": "what can go wrong, in words; needs nothing",
+    "version": "of this package and of others",
+    "files": "files and folders, whoever's they are",
+    "data": "files that are shipped",
+    "children": "processes of our own",
+    "plant": "the equations and the URDF; goes into the FMU, which has none of what follows",
+    "export": "makes an FMU of the plant, and runs none",
+    "fmu": "an FMU's file and an instance of it, whoever made it",
+    "experiments": "what an FMU is to do, checked",
+    "master": "does it",
+    "kinematics": "of a URDF, for all that shows or transforms",
+    "ros": "what ROS 2 is told of a run",
+    "bag": "what ros says, kept and read back",
+    "sweeps": "many runs, and a bag of each",
+    "plots": "figures of bags and sweeps",
+    "pages": "in the browser, what plots know and bags hold",
+    "cli": "all of it, by a command",
+}
+"""From the bottom to the top: each may import those above it in this list, and why it is there."""
+
+LIBRARIES = {
+    "coal": {"ros"},  # meshes of a scene
+    "cyclonedds": {"ros"},
+    "distributed": {"sweeps"},
+    "fmpy": {"fmu"},
+    "lz4": {"bag"},
+    "matplotlib": {"plots"},
+    "pandas": {"sweeps", "bag", "plots", "cli"},  # tables: made, of a recording, drawn, printed
+    "pinocchio": {"plant"},
+    "pyarrow": {"sweeps"},
+    "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
+    "rosbags": {"ros", "bag"},
+    "scipy": {
+        "kinematics",
+        "ros",
+        "pages",
+    },  # its rotations: for all, to URDF's rpy, to viser's wxyz
+    "tqdm": {"cli"},
+    "viser": {"pages"},
+    "websockets": {"pages"},
+}
+
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES = 350, 60, 10
+LONG = {
+    "twodof/plant/integrator.py", "fmu_src/native/integrator.c",
+    "twodof/plant/variables.py:variable_table", "twodof/export/native.py:model_header",
+    "twodof/export/model_description.py:model_description",
+}  # fmt: skip
+"""What is longer, and to be shortened."""
+
+
+def imported(path: Path) -> set[str]:
+    """Dotted names of what a file imports, also inside functions and for types alone."""
+    names = set()
+    for node in ast.walk(PYTHON[path]):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            module = [*path.parts[: -node.level], node.module] if node.level else [node.module]
+            base = ".".join(filter(None, module))
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
+
+
+def room(path: Path) -> str:
+    """A folder or a file of the package; else the folder of the checkout."""
+    parts = path.with_suffix("").parts
+    return parts[1] if parts[0] == "twodof" else parts[0]
+
+
+def test_a_room_imports_those_before_it_alone() -> None:
+    order = list(ROOMS)
+    inside = {path for path in PYTHON if path.parts[0] == "twodof"}
+    assert {room(path) for path in inside} == {*order, "__init__", "__main__"}
+    for path in inside:
+        if room(path) in ROOMS:  # __init__ and __main__ are the door to all
+            own = {name.split(".")[1] for name in imported(path) if name.startswith("twodof.")}
+            assert own <= {*order[: order.index(room(path)) + 1]}, path
+
+
+def test_modules_import_each_other_in_no_circle() -> None:
+    modules = {".".join(path.with_suffix("").parts): path for path in PYTHON}
+    graph = {}
+    for module, path in modules.items():
+        names = imported(path)
+        graph[module] = {*names, *(name.rpartition(".")[0] for name in names)} & modules.keys()
+    assert [*TopologicalSorter(graph).static_order()]  # which raises CycleError
+
+
+def test_a_foreign_library_is_in_its_room_alone() -> None:
+    rooms: dict[str, set[str]] = {library: set() for library in LIBRARIES}
+    for path in PYTHON:
+        for library in {name.partition(".")[0] for name in imported(path)} & LIBRARIES.keys():
+            rooms[library].add(room(path))
+    assert rooms == LIBRARIES
+
+
+def test_nothing_is_longer_than_can_be_read() -> None:
+    files = [*PYTHON, *(path.relative_to(ROOT) for path in (ROOT / "fmu_src").rglob("*.[ch]"))]
+    lines = {str(path): (ROOT / path).read_text("utf-8").count("\n") for path in files}
+    long = {name for name, count in lines.items() if count > MOST_LINES}
+    for path, tree in PYTHON.items():
+        functions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+        for f in functions:
+            if f.end_lineno is not None and f.end_lineno - f.lineno >= MOST_OF_A_FUNCTION:
+                long.add(f"{path}:{f.name}")
+    assert long <= LONG
+
+
+def test_the_package_has_few_files_beside_its_rooms() -> None:
+    files = {path.name for path in (ROOT / "twodof").glob("*.py")}
+    assert len(files - {"data.py"}) <= MOST_FILES  # which files.py can take up
