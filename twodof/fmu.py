@@ -73,11 +73,6 @@ class Fmu:
         """The FMU's GUID; for FMUs of this package the digest of all that matters."""
         return str(self.description.guid)
 
-    @property
-    def runs_here(self) -> bool:
-        """Whether it has a binary for this machine's platform."""
-        return fmpy.platform in self.platforms
-
     def vector(self, group: str) -> list[str]:
         """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
         if group in self.variables:
@@ -241,7 +236,7 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
     Raises:
         FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
     """
-    if not fmu.runs_here:
+    if fmpy.platform not in fmu.platforms:
         there = ", ".join(fmu.platforms) or "none"
         reason = f"has no binary for this platform ({fmpy.platform}), only for: {there}"
         raise FmuError(f"'{fmu.path}' {reason}")

@@ -5,15 +5,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
-from .integrator import Array
-
-if TYPE_CHECKING:
-    from .plant import Command, Plant
+from .integrator import Array, Response
 
 
-def command(plant: Plant) -> Command:
+def command(plant: Any) -> Response:
     """τ as a function of the state, n values; inputs held."""
     tau = list(plant.tau_cmd)
 

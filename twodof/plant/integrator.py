@@ -22,9 +22,9 @@ from .stops import Limits, Stops
 Array = NDArray[np.float64]
 State = list[float]
 """(q, v), 2n values. Plain floats: at this size a call of numpy costs more than the arithmetic."""
-Acceleration = Callable[[Array, Array], tuple[Sequence[float], int]]
-"""At (q, v), joint limits left out: q̈ of the equations of motion, n values, and the rank that J⁺
-was given, the number of its singular values that were not dropped."""
+Response = Callable[[Array, Array], tuple[Sequence[float], int]]
+"""At (q, v), joint limits left out: q̈ of the equations of motion, or what a control law gives, n
+values, and the rank of the law's J⁺, the number of its singular values that were not dropped."""
 
 A = (
     (1 / 5,),
@@ -82,7 +82,7 @@ class StepError(ArithmeticError):
 class _Equations:
     """The equations of motion as a system of first order, and how often they were evaluated."""
 
-    def __init__(self, acceleration: Acceleration, n: int) -> None:
+    def __init__(self, acceleration: Response, n: int) -> None:
         self._acceleration = acceleration
         state = np.empty(2 * n)
         self._write, self._q, self._v = state.__setitem__, state[:n], state[n:]
@@ -97,7 +97,7 @@ class _Equations:
 
 
 def advance(
-    acceleration: Acceleration,
+    acceleration: Response,
     q: Sequence[float],
     v: Sequence[float],
     h: float,

@@ -7,15 +7,12 @@ Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
-from .integrator import Array
-
-if TYPE_CHECKING:
-    from .plant import Command, Plant
+from .integrator import Array, Response
 
 
-def command(plant: Plant) -> Command:
+def command(plant: Any) -> Response:
     """q̈_cmd as a function of the state, n values; inputs held."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 

@@ -11,20 +11,18 @@ Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
 
 from . import effort_control, joint_control, task_control
-from .integrator import BUDGET, STAGES, Acceleration, Array, StepError, advance
+from .integrator import BUDGET, STAGES, Array, Response, StepError, advance
 from .robot import Robot
 from .stops import Stops
 from .variables import CONTROLS, Variable
 
 LAWS = {"task": task_control, "joint": joint_control, "effort": effort_control}
-Command = Callable[[Array, Array], tuple[list[float], int]]
-"""What a control law makes of a state: q̈_cmd or τ, n values, and the rank of its J⁺, if any."""
 
 WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
@@ -194,7 +192,7 @@ class Plant:
         inverse = pin.computeMinverse(self._model, self._data, np.array(q))
         return np.asarray(np.triu(inverse) + np.triu(inverse, 1).T)
 
-    def _control_effort(self, command: Command, q: Array, v: Array) -> tuple[Array, int]:
+    def _control_effort(self, command: Response, q: Array, v: Array) -> tuple[Array, int]:
         given, rank = command(q, v)
         tau: Array = np.array(given)
         if self._commands == "acceleration":
@@ -203,8 +201,8 @@ class Plant:
             tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
         return tau, rank
 
-    def _equations_of_motion(self) -> Acceleration:
-        command: Command = self._law(self)
+    def _equations_of_motion(self) -> Response:
+        command: Response = self._law(self)
         damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
         force = np.array(self.f_ext)
         # where none of these is there, q̈ = M⁻¹(M q̈_cmd + h − h)

@@ -11,16 +11,13 @@ IEEE TAC 25(3), 1980; the damped self-motion is that of Khatib, IEEE J-RA 3(1), 
 from __future__ import annotations
 
 from operator import mul
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from .integrator import Array
+from .integrator import Array, Response
 from .pseudo_inverse import apply_pseudo_inverse
-
-if TYPE_CHECKING:
-    from .plant import Command, Plant
 
 # looked up once: an attribute of the module costs as much as a call's arithmetic
 forward_kinematics = pin.forwardKinematics
@@ -29,7 +26,7 @@ frame_acceleration = pin.getFrameClassicalAcceleration
 WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
-def command(plant: Plant) -> Command:
+def command(plant: Any) -> Response:
     """q̈_cmd as a function of the state, n values, and the rank of its J⁺; inputs held."""
     model, data, frame = plant.model, plant.data, plant.robot.frame_id
     still = np.zeros(model.nv)
