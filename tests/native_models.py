@@ -17,13 +17,13 @@ import numpy as np
 import pinocchio as pin
 
 from twodof.export.compiler import compile_library, host_platform
+from twodof.export.flavours import engine_sources
 from twodof.export.native import model_header
 from twodof.plant.plant import Plant
 from twodof.plant.robot import Robot, load_robot
-from twodof.plant.variables import Variable, variable_table
+from twodof.plant.variables import CONTROLS, Variable, variable_table
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ROOT / "fmu_src" / "native"
 HERE = Path(__file__).parent / "native"
 GUID = "0123456789abcdef"
 SCRATCH = Path(tempfile.mkdtemp(prefix="twodof-tests-"))
@@ -58,9 +58,10 @@ class Model:
     robot: Robot
     table: list[Variable]
     starts: dict
+    control: str = "task"
 
     def plant(self) -> Plant:
-        plant = Plant(self.robot, self.table)
+        plant = Plant(self.robot, self.table, self.control)
         plant.initialise()
         return plant
 
@@ -69,21 +70,23 @@ class Model:
 
     def sources(self, *more: Path) -> dict[str, bytes]:
         headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
-        files = {p.name: p.read_bytes() for p in (*sorted(SOURCES.iterdir()), *headers, *more)}
-        files["model.h"] = model_header(self.robot, self.table, GUID).encode()
+        files = engine_sources(self.control)
+        files |= {path.name: path.read_bytes() for path in (*headers, *more)}
+        law = CONTROLS[self.control]
+        files["model.h"] = model_header(self.robot, self.table, law, GUID).encode()
         return files
 
 
 @functools.cache
-def model(name: str) -> Model:
+def model(name: str, control: str = "task") -> Model:
     """The shipped arm, or a robot of ROBOTS at the middle of its limits."""
     if name == "twodof":
         robot = load_robot((ROOT / "urdf" / "2dof.urdf").read_text(), "EndEffector", "xy")
         starts = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
-        return Model(robot, variable_table(robot, starts), starts)
+        return Model(robot, variable_table(robot, starts, control), starts, control)
     path, frame, axes = ROBOTS[name]
     text = (robots_folder() / path).read_text()
-    return from_urdf(without_mimic(text), frame, axes)
+    return from_urdf(without_mimic(text), frame, axes, control)
 
 
 def without_mimic(urdf: str) -> str:
@@ -91,7 +94,7 @@ def without_mimic(urdf: str) -> str:
     return re.sub(r"<mimic[^>]*/>", "", urdf)
 
 
-def from_urdf(urdf: str, frame: str, axes: str) -> Model:
+def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
     robot = load_robot(urdf, frame, axes)
     rest = tuple(
         0.2 if low < 0.2 < high else 0.5 * (low + high)
@@ -101,7 +104,7 @@ def from_urdf(urdf: str, frame: str, axes: str) -> Model:
     plant = Plant(robot, variable_table(robot, starts))
     plant.initialise()
     starts["x_des"] = tuple(plant.x)
-    return Model(robot, variable_table(robot, starts), starts)
+    return Model(robot, variable_table(robot, starts, control), starts, control)
 
 
 @functools.cache
@@ -151,10 +154,10 @@ class Engine:
         return int(row[0]), int(row[1]), float(row[2])
 
     def values(self, plant: Plant) -> np.ndarray:
-        """All variables of a Python plant by value reference; x and tau are 0."""
+        """All variables of a Python plant by value reference; x, xd and tau are 0."""
         row = []
         for variable in self.model.table:
-            if variable.group in ("x", "tau"):
+            if variable.group in ("x", "xd", "tau"):
                 row.append(0.0)
                 continue
             value = getattr(plant, variable.group)
@@ -166,8 +169,8 @@ class Engine:
 
 
 @functools.cache
-def engine(name: str) -> Engine:
-    return Engine(model(name))
+def engine(name: str, control: str = "task") -> Engine:
+    return Engine(model(name, control))
 
 
 def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:

@@ -4,7 +4,11 @@
 #include "dynamics.h"
 #include "fmi2Functions.h"
 #include "integrator.h"
+#include "stops.h"
+
+#ifdef HAS_RCOND
 #include "pseudo_inverse.h"
+#endif
 
 FMI2_Export void probe_task(const double q[], const double v[], double x[], double J[],
                             double drift[])
@@ -22,20 +26,43 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
                                         const double gravity[], double tau[])
 {
     Placement joint[N_JOINTS];
+    Carrier carrier;
     place_joints(q, joint);
-    inverse_dynamics(joint, v, a, gravity, tau);
+    load_carrier(0.0, v, &carrier);
+    inverse_dynamics(joint, &carrier, v, a, gravity, tau);
 }
 
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])
 {
     Placement joint[N_JOINTS];
+    Carrier carrier;
     place_joints(q, joint);
-    acceleration_of_effort(joint, tau, a);
+    load_carrier(0.0, q, &carrier);
+    acceleration_of_effort(joint, &carrier, tau, a);
 }
 
+#ifdef HAS_RCOND
 FMI2_Export void probe_pseudo_inverse(double J[], double b[], double rcond, double result[])
 {
     apply_pseudo_inverse((double(*)[N_JOINTS])J, b, rcond, result);
+}
+#endif
+
+/* q̈ with stops at a state after an impact, that state, and the joints that rest. */
+FMI2_Export void probe_stopped(double value[], double a[], double held[])
+{
+    const Plant *plant = (Plant *)value;
+    const int kept[N_JOINTS] = {0};
+    Stops stops;
+    double y[2 * N_JOINTS];
+    memcpy(y, &value[Q], N_JOINTS * sizeof *y);
+    memcpy(y + N_JOINTS, &value[V], N_JOINTS * sizeof *y);
+    impact(plant, y, kept);
+    acceleration(plant, y, y + N_JOINTS, a);
+    hold(plant, y, a, kept, &stops);
+    memcpy(&value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
+    for (int i = 0; i < N_JOINTS; i++)
+        held[i] = stops.held[i];
 }
 
 FMI2_Export void probe_acceleration(const double value[], double a[])

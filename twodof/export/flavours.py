@@ -93,6 +93,17 @@ def python_flavour(
     )
 
 
+def engine_sources(control: str) -> Files:
+    """The engine's C files with one control law: a bare plant has no code of another."""
+    left_out = {f"{other}_control.c" for other in CONTROLS if other != control}
+    left_out |= set() if control == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
+    return {
+        path.name: path.read_bytes()
+        for path in data_file("fmu_src", "native").iterdir()
+        if path.name not in left_out
+    }
+
+
 def native_flavour(
     robot: Robot, control: str, table: Sequence[Variable], name: str, platforms: Sequence[str]
 ) -> Flavour:
@@ -100,13 +111,7 @@ def native_flavour(
     fmpy = find_spec("fmpy")  # it comes with the headers of the standard
     assert fmpy is not None and fmpy.origin is not None
     headers = Path(fmpy.origin).parent / "c-code"
-    left_out = {f"{other}_control.c" for other in CONTROLS if other != control}
-    left_out |= set() if control == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
-    sources = {
-        path.name: path.read_bytes()
-        for path in data_file("fmu_src", "native").iterdir()
-        if path.name not in left_out
-    }
+    sources = engine_sources(control)
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
 
     def header(guid: str) -> Files:

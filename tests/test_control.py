@@ -1,0 +1,401 @@
+"""Control laws, payload, forces and rigid stops, in both flavours, against what is not ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from native_models import ROBOTS, Engine, engine, model
+from scipy.integrate import solve_ivp
+
+import twodof
+from twodof.export.package import FmuOptions, build_fmu
+
+EVERY_ROBOT = ("twodof", *ROBOTS)
+CONTROLS = ("task", "joint", "effort")
+
+
+def deviation(a, b):
+    return np.abs(np.subtract(a, b)).max() / max(1.0, np.abs(b).max())
+
+
+def loaded(plant) -> pin.Model:
+    """Pinocchio's model with the payload as a body of its own."""
+    robot = plant.robot
+    reference = robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    frame = reference.frames[robot.frame_id]
+    placement = frame.placement * pin.SE3(np.eye(3), np.array(plant.payload_com))
+    reference.appendBodyToJoint(
+        frame.parentJoint, pin.Inertia(plant.payload, np.zeros(3), np.zeros((3, 3))), placement
+    )
+    return reference
+
+
+def random_plant(name: str, control: str, rng):
+    plant = model(name, control).plant()
+    n = len(plant.q)
+    plant.q, plant.v = rng.uniform(-2, 2, n).tolist(), rng.normal(0, 2, n).tolist()
+    plant.f_ext, plant.tau_ext = rng.normal(0, 5, 3).tolist(), rng.normal(0, 3, n).tolist()
+    plant.payload, plant.payload_com = rng.uniform(0, 3), rng.normal(0, 0.1, 3).tolist()
+    return plant
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_bare_plant_is_pinocchios(name):
+    """q̈ with efforts, a force at the frame, damping and a payload, both flavours."""
+    native, rng = engine(name, "effort"), np.random.default_rng(1)
+    for _ in range(1000 if name in ("twodof", "ur5") else 100):
+        plant = random_plant(name, "effort", rng)
+        plant.tau_cmd = rng.normal(0, 20, native.n).tolist()
+        plant.prepare()
+        q, v = np.array(plant.q), np.array(plant.v)
+        reference = loaded(plant)
+        data = reference.createData()
+        frame = plant.robot.frame_id
+        J = pin.computeFrameJacobian(reference, data, q, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+        effort = np.add(plant.tau_cmd, plant.tau_ext) + J.T @ plant.f_ext
+        effort -= np.array(plant.robot.damping) * v
+        expected = pin.aba(reference, data, q, v, effort)
+        ours, _ = plant._equations_of_motion()(q, v)
+        theirs = np.empty(native.n)
+        native.call("acceleration", native.values(plant), theirs)
+        assert deviation(ours, expected) <= 1e-11
+        M = pin.crba(reference, data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        assert deviation(M @ theirs, M @ expected) <= 1e-11
+
+
+@pytest.mark.parametrize("name", ["twodof", "ur5", "panda"])
+@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("limit_effort", [False, True])
+@pytest.mark.parametrize("known", [False, True])
+def test_both_flavours_have_the_same_accelerations_and_efforts(name, control, limit_effort, known):
+    native, rng = engine(name, control), np.random.default_rng(2)
+    for _ in range(50):
+        plant = random_plant(name, control, rng)
+        plant.limit_effort, plant.payload_known = limit_effort, known
+        for group in ("q_des", "v_des", "a_des", "tau_cmd", "x_des", "xd_des"):
+            if hasattr(plant, group):
+                setattr(plant, group, rng.normal(0, 1, len(getattr(plant, group))).tolist())
+        plant.prepare()
+        values, a = native.values(plant), np.empty(native.n)
+        native.call("acceleration", values, a)
+        q, v = np.array(plant.q), np.array(plant.v)
+        assert deviation(a, plant._equations_of_motion()(q, v)[0]) <= 1e-9
+        native.call("outputs", values)
+        assert deviation(native.group(values, "tau"), plant.tau) <= 1e-10
+        assert deviation(native.group(values, "xd"), plant.xd) <= 1e-12
+
+
+@pytest.fixture(scope="module")
+def fmus(tmp_path_factory) -> dict[tuple[str, bool], Path]:
+    folder = tmp_path_factory.mktemp("controls")
+    return {
+        (control, native): build_fmu(
+            folder / f"{control}{native}.fmu", FmuOptions(control=control, native=native)
+        )
+        for control in CONTROLS
+        for native in (False, True)
+    }
+
+
+def trajectory(fmu: Path, **options) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    run = [(s.t, s.q, s.v) for s in twodof.samples(fmu, **options)]
+    t, q, v = zip(*run)
+    return np.array(t), np.array(q), np.array(v)
+
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-12}
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_joint_control_obeys_its_closed_form(fmus, native):
+    """ë + Kd ė + Kp e = 0 in each joint, by the matrix exponential."""
+    goal, Kp, Kd = (0.9, -0.8), (60.0, 30.0), (12.0, 14.0)
+    settings = {"q_des": goal, "Kp": Kp, "Kd": Kd, "payload": 0.4, "payload_known": True, **TIGHT}
+    t, q, _ = trajectory(fmus["joint", native], stop_time=1.0, settings=settings)
+    from scipy.linalg import expm
+
+    for i, start in enumerate((0.5, 0.35)):
+        A = np.array([[0.0, 1.0], [-Kp[i], -Kd[i]]])
+        e = [(expm(A * k) @ [goal[i] - start, 0.0])[0] for k in t]
+        np.testing.assert_allclose(goal[i] - q[:, i], e, atol=1e-9)
+
+
+@pytest.mark.parametrize("native", [False, True])
+@pytest.mark.parametrize("control", CONTROLS)
+def test_unknown_payload_against_an_independent_integration(fmus, control, native):
+    settings = {"payload": 0.05, "payload_com": (0.02, -0.03, 0.01), "f_ext": (0.1, 0.2, 0.0)}
+    if control == "effort":
+        settings["tau_cmd"] = (0.8, 0.2)
+    plant = model("twodof", control).plant()
+    for name, value in settings.items():
+        setattr(plant, name, list(value) if isinstance(value, tuple) else value)
+    known, unknown = plant.robot.model.copy(), loaded(plant)
+    known.gravity.linear = unknown.gravity.linear
+    data, truth, frame = known.createData(), unknown.createData(), plant.robot.frame_id
+
+    def law(q, v):
+        if control == "effort":
+            return np.array(plant.tau_cmd)
+        pin.forwardKinematics(known, data, q, v, np.zeros(2))
+        J = pin.computeFrameJacobian(known, data, q, frame, pin.LOCAL_WORLD_ALIGNED)[:2]
+        drift = pin.getFrameClassicalAcceleration(known, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        if control == "task":
+            x = data.oMf[frame].translation[:2]
+            command = 50.0 * (plant.x_des - x) - 40.0 * J @ v - drift.linear[:2]
+            return pin.rnea(known, data, q, v, np.linalg.solve(J, command))
+        return pin.rnea(known, data, q, v, 50.0 * (plant.q_des - q) - 40.0 * v)
+
+    def derivative(_, y):
+        q, v = y[:2], y[2:]
+        J = pin.computeFrameJacobian(unknown, truth, q, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+        effort = law(q, v) + J.T @ plant.f_ext
+        return np.r_[v, pin.aba(unknown, truth, q, v, effort)]
+
+    t, q, v = trajectory(fmus[control, native], stop_time=0.2, settings={**settings, **TIGHT})
+    y = solve_ivp(derivative, (0, 0.2), [*q[0], *v[0]], "DOP853", t, rtol=1e-12, atol=1e-14).y.T
+    np.testing.assert_allclose(np.c_[q, v], y, atol=1e-9)
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_energy_of_the_free_plant_is_kept(fmus, native):
+    """No effort, no damping, no stop: kinetic and potential energy, by Pinocchio."""
+    settings = {"q_max": 1e3, "q_min": -1e3, "rtol": 1e-12, "atol": 1e-13}
+    _, q, v = trajectory(fmus["effort", native], stop_time=10 if native else 2, settings=settings)
+    plant = model("twodof").plant()
+    reference = plant.robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    data = reference.createData()
+    energy = [
+        pin.computeKineticEnergy(reference, data, a, b)
+        + pin.computePotentialEnergy(reference, data, a)
+        for a, b in zip(q, v)
+    ]
+    assert np.ptp(energy) <= 1e-9 * max(map(abs, energy))
+
+
+# --- rigid stops ---
+
+
+def conditions(reference, q, v, a_free, W, a, low, high, held):
+    """The complementarity conditions of stops, with M by Pinocchio."""
+    for i in np.flatnonzero((q <= low) | (q >= high)):
+        side = -1.0 if q[i] >= high[i] else 1.0
+        assert side * v[i] >= -1e-12
+        if v[i] == 0.0:
+            assert side * a[i] >= -1e-9 * max(1.0, np.abs(a_free).max())
+    force = np.linalg.solve(W, a - a_free)
+    size = max(1.0, np.abs(force).max())
+    for i in range(len(q)):
+        side = -1.0 if q[i] >= high[i] else 1.0
+        if held[i]:
+            assert a[i] == 0.0 and side * force[i] >= -1e-9 * size
+        else:
+            assert abs(force[i]) <= 1e-9 * size
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_stops_satisfy_their_complementarity_conditions(name):
+    """Several joints at their limits, moving and pressed either way; the impulse too."""
+    native, rng = engine(name, "effort"), np.random.default_rng(3)
+    several = 0
+    for _ in range(100):
+        plant = model(name, "effort").plant()
+        q = rng.uniform(-1, 1, native.n)
+        v = rng.normal(0, 1, native.n) * (rng.random(native.n) < 0.7)
+        at = rng.integers(-1, 2, native.n)  # at the lower limit, at none, at the upper one
+        low, high = np.where(at < 0, q, q - 1.0), np.where(at > 0, q, q + 1.0)
+        plant.q, plant.v, plant.q_min, plant.q_max = (list(part) for part in (q, v, low, high))
+        plant.tau_cmd = rng.normal(0, 50, native.n).tolist()
+        values, a, held = native.values(plant), np.empty(native.n), np.empty(native.n)
+        native.call("stopped", values, a, held)
+        after = native.group(values, "v")
+        reference = plant.robot.model.copy()
+        reference.gravity.linear = np.array(plant.gravity)
+        data = reference.createData()
+        M = pin.crba(reference, data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        impulse = M @ (after - v)
+        size = max(1.0, np.abs(impulse).max())
+        for i in range(native.n):
+            if at[i] == 0:
+                assert abs(impulse[i]) <= 1e-11 * size
+            else:
+                assert -at[i] * impulse[i] >= -1e-11 * size
+                assert impulse[i] * after[i] == pytest.approx(0.0, abs=1e-10 * size)
+        damping = np.array(plant.robot.damping)
+        effort = plant.tau_cmd - damping * after
+        free = pin.aba(reference, data, q, after, effort)
+        conditions(reference, q, after, free, np.linalg.inv(M), a, low, high, held)
+        several += held.sum() > 1
+        kinetic = 0.5 * after @ M @ after - 0.5 * v @ M @ v
+        assert kinetic <= 1e-9 * max(1.0, 0.5 * v @ M @ v)
+    assert several or native.n < 3
+
+
+@pytest.mark.parametrize("name", ["twodof", "ur5", "panda"])
+def test_a_fall_into_stops_never_gains_energy(name):
+    native, rng = engine(name, "effort"), np.random.default_rng(4)
+    plant = model(name, "effort").plant()
+    reference = plant.robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    data = reference.createData()
+    plant.rtol, plant.atol = 1e-10, 1e-12
+    for _ in range(20):
+        q = rng.uniform(-1, 1, native.n)
+        plant.q_min, plant.q_max = (q - 0.3).tolist(), (q + 0.3).tolist()
+        plant.q, plant.v = q.tolist(), rng.normal(0, 2, native.n).tolist()
+        values, before, stopped = native.values(plant), np.inf, False
+        for _ in range(100):
+            assert native.call("advance", values, 0.01) == 1
+            q, v = native.group(values, "q").copy(), native.group(values, "v").copy()
+            assert (q >= plant.q_min).all() and (q <= plant.q_max).all()
+            stopped |= bool(((q == plant.q_min) | (q == plant.q_max)).any())
+            energy = pin.computeKineticEnergy(reference, data, q, v)
+            energy += pin.computePotentialEnergy(reference, data, q)
+            scale = max(1.0, abs(energy))
+            assert energy <= before + 1e-9 * scale
+            before = energy
+        assert stopped
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
+    """Stopped and let go at several limits, by an input that turns."""
+    settings = {"q_min": (0.2, 0.1), "q_max": (0.7, 0.5), "rigid_stops": True, **TIGHT}
+    table = {
+        "task": ("x_des", [(0.1, 0.25), (0.28, 0.05), (0.2, 0.15)]),
+        "joint": ("q_des", [(1.0, 1.0), (0.0, 0.7), (0.4, 0.0)]),
+        "effort": ("tau_cmd", [(3.0, 1.0), (-1.0, 1.0), (2.0, -1.0)]),
+    }
+    group, values = table[control]
+    if control != "effort":
+        settings |= {"Kp": 400.0, "Kd": 20.0}
+    trajectories = []
+    for native, step in ((True, 0.01), (True, 0.002), (False, 0.01)):
+        changes = dict(zip((0.0, 0.2, 0.4), values))
+        run = twodof.samples(
+            fmus[control, native], step=step, stop_time=0.6,
+            settings={**settings, group: changes[0.0]},
+        )  # fmt: skip
+        states = []
+        sample = next(run)
+        while True:
+            if round(sample.t / 0.01, 6).is_integer():
+                states.append(sample.q + sample.v)
+            due = [value for t, value in changes.items() if abs(t - sample.t) < 1e-9]
+            try:
+                sample = run.send({group: due[0]} if due else None)
+            except StopIteration:
+                break
+        trajectories.append(np.array(states))
+    at_stops = (trajectories[0][:, :2] == [0.7, 0.5]).any() and (
+        trajectories[0][:, :2] == [0.2, 0.1]
+    ).any()
+    assert at_stops
+    size = np.maximum(1.0, np.abs(trajectories[0]))  # joints are thrown at up to 200 rad/s
+    assert (np.abs(trajectories[0] - trajectories[1]) / size).max() <= 1e-6
+    assert (np.abs(trajectories[0] - trajectories[2]) / size).max() <= 1e-9
+
+
+def test_two_stops_that_drive_off_each_other_come_to_rest():
+    """As the feet of a rocking block; impacts in turn would never end."""
+    for native in (False, True):
+        of: Engine = engine("twodof", "effort")
+        plant = of.model.plant()
+        plant.q_max, plant.q_min, plant.tau_cmd = [0.6, 0.36], [0.4, 0.34], [0.5, -0.1]
+        plant.initialise()
+        values = of.values(plant)
+        for _ in range(200):
+            if native:
+                assert of.call("advance", values, 0.01) == 1
+            else:
+                plant.step(0.01)
+        q, v = (of.group(values, g) for g in "qv") if native else (plant.q, plant.v)
+        assert [*q, *v] == [0.6, 0.34, 0.0, 0.0]
+
+
+# --- what an FMU has ---
+
+
+def test_a_pd_loop_outside_comes_near_the_one_inside(fmus):
+    """Halving the step halves the distance."""
+    Kp, Kd, goal = 60.0, 14.0, np.array([0.9, -0.6])
+    plant = model("twodof").plant()
+    reference = plant.robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    data = reference.createData()
+    _, inside, _ = trajectory(
+        fmus["joint", True], stop_time=1.0,
+        settings={"q_des": tuple(goal), "Kp": Kp, "Kd": Kd, **TIGHT},
+    )  # fmt: skip
+    distances = []
+    for step in (0.002, 0.001):
+        run = twodof.samples(fmus["effort", True], step=step, stop_time=1.0, settings=TIGHT)
+        sample, q = next(run), []
+        while True:
+            if round(sample.t / 0.01, 6).is_integer():
+                q.append(sample.q)
+            a = Kp * (goal - sample.q) - Kd * np.array(sample.v)
+            tau = pin.rnea(reference, data, np.array(sample.q), np.array(sample.v), a)
+            try:
+                sample = run.send({"tau_cmd": tuple(tau)})
+            except StopIteration:
+                break
+        distances.append(np.abs(np.array(q) - inside).max())
+    assert distances[1] < 0.01 and distances[1] / distances[0] == pytest.approx(0.5, abs=0.05)
+    assert np.abs(sample.q - goal).max() < 0.02
+
+
+def test_a_bare_plant_has_no_code_of_a_controller(fmus):
+    import zipfile
+
+    with zipfile.ZipFile(fmus["effort", True]) as archive:
+        names = archive.namelist()
+        text = b"".join(archive.read(n) for n in names if n.startswith("sources/"))
+    assert not [name for name in names if "task_control" in name or "pseudo_inverse" in name]
+    assert b"X_DES" not in text and b"KP" not in text
+    with zipfile.ZipFile(fmus["joint", True]) as archive:
+        assert "sources/pseudo_inverse.c" not in archive.namelist()
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_the_description_is_that_of_the_control(fmus, control):
+    fmpy = pytest.importorskip("fmpy")
+    from fmpy.validation import validate_fmu
+
+    of = {
+        "task": ["x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "f_ext", "Kn"],
+        "joint": ["q_des", "v_des", "a_des", "Kp", "Kd", "tau_ext", "f_ext"],
+        "effort": ["tau_cmd", "tau_ext", "f_ext"],
+    }
+    descriptions = []
+    for native in (False, True):
+        path = fmus[control, native]
+        assert validate_fmu(str(path)) == []
+        fmu = twodof.load_fmu(path)
+        assert [*fmu.groups("input")] == of[control]
+        assert [*fmu.groups("output")] == ["q", "v", "x", "xd", "tau"]
+        description = fmpy.read_model_description(str(path))
+        unknowns = {u.variable.name: {d.name for d in u.dependencies} for u in description.outputs}
+        driving = set(of[control]) - {"tau_ext", "f_ext"}
+        groups = {name.partition("[")[0] for name in unknowns["tau[1]"]}
+        assert groups == driving and not unknowns["x[1]"] | unknowns["xd[1]"] | unknowns["q[1]"]
+        descriptions.append([(v.name, v.start, v.unit) for v in description.modelVariables])
+    assert descriptions[0] == descriptions[1]
+
+
+def test_a_control_that_is_none_is_refused():
+    with pytest.raises(twodof.TwoDofError, match="control 'velocity' is none of task, joint"):
+        build_fmu(None, FmuOptions(control="velocity"))
+
+
+@pytest.mark.parametrize("payload", [-1.0, float("nan")])
+def test_a_payload_that_is_none_is_refused(fmus, payload):
+    for native in (False, True):
+        with pytest.raises(twodof.TwoDofError, match="payload"):
+            [*twodof.samples(fmus["task", native], settings={"payload": payload}, stop_time=0.01)]
