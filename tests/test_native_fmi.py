@@ -236,7 +236,8 @@ def test_values_that_are_not_finite(value, text):
 def test_refusals_name_the_culprit():
     arm = Arm()
     vr = arm.of.reference
-    arm.refused("no variable with value reference 37", "getReal", [0, 37])
+    beyond = len(arm.of.table)
+    arm.refused(f"no variable with value reference {beyond}", "getReal", [0, beyond])
     arm.refused("no variable with value reference 4294967295", "setReal", [2**32 - 1], [0.0])
     arm.refused(r"q\[1\] is an output and cannot be set", "setReal", [vr("q[1]")], [0.0])
     arm.refused(r"parameter \(max_step\) is not allowed", "setReal", [vr("max_step")], [0.1])

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from math import inf, isfinite
+from math import inf, isfinite, pi
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Lock
@@ -111,7 +111,8 @@ class Controls:
                 rows = self._rows[::-1][::thin][::-1]
                 age = np.arange(1.0 - len(rows), 1.0) * self._step * thin
                 self._plots[0].show(age, rows[:, :-1])
-                self._plots[1].show(age, rows[:, -1:])
+                for plot in self._plots[1:]:
+                    plot.show(age, rows[:, -1:])
             shown = sample.t
             for title, text in news.notes:
                 self._page.notify(title, text)
@@ -129,8 +130,10 @@ class Controls:
         middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
         around = middle + 1.35 * (shown - middle)  # room to drag the target
         size = self._page.frame(around, fmu.axes, gravity if any(gravity) else (0.0, 0.0, 1.0))
-        self._target = self._page.add_target(size, fmu.axes, draggable=True)
-        self._target.position = self._target_place
+        self._target: Any = None
+        if sample.target:
+            self._target = self._page.add_target(size, fmu.axes, draggable=True)
+            self._target.position = self._target_place
         self._trail = self._page.add_line("/trail", TRAIL, 4.0)
         self._robot.pose(sample.q)
 
@@ -144,24 +147,24 @@ class Controls:
         self._record = Switch(page, "Record", "Stop recording", record, False, color="red")
         self._readout = Readout(page, fmu.joints)
 
-        self._add_target_fields()
-        with gui.add_folder("Gains"):
-            for group, unit in (("Kp", "s⁻²"), ("Kd", "s⁻¹")):
-                self._add_gain(group, unit)
-        if fmu.vector("tau_ext"):
-            self._add_disturbance(joints)
+        if self._target is not None:
+            self._add_target_fields(self._target)
+        if fmu.vector("Kp"):
+            with gui.add_folder("Gains"):
+                for group, unit in (("Kp", "s⁻²"), ("Kd", "s⁻¹")):
+                    self._add_gain(group, unit)
+        self._add_joint_inputs(joints)
         self._units = ["m" if joint.prismatic else "rad" for joint in joints]
         units = " or ".join(dict.fromkeys(self._units))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
         position, error = f"position, {units}", "distance from the target, mm"
-        self._plots = (
-            Plot(page, position, fmu.joints, age, rows[:, :-1], marked=False),
-            Plot(page, error, ["error"], age, rows[:, -1:], marked=False),
-        )
+        self._plots = [Plot(page, position, fmu.joints, age, rows[:, :-1], marked=False)]
+        if self._target is not None:
+            self._plots.append(Plot(page, error, ["error"], age, rows[:, -1:], marked=False))
 
-    def _add_target_fields(self) -> None:
+    def _add_target_fields(self, target: Any) -> None:
         """Numbers that go with the marker in the scene."""
-        target, gui = self._target, self._page.gui
+        gui = self._page.gui
         axes = {axis: "xyz".index(axis) for axis in self._fmu.axes}
         with gui.add_folder("Target, m"):
             fields = {
@@ -193,21 +196,38 @@ class Controls:
         for axis, k in axes.items():
             fields[axis].on_update(partial(typed, k))
 
-    def _add_disturbance(self, joints: Sequence[Joint]) -> None:
-        names, starts = self._fmu.vector("tau_ext"), self._starts
+    def _add_joint_inputs(self, joints: Sequence[Joint]) -> None:
+        """Sliders for what drives or disturbs the joints and the frame, as far as there are any."""
+        efforts = [f"{j.name}, {'N' if j.prismatic else 'N·m'}" for j in joints]
+        most = [joint.effort if isfinite(joint.effort) else 10.0 for joint in joints]
+        reach = [(max(j.low, -2 * pi), min(j.high, 2 * pi)) for j in joints]
+        places = [f"{j.name}, {'m' if j.prismatic else 'rad'}" for j in joints]
+        self._add_sliders("Joint targets", "q_des", places, reach, "")
+        self._add_sliders("Efforts", "tau_cmd", efforts, [(-m, m) for m in most], "No effort")
+        pushes = [(-0.1 * m, 0.1 * m) for m in most]
+        self._add_sliders("Disturbance", "tau_ext", efforts, pushes, "No disturbance")
+        force = [f"{axis}, N" for axis in "xyz"]
+        self._add_sliders("Force", "f_ext", force, [(-10.0, 10.0)] * 3, "No force")
+
+    def _add_sliders(
+        self,
+        title: str,
+        group: str,
+        labels: Sequence[str],
+        ranges: Sequence[tuple[float, float]],
+        release: str,
+    ) -> None:
+        """A folder of sliders for a vector; with a button that sets all to 0."""
+        names, gui = self._fmu.vector(group), self._page.gui
         sliders = {}
-        with self._page.gui.add_folder("Disturbance", expand_by_default=len(names) <= 3):
-            for name, joint in zip(names, joints):
-                start = float(starts[name])
-                most = max(0.1 * joint.effort if isfinite(joint.effort) else 1.0, abs(start))
-                sliders[name] = self._page.gui.add_slider(
-                    f"{joint.name}, {'N' if joint.prismatic else 'N·m'}",
-                    -most,
-                    most,
-                    most / 100,
-                    start,
-                )
-            release = self._page.gui.add_button("No disturbance")
+        if not names:
+            return
+        with gui.add_folder(title, expand_by_default=len(names) <= 3 and group != "f_ext"):
+            for name, label, (low, high) in zip(names, labels, ranges):
+                start = float(self._starts[name])
+                low, high = min(low, start), max(high, start)
+                sliders[name] = gui.add_slider(label, low, high, (high - low) / 200, start)
+            button = gui.add_button(release) if release else None
 
         def pushed(event: Any) -> None:
             self._change({name: float(slider.value) for name, slider in sliders.items()})
@@ -218,7 +238,8 @@ class Controls:
 
         for slider in sliders.values():
             slider.on_update(pushed)
-        release.on_click(released)
+        if button is not None:
+            button.on_click(released)
 
     def _add_gain(self, group: str, unit: str) -> None:
         names = self._fmu.vector(group)
@@ -246,8 +267,14 @@ class Controls:
             "real-time factor": "-" if factor is None else f"{factor:.2f}",
             "deadlines missed": f"{news.missed} of {news.steps}, worst {1e3 * news.worst:.1f} ms",
             "end effector": f"({', '.join(f'{value:+.5f}' for value in sample.x)}) m",
-            "target": f"({', '.join(f'{value:+.5f}' for value in sample.target or ())}) m",
-            "error": f"{1e3 * (sample.error or 0.0):.4g} mm",
+            **(
+                {
+                    "target": f"({', '.join(f'{value:+.5f}' for value in sample.target)}) m",
+                    "error": f"{1e3 * (sample.error or 0.0):.4g} mm",
+                }
+                if sample.target
+                else {}
+            ),
             **{
                 name: f"{q:+.5f} {unit}"
                 for name, q, unit in zip(self._fmu.joints, sample.q, self._units)

@@ -94,8 +94,9 @@ class Loop:
 
     def __init__(self, run: Experiment, *, bag: str | None = None, command_line: str = "") -> None:
         fmu = run.fmu
-        if urdf_text(fmu) is None or not fmu.axes or not fmu.vector("x_des"):
-            raise PageError(f"'{fmu.path}' carries no robot, or has no inputs x_des[k]")
+        drives = [group for group in ("x_des", "q_des", "tau_cmd") if fmu.vector(group)]
+        if urdf_text(fmu) is None or not fmu.axes or not drives:
+            raise PageError(f"'{fmu.path}' carries no robot, or no inputs that drive it")
         self._run, self._bag, self._command_line = run, bag, command_line
         self.recorded: list[Path] = []
         self.pace = RealTime()

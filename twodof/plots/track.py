@@ -23,7 +23,7 @@ NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
 MAX_URDF = 8 * 1024**2
 UNITS = {
     "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
-    "gravity": "m/s²", "max_step": "s",
+    "gravity": "m/s²", "max_step": "s", "payload": "kg", "payload_com": "m", "f_ext": "N",
 }  # fmt: skip
 """Units of variables, where they do not depend on the joint."""
 
@@ -251,12 +251,13 @@ def _disturbances(
 ) -> tuple[str, ...]:
     """What moves, brakes or stops the arm and is not in the closed form, which it is off or not."""
     first = schedule[0][1]
-    external = [name for name in first if name.startswith("tau_ext[")]
+    external = [name for name in first if name.startswith(("tau_ext[", "f_ext["))]
     at_work = {
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
         "singularities": astray and is_singular(robot, q, float(first.get("rcond", 0.0))),
         "damping": any(joint.damping for joint in robot.moving),
+        "unknown payload": bool(first.get("payload")) and not first.get("payload_known"),
         "external torque": any(values[name] for _, values in schedule for name in external),
     }
     return tuple(name for name, present in at_work.items() if present)
