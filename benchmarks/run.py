@@ -351,7 +351,7 @@ def without_shapes(urdf: str) -> ET.Element:
 def native_cost(arm: Arm, folder: Path) -> Callable[[], float]:
     """Times a run of the native engine in C, compiled as in its FMU."""
     name = f"step{len(list(folder.glob('step*')))}"
-    flavour = native_flavour(arm.robot, variable_table(arm.robot, arm.starts), name, ())
+    flavour = native_flavour(arm.robot, "task", variable_table(arm.robot, arm.starts), name, ())
     sources = {Path(path).name: content for path, content in flavour.files.items()}
     sources["native_step.c"] = (HERE / "native_step.c").read_bytes()
     path = folder / name

@@ -43,9 +43,11 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
         ("input", "1/s2"): {"Kp[1]": "50.0", "Kp[2]": "50.0"},
         ("input", "1/s"): {"Kd[1]": "40.0", "Kd[2]": "40.0", "Kn": "0.0"},
         ("input", "N.m"): {"tau_ext[1]": "0.0", "tau_ext[2]": "0.0"},
+        ("input", "N"): {"f_ext[1]": "0.0", "f_ext[2]": "0.0", "f_ext[3]": "0.0"},
         ("output", "rad"): {"q[1]": None, "q[2]": None},
         ("output", "rad/s"): {"v[1]": None, "v[2]": None},
         ("output", "m"): {"x[1]": None, "x[2]": None},
+        ("output", "m/s"): {"xd[1]": None, "xd[2]": None},
         ("output", "N.m"): {"tau[1]": None, "tau[2]": None},
         ("parameter", "rad"): {
             "q_start[1]": "0.5", "q_start[2]": "0.35",
@@ -54,8 +56,11 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
         ("parameter", "rad/s"): {"v_start[1]": "0.0", "v_start[2]": "0.0"},
         ("parameter", "m/s2"): {"gravity[1]": "0.0", "gravity[2]": "-9.81", "gravity[3]": "0.0"},
         ("parameter", "s"): {"max_step": "0.001"},
+        ("parameter", "kg"): {"payload": "0.0"},
+        ("parameter", "m"): {f"payload_com[{i}]": "0.0" for i in (1, 2, 3)},
         ("parameter", None): {
             "rcond": "0.01", "rtol": "0.001", "atol": "1e-06", "limit_effort": "false",
+            "rigid_stops": "false", "payload_known": "false",
         },
     }  # fmt: skip
     found: dict = {}
@@ -74,7 +79,7 @@ def test_units_are_given_in_si_base_units(description):
     assert dimensions == {
         "m": {"m": 1}, "m/s": {"m": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad": {"rad": 1},
         "rad/s": {"rad": 1, "s": -1}, "N.m": {"kg": 1, "m": 2, "s": -2}, "s": {"s": 1},
-        "1/s": {"s": -1}, "1/s2": {"s": -2},
+        "1/s": {"s": -1}, "1/s2": {"s": -2}, "N": {"kg": 1, "m": 1, "s": -2}, "kg": {"kg": 1},
     }  # fmt: skip
     assert {base.get("factor") for base in description.iter("BaseUnit")} == {"1"}
 
@@ -206,7 +211,7 @@ def test_an_fmu_holds_no_file_that_is_none_of_the_robots(uri, tmp_path):
         SHAPES.sub(f"<mesh filename='{uri}'/>", data_file("urdf", "2dof.urdf").read_text())
     )
     with pytest.raises(
-        TwoDofError, match=f"mesh '{uri}' not found in '{urdf.parent}', .*--mesh-dir"
+        TwoDofError, match=f"mesh '{uri}' not found in '{urdf.parent}', .*`mesh_dir`"
     ):
         build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
     assert list(tmp_path.iterdir()) == [urdf.parent]
@@ -218,7 +223,7 @@ def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
     urdf.write_text(text.replace("<limit ", '<dynamics friction="0.3"/><limit ', 1))
     build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
     (record,) = caplog.records
-    assert "joint 'joint1': friction is not modelled and is ignored" in record.getMessage()
+    assert "friction is not modelled and is ignored: joint 'joint1'" in record.getMessage()
 
 
 NAMES = (
@@ -284,7 +289,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 PERTURBATION = {
     "q_start": 0.05, "v_start": 0.3, "x_des": 0.01, "xd_des": 0.1, "xdd_des": 0.5, "Kp": 5.0,
     "Kd": 5.0, "tau_ext": 0.3, "Kn": 1.0, "gravity": 1.0, "rtol": 1e-4, "atol": 1e-7,
-    "max_step": 1e-4,
+    "max_step": 1e-4, "f_ext": 0.3, "payload": 0.05, "payload_com": 0.02,
 }  # fmt: skip
 
 
@@ -304,7 +309,7 @@ def moved(before, after):
 
 
 def outputs(driver):
-    names = [n for n in driver.vr if re.match(r"(q|v|x|tau)\[", n)]
+    names = [n for n in driver.vr if re.match(r"(q|v|x|xd|tau)\[", n)]
     return dict(zip(names, driver.call("getReal", [driver.vr[n] for n in names])))
 
 
@@ -327,6 +332,7 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
         description = etree.fromstring(archive.read("modelDescription.xml"))
     found: dict = {name: set() for name in declared(description, "InitialUnknowns")}
     generic = {"v_start[1]": 0.7, "v_start[2]": -0.4, "xd_des[1]": 0.1, "xd_des[2]": 0.2}
+    generic |= {"payload": 0.3, "payload_known": True}
     back = {**generic, "v_start[1]": -0.7, "v_start[2]": 0.4}
     limits = {"q_max[1]": 0.5, "q_min[2]": 0.35}
     for base in (generic, back, {**generic, **limits}, {**back, **limits}):
@@ -351,7 +357,7 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
     expected = declared(description, "InitialUnknowns")
     # of no effect on this arm, but on others: gravity along the joints' axes, and null-space
     # damping where there is no null space
-    idle = {"gravity[3]", "Kn"}
+    idle = {"gravity[3]", "payload_com[3]", "Kn"}
     for output, names in found.items():
         assert names | idle == expected[output] | idle, (output, names ^ expected[output])
         assert not names & {"rtol", "atol", "max_step"}

@@ -70,7 +70,7 @@ def test_run_native_builds_its_own_fmu_once(tmp_path, monkeypatch, capsys):
 
 
 def test_run_native_beside_an_fmu_is_refused(native_path, capsys):
-    assert main(["run", "--native", str(native_path)]) == 1
+    assert main(["run", "--native", str(native_path)]) == 2
     assert "--native builds the default arm's FMU" in capsys.readouterr().err
 
 
@@ -90,7 +90,7 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
 
 def test_a_machine_that_is_no_fmi_platform_needs_to_be_told_one(tmp_path, monkeypatch):
     monkeypatch.setattr("twodof.export.package.host_platform", lambda: "")
-    with pytest.raises(twodof.TwoDofError, match="choose one with --platform"):
+    with pytest.raises(twodof.TwoDofError, match="choose one with `platforms`"):
         build_fmu(tmp_path / "A.fmu", FmuOptions(native=True))
 
 

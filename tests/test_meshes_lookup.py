@@ -141,14 +141,35 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("uri", "mesh_dir"), REFUSED.values(), ids=REFUSED)
+ABSENT = [
+    "not there", "not there, no mesh_dir", "no path", "absolute, not there", "another scheme",
+    "not a URI",
+]  # fmt: skip
+"""Those that name no file at all: they are left out with a warning."""
+
+
+@pytest.mark.parametrize(("uri", "mesh_dir"), [REFUSED[case] for case in ABSENT], ids=ABSENT)
+def test_warning_names_the_mesh_that_is_left_out(
+    disk: Path, uri: str, mesh_dir: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    uri = uri.format(disk=disk)
+    text, files = collect_meshes(
+        urdf(uri), disk / "ws/arm_description/urdf", None if mesh_dir is None else disk / mesh_dir
+    )
+    assert files == {} and uri in text and uri in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("uri", "mesh_dir"), [REFUSED[case] for case in REFUSED if case not in ABSENT],
+    ids=[case for case in REFUSED if case not in ABSENT],
+)  # fmt: skip
 def test_refusal_names_the_mesh_and_where_it_may_be(
     disk: Path, uri: str, mesh_dir: str | None
 ) -> None:
     uri = uri.format(disk=disk)
     (disk / "ws2").mkdir()
     (disk / "ws2/secret.stl").write_bytes(b"secret")
-    with pytest.raises(BuildError, match=r"not found in .*--mesh-dir") as refusal:
+    with pytest.raises(BuildError, match=r"not found in .*`mesh_dir`") as refusal:
         collect(disk, uri, mesh_dir)
     assert f"mesh '{uri}'" in str(refusal.value)
     assert f"'{disk / (mesh_dir or 'ws/arm_description')}'" in str(refusal.value)

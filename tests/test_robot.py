@@ -127,7 +127,6 @@ REFUSED = {
     "infinite mass": (arm(tip=link("tip", inertial("inf"))), "'tip': <mass value='inf'>"),
     "huge mass": (arm(tip=link("tip", inertial("1e30"))), "'tip': <mass value='1e30'>"),
     "mass no number": (arm(tip=link("tip", inertial("1 kg"))), "'tip': <mass value='1 kg'>"),
-    "triangle inequality": (arm(tip=link("tip", inertial(1, 1, 1, 2.1))), "'tip': its inertia"),
     "negative inertia": (arm(tip=link("tip", inertial(1, 1, 1, -0.1))), "'tip': its inertia"),
     "NaN inertia": (arm(tip=link("tip", inertial(1, "nan"))), "'tip': <inertia ixx='nan'>"),
     "huge inertia": (arm(tip=link("tip", inertial(1, "1e99"))), "'tip': <inertia ixx='1e99'>"),
@@ -320,7 +319,7 @@ def test_friction_is_ignored_with_a_warning() -> None:
     loaded = load_robot(arm(elbow=rough), "tip", "xyz")
     assert loaded.damping == (0.0, 0.5)
     assert len(loaded.warnings) == 1
-    assert "joint 'elbow': friction" in loaded.warnings[0]
+    assert "friction is not modelled and is ignored: joint 'elbow'" in loaded.warnings[0]
 
 
 EXTRAS = {
@@ -452,5 +451,5 @@ def test_example_robot_is_the_one_that_pinocchio_loads(
 
 def test_panda_as_published_is_refused_for_its_mimic_joint(robots: Path) -> None:
     urdf = (robots / "panda_description/urdf/panda.urdf").read_text("utf-8")
-    with pytest.raises(RobotError, match=r"'panda_finger_joint2' mimics .* make it fixed"):
+    with pytest.raises(RobotError, match=r"'panda_finger_joint2' mimics .* hold both with `lock`"):
         load_robot(urdf, "panda_hand_tcp", "xyz")

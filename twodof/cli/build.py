@@ -8,18 +8,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .common import controlled, print_next, print_table, quote
+from .common import CommandLineError, controlled, print_next, print_table, quote
 
 
 def add(verbs: Any) -> None:
     """Add the verb and its options."""
     build = verbs.add_parser("build", help="build an FMU from a URDF")
     build.add_argument("-o", dest="output", metavar="FILE.fmu", help="default: <name>.fmu")
-    build.add_argument("--urdf", type=Path, help="default: the shipped planar 2-DoF arm")
+    build.add_argument(
+        "robot", nargs="?", type=Path, metavar="URDF", help="default: the shipped planar 2-DoF arm"
+    )
+    build.add_argument("--urdf", type=Path, metavar="U", help="the same")
     build.add_argument(
         "--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes"
     )
-    build.add_argument("--frame", default="EndEffector", help="controlled link (%(default)s)")
+    build.add_argument(
+        "--no-meshes", action="store_true", help="leave the URDF's meshes out of the FMU"
+    )
+    build.add_argument("--frame", help="controlled link (EndEffector, or the only last link)")
+    build.add_argument(
+        "--lock", dest="locks", action="append", default=[], metavar="JOINT[=VALUE]",
+        help="fix joints, names or shell patterns, at a position (0), rad or m",
+    )  # fmt: skip
     build.add_argument("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
     build.add_argument(
         "--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"),
@@ -50,13 +60,17 @@ def add(verbs: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
+    if options.urdf and options.robot:
+        raise CommandLineError("a URDF is given twice, by its place and with --urdf")
     from ..export.package import FmuOptions, build_fmu
 
     gravity = None if options.gravity is None else tuple(options.gravity)
     chosen = FmuOptions(
-        urdf=options.urdf,
+        urdf=options.urdf or options.robot,
         mesh_dir=options.mesh_dir,
         frame=options.frame,
+        lock=_locks(options.locks),
+        meshes=not options.no_meshes,
         axes=options.axes,
         gravity=gravity,
         q_start=None if options.q_start is None else tuple(options.q_start),
@@ -78,6 +92,17 @@ def call(options: argparse.Namespace) -> int:
     )
     print_next(f"twodof run {quote(path)}", f"twodof info {quote(path)}")
     return 0
+
+
+def _locks(texts: Sequence[str]) -> dict[str, float]:
+    locks: dict[str, float] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        try:
+            locks[name] = float(value) if equals else 0.0
+        except ValueError:
+            raise CommandLineError(f"--lock {text}: '{value}' is not a number") from None
+    return locks
 
 
 def _platforms(chosen: Sequence[str]) -> tuple[str, ...]:

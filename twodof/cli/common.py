@@ -143,8 +143,8 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
-    """The FMU that is named, else the default arm's, built if need be."""
-    if options.fmu:
+    """The FMU that is named, else that of the URDF or of the default arm, built if need be."""
+    if options.fmu and Path(options.fmu).suffix != ".urdf":
         if options.native:
             raise CommandLineError(
                 "--native builds the default arm's FMU; leave it out beside an FMU"
@@ -154,9 +154,14 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
     from ..export.package import FmuOptions, build_fmu
 
     native = options.native or host_platform() != "linux64"
+    robot = Path(options.fmu) if options.fmu else None
     if native and not options.native:
         print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
-    return build_fmu(None, FmuOptions(native=native))
+    if robot is None:
+        return build_fmu(None, FmuOptions(native=native))
+    name = re.sub(r"\W", "_", robot.stem, flags=re.ASCII)
+    name = name if name.isidentifier() else f"robot_{name}"
+    return build_fmu(None, FmuOptions(urdf=robot, name=name, native=native))
 
 
 def print_summary(

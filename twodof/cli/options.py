@@ -8,7 +8,7 @@ import argparse
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Of a run that may leave a bag."""
     parser.add_argument(
-        "fmu", nargs="?", metavar="FMU", help="default: TwoDof.fmu, built if need be"
+        "fmu", nargs="?", metavar="FMU|URDF", help="default: TwoDof.fmu, built if need be"
     )
     parser.add_argument(
         "--native", action="store_true", help="build and run the native default FMU instead"

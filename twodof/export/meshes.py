@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path, PurePosixPath
@@ -10,6 +12,7 @@ from urllib.parse import unquote
 from ..errors import BuildError
 from ..files import read_file
 
+LOG = logging.getLogger(__name__)
 MAX_MESHES = 256 * 1024**2  # bytes of all meshes together
 
 
@@ -17,7 +20,8 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     """The URDF with its meshes renamed to ``package://meshes/…``, and the files by that name.
 
     The URDF may be anybody's, and the FMU is mailed: a mesh comes from ``mesh_dir``, the URDF's
-    folder or its package, however it is named or linked, or it is refused.
+    folder or its package, however it is named or linked, or it is refused. Those that are not there
+    are left out with a warning.
 
     Args:
         urdf: XML text.
@@ -25,24 +29,35 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
         mesh_dir: folder of the packages, of one package, or of the meshes themselves.
 
     Raises:
-        BuildError: a mesh that is missing, cannot be read, or lies elsewhere.
+        BuildError: a mesh that cannot be read, or lies elsewhere.
     """
     tree = ET.fromstring(urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
+    missing: list[str] = []
     for mesh in tree.iter("mesh"):
         uri = mesh.get("filename")
         if uri is None:
+            continue
+        if uri in missing:
             continue
         if uri not in names:
             try:
                 path = _find(uri, folder, mesh_dir)
                 names[uri] = _inside(path, files)
                 files[names[uri]] = read_file(path, MAX_MESHES - sum(map(len, files.values())))
+            except FileNotFoundError:
+                missing.append(uri)
+                continue
             except (OSError, ValueError, RuntimeError) as error:  # the last: links in a circle
                 reason = (isinstance(error, OSError) and error.strerror) or error
                 raise BuildError(f"mesh '{uri}' cannot be read: {reason}") from error
         mesh.set("filename", f"package://{names[uri]}")
+    if missing:
+        LOG.warning(
+            "meshes are left out, as they were not found; give their folder, or that of their"
+            " packages, with `mesh_dir`: %s", ", ".join(dict.fromkeys(missing)),
+        )  # fmt: skip
     return ET.tostring(tree, encoding="unicode") + "\n", files
 
 
@@ -70,11 +85,13 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
         path = candidate.resolve()
         if any(path.is_relative_to(place) for place in places) and path.is_file():
             return path
-    where = " or ".join(f"'{place}'" for place in dict.fromkeys(places))
-    raise BuildError(
-        f"mesh '{uri}' not found in {where}, and it may come from nowhere else; give the folder of"
-        " the meshes, or of their packages, with `mesh_dir`"
-    )
+    if any(os.path.lexists(candidate) for candidate in candidates):
+        where = " or ".join(f"'{place}'" for place in dict.fromkeys(places))
+        raise BuildError(
+            f"mesh '{uri}' not found in {where}, and it may come from nowhere else; give the folder"
+            " of the meshes, or of their packages, with `mesh_dir`"
+        )
+    raise FileNotFoundError
 
 
 def _inside(path: Path, files: dict[str, bytes]) -> str:

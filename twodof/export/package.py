@@ -8,16 +8,16 @@ import logging
 import math
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..data import data_file
 from ..errors import ZIP_ERRORS, BuildError
-from ..files import check_archive, read_file, write_file
+from ..files import check_archive, write_file
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
-from ..plant.urdf import RobotError
+from ..plant.urdf import RobotError, read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
 from .compiler import host_platform
@@ -25,15 +25,14 @@ from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
+from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_FRAME = "EndEffector"
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-MAX_URDF = 8 * 1024**2
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,10 @@ class FmuOptions:
     Attributes:
         urdf: the URDF; None for the shipped planar arm.
         mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
-        frame: link whose origin is controlled.
+        frame: link whose origin is controlled; None: "EndEffector", or the only link without
+            a link behind it.
+        lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
+        meshes: whether to carry them.
         axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else
             (0, 0, −9.81).
@@ -59,7 +61,9 @@ class FmuOptions:
 
     urdf: Path | None = None
     mesh_dir: Path | None = None
-    frame: str = DEFAULT_FRAME
+    frame: str | None = None
+    lock: Mapping[str, float] = field(default_factory=dict)
+    meshes: bool = True
     axes: str | None = None
     gravity: tuple[float, float, float] | None = None
     q_start: tuple[float, ...] | None = None
@@ -101,7 +105,15 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     if options.control not in CONTROLS:
         raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
     path = options.urdf or data_file("urdf", "2dof.urdf")
-    text = _read_urdf(path)
+    text = read_text(path)
+    try:
+        text = lock_joints(text, options.lock) if options.lock else text
+        frame = options.frame or end_effector(read_urdf(text))
+    except RobotError as error:
+        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    options = replace(options, frame=frame)
+    if not options.meshes:
+        text = without_meshes(text)
     robot, table, starts = _model(options, text)
     urdf, meshes = collect_meshes(text, path.parent, _mesh_dir(options))
     flavour = _flavour(options, robot, table, urdf, starts)
@@ -163,15 +175,6 @@ def _flavour(
     return native_flavour(robot, options.control, table, options.name, platforms)
 
 
-def _read_urdf(path: Path) -> str:
-    try:
-        return read_file(path, MAX_URDF).decode("utf-8")
-    except OSError as error:
-        raise BuildError(f"cannot read the URDF '{path}': {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
-
-
 def _mesh_dir(options: FmuOptions) -> Path | None:
     if options.mesh_dir is not None and not options.mesh_dir.is_dir():
         raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
@@ -183,6 +186,7 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
     shipped = options.urdf is None
     axes = options.axes or ("xy" if shipped else "xyz")
     try:
+        assert options.frame is not None
         robot = load_robot(urdf, options.frame, axes)
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error

@@ -70,11 +70,19 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
         if element.find("mimic") is not None:
             raise RobotError(
                 f"joint '{element.get('name')}' mimics another joint, which is not supported;"
-                " make it fixed, or leave out its <mimic> to move it on its own"
+                " hold both with `lock`, or leave out its <mimic> to move it on its own"
             )
+    odd: list[str] = []
     for joint in urdf.joints.values():
         if joint.moves:
-            _check_body(urdf, joint)
+            _check_body(urdf, joint, odd)
+    warnings = list(urdf.warnings)
+    if odd:
+        links = ", ".join(f"'{link}'" for link in dict.fromkeys(odd))
+        warnings.append(
+            "no body can have these inertias, one principal moment larger than the sum of the"
+            f" other two, which are taken as they are: {links}"
+        )
     if not any(joint.moves for joint in urdf.joints.values()):
         raise RobotError("the URDF has no moving joint")
     if frame not in urdf.links:
@@ -99,14 +107,14 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
         frame_id=model.getFrameId(frame, pin.FrameType.BODY),
         axes=axes,
         root=urdf.root,
-        warnings=urdf.warnings,
+        warnings=tuple(warnings),
     )
     if not any(robot.moves_frame()):
         raise RobotError(f"no joint moves the frame '{frame}'")
     return robot
 
 
-def _check_body(urdf: Urdf, joint: Joint) -> None:
+def _check_body(urdf: Urdf, joint: Joint, odd: list[str]) -> None:
     """A moving body, that is a link with all that is fixed to it, needs physical inertia."""
     fixed = [other for other in urdf.joints.values() if not other.moves]
     body = [joint.child]
@@ -117,7 +125,7 @@ def _check_body(urdf: Urdf, joint: Joint) -> None:
     for name in body:
         inertial = links[name].find("inertial")
         if inertial is not None:
-            mass += _check_inertia(name, inertial)
+            mass += _check_inertia(name, inertial, odd)
     if mass == 0.0:
         raise RobotError(
             f"link '{joint.child}' moves (joint '{joint.name}') but has no mass;"
@@ -125,8 +133,8 @@ def _check_body(urdf: Urdf, joint: Joint) -> None:
         )
 
 
-def _check_inertia(link: str, inertial: ET.Element) -> float:
-    """The link's mass, after the checks."""
+def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
+    """The link's mass, after the checks; ``odd`` gets it if its inertia is slightly off."""
     if missing := _missing(inertial):
         raise RobotError(f"link '{link}': its <inertial> has no {missing}")
     mass = attribute(inertial, "mass", "value", 0.0)
@@ -135,11 +143,13 @@ def _check_inertia(link: str, inertial: ET.Element) -> float:
     xx, xy, xz, yy, yz, zz = (attribute(inertial, "inertia", key, 0.0) for key in _INERTIA_KEYS)
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     slack = 1e-6 * float(np.abs(moments).sum()) + 1e-15  # URDFs are written with few digits
-    if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
+    if moments[2] > moments[0] + moments[1] + slack:
+        odd.append(link)
+    if moments[0] < -slack:
         text = ", ".join(f"{moment:.3g}" for moment in moments)
         raise RobotError(
             f"link '{link}': its inertia is not physical, principal moments {text} kg·m2"
-            " must be positive and none larger than the sum of the other two"
+            " must be positive"
         )
     return mass
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 UNBOUNDED = 1.7976931348623157e308
@@ -125,8 +126,15 @@ def read_urdf(text: str) -> Urdf:
     root = _check_tree(links, elements)
     joints = {name: _joint(name, element) for name, element in elements.items()}
     frictional = [n for n, e in elements.items() if attribute(e, "dynamics", "friction", 0.0)]
-    warnings = [f"joint '{name}': friction is not modelled and is ignored" for name in frictional]
-    return Urdf(tree.get("name", ""), root, tuple(links), joints, tree, tuple(warnings))
+    warnings = (f"friction is not modelled and is ignored: {_listed('joint', frictional)}",)
+    return Urdf(
+        tree.get("name", ""), root, tuple(links), joints, tree, warnings if frictional else ()
+    )
+
+
+def _listed(what: str, names: Sequence[str]) -> str:
+    quoted = ", ".join(f"'{name}'" for name in names)
+    return f"{what}{'s' if len(names) > 1 else ''} {quoted}"
 
 
 def _parse(urdf: str) -> ET.Element:

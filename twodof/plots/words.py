@@ -9,7 +9,8 @@ from .track import Track, number
 
 TOLD = {
     "x_des": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²", "Kp": "", "Kd": "", "Kn": "0 s⁻¹",
-    "tau_ext": "0", "f_ext": "0 N", "payload": "0 kg", "limit_effort": "false", "step": "", "FMU": "",
+    "tau_ext": "0", "f_ext": "0 N", "payload": "0 kg", "limit_effort": "false", "step": "",
+    "FMU": "",
 }  # fmt: skip
 """Settings that a figure tells, and the values that go without saying."""
 

@@ -1,0 +1,142 @@
+"""Stock robots with no edit of their URDFs: locked joints, leaves, missing meshes, odd inertias."""
+
+from __future__ import annotations
+
+import logging
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import twodof
+from twodof.cli.main import main
+from twodof.export.package import FmuOptions, build_fmu
+from twodof.export.urdf_source import end_effector, lock_joints
+from twodof.plant.robot import load_robot
+from twodof.plant.urdf import RobotError, read_urdf
+
+
+@pytest.fixture(scope="module")
+def panda_file(robots: Path) -> Path:
+    return robots / "panda_description/urdf/panda.urdf"
+
+
+@pytest.mark.parametrize(
+    "locks",
+    [{"panda_joint7": 0.7}, {"panda_joint[24]": -0.5}, {"*": 0.0, "panda_joint4": -1.0}],
+)
+def test_locked_joints_are_pinocchios_reduced_model(
+    panda_file: Path, locks: dict[str, float]
+) -> None:
+    """M, h and the frame's place; the fingers, one of which mimics the other, are always locked."""
+    text = panda_file.read_text()
+    full = pin.buildModelFromXML(text)
+    free = {"*": [], "panda_joint4": ["panda_joint4"]}
+    positions = {"panda_finger_joint?": 0.02}
+    if "*" in locks:
+        positions |= {f"panda_joint{i}": 0.0 for i in (1, 2, 3, 5, 6)}
+        positions["panda_joint4"] = locks["panda_joint4"]
+    else:
+        positions |= locks
+    robot = load_robot(lock_joints(text, positions), "panda_hand_tcp", "xyz")
+    held = [name for name in list(full.names)[1:] if name not in robot.joints]
+    q0 = pin.neutral(full)
+    for name in held:
+        (value,) = {v for pattern, v in positions.items() if Path(name).match(pattern)}
+        q0[full.joints[full.getJointId(name)].idx_q] = value
+    reduced = pin.buildReducedModel(full, [full.getJointId(name) for name in held], q0)
+    assert robot.joints == tuple(reduced.names)[1:] and free
+    data, ours = reduced.createData(), robot.model.createData()
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        q, v, a = (rng.normal(size=reduced.nv) for _ in "qva")
+        expected = pin.rnea(reduced, data, q, v, a)
+        np.testing.assert_allclose(pin.rnea(robot.model, ours, q, v, a), expected, atol=1e-11)
+        pin.framesForwardKinematics(reduced, data, q)
+        pin.framesForwardKinematics(robot.model, ours, q)
+        place = data.oMf[reduced.getFrameId("panda_hand_tcp")].translation
+        np.testing.assert_allclose(ours.oMf[robot.frame_id].translation, place, atol=1e-12)
+
+
+def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
+    text = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
+    <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1"/></joint><joint name="k" type="prismatic"><parent link="b"/>
+    <child link="c"/><axis xyz="1 0 0"/><limit lower="-1" upper="1"/>
+    <mimic joint="j" multiplier="0.5" offset="0.1"/></joint></robot>"""
+    joints = read_urdf(lock_joints(text, {"j": 0.4})).joints
+    assert {joint.type for joint in joints.values()} == {"fixed"}
+    assert joints["j"].rpy == pytest.approx((0, 0, 0.4), abs=1e-15) and joints[
+        "k"
+    ].xyz == pytest.approx((0.3, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("locks", "message"),
+    [
+        ({"elbow": 0.0}, r"no joint 'elbow' to lock; there are: joint1, joint2"),
+        ({"joint1": 4.0}, r"joint 'joint1' cannot be locked at 4: its limits are"),
+    ],
+)
+def test_a_lock_that_cannot_be_is_refused(locks: dict[str, float], message: str) -> None:
+    with pytest.raises(twodof.TwoDofError, match=message):
+        build_fmu(None, FmuOptions(lock=locks))
+
+
+def test_the_only_last_link_is_controlled(robots: Path, tmp_path: Path) -> None:
+    xarm = robots / "xarm_description/urdf/xarm7.urdf"
+    path = build_fmu(tmp_path / "k.fmu", FmuOptions(urdf=xarm, native=True, meshes=False))
+    fmu = twodof.load_fmu(path)
+    assert fmu.frame == end_effector(read_urdf(xarm.read_text())) == "link_eef"
+
+
+def test_of_several_last_links_one_must_be_named(panda_file: Path) -> None:
+    with pytest.raises(RobotError, match=r"`frame`; at the ends are: panda_.*; and there are: "):
+        end_effector(read_urdf(panda_file.read_text()))
+
+
+def test_a_mesh_that_is_not_there_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shipped = Path(twodof.__file__).parents[1] / "urdf/2dof.urdf"
+    text = shipped.read_text().replace("link1.stl", "gone.stl")
+    (tmp_path / "arm.urdf").write_text(text.replace("link2.stl", "lost.stl"))
+    with caplog.at_level(logging.WARNING, "twodof"):
+        path = build_fmu(tmp_path / "arm.fmu", FmuOptions(urdf=tmp_path / "arm.urdf"))
+    (record,) = caplog.records
+    assert "meshes are left out" in record.getMessage() and "gone.stl" in record.getMessage()
+    twodof.simulate(path, twodof.Bag(tmp_path / "bag", scene=True), stop_time=0.05)
+    assert len(twodof.read_bag(tmp_path / "bag").t) == 6
+
+
+def test_meshes_can_be_left_out(tmp_path: Path) -> None:
+    path = build_fmu(tmp_path / "arm.fmu", FmuOptions(meshes=False))
+    with zipfile.ZipFile(path) as archive:
+        assert not [name for name in archive.namelist() if name.startswith("resources/meshes")]
+        assert b"<mesh" not in archive.read("resources/robot.urdf")
+
+
+def test_inertias_that_no_body_has_are_named_in_one_line() -> None:
+    shipped = Path(twodof.__file__).parents[1] / "urdf/2dof.urdf"
+    tree = shipped.read_text()
+    import re
+
+    odd = re.sub(r'izz="[^"]*"', 'izz="1.0"', tree)
+    robot = load_robot(odd, "EndEffector", "xy")
+    (line,) = robot.warnings
+    assert "'link1', 'link2'" in line and "taken as they are" in line
+
+
+def test_a_urdf_is_run_by_one_command(
+    panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["--native", "--no-meshes", "--frame", "panda_hand_tcp", "--lock", "panda_finger*"]
+    assert main(["build", str(panda_file), *options, "-o", "panda.fmu"]) == 0
+    assert main(["run", "panda.fmu", "-o", "bag", "--stop-time", "0.1"]) == 0
+    assert len(twodof.read_bag("bag").joints) == 7
+    xarm = panda_file.parents[2] / "xarm_description/urdf/xarm7.urdf"
+    assert main(["run", str(xarm), "--native", "-o", "bag2", "--stop-time", "0.1"]) == 0
+    assert (tmp_path / "xarm7-native.fmu").exists()

@@ -1,0 +1,114 @@
+"""The URDF that an FMU is made of: read, its joints locked, its meshes left out, its end found."""
+
+from __future__ import annotations
+
+import fnmatch
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import BuildError
+from ..files import read_file
+from ..plant.urdf import RobotError, Urdf, read_urdf
+
+DEFAULT_FRAME = "EndEffector"
+MAX_URDF = 8 * 1024**2
+
+
+def read_text(path: Path) -> str:
+    """The text of a URDF.
+
+    Raises:
+        BuildError: it cannot be read, or is not UTF-8.
+    """
+    try:
+        return read_file(path, MAX_URDF).decode("utf-8")
+    except OSError as error:
+        raise BuildError(f"cannot read the URDF '{path}': {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
+
+
+def end_effector(urdf: Urdf) -> str:
+    """The link that is controlled where none is named."""
+    if DEFAULT_FRAME in urdf.links:
+        return DEFAULT_FRAME
+    parents = {joint.parent for joint in urdf.joints.values()}
+    leaves = [
+        link
+        for link in urdf.links
+        if link not in parents and any(joint.moves for joint in urdf.chain(link))
+    ]
+    if len(leaves) == 1:
+        return leaves[0]
+    others = [link for link in urdf.links if link not in leaves]
+    raise RobotError(
+        f"name the controlled link with `frame`; at the ends are: {', '.join(leaves) or 'none'};"
+        f" and there are: {', '.join(others)}"
+    )
+
+
+def without_meshes(text: str) -> str:
+    """A URDF without the visuals and collisions that are meshes."""
+    tree = ET.fromstring(text)
+    for link in tree.findall("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            if shape.find("geometry/mesh") is not None:
+                link.remove(shape)
+    return ET.tostring(tree, encoding="unicode")
+
+
+def lock_joints(text: str, locks: Mapping[str, float]) -> str:
+    """A URDF with joints fixed at positions; joints that mimic one of them are fixed too.
+
+    Args:
+        text: XML text.
+        locks: positions, rad or m, by joint name or shell pattern.
+
+    Raises:
+        RobotError: no joint has such a name, or a position is outside its joint's limits.
+    """
+    from scipy.spatial.transform import Rotation  # which takes half a second to import
+
+    urdf = read_urdf(text)
+    moving = {name: joint for name, joint in urdf.joints.items() if joint.moves}
+    positions: dict[str, float] = {}
+    for pattern, value in locks.items():
+        matches = fnmatch.filter(moving, pattern)
+        if not matches:
+            raise RobotError(f"no joint '{pattern}' to lock; there are: {', '.join(moving)}")
+        positions |= dict.fromkeys(matches, value)
+    elements = {str(e.get("name")): e for e in urdf.tree.findall("joint")}
+    mimics = {name: e.find("mimic") for name, e in elements.items() if name in moving}
+    for _ in mimics:  # of a mimic of a mimic too
+        for name, mimic in mimics.items():
+            if mimic is not None and mimic.get("joint") in positions and name not in positions:
+                factor, offset = (
+                    float(mimic.get(k, d)) for k, d in (("multiplier", 1), ("offset", 0))
+                )
+                positions[name] = factor * positions[str(mimic.get("joint"))] + offset
+    for name, value in positions.items():
+        joint, element = moving[name], elements[name]
+        if not joint.low <= value <= joint.high:
+            raise RobotError(
+                f"joint '{name}' cannot be locked at {value:g}: its limits are"
+                f" {joint.low:g} and {joint.high:g}"
+            )
+        turned = Rotation.from_euler("xyz", joint.rpy)
+        place = np.array(joint.xyz)
+        if joint.prismatic:
+            place = place + turned.apply(np.array(joint.axis) * value)
+        else:
+            turned = turned * Rotation.from_rotvec(np.array(joint.axis) * value)
+        for tag in ("origin", "mimic", "limit", "dynamics"):
+            for child in element.findall(tag):
+                element.remove(child)
+        element.set("type", "fixed")
+        rpy = turned.as_euler("xyz")
+        ET.SubElement(
+            element, "origin", xyz=" ".join(map(repr, place.tolist())),
+            rpy=" ".join(map(repr, rpy.tolist())),
+        )  # fmt: skip
+    return ET.tostring(urdf.tree, encoding="unicode")
