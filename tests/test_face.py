@@ -8,6 +8,7 @@ import os
 import pkgutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -226,6 +227,21 @@ def test_one_value_for_a_vector_says_that_it_was_spread(
     assert "Kp            60, all 2 elements\n" in capsys.readouterr().out
     given = twodof.read_bag(tmp_path / "bag").provenance["start_values"]
     assert given["Kp[1]"] == given["Kp[2]"] == 60.0
+
+
+def test_times_are_those_of_the_fmus_default_experiment(native_path: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.fmu"
+    with zipfile.ZipFile(native_path) as archive, zipfile.ZipFile(other, "w") as changed:
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name == "modelDescription.xml":
+                content = content.replace(b'stopTime="5.0"', b'stopTime="0.3"')
+                content = content.replace(b'stepSize="0.01"', b'stepSize="0.02"')
+            changed.writestr(name, content)
+    run = twodof.experiment(other)
+    assert (run.steps, run.step) == (15, 0.02)
+    run = twodof.experiment(native_path)
+    assert (run.steps, run.step) == (500, 0.01)
 
 
 def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path: Path) -> None:

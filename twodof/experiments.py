@@ -85,8 +85,8 @@ def experiment(
     fmu: Fmu | str | Path,
     *,
     start_time: float = 0.0,
-    stop_time: float = 5.0,
-    step: float = 0.01,
+    stop_time: float | None = None,
+    step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
     input_file: str | Path | None = None,
     stamp_start: float | None = None,
@@ -96,7 +96,7 @@ def experiment(
     Args:
         fmu: the FMU or its path.
         start_time, stop_time, step: s; the stop a whole number of steps after the start, or
-            infinite.
+            infinite. None: the FMU's default experiment, or 5 s after the start in steps of 10 ms.
         settings: start values of inputs and parameters by name; a vector's name takes one value
             for all elements or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
@@ -106,6 +106,9 @@ def experiment(
         InputError, FmuError: naming what is wrong.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
+    step = _default(fmu, "stepSize", 0.01) if step is None else step
+    if stop_time is None:
+        stop_time = start_time + _default(fmu, "stopTime", 5.0) - _default(fmu, "startTime", 0.0)
     given = resolve(fmu, settings or {})
     changes = [] if input_file is None else read_changes(fmu, input_file)
     for name in changes[0][1] if changes else ():
@@ -140,6 +143,12 @@ def _steps(start: float, stop: float, h: float) -> float:
     if abs(steps * h - (stop - start)) > TIME_TOLERANCE * h * max(1, steps):
         raise InputError(f"the run of {stop - start:g} s is no whole number of steps of {h:g} s")
     return steps
+
+
+def _default(fmu: Fmu, name: str, fallback: float) -> float:
+    """A number of the FMU's default experiment."""
+    number = getattr(fmu.description.defaultExperiment, name, None)
+    return fallback if number is None else float(number)
 
 
 def _declared_starts(fmu: Fmu) -> dict[str, Value]:

@@ -103,7 +103,9 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def experiment_of(options: argparse.Namespace, stop_time: float, step: float) -> Experiment:
+def experiment_of(
+    options: argparse.Namespace, stop_time: float | None, step: float | None
+) -> Experiment:
     """The experiment that the options ask for."""
     from ..experiments import experiment
 

@@ -34,14 +34,14 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 
 def add_time_options(parser: argparse.ArgumentParser) -> None:
     """Stop time and step."""
-    parser.add_argument("--stop-time", type=float, default=5.0, metavar="S", help="s (%(default)s)")
+    parser.add_argument("--stop-time", type=float, metavar="S", help="s (the FMU's own)")
     add_step_option(parser)
 
 
 def add_step_option(parser: argparse.ArgumentParser) -> None:
     """Communication step."""
     parser.add_argument(
-        "--step", type=float, default=0.01, metavar="S", help="communication step, s (%(default)s)"
+        "--step", type=float, metavar="S", help="communication step, s (the FMU's own)"
     )
 
 

@@ -328,7 +328,7 @@ def live(
     *,
     host: str = HOST,
     port: int = PORT,
-    step: float = 0.01,
+    step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
     bag: str | None = None,
     command_line: str = "",
@@ -340,7 +340,7 @@ def live(
         stop: asked between two steps.
         opened: told the URL, when it can be opened.
         host, port: where to listen.
-        step: communication step, s.
+        step: communication step, s; None: the FMU's own.
         settings: start values, as of ``experiment``.
         bag: name of the first recording; None: rosbag2_<date and time>.
         command_line: for the provenance of recordings.

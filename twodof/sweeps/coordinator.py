@@ -35,8 +35,8 @@ def sweep(
     ranges: Mapping[str, Sequence[float]] | None = None,
     random: int = 0,
     seed: int = 0,
-    stop_time: float = 5.0,
-    step: float = 0.01,
+    stop_time: float | None = None,
+    step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
     output: str | Path | None = None,
     resume: bool = False,
@@ -77,7 +77,8 @@ def sweep(
         BagError: a bag cannot be written.
     """
     run = experiment(fmu, stop_time=stop_time, step=step, settings=settings)
-    options = {"stop_time": stop_time, "step": step, "settings": dict(run.given)}
+    stop_time = run.time(run.steps) if stop_time is None else stop_time
+    options = {"stop_time": stop_time, "step": run.step, "settings": dict(run.given)}
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
     units = [_unit(run.fmu, name) for name in design.names]
     with _folder(output) as path:
