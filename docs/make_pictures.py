@@ -1,11 +1,11 @@
-"""Makes docs/arm.png, plot.png and map.png, the README's pictures, and fmu_src/model.png, the icon.
+"""Makes docs/arm.png, plot.png and map.png, and fmu_src/model.png, the icon of FMUs.
 
     python docs/make_pictures.py
 
 The first picture shows the default run, from the samples of the FMU itself, with the arm drawn from
 its meshes as seen from above. The second is what ``twodof plot`` makes of three runs, the third is
-what it makes of the README's sweep. The icon is for FMI tools and suits the FMU of any robot. Needs
-the extras 'view', 'sweep' and 'native'.
+what it makes of the sweep in docs/gains.md. The icon is for FMI tools and suits the FMU of any
+robot. Needs the extras 'view', 'sweep' and 'native'.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Makes docs/view.png and docs/live.png, the README's screenshots of the pages.
+"""Makes docs/view.png and docs/live.png, screenshots of the pages.
 
     python docs/make_screenshots.py
 

@@ -1,0 +1,201 @@
+"""The documentation does what it says: its commands and programs run, its links lead somewhere.
+
+A page is run as one shell script, from top to bottom, in a folder that holds nothing but an
+environment ``.venv``, which is this one. What is run are blocks fenced as ``sh`` and ``python``;
+what needs ROS 2, a display, a network or minutes is fenced as ``console``, output as ``text``.
+All that is not run is left blank in the script, so that its line numbers are those of the page.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import twodof
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+FENCES = {"sh", "python", "console", "text"}
+MAX_README = 10 * 1024  # bytes
+SECONDS = 300  # by the clock: a guard against hanging
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, the number of its first line, from 1, and its lines."""
+
+    language: str
+    line: int
+    lines: list[str]
+
+
+def blocks(text: str) -> Iterator[Block]:
+    """The fenced blocks of a page."""
+    block: Block | None = None
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.startswith("```"):
+            if block is not None:
+                block.lines.append(line)
+        elif block is None:
+            block = Block(line[3:].strip(), number + 1, [])
+        else:
+            yield block
+            block = None
+    assert block is None, "a fence is open at the end"
+
+
+def script(text: str, name: str, folder: Path) -> str:
+    """The page as a shell script; its programs become files in a folder."""
+    lines = [""] * (len(text.splitlines()) + 1)
+    # without the trap, a failure in the middle of a page would say no line
+    lines[0] = f"set -eE; trap 'echo \"{name}:$LINENO: $BASH_COMMAND\" >&2' ERR"
+    for block in blocks(text):
+        if block.language == "sh":
+            lines[block.line - 1 : block.line - 1 + len(block.lines)] = block.lines
+        elif block.language == "python":
+            program = folder / str(block.line) / name
+            program.parent.mkdir()
+            program.write_text("\n" * (block.line - 1) + "\n".join(block.lines))
+            lines[block.line - 1] = f"python {shlex.quote(str(program))}"
+    return "\n".join(lines)
+
+
+def run_page(text: str, name: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A page run in an environment in which nothing is activated."""
+    work, home, programs = (folder / part for part in ("work", "home", "programs"))
+    for part in (work, home, programs):
+        part.mkdir()
+    here = Path(sys.executable).parent  # a link: what it leads to is no environment
+    bin = work / ".venv" / "bin"
+    bin.mkdir(parents=True)
+    (bin / "twodof").symlink_to(here / "twodof")
+    (bin / "activate").write_text(f'PATH={shlex.quote(str(here))}:"$PATH"\n')
+    path = os.environ["PATH"].split(os.pathsep)
+    others = [part for part in path if not (Path(part) / "twodof").exists()]
+    environment = {
+        **{k: v for k, v in os.environ.items() if k not in ("DISPLAY", "PYTHONPATH")},
+        "HOME": str(home),
+        "LC_ALL": "C.UTF-8",
+        "PATH": os.pathsep.join(others),
+        "ROS_LOCALHOST_ONLY": "1",
+        # compiled libraries are kept between tests
+        "XDG_CACHE_HOME": os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache")),
+    }
+    file = programs / name
+    file.write_text(script(text, name, programs))
+    return subprocess.run(
+        ["bash", file],
+        cwd=work,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+    )
+
+
+def with_commands(page: Path) -> bool:
+    return any(block.language in ("sh", "python") for block in blocks(page.read_text("utf-8")))
+
+
+@pytest.mark.parametrize("page", [*filter(with_commands, PAGES)], ids=lambda page: page.name)
+def test_commands_and_programs_run_in_the_order_of_the_text(page: Path, tmp_path: Path) -> None:
+    done = run_page(page.read_text("utf-8"), page.name, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("# Title\n\n```sh\ntrue\nfalse\n```\n", "page.md:5: false"),
+        ("\n```sh\ntwodof --version\n```\n", "page.md: line 3: twodof: command not found"),
+        ("\n```sh\n. .venv/bin/activate\n```\n\n```python\n\n1 / 0\n```\n", 'page.md", line 8'),
+        ("```sh\necho a | grep b\n```\n\n```sh\ntouch after\n```\n", "page.md:2: grep b"),
+    ],
+)
+def test_a_page_that_fails_names_the_line(text: str, line: str, tmp_path: Path) -> None:
+    done = run_page(text, "page.md", tmp_path)
+    assert done.returncode != 0
+    assert line in done.stderr
+    assert not (tmp_path / "work" / "after").exists()
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+def test_every_block_is_of_a_known_kind(page: Path) -> None:
+    for block in blocks(page.read_text("utf-8")):
+        assert block.language in FENCES, f"{page.name}:{block.line}"
+        if block.language == "sh":  # of 'a && b' the shell lets 'a' fail
+            assert not re.search("&&|[|][|]", "\n".join(block.lines)), f"{page.name}:{block.line}"
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as forges and mkdocs make them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")) + PAGES[1:], ids=lambda page: page.name)
+def test_relative_links_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
+        if re.match("[a-z]+:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_readme_is_short_and_has_the_command_of_the_tests() -> None:
+    readme = (ROOT / "README.md").read_bytes()
+    assert len(readme) <= MAX_README
+    command = "python3 -m venv .venv && .venv/bin/pip install '.[test]' && .venv/bin/pytest"
+    assert f"\n    {command}\n".encode() in readme  # .ci/run takes it from there
+
+
+def test_every_public_name_is_on_the_page_of_functions() -> None:
+    told = re.findall(r"^::: twodof\.(\w+)$", (DOCS / "api.md").read_text("utf-8"), re.MULTILINE)
+    assert len(told) == len(set(told))
+    assert {*told, "__version__"} == set(dir(twodof))
+
+
+def test_every_module_is_in_the_architecture() -> None:
+    text = (DOCS / "architecture.md").read_text("utf-8")
+    for file in (ROOT / "twodof").rglob("*.py"):
+        room = "" if file.parent.parent == ROOT else f"`{file.parent.name}/`"
+        verb = file.parent.name == "cli"  # one file each, as the text says
+        if not file.name.startswith("_") and not verb:
+            assert f"`{file.name}`" in text, file
+        assert room in text, file
+
+
+def test_rooms_import_none_that_stand_below_them() -> None:
+    text = (DOCS / "architecture.md").read_text("utf-8")
+    rooms = re.findall(r"^- `(\w+)(?:/|[.]py)`:", text, re.MULTILINE)
+    place = {room: i for i, room in enumerate(rooms)}  # what all may import has none
+    assert len(place) == 12
+    for file in (ROOT / "twodof").rglob("*.py"):
+        parts = file.relative_to(ROOT / "twodof").with_suffix("").parts
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            from_package = isinstance(node, ast.ImportFrom) and node.level == len(parts)
+            if from_package and node.module and not parts[0].startswith("__"):
+                other = node.module.split(".")[0]
+                here = f"{file}:{node.lineno}"
+                assert place.get(other, -1) <= place.get(parts[0], -1), here
+
+
+def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    api = (tmp_path / "api" / "index.html").read_text("utf-8")
+    assert 'id="twodof.simulate"' in api
