@@ -73,6 +73,15 @@ class Fmu:
         """The FMU's GUID; for FMUs of this package the digest of all that matters."""
         return str(self.description.guid)
 
+    @property
+    def urdf(self) -> str | None:
+        """The text of resources/robot.urdf, None where there is none."""
+        content = read_resource(self, "robot.urdf")
+        try:
+            return None if content is None else content.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise FmuError(f"'{self.path}': resources/robot.urdf is not UTF-8 text") from error
+
     def vector(self, group: str) -> list[str]:
         """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
         if group in self.variables:
@@ -283,15 +292,6 @@ def read_resource(fmu: Fmu, name: str) -> bytes | None:
         return None
     except ZIP_ERRORS as error:
         raise FmuError(f"cannot read resources/{name} of '{fmu.path}': {error}") from error
-
-
-def urdf_text(fmu: Fmu) -> str | None:
-    """The text of resources/robot.urdf, None where there is none."""
-    content = read_resource(fmu, "robot.urdf")
-    try:
-        return None if content is None else content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise FmuError(f"'{fmu.path}': resources/robot.urdf is not UTF-8 text") from error
 
 
 def _read(path: Path) -> tuple[bytes, list[str]]:

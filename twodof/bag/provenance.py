@@ -9,7 +9,6 @@ from typing import Any
 from ..errors import BagError
 from ..experiments import Changes, Experiment
 from ..files import read_file
-from ..fmu import urdf_text
 from ..version import versions
 
 FILE = "run.json"
@@ -99,7 +98,7 @@ def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
         "start_values": dict(run.start_values),
         "versions": versions(*PACKAGES),
         "command_line": command_line,
-        "urdf": urdf_text(fmu),
+        "urdf": fmu.urdf,
     }
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from ..children import Child
 from ..errors import PageError
 from ..experiments import Experiment, Setting, Value, experiment
-from ..fmu import Fmu, load_fmu, read_resource, urdf_text
+from ..fmu import Fmu, load_fmu, read_resource
 from ..plant.urdf import Joint, RobotError, read_urdf
 from .loop import IDLE, Loop, News
 from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
@@ -54,7 +54,7 @@ class Controls:
     def __init__(
         self, page: Page, fmu: Fmu, start_values: Mapping[str, Value], step: float, loop: Connection
     ) -> None:
-        urdf = urdf_text(fmu) or ""
+        urdf = fmu.urdf or ""
         try:
             robot = read_urdf(urdf)
             joints = [robot.joints[name] for name in fmu.joints]

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
 from ..experiments import Experiment, Setting, resolve
-from ..fmu import urdf_text
 from ..master import RealTime, Sample, at_rest, samples
 
 MOST_ROWS = 10_000  # that wait for a page to ask
@@ -95,7 +94,7 @@ class Loop:
     def __init__(self, run: Experiment, *, bag: str | None = None, command_line: str = "") -> None:
         fmu = run.fmu
         drives = [group for group in ("x_des", "q_des", "tau_cmd") if fmu.vector(group)]
-        if urdf_text(fmu) is None or not fmu.axes or not drives:
+        if fmu.urdf is None or not fmu.axes or not drives:
             raise PageError(f"'{fmu.path}' carries no robot, or no inputs that drive it")
         self._run, self._bag, self._command_line = run, bag, command_line
         self.recorded: list[Path] = []

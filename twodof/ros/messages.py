@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from ..errors import BagError
 from ..experiments import NANOSECONDS, Experiment
-from ..fmu import read_resource, urdf_text
+from ..fmu import read_resource
 from ..master import Sample
 from ..plant.urdf import RobotError
 from .cdr import JointStateLayout
@@ -126,7 +126,7 @@ class Messages:
 
 
 def _load_scene(run: Experiment) -> Scene:
-    urdf = urdf_text(run.fmu)
+    urdf = run.fmu.urdf
     if urdf is None or not run.fmu.axes:
         raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which a scene shows")
     from .scene import Scene  # SciPy takes half a second to import
