@@ -47,10 +47,11 @@ LIBRARIES = {
     "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
     "rosbags": {"ros", "bag"},
     "scipy": {
+        "export",
         "kinematics",
         "ros",
         "pages",
-    },  # its rotations: for all, to URDF's rpy, to viser's wxyz
+    },  # its rotations: of joints that are locked, for all, to URDF's rpy, to viser's wxyz
     "tqdm": {"cli"},
     "viser": {"pages"},
     "websockets": {"pages"},

@@ -27,7 +27,7 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 FENCES = {"sh", "python", "console", "text"}
 MAX_README = 10 * 1024  # bytes
-SECONDS = 300  # by the clock: a guard against hanging
+SECONDS = 900  # by the clock: a guard against hanging
 
 
 class Block(NamedTuple):

@@ -267,19 +267,12 @@ class Controls:
             "real-time factor": "-" if factor is None else f"{factor:.2f}",
             "deadlines missed": f"{news.missed} of {news.steps}, worst {1e3 * news.worst:.1f} ms",
             "end effector": f"({', '.join(f'{value:+.5f}' for value in sample.x)}) m",
-            **(
-                {
-                    "target": f"({', '.join(f'{value:+.5f}' for value in sample.target)}) m",
-                    "error": f"{1e3 * (sample.error or 0.0):.4g} mm",
-                }
-                if sample.target
-                else {}
-            ),
-            **{
-                name: f"{q:+.5f} {unit}"
-                for name, q, unit in zip(self._fmu.joints, sample.q, self._units)
-            },
         }
+        if sample.target:
+            rows["target"] = f"({', '.join(f'{value:+.5f}' for value in sample.target)}) m"
+            rows["error"] = f"{1e3 * (sample.error or 0.0):.4g} mm"
+        for name, q, unit in zip(self._fmu.joints, sample.q, self._units):
+            rows[name] = f"{q:+.5f} {unit}"
         self._readout.show(rows)
 
 
@@ -323,7 +316,7 @@ def page_of(
 
 def live(
     fmu: Fmu | str | Path,
-    stop: Callable[[], bool],
+    stop: Callable[[], bool] = lambda: False,
     opened: Callable[[str], None] = lambda url: None,
     *,
     host: str = HOST,

@@ -285,7 +285,7 @@ def nearest(t: Array, time: float) -> int:
 
 def view(
     bag: Recording | str | Path,
-    stop: Callable[[], bool],
+    stop: Callable[[], bool] = lambda: False,
     opened: Callable[[str, Sequence[str]], None] = lambda url, remarks: None,
     *,
     host: str = HOST,

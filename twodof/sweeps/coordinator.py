@@ -58,8 +58,7 @@ def sweep(
         ranges: low and high by variable, drawn uniformly, ``random`` times, beside each
             combination of the grid.
         random, seed: number of draws, and what makes them reproducible.
-        stop_time, step: of each run, s.
-        settings: start values of other inputs and parameters, as of ``experiment``.
+        stop_time, step, settings: of each run, as of ``experiment``.
         output: folder for the table; None: it is not kept.
         resume: go on with the sweep in ``output``; what is done is not repeated.
         bags: write a bag of each run, ``output``/bags/<run>; workers must see that folder.
@@ -77,8 +76,8 @@ def sweep(
         BagError: a bag cannot be written.
     """
     run = experiment(fmu, stop_time=stop_time, step=step, settings=settings)
-    stop_time = run.time(run.steps) if stop_time is None else stop_time
-    options = {"stop_time": stop_time, "step": run.step, "settings": dict(run.given)}
+    end = run.time(run.steps) if stop_time is None else stop_time
+    options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
     units = [_unit(run.fmu, name) for name in design.names]
     with _folder(output) as path:
