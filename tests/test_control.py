@@ -399,3 +399,25 @@ def test_a_payload_that_is_none_is_refused(fmus, payload):
     for native in (False, True):
         with pytest.raises(twodof.TwoDofError, match="payload"):
             [*twodof.samples(fmus["task", native], settings={"payload": payload}, stop_time=0.01)]
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, capsys):
+    """Bag, figure, replay, sweep and what a page offers, with an FMU of each control."""
+    from twodof.cli.main import main
+    from twodof.pages.loop import Loop
+
+    monkeypatch.chdir(tmp_path)
+    fmu, swept = str(fmus[control, True]), "tau_cmd" if control == "effort" else "Kp"
+    for line in (
+        f"run {fmu} -o bag --scene --effort --stop-time 0.3 --set payload=0.1 --set f_ext=0.2,0,0",
+        "plot bag -o p.html", "plot bag bag -o p2.svg", "view bag --export v.html", "info bag",
+        f"sweep {fmu} --grid {swept}=1:3:3 --stop-time 0.2 -o s", "info s", "plot s -o s.svg",
+    ):  # fmt: skip
+        assert main(line.split()) == 0, capsys.readouterr().err
+    best = capsys.readouterr().out.partition("best:")[2]
+    assert ("final_error" in best) == (control == "task")
+    bag = twodof.read_bag("bag")
+    assert bag.tau.shape == bag.q.shape and bag.target.shape[1] == (2 if control == "task" else 0)
+    loop = Loop(twodof.experiment(fmu, stop_time=np.inf))
+    assert (loop.news().sample.error is None) == (control != "task")

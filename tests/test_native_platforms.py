@@ -255,7 +255,7 @@ def test_windows_library_runs_as_linux_library(unzipped, tmp_path):
     for settings in ({}, LIMITED):
         linux = drive(unzipped, "linux64", tmp_path, settings)
         windows = drive(unzipped, "win64", tmp_path, settings)
-        assert linux.shape == windows.shape == (51, 8)
+        assert linux.shape == windows.shape == (51, 10)
         assert np.abs(windows - linux).max() <= 1e-12
         assert np.ptp(linux, axis=0).min() > 0.0
     assert linux[:, 0].min() == 0.3 and linux[:, 1].max() == 1.2  # limits were met

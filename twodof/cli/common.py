@@ -242,12 +242,12 @@ def open_page(
 
 
 def best_runs(table: DataFrame) -> DataFrame:
-    """The first few runs by settling time, effort and final error: variables and metrics."""
+    """The first few runs by settling time, effort and final error: variables, metrics known."""
     from ..sweeps.results import ranked
 
     best = ranked(table).head(5)
     columns = [*best.columns]
-    return best[columns[: columns.index("end_time")]]
+    return best[columns[: columns.index("end_time")]].dropna(axis="columns", how="all")
 
 
 def print_best(table: DataFrame) -> None:

@@ -8,7 +8,8 @@ from ..files import shown
 from .track import Track, number
 
 TOLD = {
-    "x_des": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²", "Kp": "", "Kd": "", "Kn": "0 s⁻¹",
+    "x_des": "", "q_des": "", "tau_cmd": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²",
+    "Kp": "", "Kd": "", "Kn": "0 s⁻¹",
     "tau_ext": "0", "f_ext": "0 N", "payload": "0 kg", "limit_effort": "false", "step": "",
     "FMU": "",
 }  # fmt: skip
@@ -65,7 +66,9 @@ def outcome(track: Track) -> str:
 def summary(track: Track) -> dict[str, str]:
     """The main numbers of a run in words, by what they are."""
     settings = {
-        key: track.settings[key] for key in ("FMU", "step", "x_des", "Kp", "Kd") if track.settings
+        key: track.settings[key]
+        for key in ("FMU", "step", "x_des", "q_des", "tau_cmd", "Kp", "Kd")
+        if key in track.settings
     }
     stopped = [joint.name for joint in track.joints if joint.at_limit]
     rows = {

@@ -92,7 +92,11 @@ class Messages:
         self._root = run.fmu.root
         n = len(run.fmu.joints)
         self._joint_state = JointStateLayout(run.fmu.joints, "", (n, n, n if effort else 0))
-        self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM), **(SCENE_TOPICS if scene else {})}
+        self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM)}
+        if scene:
+            self.topics |= SCENE_TOPICS
+            if not run.fmu.vector("x_des"):
+                del self.topics[TARGET]
 
     def of(self, sample: Sample) -> list[tuple[str, Serialised]]:
         """Topics and messages of one sample."""
@@ -118,10 +122,11 @@ class Messages:
         stamp = sample.stamp
         yield "/tf", _tf_message(stamp, scene.moving(sample.q))
         end_effector = scene.end_effector(sample.q)
-        target = list(end_effector)  # the target leaves an axis that is not controlled as it is
-        for axis, value in zip(self._axes, sample.target or ()):
-            target["xyz".index(axis)] = value
-        yield TARGET, _point(stamp, self._root, target)
+        if TARGET in self.topics:
+            target = list(end_effector)  # the target leaves an axis that is not controlled as it is
+            for axis, value in zip(self._axes, sample.target or ()):
+                target["xyz".index(axis)] = value
+            yield TARGET, _point(stamp, self._root, target)
         yield "/end_effector", _point(stamp, self._root, end_effector)
 
 
