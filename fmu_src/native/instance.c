@@ -1,5 +1,6 @@
 /* The state machine of FMI 2.0 co-simulation, messages, and initialisation. */
 #include "instance.h"
+#include "stops.h"
 
 #include <math.h>
 #include <stdarg.h>
@@ -116,6 +117,17 @@ fmi2Status check_parameters(Instance *instance)
     return fmi2OK;
 }
 
+/* Take the velocity that points into a limit at the start, as at any other time. */
+static void stop_at_start(Plant *plant)
+{
+    const int kept[N_JOINTS] = {0};
+    double y[2 * N_JOINTS];
+    memcpy(y, &plant->value[Q], N_JOINTS * sizeof *y);
+    memcpy(y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *y);
+    impact(plant, y, kept);
+    memcpy(&plant->value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
+}
+
 fmi2Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
@@ -123,17 +135,17 @@ fmi2Status initialise(Instance *instance, int warn)
     if (check_parameters(instance) != fmi2OK)
         return fmi2Error;
     for (int i = 0; i < N_JOINTS; i++) {
-        const double start = value[Q_START + i], v = value[V_START + i];
+        const double start = value[Q_START + i];
         const double low = value[Q_MIN + i], high = value[Q_MAX + i];
         const double q = start < low ? low : start > high ? high : start;
-        const int into = (q >= high && v > 0.0) || (q <= low && v < 0.0);
         if (warn && q != start)
             report(instance, fmi2Warning,
                    "q_start[%d] = %g of joint '%s' is outside its limits [%g, %g] and was clamped"
                    " to %g", i + 1, start, JOINT_NAME[i], low, high, q);
         value[Q + i] = q;
-        value[V + i] = into ? 0.0 : v;
+        value[V + i] = value[V_START + i];
     }
+    stop_at_start(&state->plant);
     state->initialised = 1;
     state->has_x = state->has_tau = 0;
     return fmi2OK;

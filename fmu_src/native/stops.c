@@ -143,8 +143,12 @@ void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
     if (plant->value[RIGID_STOPS] != 0.0 && count > 0) {
         inverse_mass(plant, y, count, contacts.joint, columns);
         complementary(&contacts, fixed, columns, a, active, z);
-        for (int k = 0; k < count; k++)
-            active[k] = fixed[k] || z[k] != 0.0 || a[contacts.joint[k]] == 0.0;
+        for (int k = 0; k < count; k++) {
+            double stopped = a[contacts.joint[k]];
+            for (int c = 0; c < count; c++)
+                stopped += columns[c][contacts.joint[k]] * z[c];
+            active[k] = fixed[k] || z[k] != 0.0 || contacts.side[k] * stopped <= 0.0;
+        }
     }
     for (int k = 0; k < count; k++) {
         const int i = contacts.joint[k];

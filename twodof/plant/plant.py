@@ -114,9 +114,11 @@ class Plant:
                     f"q_start[{i + 1}] = {q:g} of joint '{joint}' is outside its limits"
                     f" [{low:g}, {high:g}] and was clamped to {inside:g}"
                 )
-            into = (inside >= high and v > 0.0) or (inside <= low and v < 0.0)
             self.q.append(inside)
-            self.v.append(0.0 if into else v)
+            self.v.append(v)
+        y = [*self.q, *self.v]
+        self._stops().impact(y, [False] * len(self.q))
+        self.v = y[len(self.q) :]
         return warnings
 
     def prepare(self) -> None:
@@ -141,9 +143,7 @@ class Plant:
                 f"max_step = {self.max_step:g} s divides a step of {h:g} s into more than"
                 f" {BUDGET // STAGES} integration steps; enlarge max_step or shorten the step"
             )
-        stops = Stops(
-            list(zip(self.q_min, self.q_max)), self._inverse_mass if self.rigid_stops else None
-        )
+        stops = self._stops()
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # an exception tells it
                 self.q, self.v = advance(
@@ -181,6 +181,10 @@ class Plant:
         effort, _ = self._control_effort(self._law(self), np.array(self.q), np.array(self.v))
         tau: list[float] = effort.tolist()
         return tau
+
+    def _stops(self) -> Stops:
+        limits = list(zip(self.q_min, self.q_max))
+        return Stops(limits, self._inverse_mass if self.rigid_stops else None)
 
     def _jacobian(self, q: Array) -> Array:
         """Of the task frame's position in the root's axes, 3 × n."""

@@ -90,8 +90,11 @@ class Stops:
         elif contacts:
             W = self._inverse_mass(y[:n])
             reaction = self._complementary(W, contacts, a, forced)
+            stopped = (W @ reaction + a).tolist()
             self.held = [
-                i for i, _ in contacts if reaction[i] or a[i] == 0.0 or self._has_no_range(i)
+                i
+                for i, side in contacts
+                if reaction[i] or kept[i] or self._has_no_range(i) or side * stopped[i] <= 0.0
             ]
         else:
             self.held = []
