@@ -17,7 +17,7 @@ from harness import Driver, in_child_process
 from lxml import etree
 
 from twodof import FmuOptions, TwoDofError, build_fmu
-from twodof.data import data_file
+from twodof.files import data_file
 
 SHAPES = re.compile(r"<mesh [^>]*>")
 

@@ -389,6 +389,40 @@ def test_the_description_is_that_of_the_control(fmus, control):
     assert descriptions[0] == descriptions[1]
 
 
+def test_a_variable_of_another_control_is_named_as_such(fmus):
+    message = r"no variable 'x_des': it is of control 'task'; this FMU has 'effort'"
+    with pytest.raises(twodof.TwoDofError, match=message):
+        twodof.experiment(fmus["effort", True], settings={"x_des": 1.0})
+    assert twodof.load_fmu(fmus["joint", False]).control == "joint"
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_a_start_into_a_stop_is_an_impact(fmus, rigid):
+    """Rigid: the plastic impulse, with M by Pinocchio; else that joint's velocity alone."""
+    plant = model("twodof").plant()
+    q, v = np.array([0.5, 0.35]), np.array([3.0, -9.0])
+    M = pin.crba(plant.robot.model, plant.robot.model.createData(), q)
+    M = np.triu(M) + np.triu(M, 1).T
+    W = np.linalg.inv(M)
+    expected = v - W[:, 0] * v[0] / W[0, 0] if rigid else [0.0, -9.0]
+    settings = {"q_max": (0.5, 3.0), "q_min": -3.0, "v_start": tuple(v), "rigid_stops": rigid}
+    for native in (False, True):
+        sample = next(twodof.samples(fmus["effort", native], settings=settings, stop_time=0.01))
+        np.testing.assert_allclose(sample.v, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_target_on_a_limit_does_not_chatter(fmus, side):
+    """The joint that is not pressed is driven off by the other's stop."""
+    settings = {
+        "q_min": -1.0, "q_max": 1.0, "q_start": (side, -side), "q_des": (4 * side, -side),
+    }  # fmt: skip
+    _, q, _ = trajectory(fmus["joint", True], settings={**settings, **TIGHT}, stop_time=0.3)
+    assert (q[:, 0] == side).all() and side * q[-1, 1] > 0.5
+    _, other, _ = trajectory(fmus["joint", False], settings={**settings, **TIGHT}, stop_time=0.3)
+    np.testing.assert_allclose(other, q, atol=1e-9)
+
+
 def test_a_control_that_is_none_is_refused():
     with pytest.raises(twodof.TwoDofError, match="control 'velocity' is none of task, joint"):
         build_fmu(None, FmuOptions(control="velocity"))

@@ -740,7 +740,7 @@ HOSTILE_URDFS: dict[str, tuple[Callable[[], str], str]] = {
         lambda: robot(tip(inside=shapes(["file:///dev/zero"]))), "not found"
     ),
     "a file without an end": (
-        lambda: robot(tip(inside=shapes(["file:///proc/kcore"]))), "not found"
+        lambda: robot(tip(inside=shapes(["file:///dev/zero"]))), "not found"
     ),
     "a mesh that is a link out": (lambda: robot(tip(inside=shapes(["out"]))), "not found"),
     "a mesh behind a link out": (

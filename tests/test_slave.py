@@ -23,8 +23,8 @@ from harness import Driver, in_child_process
 from oracles import REST, position, task_error
 
 from twodof import FmuOptions, build_fmu
-from twodof.data import data_file
 from twodof.export.package import DEFAULT_ARM
+from twodof.files import data_file
 from twodof.plant.plant import Plant
 from twodof.plant.robot import load_robot
 from twodof.plant.variables import variable_table

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from oracles import REST
 
 from twodof import FmuOptions, build_fmu
-from twodof.data import data_file
+from twodof.files import data_file
 from twodof.plant.robot import Robot, load_robot
 
 OK, DISCARD, ERROR = 0, 2, 3

@@ -178,8 +178,8 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kpp=1:2:3"], "there is no variable 'Kpp'; did you mean 'Kp"),
         (["--grid", "q=1:2:3"], "q[1] is of causality 'output' and cannot be set"),
         (["--grid", "Kp=5:1:3"], "LOW 5 must be below HIGH 1"),
-        (["--grid", "Kp=1:2:0"], "COUNT 0 must be a whole number from 2 on"),
-        (["--grid", "Kp=1:2:2.5"], "COUNT 2.5 must be a whole number from 2 on"),
+        (["--grid", "Kp=1:2:0"], "COUNT 0 is no whole number from 2 on"),
+        (["--grid", "Kp=1:2:2.5"], "COUNT 2.5 is no whole number from 2 on"),
         (["--grid", "Kp=1:2"], "--grid Kp=1:2: expected NAME=LOW:HIGH:COUNT"),
         (["--grid", "Kp=1:nan:3"], "its numbers must be finite"),
         (["--grid", "Kp=1:2:3", "--grid", "Kp=1:2:3"], "--grid Kp is given twice"),
@@ -211,7 +211,7 @@ def test_bad_input_gets_one_line(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     begin = time.process_time()
-    assert main(["sweep", str(native_path), *arguments]) == 1
+    assert main(["sweep", str(native_path), *arguments]) in (1, 2)
     assert time.process_time() - begin < 5.0
     out, err = capsys.readouterr()
     assert out == ""
@@ -940,7 +940,7 @@ def test_plot_of_a_sweep_prints_the_best_runs(
     assert [float(cell) for cell in row[:4]] == pytest.approx(
         [best["run"], best["Kp"], best["Kd"], best["settling_time"]]
     )
-    assert main(["plot", str(undisturbed), str(undisturbed)]) == 1
+    assert main(["plot", str(undisturbed), str(undisturbed)]) == 2
     assert "is a sweep; it is drawn alone" in capsys.readouterr().err
     found = drawing(*read_sweep(undisturbed), "a")
     assert f"{best['Kp']:g}" in save(found, tmp_path / "a.html").read_text("utf-8")

@@ -14,6 +14,7 @@ import twodof
 from twodof.cli.main import main
 from twodof.export.package import FmuOptions, build_fmu
 from twodof.export.urdf_source import end_effector, lock_joints
+from twodof.files import data_file
 from twodof.plant.robot import load_robot
 from twodof.plant.urdf import RobotError, read_urdf
 
@@ -73,6 +74,26 @@ def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
     ].xyz == pytest.approx((0.3, 0.0, 0.0))
 
 
+MIMIC = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1"/></joint><joint name="k" type="revolute"><parent link="b"/>
+<child link="c"/><axis xyz="1 0 0"/><limit lower="-1" upper="1"/>
+<mimic joint="j" multiplier="{factor}"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("factor", "lock", "message"),
+    [
+        ("abc", "j", "'k': its <mimic> has a factor or offset that is no number"),
+        ("nan", "j", "'k': its <mimic> has"), ("1_0", "j", "'k': its <mimic> has"),
+        ("2", "k", "'k' mimics 'j', which moves: lock that"),
+    ],
+)  # fmt: skip
+def test_a_mimic_that_cannot_be_followed_is_refused(factor: str, lock: str, message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        lock_joints(MIMIC.format(factor=factor), {lock: 0.3})
+
+
 @pytest.mark.parametrize(
     ("locks", "message"),
     [
@@ -100,7 +121,7 @@ def test_of_several_last_links_one_must_be_named(panda_file: Path) -> None:
 def test_a_mesh_that_is_not_there_is_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    shipped = Path(twodof.__file__).parents[1] / "urdf/2dof.urdf"
+    shipped = data_file("urdf", "2dof.urdf")
     text = shipped.read_text().replace("link1.stl", "gone.stl")
     (tmp_path / "arm.urdf").write_text(text.replace("link2.stl", "lost.stl"))
     with caplog.at_level(logging.WARNING, "twodof"):
@@ -119,7 +140,7 @@ def test_meshes_can_be_left_out(tmp_path: Path) -> None:
 
 
 def test_inertias_that_no_body_has_are_named_in_one_line() -> None:
-    shipped = Path(twodof.__file__).parents[1] / "urdf/2dof.urdf"
+    shipped = data_file("urdf", "2dof.urdf")
     tree = shipped.read_text()
     import re
 

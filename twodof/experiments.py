@@ -6,6 +6,7 @@ import csv
 import difflib
 import math
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,6 +17,7 @@ from typing import Any
 from .errors import InputError
 from .files import check_file
 from .fmu import Fmu, load_fmu
+from .plant.variables import CONTROLS
 
 Value = float | bool
 Setting = Any
@@ -175,7 +177,9 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
         if not elements:
             settable = {**fmu.groups("input"), **fmu.groups("parameter")}
             known = [*settable, *(element for group in settable.values() for element in group)]
-            raise InputError(f"there is no variable '{name}'{_suggestion(name, known)}")
+            raise InputError(
+                f"there is no variable '{name}'{_of_another(fmu, name) or _suggestion(name, known)}"
+            )
         # arrays give their own kind of numbers
         plain = setting.tolist() if hasattr(setting, "tolist") else setting
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
@@ -199,6 +203,16 @@ def _checked(fmu: Fmu, name: str, value: object) -> Value:
     if not math.isfinite(value):
         raise InputError(f"{name} = {value} is not finite")
     return float(value)
+
+
+def _of_another(fmu: Fmu, name: str) -> str:
+    """Of which controls a variable is that this FMU has not; "" where of none."""
+    group = name.partition("[")[0]
+    having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
+    if not fmu.control or not having:
+        return ""
+    quoted = " or ".join(f"'{control}'" for control in having)
+    return f": it is of control {quoted}; this FMU has '{fmu.control}'"
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
@@ -231,10 +245,10 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     if "time" not in header:
         raise InputError(f"'{path}' has no column 'time'")
     elements = {name: _inputs(fmu, path, name) for name in header if name != "time"}
-    for i, name in enumerate(header):
-        for element in elements.get(name, ["time"]):
-            if any(element in elements.get(other, ["time"]) for other in header[:i]):
-                raise InputError(f"'{path}' has two columns for '{element:.50}'")
+    columns = [element for name in header for element in elements.get(name, ["time"])]
+    twice = next((element for element, n in Counter(columns).items() if n > 1), None)
+    if twice is not None:
+        raise InputError(f"'{path}' has two columns for '{twice:.50}'")
     changes: Changes = []
     for number, row in rows:
         if len(row) != len(header):

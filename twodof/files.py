@@ -235,3 +235,10 @@ def sync(*paths: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def data_file(*parts: str) -> Path:
+    """A file that the package ships beside its code: inside it when installed, else around it."""
+    package = Path(__file__).parent
+    installed = package.joinpath(*parts)
+    return installed if installed.exists() else package.parent.joinpath(*parts)

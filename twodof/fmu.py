@@ -24,6 +24,7 @@ from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ModelDescription, ScalarVariable
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
+from .export.python_wrapper import check_python_wrapper
 from .files import UnsafeArchiveError, check_archive, read_member, temporary_folder
 
 logger = logging.getLogger(__name__)
@@ -32,7 +33,6 @@ LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERRO
 
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
 MAX_RESOURCE = 256 * 1024**2
-MAX_WRAPPER = 16 * 1024**2  # it has 0.3 MiB
 
 
 @dataclass(frozen=True, repr=False)
@@ -46,8 +46,9 @@ class Fmu:
         platforms: FMI names of the platforms that it has binaries for, e.g. "linux64".
         robot: name of the robot; "" where the FMU does not say.
         joints: joint names, one for each q[i]; "joint1", … where the FMU does not say.
-        frame, root, axes: the controlled frame, the frame its position is expressed in and the
-            task axes; "" where the FMU does not say.
+        frame, root, axes: the task frame, the frame its position is expressed in and the task
+            axes; "" where the FMU does not say.
+        control: name of its control law, e.g. "task"; likewise.
     """
 
     path: Path
@@ -59,6 +60,7 @@ class Fmu:
     frame: str
     root: str
     axes: str
+    control: str
 
     def __repr__(self) -> str:
         return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"
@@ -72,6 +74,12 @@ class Fmu:
     def guid(self) -> str:
         """The FMU's GUID; for FMUs of this package the digest of all that matters."""
         return str(self.description.guid)
+
+    @property
+    def library(self) -> str:
+        """Name of its binary on this platform."""
+        identifier = self.description.coSimulation.modelIdentifier
+        return f"{identifier}{fmpy.sharedLibraryExtension}"
 
     @property
     def urdf(self) -> str | None:
@@ -255,32 +263,13 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
                 archive.extractall(folder)
         except ZIP_ERRORS as error:
             raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
-        _check_python_wrapper(fmu, folder)
+        library = folder / "binaries" / fmpy.platform / fmu.library
+        check_python_wrapper(fmu.path, library, folder)
         instance = Instance(fmu, folder)
         try:
             yield instance
         finally:
             instance.free()
-
-
-def _check_python_wrapper(fmu: Fmu, folder: Path) -> None:
-    """pythonfmu's wrapper decodes no escape but %20, and crashes where it finds no module."""
-    identifier = fmu.description.coSimulation.modelIdentifier
-    library = folder / "binaries" / fmpy.platform / (identifier + fmpy.sharedLibraryExtension)
-    with library.open("rb") as file:
-        if b"slavemodule.txt" not in file.read(MAX_WRAPPER):
-            return  # it is no such wrapper
-    if "%" in folder.as_uri().replace("%20", ""):
-        raise FmuError(
-            f"the temporary folder '{folder.parent}' has characters that the FMU's Python wrapper"
-            " cannot read; set TMPDIR to a folder with a plain name"
-        )
-    resources = folder / "resources"
-    with suppress(OSError, ValueError):
-        name = (resources / "slavemodule.txt").read_text("utf-8").partition("\n")[0]
-        if "/" not in name and (resources / f"{name}.py").is_file():
-            return
-    raise FmuError(f"'{fmu.path}': resources/slavemodule.txt does not name a module beside it")
 
 
 def read_resource(fmu: Fmu, name: str) -> bytes | None:
@@ -340,9 +329,10 @@ def _vendor_annotation(root: ET.Element, description: ModelDescription) -> dict[
     if robot is None:
         n = sum(re.fullmatch(r"q\[\d+\]", v.name) is not None for v in description.modelVariables)
         joints = tuple(f"joint{i + 1}" for i in range(n))
-        return {"robot": "", "joints": joints, "frame": "", "root": "", "axes": ""}
+        nothing = dict.fromkeys(("robot", "frame", "root", "axes", "control"), "")
+        return {**nothing, "joints": joints}
     return {
         "robot": robot.get("name", ""),
         "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),
-        **{key: robot.get(key, "") for key in ("frame", "root", "axes")},
+        **{key: robot.get(key, "") for key in ("frame", "root", "axes", "control")},
     }

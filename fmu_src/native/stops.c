@@ -147,7 +147,7 @@ void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
             double stopped = a[contacts.joint[k]];
             for (int c = 0; c < count; c++)
                 stopped += columns[c][contacts.joint[k]] * z[c];
-            active[k] = fixed[k] || z[k] != 0.0 || contacts.side[k] * stopped <= 0.0;
+            active[k] = fixed[k] || z[k] != 0.0 || stopped == 0.0;
         }
     }
     for (int k = 0; k < count; k++) {

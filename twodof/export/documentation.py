@@ -8,7 +8,7 @@ import importlib.metadata
 from collections.abc import Sequence
 from string import Template
 
-from ..data import data_file
+from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .flavours import Files, Flavour

@@ -15,7 +15,7 @@ from typing import Any
 
 import pythonfmu
 
-from ..data import data_file
+from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, compile_library

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
 from ..plant.robot import Robot
-from ..plant.variables import Control, Variable
+from ..plant.variables import CONTROLS, Control, Variable
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
@@ -41,7 +41,7 @@ START = ("q_start", "q_min", "q_max")
 def model_description(
     robot: Robot,
     table: Sequence[Variable],
-    control: Control,
+    control: str,
     *,
     name: str,
     guid: str,
@@ -52,7 +52,7 @@ def model_description(
     """The XML text.
 
     Args:
-        robot, table, control: the robot, its variables, and what drives it.
+        robot, table, control: the robot, its variables, and the name of its control law.
         name: model name and model identifier.
         guid: as it shall stand in the file; "" while it is being computed.
         version: version of this package.
@@ -65,7 +65,7 @@ def model_description(
         modelName=name,
         guid=guid,
         description=f"Robot '{robot.name}' with {len(robot.joints)} joints under"
-        f" {control.title.format(frame=robot.frame)}",
+        f" {CONTROLS[control].title.format(frame=robot.frame)}",
         version=version,
         license="BSD-3-Clause",
         generationTool=f"{VENDOR} {version}",
@@ -95,9 +95,9 @@ def model_description(
         stopTime=repr(DEFAULT_STOP_TIME),
         stepSize=repr(DEFAULT_STEP),
     )
-    _vendor_annotation(root, robot)
+    _vendor_annotation(root, robot, control)
     _variables(root, table)
-    _structure(root, robot, table, control)
+    _structure(root, robot, table, CONTROLS[control])
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
@@ -113,12 +113,13 @@ def _units(root: ET.Element, table: Sequence[Variable]) -> None:
             ET.SubElement(unit, "BaseUnit", {**base, "factor": "1"})
 
 
-def _vendor_annotation(root: ET.Element, robot: Robot) -> None:
+def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
     """What a logger needs to know beyond variable names."""
     tool = ET.SubElement(ET.SubElement(root, "VendorAnnotations"), "Tool", name=VENDOR)
     task = ET.SubElement(tool, "Robot", name=robot.name, root=robot.root)
     task.set("frame", robot.frame)
     task.set("axes", robot.axes)
+    task.set("control", control)
     for joint, prismatic in zip(robot.joints, robot.prismatic, strict=True):
         ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
 

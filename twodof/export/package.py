@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..data import data_file
 from ..errors import ZIP_ERRORS, BuildError
-from ..files import check_archive, write_file
+from ..files import check_archive, data_file, write_file
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, read_urdf
@@ -125,7 +124,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
         return model_description(
             robot,
             table,
-            CONTROLS[options.control],
+            options.control,
             name=options.name,
             guid=guid,
             version=__version__,

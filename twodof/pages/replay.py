@@ -14,10 +14,9 @@ import numpy as np
 
 from ..bag.reader import read_bag
 from ..bag.recording import Recording
-from ..data import data_file
 from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
-from ..files import refusing, shown, write_file
+from ..files import data_file, refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
 from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks

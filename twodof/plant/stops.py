@@ -93,8 +93,8 @@ class Stops:
             stopped = (W @ reaction + a).tolist()
             self.held = [
                 i
-                for i, side in contacts
-                if reaction[i] or kept[i] or self._has_no_range(i) or side * stopped[i] <= 0.0
+                for i, _ in contacts
+                if reaction[i] or kept[i] or self._has_no_range(i) or stopped[i] == 0.0
             ]
         else:
             self.held = []
