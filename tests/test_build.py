@@ -335,7 +335,13 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
     generic |= {"payload": 0.3, "payload_known": True}
     back = {**generic, "v_start[1]": -0.7, "v_start[2]": 0.4}
     limits = {"q_max[1]": 0.5, "q_min[2]": 0.35}
-    for base in (generic, back, {**generic, **limits}, {**back, **limits}):
+    stopped = [{**generic, **limits}, {**back, **limits}]
+    into = [
+        {**generic, "q_min[2]": 0.35}, {**back, "q_max[2]": 0.35},
+        {**generic, "q_max[1]": 0.5}, {**back, "q_min[1]": 0.5},
+    ]  # fmt: skip
+    rigid = [{**base, "rigid_stops": True} for base in into]
+    for base in (generic, back, *stopped, *rigid):
         for saturated in (False, True):
             driver = Driver(fmu_path)
             start = {**start_values(driver), **base, "limit_effort": saturated, "Kp[1]": 60.0}

@@ -35,7 +35,9 @@ DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
 VENDOR = "twodof"
 
 START = ("q_start", "q_min", "q_max")
-"""What q depends on at the start; v depends on v_start too."""
+"""What q depends on at the start."""
+IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
+"""What v depends on at the start, where it may be into a stop."""
 
 
 def model_description(
@@ -164,15 +166,14 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
         if variable.group == "q":
             return known(START, joint=variable.index)
         if variable.group == "v":
-            return known((*START, "v_start"), joint=variable.index)
+            return known(IMPACT)
         if variable.group == "x":
             return known(START, of_frame=True)
         if variable.group == "xd":
-            return known((*START, "v_start"), of_frame=True)
+            return known(IMPACT)
         if control.commands == "effort":
             return known(("limit_effort", *control.inputs), joint=variable.index)
-        load = ("payload", "payload_com")
-        mechanics = (*START, "v_start", "gravity", *load, *control.parameters)
+        mechanics = (*IMPACT, "gravity", *control.parameters)
         return known((*mechanics, "limit_effort", *control.inputs))
 
     structure = ET.SubElement(root, "ModelStructure")
