@@ -319,8 +319,8 @@ def test_a_refusal_of_the_fmu_comes_with_its_own_words(fmu_path):
 @in_child_process
 def test_an_fmu_that_returns_nan_ends_the_run_with_what_was_good(fmu_path, tmp_path):
     changed = changed_plant(
-        fmu_path, tmp_path, b"        stops = Stops(",
-        b"        self.v = [float('nan')] * 2; return\n        stops = Stops(",
+        fmu_path, tmp_path, b"        stops = self._stops()",
+        b"        self.v = [float('nan')] * 2; return\n        stops = self._stops()",
     )  # fmt: skip
     recorder = Recorder()
     with pytest.raises(SimulationError, match=r"not finite at t = 0\.01 s"):
@@ -332,8 +332,8 @@ def test_an_fmu_that_returns_nan_ends_the_run_with_what_was_good(fmu_path, tmp_p
 @in_child_process
 def test_an_fmu_that_fails_fatally_ends_the_run(fmu_path, tmp_path):
     changed = changed_plant(
-        fmu_path, tmp_path, b"        stops = Stops(",
-        b"        raise RuntimeError('broken inside')\n        stops = Stops(",
+        fmu_path, tmp_path, b"        stops = self._stops()",
+        b"        raise RuntimeError('broken inside')\n        stops = self._stops()",
     )  # fmt: skip
     recorder = Recorder()
     with pytest.raises(SimulationError, match="broken inside"):

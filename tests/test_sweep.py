@@ -281,11 +281,11 @@ ODD = b"""        if self.Kp[0] == 2.0:
             import os, signal; os.kill(os.getpid(), signal.SIGKILL)
         if self.Kp[0] == 5.0:
             raise RuntimeError('fatal, after which the standard allows no call')
-        stops = Stops("""
+        stops = self._stops()"""
 
 
 def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: Path) -> None:
-    odd = changed_plant(fmu_path, tmp_path, b"        stops = Stops(", ODD)
+    odd = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", ODD)
     grid = {"Kp": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0], "rtol": [1e-3, -1.0]}
     table = sweep(odd, grid=grid, stop_time=0.05)
     wanted = []
@@ -312,14 +312,14 @@ BEGUN = b"""        import os, signal
             file.write(f'{self.Kp[0]:g} ')
         if self.Kp[0] % 50 == 0:
             os.kill(os.getpid(), signal.SIGKILL)
-        stops = Stops("""
+        stops = self._stops()"""
 
 
 def test_a_run_that_kills_is_given_up_alone(
     fmu_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is begun three times; what was in its batch, twice at most; all else once."""
-    fmu = changed_plant(fmu_path, tmp_path, b"        stops = Stops(", BEGUN)
+    fmu = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", BEGUN)
     monkeypatch.setenv("BEGUN", str(tmp_path / "begun"))
     grid = {"Kp": np.arange(1.0, 151.0)}
     table = sweep(fmu, grid=grid, stop_time=0.01, workers=2)
@@ -670,13 +670,13 @@ SLEEP = b"""        if self.Kp[0] == 4.0:
             import os, time
             open(os.environ['ASLEEP'], 'w').close()
             time.sleep(1e6)
-        stops = Stops("""
+        stops = self._stops()"""
 
 
 @contextmanager
 def asleep(fmu_path: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """A sweep, in folder/s, whose third run takes days and has begun; and its workers."""
-    fmu = changed_plant(fmu_path, folder, b"        stops = Stops(", SLEEP)
+    fmu = changed_plant(fmu_path, folder, b"        stops = self._stops()", SLEEP)
     grid = ["--grid", "Kp=2:6:5", "--stop-time", "0.05", "--workers", "1"]
     process = subprocess.Popen(
         [*COMMAND, "sweep", str(fmu), *grid, "-o", str(folder / "s")],
@@ -822,7 +822,7 @@ def test_a_cluster_gives_the_table_of_local_workers(native_path: Path, tmp_path:
 
 def test_a_run_that_kills_is_given_up_by_a_cluster(fmu_path: Path, tmp_path: Path) -> None:
     """And not what its worker has in hand beside it, of which Dask thinks no better."""
-    fmu = changed_plant(fmu_path, tmp_path, b"        stops = Stops(", BEGUN)
+    fmu = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", BEGUN)
     variables = {
         "BEGUN": str(tmp_path / "begun"), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"
     }  # fmt: skip
