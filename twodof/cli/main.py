@@ -59,6 +59,13 @@ def _add_help(program: argparse.ArgumentParser, verbs: Any) -> None:
     helped.set_defaults(call=call)
 
 
+class _Words(logging.Formatter):
+    """The library's messages, with the options that its arguments have here."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return in_options(super().format(record))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -71,7 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.command_line = shlex.join(["twodof", *arguments])
     if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
         sys.stdout.reconfigure(errors="backslashreplace")
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    log = logging.StreamHandler()
+    log.setFormatter(_Words("%(levelname)s: %(message)s"))
+    logging.basicConfig(handlers=[log], level=logging.WARNING)
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     try:

@@ -77,7 +77,7 @@ class Replay:
             text, read = self._robot(bag, urdf, mesh_dir, fmu)
             names = [joint.name for joint in track.joints]
             self._figure = PageRobot(page, text, names, track.motion.frame, read)
-            if self._figure.missing:
+            if self._figure.missing and urdf is None:  # of a URDF given, `collect_meshes` says it
                 missing = ", ".join(self._figure.missing[:3])
                 self.remarks.append(f"without the meshes {missing}; give them with `fmu` or `urdf`")
         self._set_scene()
