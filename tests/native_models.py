@@ -6,9 +6,9 @@ import ctypes
 import functools
 import hashlib
 import os
-import re
 import subprocess
 import tempfile
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +42,7 @@ def robots_folder() -> Path:
 ROBOTS = {
     "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0", "xyz"),
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp", "xyz"),
+    "panda_finger": ("panda_description/urdf/panda.urdf", "panda_rightfinger", "xyz"),
     "z1": ("z1_description/urdf/z1.urdf", "gripperMover", "zx"),
     "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", "link2", "y"),
     "anymal_c": ("anymal_c_simple_description/urdf/anymal.urdf", "LF_FOOT", "xyz"),
@@ -86,12 +87,28 @@ def model(name: str, control: str = "task") -> Model:
         return Model(robot, variable_table(robot, starts, control), starts, control)
     path, frame, axes = ROBOTS[name]
     text = (robots_folder() / path).read_text()
-    return from_urdf(without_mimic(text), frame, axes, control)
+    return from_urdf(text, frame, axes, control)
 
 
-def without_mimic(urdf: str) -> str:
-    """Mimic joints as joints of their own: the plant refuses them, the dynamics have them all."""
-    return re.sub(r"<mimic[^>]*/>", "", urdf)
+@functools.cache
+def coupling(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """G and c of the positions G q + c of all joints of Pinocchio's model, from <mimic> alone."""
+    robot = model(name).robot
+    names = list(robot.model.names)[1:]
+    path = ROOT / "urdf" / "2dof.urdf" if name == "twodof" else robots_folder() / ROBOTS[name][0]
+    mimics = {
+        str(joint.get("name")): mimic
+        for joint in ET.parse(path).iter("joint")
+        for mimic in joint.findall("mimic")
+    }
+    alone = [name for name in names if name not in mimics]
+    G, c = np.zeros((len(names), len(alone))), np.zeros(len(names))
+    for i, joint in enumerate(names):
+        mimic = mimics.get(joint)
+        leader = joint if mimic is None else str(mimic.get("joint"))
+        G[i, alone.index(leader)] = 1.0 if mimic is None else float(mimic.get("multiplier", 1))
+        c[i] = 0.0 if mimic is None else float(mimic.get("offset", 0))
+    return G, c
 
 
 def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
@@ -132,10 +149,16 @@ class Engine:
         )
         return getattr(self.lib, f"probe_{name}")(*values)
 
+    def frame(self, q, v):
+        """Position, orientation, Jacobian and drift, all three axes, linear then angular."""
+        x, R, J, drift = np.empty(3), np.empty((3, 3)), np.empty((6, self.n)), np.empty(6)
+        self.call("task", q, v, x, R, J, drift)
+        return x, R, J, drift
+
     def task(self, q, v):
-        x, J, drift = np.empty(self.m), np.empty((self.m, self.n)), np.empty(self.m)
-        self.call("task", q, v, x, J, drift)
-        return x, J, drift
+        axes = ["xyz".index(axis) for axis in self.model.robot.axes]
+        x, _, J, drift = self.frame(q, v)
+        return x[axes], J[axes], drift[axes]
 
     def inverse_dynamics(self, q, v, a, gravity):
         tau = np.empty(self.n)

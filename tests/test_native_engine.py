@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from native_models import ROBOTS, Engine, engine, from_urdf, model
+from native_models import ROBOTS, Engine, coupling, engine, from_urdf, model
 
-# trees, prismatic joints, axes along x, y, z and none of them; mimic joints count as joints
+# trees, prismatic joints, axes along x, y, z and none of them, joints that mimic others
 EVERY_ROBOT = ("twodof", *ROBOTS)
 STATES = 1000
 
@@ -31,35 +31,37 @@ def test_robots_cover_trees_prismatic_joints_and_every_axis():
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_kinematics_equal_pinocchio(name):
-    native, robot = engine(name), model(name).robot
-    data = robot.model.createData()
-    axes = ["xyz".index(axis) for axis in robot.axes]
+    native, robot, (G, c) = engine(name), model(name).robot, coupling(name)
+    data, frame = robot.model.createData(), robot.frame_id
     for q, v, _ in random_states(np.random.default_rng(1), native.n):
-        pin.forwardKinematics(robot.model, data, q, v, np.zeros(native.n))
-        J = pin.computeFrameJacobian(robot.model, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED)
+        Q = G @ q + c
+        pin.forwardKinematics(robot.model, data, Q, G @ v, np.zeros(robot.model.nv))
+        J = pin.computeFrameJacobian(robot.model, data, Q, frame, pin.LOCAL_WORLD_ALIGNED)
         drift = pin.getFrameClassicalAcceleration(
-            robot.model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
-        ).linear[axes]
-        x = data.oMf[robot.frame_id].translation[axes]
-        for ours, theirs in zip(native.task(q, v), (x, J[axes], drift)):
+            robot.model, data, frame, pin.LOCAL_WORLD_ALIGNED
+        ).vector
+        place = data.oMf[frame]
+        expected = (place.translation, place.rotation, J @ G, drift)
+        for ours, theirs in zip(native.frame(q, v), expected, strict=True):
             assert deviation(ours, theirs) <= 1e-11
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_dynamics_equal_pinocchio(name):
-    native, robot = engine(name), model(name).robot
+    native, robot, (G, c) = engine(name), model(name).robot, coupling(name)
     n, reference = native.n, robot.model.copy()
     data = reference.createData()
     gravity, still = np.array([0.3, -2.0, -9.81]), np.zeros(native.n)
     reference.gravity.linear = gravity
     for q, v, a in random_states(np.random.default_rng(2), n):
-        M = pin.crba(reference, data, q)
-        M = np.triu(M) + np.triu(M, 1).T
+        Q = G @ q + c
+        M = pin.crba(reference, data, Q)
+        M = G.T @ (np.triu(M) + np.triu(M, 1).T) @ G
         columns = [native.inverse_dynamics(q, still, e, np.zeros(3)) for e in np.eye(n)]
         assert deviation(np.array(columns).T, M) <= 1e-11
-        h = pin.nonLinearEffects(reference, data, q, v)
+        h = G.T @ pin.nonLinearEffects(reference, data, Q, G @ v)
         assert deviation(native.inverse_dynamics(q, v, still, gravity), h) <= 1e-11
-        tau = pin.rnea(reference, data, q, v, a)
+        tau = G.T @ pin.rnea(reference, data, Q, G @ v, G @ a)
         assert deviation(native.inverse_dynamics(q, v, a, gravity), tau) <= 1e-11
         assert deviation(M @ native.acceleration_of_effort(q, a), a) <= 1e-11
 
@@ -67,7 +69,7 @@ def test_dynamics_equal_pinocchio(name):
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_controller_equals_pinocchio(name):
     """τ of the controller with NumPy's pseudo-inverse, where σ_min/σ_max ≥ 0.05."""
-    native, robot = engine(name), model(name).robot
+    native, robot, (G, c) = engine(name), model(name).robot, coupling(name)
     reference, plant = robot.model.copy(), model(name).plant()
     data = reference.createData()
     rng = np.random.default_rng(3)
@@ -87,7 +89,7 @@ def test_controller_equals_pinocchio(name):
         inverse = np.linalg.pinv(J, rcond=plant.rcond)
         a = inverse @ command - 3.0 * (v - inverse @ (J @ v))
         reference.gravity.linear = np.array(plant.gravity)
-        tau = pin.rnea(reference, data, q, v, a)
+        tau = G.T @ pin.rnea(reference, data, G @ q + c, G @ v, G @ a)
         assert deviation(native.group(values, "tau"), tau) <= 1e-11
         assert deviation(native.group(values, "x"), x) == 0.0
         compared += 1

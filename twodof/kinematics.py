@@ -42,7 +42,8 @@ class Kinematics:
 
     Args:
         urdf: the robot.
-        joints: names of the joints whose positions are the columns of q; all others rest at 0.
+        joints: names of the joints whose positions are the columns of q. Those that mimic one of
+            them, and have no column, follow it; all others rest at 0.
     """
 
     def __init__(self, urdf: Urdf, joints: Sequence[str]) -> None:
@@ -52,11 +53,23 @@ class Kinematics:
             joint.name: Rotation.from_euler("xyz", joint.rpy) for joint in urdf.joints.values()
         }
 
+    def moves(self, joint: Joint) -> bool:
+        """Whether a joint's position depends on q."""
+        return self._column(joint)[0] is not None
+
+    def _column(self, joint: Joint) -> tuple[int | None, float, float]:
+        """Which column of q moves a joint, and how; for one at rest the column is None."""
+        if joint.name in self._columns:
+            return self._columns[joint.name], 1.0, 0.0
+        return self._columns.get(joint.leader), joint.ratio, joint.offset
+
     def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
         """Where a joint's child is in its parent; q is N × joints, rad or m."""
         q = np.asarray(q, dtype=np.float64)
-        column = self._columns.get(joint.name)
-        moved = np.zeros((len(q), 1)) if column is None else q[:, column, None]
+        column, ratio, offset = self._column(joint)
+        moved = np.full((len(q), 1), offset)
+        if column is not None:
+            moved = moved + ratio * q[:, column, None]
         origin, along = self._origins[joint.name], moved * joint.axis
         if joint.prismatic:
             turn = Rotation.from_rotvec(np.zeros_like(along))
@@ -86,8 +99,9 @@ class Kinematics:
         end = places[-1].translation
         jacobian = np.zeros((len(end), 3, len(self._columns)))
         for joint, place in zip(chain, places[1:]):
-            if joint.name in self._columns:
-                axis = place.rotation.apply(joint.axis)
-                column = axis if joint.prismatic else np.cross(axis, end - place.translation)
-                jacobian[:, :, self._columns[joint.name]] = column
+            column, ratio, _ = self._column(joint)
+            if column is not None:
+                axis = ratio * place.rotation.apply(joint.axis)
+                arm = end - place.translation
+                jacobian[:, :, column] += axis if joint.prismatic else np.cross(axis, arm)
         return jacobian

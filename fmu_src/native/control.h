@@ -8,7 +8,7 @@
 /* What the law makes of a state, inputs held: accelerations q̈_cmd where COMMANDS_ACCELERATION, else
    efforts τ. The rank of its J⁺, the number of singular values that were not dropped; 0 where it
    has none. */
-INTERNAL int command(const double value[N_VARIABLES], Placement joint[N_JOINTS],
+INTERNAL int command(const double value[N_VARIABLES], Placement joint[N_BODIES],
                      const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS]);
 
 #endif

@@ -1,6 +1,7 @@
 /* Recursive dynamics in link frames; each joint's axis is the z axis of its own. */
 #include "dynamics.h"
 
+#include <math.h>
 #include <string.h>
 
 #include "vector.h"
@@ -39,17 +40,18 @@ void load_carrier(double payload, const double place[3], Carrier *carrier)
    Gravity enters as an acceleration of the root upwards.
    Source: Luh, Walker & Paul, "On-line computational scheme for mechanical manipulators",
    ASME J. Dyn. Sys. 102(2), 1980. */
-void inverse_dynamics(Placement joint[N_JOINTS], const Carrier *carrier, const double v[N_JOINTS],
+void inverse_dynamics(Placement joint[N_BODIES], const Carrier *carrier, const double v[N_JOINTS],
                       const double a[N_JOINTS], const double gravity[3], double tau[N_JOINTS])
 {
     const double still[3] = {0.0, 0.0, 0.0};
     const double lift[3] = {-gravity[0], -gravity[1], -gravity[2]};
-    double omega[N_JOINTS][3], alpha[N_JOINTS][3], acc[N_JOINTS][3];
-    double f[N_JOINTS][3], n[N_JOINTS][3];
-    for (int i = 0; i < N_JOINTS; i++) {
+    double omega[N_BODIES][3], alpha[N_BODIES][3], acc[N_BODIES][3];
+    double f[N_BODIES][3], n[N_BODIES][3];
+    for (int i = 0; i < N_BODIES; i++) {
         const int parent = PARENT[i];
         const double *omega_p = parent < 0 ? still : omega[parent];
         const double *alpha_p = parent < 0 ? still : alpha[parent];
+        const double vi = rate(v, i), ai = rate(a, i);
         double linear[3], momentum[3] = {0.0, 0.0, 0.0};
         memcpy(linear, parent < 0 ? lift : acc[parent], sizeof linear);
         add_cross(linear, alpha_p, joint[i].p);
@@ -57,16 +59,16 @@ void inverse_dynamics(Placement joint[N_JOINTS], const Carrier *carrier, const d
         rotate_back(acc[i], joint[i].R, linear);
         rotate_back(omega[i], joint[i].R, omega_p);
         rotate_back(alpha[i], joint[i].R, alpha_p);
-        const double coriolis[2] = {omega[i][1] * v[i], -omega[i][0] * v[i]}; /* ω_p × z v */
+        const double coriolis[2] = {omega[i][1] * vi, -omega[i][0] * vi}; /* ω_p × z v */
         if (PRISMATIC[i]) {
             acc[i][0] += 2.0 * coriolis[0];
             acc[i][1] += 2.0 * coriolis[1];
-            acc[i][2] += a[i];
+            acc[i][2] += ai;
         } else {
             alpha[i][0] += coriolis[0];
             alpha[i][1] += coriolis[1];
-            alpha[i][2] += a[i];
-            omega[i][2] += v[i];
+            alpha[i][2] += ai;
+            omega[i][2] += vi;
         }
         const double *com = i == CARRIER ? carrier->com : COM[i];
         const double mass = i == CARRIER ? carrier->mass : MASS[i];
@@ -82,9 +84,10 @@ void inverse_dynamics(Placement joint[N_JOINTS], const Carrier *carrier, const d
         add_cross(n[i], omega[i], momentum);
         add_cross(n[i], com, f[i]);
     }
-    for (int i = N_JOINTS - 1; i >= 0; i--) {
+    memset(tau, 0, N_JOINTS * sizeof *tau);
+    for (int i = N_BODIES - 1; i >= 0; i--) {
         const int parent = PARENT[i];
-        tau[i] = PRISMATIC[i] ? f[i][2] : n[i][2];
+        add_to_leader(tau, i, PRISMATIC[i] ? f[i][2] : n[i][2]);
         if (parent >= 0) {
             double force[3] = {0.0, 0.0, 0.0};
             add_rotated(force, joint[i].R, f[i]);
@@ -95,6 +98,42 @@ void inverse_dynamics(Placement joint[N_JOINTS], const Carrier *carrier, const d
         }
     }
 }
+
+#if N_BODIES > N_JOINTS
+
+/* M(q)⁻¹ τ by Cholesky's decomposition of M(q), whose columns are what unit accelerations need. */
+void acceleration_of_effort(Placement joint[N_BODIES], const Carrier *carrier,
+                            const double tau[N_JOINTS], double a[N_JOINTS])
+{
+    const double zero[3] = {0.0, 0.0, 0.0}, still[N_JOINTS] = {0.0};
+    double L[N_JOINTS][N_JOINTS];
+    for (int k = 0; k < N_JOINTS; k++) {
+        double unit[N_JOINTS] = {0.0};
+        unit[k] = 1.0;
+        inverse_dynamics(joint, carrier, still, unit, zero, L[k]);
+    }
+    for (int k = 0; k < N_JOINTS; k++) {
+        for (int j = 0; j < k; j++)
+            for (int i = k; i < N_JOINTS; i++)
+                L[i][k] -= L[i][j] * L[k][j];
+        const double root = sqrt(L[k][k]);
+        for (int i = k; i < N_JOINTS; i++)
+            L[i][k] /= root;
+    }
+    for (int i = 0; i < N_JOINTS; i++) {
+        a[i] = tau[i];
+        for (int k = 0; k < i; k++)
+            a[i] -= L[i][k] * a[k];
+        a[i] /= L[i][i];
+    }
+    for (int i = N_JOINTS - 1; i >= 0; i--) {
+        for (int k = i + 1; k < N_JOINTS; k++)
+            a[i] -= L[k][i] * a[k];
+        a[i] /= L[i][i];
+    }
+}
+
+#else
 
 /* A spatial inertia: n = A α + B a and f = Bᵀ α + C a, at the origin of its frame. */
 typedef struct {
@@ -175,7 +214,7 @@ static void add_child(Inertia *total, Inertia *child, Placement *placement)
 
    outwards the accelerations q̈ = (u − Uᵀ a)/D.
    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 7.3. */
-void acceleration_of_effort(Placement joint[N_JOINTS], const Carrier *carrier,
+void acceleration_of_effort(Placement joint[N_BODIES], const Carrier *carrier,
                             const double tau[N_JOINTS], double a[N_JOINTS])
 {
     Inertia body[N_JOINTS];
@@ -227,3 +266,5 @@ void acceleration_of_effort(Placement joint[N_JOINTS], const Carrier *carrier,
         motion[i][PRISMATIC[i]][2] += a[i];
     }
 }
+
+#endif

@@ -2,7 +2,7 @@
    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2. */
 #include "control.h"
 
-int command(const double value[N_VARIABLES], Placement joint[N_JOINTS], const double q[N_JOINTS],
+int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const double q[N_JOINTS],
             const double v[N_JOINTS], double given[N_JOINTS])
 {
     (void)joint;

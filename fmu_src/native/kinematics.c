@@ -14,12 +14,13 @@
 
 #include "vector.h"
 
-void place_joints(const double q[N_JOINTS], Placement joint[N_JOINTS])
+void place_joints(const double q[N_JOINTS], Placement joint[N_BODIES])
 {
-    for (int i = 0; i < N_JOINTS; i++) {
-        const double c = PRISMATIC[i] ? 1.0 : cos(q[i]);
-        const double s = PRISMATIC[i] ? 0.0 : sin(q[i]);
-        const double slide = PRISMATIC[i] ? q[i] : 0.0;
+    for (int i = 0; i < N_BODIES; i++) {
+        const double position = rate(q, i) + OFFSET[i];
+        const double c = PRISMATIC[i] ? 1.0 : cos(position);
+        const double s = PRISMATIC[i] ? 0.0 : sin(position);
+        const double slide = PRISMATIC[i] ? position : 0.0;
         for (int k = 0; k < 3; k++) {
             const double *row = JOINT_R[i][k];
             joint[i].R[k][0] = c * row[0] + s * row[1];
@@ -40,12 +41,31 @@ static void turn(double R[3][3], double S[3][3])
     }
 }
 
-void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *task)
+/* Columns of the Jacobian from the joints' origins and axes. */
+static void jacobian(TaskFrame *task, double origin[N_PATH + 1][3], double axis[N_PATH + 1][3])
+{
+    memset(task->J, 0, sizeof task->J);
+    for (int k = 0; k < N_PATH; k++) {
+        double linear[3] = {0.0, 0.0, 0.0}, arm[3];
+        for (int d = 0; d < 3; d++)
+            arm[d] = task->x[d] - origin[k][d];
+        if (PRISMATIC[PATH[k]])
+            memcpy(linear, axis[k], sizeof linear);
+        else
+            add_cross(linear, axis[k], arm);
+        for (int d = 0; d < 3; d++) {
+            add_to_leader(task->J[d], PATH[k], linear[d]);
+            add_to_leader(task->J[3 + d], PATH[k], PRISMATIC[PATH[k]] ? 0.0 : axis[k][d]);
+        }
+    }
+}
+
+void task_frame(Placement joint[N_BODIES], const double v[N_JOINTS], TaskFrame *task)
 {
     double R[3][3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
     double x[3] = {0.0, 0.0, 0.0};
     double omega[3] = {0.0, 0.0, 0.0}, alpha[3] = {0.0, 0.0, 0.0}, a[3] = {0.0, 0.0, 0.0};
-    double origin[N_JOINTS][3], axis[N_JOINTS][3];
+    double origin[N_PATH + 1][3], axis[N_PATH + 1][3];
     for (int k = 0; k <= N_PATH; k++) {
         const int i = k < N_PATH ? PATH[k] : 0;
         if (k == 0 && k < N_PATH) { /* its parent is the root, which rests */
@@ -66,7 +86,7 @@ void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *
         for (int d = 0; d < 3; d++) {
             origin[k][d] = x[d];
             axis[k][d] = R[d][2];
-            motion[d] = R[d][2] * v[i];
+            motion[d] = R[d][2] * rate(v, i);
         }
         add_cross(coriolis, omega, motion);
         for (int d = 0; d < 3; d++) {
@@ -78,22 +98,11 @@ void task_frame(Placement joint[N_JOINTS], const double v[N_JOINTS], TaskFrame *
             }
         }
     }
-    memset(task->column, 0, sizeof task->column);
-    for (int k = 0; k < N_PATH; k++) {
-        double *column = task->column[PATH[k]];
-        const double arm[3] = {x[0] - origin[k][0], x[1] - origin[k][1], x[2] - origin[k][2]};
-        if (PRISMATIC[PATH[k]])
-            memcpy(column, axis[k], sizeof axis[k]);
-        else
-            add_cross(column, axis[k], arm);
-    }
-    for (int d = 0; d < N_AXES; d++) {
-        task->x[d] = x[AXIS[d]];
-        task->xd[d] = 0.0;
-        task->drift[d] = a[AXIS[d]];
-        for (int i = 0; i < N_JOINTS; i++) {
-            task->J[d][i] = task->column[i][AXIS[d]];
-            task->xd[d] += task->J[d][i] * v[i];
-        }
-    }
+    memcpy(task->x, x, sizeof x);
+    memcpy(task->R, FRAME_R, sizeof R);
+    turn(R, task->R);
+    memcpy(task->R, R, sizeof R);
+    memcpy(task->drift, a, sizeof a);
+    memcpy(task->drift + 3, alpha, sizeof alpha);
+    jacobian(task, origin, axis);
 }

@@ -32,7 +32,7 @@ static void body(const double value[N_VARIABLES], int as_known, Carrier *carrier
 }
 
 /* τ of what the law gave, limited where it is to be. */
-static void control_effort(const double value[N_VARIABLES], Placement joint[N_JOINTS],
+static void control_effort(const double value[N_VARIABLES], Placement joint[N_BODIES],
                            const double v[N_JOINTS], const double given[N_JOINTS],
                            double tau[N_JOINTS])
 {
@@ -49,7 +49,7 @@ static void control_effort(const double value[N_VARIABLES], Placement joint[N_JO
 }
 
 /* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 where a was commanded and is what comes. */
-static void add_excess(const double value[N_VARIABLES], Placement joint[N_JOINTS],
+static void add_excess(const double value[N_VARIABLES], Placement joint[N_BODIES],
                        const Carrier *carrier, const double v[N_JOINTS],
                        const double given[N_JOINTS], const double a[N_JOINTS],
                        double sum[N_JOINTS])
@@ -65,7 +65,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
                  double a[N_JOINTS])
 {
     const double *value = plant->value, *force = &value[F_EXT];
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     Carrier carrier;
     double given[N_JOINTS], excess[N_JOINTS];
     int acts = 0;
@@ -81,7 +81,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
         task_frame(joint, v, &task);
         for (int i = 0; i < N_JOINTS; i++)
             for (int k = 0; k < 3; k++)
-                excess[i] += task.column[i][k] * force[k];
+                excess[i] += task.J[k][i] * force[k];
     }
 #if COMMANDS_ACCELERATION
     const int exact = value[LIMIT_EFFORT] == 0.0
@@ -105,7 +105,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
 void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
                   const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS])
 {
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     Carrier carrier;
     place_joints(q, joint);
     body(plant->value, 0, &carrier);
@@ -118,18 +118,22 @@ void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
 
 void compute_position(Plant *plant)
 {
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     TaskFrame task;
     place_joints(&plant->value[Q], joint);
     task_frame(joint, &plant->value[V], &task);
-    memcpy(&plant->value[X], task.x, sizeof task.x);
-    memcpy(&plant->value[XD], task.xd, sizeof task.xd);
+    for (int k = 0; k < N_AXES; k++) {
+        plant->value[X + k] = task.x[AXIS[k]];
+        plant->value[XD + k] = 0.0;
+        for (int i = 0; i < N_JOINTS; i++)
+            plant->value[XD + k] += task.J[AXIS[k]][i] * plant->value[V + i];
+    }
 }
 
 void compute_effort(Plant *plant)
 {
     double *value = plant->value, given[N_JOINTS];
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     place_joints(&value[Q], joint);
     command(value, joint, &value[Q], &value[V], given);
     control_effort(value, joint, &value[V], given, &value[TAU]);

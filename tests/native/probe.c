@@ -10,14 +10,15 @@
 #include "pseudo_inverse.h"
 #endif
 
-FMI2_Export void probe_task(const double q[], const double v[], double x[], double J[],
+FMI2_Export void probe_task(const double q[], const double v[], double x[], double R[], double J[],
                             double drift[])
 {
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     TaskFrame task;
     place_joints(q, joint);
     task_frame(joint, v, &task);
     memcpy(x, task.x, sizeof task.x);
+    memcpy(R, task.R, sizeof task.R);
     memcpy(J, task.J, sizeof task.J);
     memcpy(drift, task.drift, sizeof task.drift);
 }
@@ -25,7 +26,7 @@ FMI2_Export void probe_task(const double q[], const double v[], double x[], doub
 FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], const double a[],
                                         const double gravity[], double tau[])
 {
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, v, &carrier);
@@ -34,7 +35,7 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
 
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])
 {
-    Placement joint[N_JOINTS];
+    Placement joint[N_BODIES];
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, q, &carrier);

@@ -43,7 +43,8 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
         raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
     groups = [variable.group for variable in table]
     model = robot.model
-    to_z = [_rotation_to_z(_axis(joint)) for joint in list(model.joints)[1:]]
+    subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
+    to_z = [_rotation_to_z(axis[:3] + axis[3:]) for axis in subspaces]
     turned = [np.eye(3), *to_z]  # by Pinocchio's joint index, 0 the root
     parents = [int(parent) for parent in list(model.parents)[1:]]
     placements = list(model.jointPlacements)[1:]
@@ -55,7 +56,8 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
         "   slides along, the z axis of its own frame. */\n"
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
         f"#define MODEL_GUID {_quoted(guid)}\n"
-        f"#define N_JOINTS {n}\n#define N_AXES {m}\n"
+        f"#define N_JOINTS {n} /* that move on their own */\n"
+        f"#define N_BODIES {len(parents)}\n#define N_AXES {m}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
         f"#define COMMANDS_ACCELERATION {int(control.commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
@@ -65,7 +67,8 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
         _table("char *const JOINT_NAME", robot.joints),
         "/* The tree: parents are -1 for the root; joints from the root to the task frame. */\n"
         + _table("int PARENT", (parent - 1 for parent in parents)),
-        _table("int PRISMATIC", map(int, robot.prismatic)),
+        _table("int PRISMATIC", (int(axis[:3].any()) for axis in subspaces)),
+        _following(robot),
         _table("int PATH", path or [0]),
         _table("int AXIS", ("xyz".index(axis) for axis in robot.axes)),
         "/* Joint frames in their parents' at q = 0; the task frame in its joint's. */\n"
@@ -93,13 +96,21 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
     return "\n".join(sections)
 
 
-def _axis(joint: object) -> Array:
-    """Unit axis of a joint with one coordinate, in its own frame."""
+def _subspace(joint: object) -> Array:
+    """Velocity of a joint with one coordinate, in its own frame: linear, angular; one is zero."""
     data = joint.createData()  # type: ignore[attr-defined]
     joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
-    subspace = np.asarray(data.S).reshape(6)  # linear, angular
-    axis: Array = subspace[:3] + subspace[3:]
-    return axis
+    return np.asarray(data.S).reshape(6)
+
+
+def _following(robot: Robot) -> str:
+    """Which of the joints that move on their own each body's joint follows, and how."""
+    G = np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling
+    tables = _table("double OFFSET", robot.offset.tolist())
+    if robot.coupling is not None:
+        tables += _table("double RATIO", G.sum(axis=1).tolist())
+        tables += _table("int LEADER", (int(np.argmax(np.abs(row))) for row in G))
+    return "/* A joint's position is RATIO q[LEADER] + OFFSET. */\n" + tables
 
 
 def _rotation_to_z(axis: Array) -> Array:

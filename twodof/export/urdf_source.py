@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from ..errors import BuildError
 from ..files import read_file
-from ..plant.urdf import RobotError, Urdf, number, read_urdf
+from ..plant.urdf import RobotError, Urdf, read_urdf
 
 DEFAULT_FRAME = "EndEffector"
 MAX_URDF = 8 * 1024**2
@@ -82,16 +81,11 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
             raise RobotError(f"no joint '{pattern}' to lock; there are: {', '.join(moving)}")
         positions |= dict.fromkeys(matches, value)
     elements = {str(e.get("name")): e for e in urdf.tree.findall("joint")}
-    mimics = {name: e.find("mimic") for name, e in elements.items() if name in moving}
-    for _ in mimics:  # of a mimic of a mimic too
-        for name, mimic in mimics.items():
-            if mimic is not None and mimic.get("joint") in positions and name not in positions:
-                positions[name] = _followed(name, mimic, positions[str(mimic.get("joint"))])
-    for name, mimic in mimics.items():
-        if mimic is not None and name in positions and mimic.get("joint") not in positions:
-            raise RobotError(
-                f"joint '{name}' mimics '{mimic.get('joint')}', which moves: lock that"
-            )
+    for name, joint in moving.items():
+        if joint.leader in positions:
+            positions.setdefault(name, joint.ratio * positions[joint.leader] + joint.offset)
+        elif name in positions:
+            raise RobotError(f"joint '{name}' mimics '{joint.leader}', which moves: lock that")
     for name, value in positions.items():
         joint, element = moving[name], elements[name]
         if not joint.low <= value <= joint.high:
@@ -115,14 +109,3 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
             rpy=" ".join(map(repr, rpy.tolist())),
         )  # fmt: skip
     return ET.tostring(urdf.tree, encoding="unicode")
-
-
-def _followed(name: str, mimic: ET.Element, position: float) -> float:
-    """Where a joint is that mimics one at a position."""
-    try:
-        factor, offset = (number(mimic.get(*key)) for key in (("multiplier", "1"), ("offset", "0")))
-    except ValueError:
-        factor = offset = math.nan
-    if not math.isfinite(factor * position + offset):
-        raise RobotError(f"joint '{name}': its <mimic> has a factor or offset that is no number")
-    return factor * position + offset

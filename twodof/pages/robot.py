@@ -29,7 +29,7 @@ class PageRobot:
     Args:
         page: the page.
         urdf: XML text.
-        joints: names of the moving joints in the order of q.
+        joints: names of the joints whose positions q has, in its order.
         frame: the end effector's link.
         read: where the meshes are from.
 
@@ -49,7 +49,7 @@ class PageRobot:
             raise PageError(str(error)) from error
         self._scene, self._read, self._frame = page.scene, read, frame
         self._kinematics = Kinematics(robot, joints)
-        self._moving = [joint for joint in robot.joints.values() if joint.name in joints]
+        self._moving = [joint for joint in robot.joints.values() if self._kinematics.moves(joint)]
         self.missing: list[str] = []
         numbers = {link: i for i, link in enumerate(robot.links)}
         self._names = {}

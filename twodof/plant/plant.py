@@ -12,19 +12,19 @@ Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import mul
+from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from . import effort_control, joint_control, task_control
 from .integrator import BUDGET, STAGES, Array, Response, StepError, advance
+from .mechanism import Mechanism
 from .robot import Robot
 from .stops import Stops
 from .variables import CONTROLS, Variable
 
 LAWS = {"task": task_control, "joint": joint_control, "effort": effort_control}
-
-WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 class ParameterError(ValueError):
@@ -48,7 +48,7 @@ class Plant:
         control: the law, a key of ``CONTROLS``.
 
     Attributes:
-        model, data: Pinocchio's, as the control law knows the robot.
+        known: the robot as its control law knows it.
     """
 
     x_des: list[float]
@@ -123,13 +123,10 @@ class Plant:
 
     def prepare(self) -> None:
         """Take over parameters that were set directly, as after restoring a state."""
-        self._model = _loaded(self.robot, self.gravity, self.payload, self.payload_com)
-        self._data = self._model.createData()
+        place = self.payload_com
+        self._real = self.known = Mechanism(self.robot, self.gravity, self.payload, place)
         if self.payload and not getattr(self, "payload_known", False):
-            self.model = _loaded(self.robot, self.gravity, 0.0, self.payload_com)
-            self.data = self.model.createData()
-        else:
-            self.model, self.data = self._model, self._data
+            self.known = Mechanism(self.robot, self.gravity, 0.0, place)
 
     def step(self, h: float) -> None:
         """Advance the state by one communication step of h seconds, inputs held.
@@ -165,15 +162,14 @@ class Plant:
     @property
     def x(self) -> list[float]:
         """Position of the task frame along the task axes, m, root frame."""
-        pin.framesForwardKinematics(self._model, self._data, np.array(self.q))
-        position: list[float] = self._data.oMf[self.robot.frame_id].translation.tolist()
+        position = self._observed()[0].translation.tolist()
         return [position[axis] for axis in self._axes]
 
     @property
     def xd(self) -> list[float]:
         """Velocity of the task frame along the task axes, m/s, root frame."""
-        velocity: list[float] = (self._jacobian(np.array(self.q)) @ self.v).tolist()
-        return [velocity[axis] for axis in self._axes]
+        jacobian = self._observed()[1]
+        return [sum(map(mul, jacobian[axis], self.v)) for axis in self._axes]
 
     @property
     def tau(self) -> list[float]:
@@ -182,25 +178,18 @@ class Plant:
         tau: list[float] = effort.tolist()
         return tau
 
+    def _observed(self) -> tuple[Any, list[list[float]], Any]:
+        return self._real.observe(np.array(self.q), np.array(self.v))
+
     def _stops(self) -> Stops:
         limits = list(zip(self.q_min, self.q_max))
-        return Stops(limits, self._inverse_mass if self.rigid_stops else None)
-
-    def _jacobian(self, q: Array) -> Array:
-        """Of the task frame's position in the root's axes, 3 × n."""
-        frame = self.robot.frame_id
-        jacobian = pin.computeFrameJacobian(self._model, self._data, q, frame, WORLD_ALIGNED)
-        return np.asarray(jacobian).reshape(6, -1)[:3]
-
-    def _inverse_mass(self, q: Sequence[float]) -> Array:
-        inverse = pin.computeMinverse(self._model, self._data, np.array(q))
-        return np.asarray(np.triu(inverse) + np.triu(inverse, 1).T)
+        return Stops(limits, self._real.inverse_mass if self.rigid_stops else None)
 
     def _control_effort(self, command: Response, q: Array, v: Array) -> tuple[Array, int]:
         given, rank = command(q, v)
         tau: Array = np.array(given)
         if self._commands == "acceleration":
-            tau = pin.rnea(self.model, self.data, q, v, tau)
+            tau = self.known.inverse_dynamics(q, v, tau)
         if self.limit_effort:
             tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
         return tau, rank
@@ -211,15 +200,15 @@ class Plant:
         force = np.array(self.f_ext)
         # where none of these is there, q̈ = M⁻¹(M q̈_cmd + h − h)
         acts = damping.any() or external.any() or force.any() or self.limit_effort
-        if self._commands == "acceleration" and self.model is self._model and not acts:
+        if self._commands == "acceleration" and self.known is self._real and not acts:
             return command
 
         def acceleration(q: Array, v: Array) -> tuple[list[float], int]:
             tau, rank = self._control_effort(command, q, v)
             effort = tau + external - damping * v
             if force.any():
-                effort += force @ self._jacobian(q)
-            return pin.aba(self._model, self._data, q, v, effort).tolist(), rank
+                effort += force @ np.array(self._real.observe(q, v)[1][:3])
+            return self._real.forward_dynamics(q, v, effort).tolist(), rank
 
         return acceleration
 
@@ -237,16 +226,3 @@ class Plant:
                     f"q_min[{i + 1}] = {low:g} > q_max[{i + 1}] = {high:g}"
                     f" (joint '{self.robot.joints[i]}')"
                 )
-
-
-def _loaded(
-    robot: Robot, gravity: Sequence[float], payload: float, place: Sequence[float]
-) -> pin.Model:
-    """The robot's model with a gravity, and with a point mass in its task frame."""
-    model = robot.model.copy()
-    model.gravity.linear = np.array(gravity)
-    if payload:
-        frame = model.frames[robot.frame_id]
-        mass = pin.Inertia(payload, frame.placement.act(np.array(place)), np.zeros((3, 3)))
-        model.inertias[frame.parentJoint] += mass
-    return model

@@ -1,4 +1,4 @@
-"""The robot: a URDF, checked, as a Pinocchio model with one coordinate per joint.
+"""The robot: a URDF, checked, as a Pinocchio model and the joints in it that move on their own.
 
 Pinocchio loads several things silently that this plant cannot simulate, so the XML is
 checked before Pinocchio sees it, and every refusal names the joint or the link.
@@ -6,27 +6,44 @@ checked before Pinocchio sees it, and every refusal names the joint or the link.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
-from .urdf import NUMERIC_TAGS, Joint, RobotError, Urdf, attribute, check_axes, number, read_urdf
+from .urdf import (
+    NUMERIC_TAGS,
+    UNBOUNDED,
+    Joint,
+    RobotError,
+    Urdf,
+    attribute,
+    check_axes,
+    number,
+    read_urdf,
+)
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A fixed-base robot whose n joints each have one coordinate, and its task frame.
+    """A fixed-base robot, n of whose joints move on their own, and its task frame.
 
     Attributes:
         name: the URDF's robot name.
-        model: Pinocchio model, nq = nv = n; its gravity is not used (see ``Plant``).
-        joints: joint names in the model's order, Pinocchio's joint 1 first.
+        model: Pinocchio model of all joints that move, one coordinate each; its gravity is not
+            used (see ``Mechanism``).
+        coupling, offset: positions of the model's joints are ``coupling @ q + offset``; no coupling
+            where no joint mimics another, and they are q.
+        joints: names of the n joints in the model's order.
         prismatic: per joint, True where the coordinate is a length (m), else an angle (rad).
-        q_min, q_max: position limits, rad or m; ∓UNBOUNDED where there is none.
+        q_min, q_max: position limits, rad or m, with those of the joints that follow; ∓UNBOUNDED
+            where there is none.
         effort: effort limits, N·m or N; infinite where the URDF has 0 or none.
-        damping: viscous joint damping D, N·m·s/rad or N·s/m.
+        damping: viscous joint damping D, N·m·s/rad or N·s/m, with that of the joints that follow.
         frame: name of the task frame, and its Pinocchio index ``frame_id``.
         axes: task axes, a subset of "xyz" in the root frame, e.g. "xy"; m = len(axes).
         root: name of the URDF's root link, the frame in which positions are expressed.
@@ -35,6 +52,8 @@ class Robot:
 
     name: str
     model: pin.Model
+    coupling: NDArray[np.float64] | None
+    offset: NDArray[np.float64]
     joints: tuple[str, ...]
     prismatic: tuple[bool, ...]
     q_min: tuple[float, ...]
@@ -49,8 +68,11 @@ class Robot:
 
     def moves_frame(self) -> tuple[bool, ...]:
         """Per joint, whether it lies between the root and the task frame."""
-        supports = set(self.model.supports[self.model.frames[self.frame_id].parentJoint])
-        return tuple(i + 1 in supports for i in range(len(self.joints)))
+        support = list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
+        path = [i - 1 for i in support]
+        if self.coupling is None:
+            return tuple(i in path for i in range(len(self.joints)))
+        return tuple(bool(column.any()) for column in self.coupling[path].T)
 
 
 def load_robot(text: str, frame: str, axes: str) -> Robot:
@@ -66,12 +88,6 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     """
     check_axes(axes)
     urdf = read_urdf(text)
-    for element in urdf.tree.findall("joint"):
-        if element.find("mimic") is not None:
-            raise RobotError(
-                f"joint '{element.get('name')}' mimics another joint, which is not supported;"
-                " hold both with `lock`, or leave out its <mimic> to move it on its own"
-            )
     odd: list[str] = []
     for joint in urdf.joints.values():
         if joint.moves:
@@ -91,27 +107,69 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
         model = pin.buildModelFromXML(ET.tostring(_mechanism(urdf), encoding="unicode"))
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"Pinocchio cannot read the URDF: {error}") from error
-    names = tuple(model.names)[1:]
-    _check_mass_matrix(model, names)
-    joints = [urdf.joints[name] for name in names]
+    moving = [urdf.joints[name] for name in list(model.names)[1:]]
+    joints = [joint for joint in moving if joint.leader == joint.name]
+    coupling, offset = _coupling(moving, joints)
+    limits = [_limits(joint, moving) for joint in joints]
     robot = Robot(
         name=urdf.name,
         model=model,
-        joints=names,
+        coupling=coupling,
+        offset=offset,
+        joints=tuple(joint.name for joint in joints),
         prismatic=tuple(joint.prismatic for joint in joints),
-        q_min=tuple(joint.low for joint in joints),
-        q_max=tuple(joint.high for joint in joints),
+        q_min=tuple(low for low, _ in limits),
+        q_max=tuple(high for _, high in limits),
         effort=tuple(joint.effort for joint in joints),
-        damping=tuple(joint.damping for joint in joints),
+        damping=tuple(
+            sum(j.ratio**2 * j.damping for j in moving if j.leader == joint.name)
+            for joint in joints
+        ),
         frame=frame,
         frame_id=model.getFrameId(frame, pin.FrameType.BODY),
         axes=axes,
         root=urdf.root,
         warnings=tuple(warnings),
     )
+    _check_mass_matrix(robot)
     if not any(robot.moves_frame()):
         raise RobotError(f"no joint moves the frame '{frame}'")
     return robot
+
+
+def _coupling(
+    moving: Sequence[Joint], joints: Sequence[Joint]
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+    """G and c of all joints' positions G q + c; no G where they are q itself."""
+    offset = np.array([joint.offset for joint in moving])
+    if len(moving) == len(joints):
+        return None, offset
+    columns = {joint.name: i for i, joint in enumerate(joints)}
+    G = np.zeros((len(moving), len(joints)))
+    for row, joint in zip(G, moving):
+        row[columns[joint.leader]] = joint.ratio
+    return G, offset
+
+
+def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
+    """The range in which a joint and all that follow it are within their limits."""
+    low, high = leader.low, leader.high
+    for joint in moving:
+        if joint.leader != leader.name or joint is leader or not joint.ratio:
+            continue
+        ends = [
+            math.copysign(UNBOUNDED, limit * joint.ratio)
+            if abs(limit) >= UNBOUNDED
+            else (limit - joint.offset) / joint.ratio
+            for limit in (joint.low, joint.high)
+        ]
+        low, high = max(low, min(ends)), min(high, max(ends))
+        if low > high:
+            raise RobotError(
+                f"joint '{joint.name}' mimics '{leader.name}', but no position of that is within"
+                " the limits of both"
+            )
+    return low, high
 
 
 def _check_body(urdf: Urdf, joint: Joint, odd: list[str]) -> None:
@@ -196,14 +254,16 @@ def _mechanism(urdf: Urdf) -> ET.Element:
     return bare
 
 
-def _check_mass_matrix(model: pin.Model, joints: tuple[str, ...]) -> None:
+def _check_mass_matrix(robot: Robot) -> None:
     """Every joint, the outermost first, must have something to move."""
-    mass_matrix = pin.crba(model, model.createData(), np.zeros(model.nq))
-    mass_matrix = np.triu(mass_matrix) + np.triu(mass_matrix, 1).T
-    for i in reversed(range(len(joints))):
-        block = mass_matrix[i:, i:]
+    model, n = robot.model, len(robot.joints)
+    G = np.eye(n) if robot.coupling is None else robot.coupling
+    M = pin.crba(model, model.createData(), np.zeros(model.nq))
+    M = G.T @ (np.triu(M) + np.triu(M, 1).T) @ G
+    for i in reversed(range(n)):
+        block = M[i:, i:]
         if not np.linalg.eigvalsh(block)[0] > 1e-12 * np.trace(block):
             raise RobotError(
-                f"joint '{joints[i]}': the links behind it have no inertia about its axis,"
+                f"joint '{robot.joints[i]}': the links behind it have no inertia about its axis,"
                 " so its acceleration is not defined"
             )

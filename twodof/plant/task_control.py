@@ -13,38 +13,24 @@ from __future__ import annotations
 from operator import mul
 from typing import Any
 
-import numpy as np
-import pinocchio as pin
-
 from .integrator import Array, Response
 from .pseudo_inverse import apply_pseudo_inverse
-
-# looked up once: an attribute of the module costs as much as a call's arithmetic
-forward_kinematics = pin.forwardKinematics
-frame_jacobian = pin.computeFrameJacobian
-frame_acceleration = pin.getFrameClassicalAcceleration
-WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 def command(plant: Any) -> Response:
     """q̈_cmd as a function of the state, n values, and the rank of its J⁺; inputs held."""
-    model, data, frame = plant.model, plant.data, plant.robot.frame_id
-    still = np.zeros(model.nv)
+    observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]
     task = list(zip(axes, plant.x_des, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))
-    Kn, rcond, several = plant.Kn, plant.rcond, model.nv > 1
-    position = data.oMf[frame].translation  # a view: it follows what Pinocchio computes
+    Kn, rcond = plant.Kn, plant.rcond
 
     def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
-        forward_kinematics(model, data, q, v, still)
-        jacobian = frame_jacobian(model, data, q, frame, WORLD_ALIGNED).tolist()
-        # with q̈ = 0 the frame's acceleration is the drift J̇v
-        drift = frame_acceleration(model, data, frame, WORLD_ALIGNED).linear.tolist()
-        x = position.tolist()
+        placement, jacobian, acceleration = observe(q, v)
+        x, drift = placement.translation.tolist(), acceleration.linear.tolist()
         velocity = v.tolist()
         rows, command = [], []
         for axis, x_des, xd_des, xdd_des, Kp, Kd in task:
-            row = jacobian[axis] if several else [jacobian[axis]]
+            row = jacobian[axis]
             xd = sum(map(mul, row, velocity))
             rows.append(row)
             command.append(

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 UNBOUNDED = 1.7976931348623157e308
 """Magnitude of q_min and q_max that stands for "no limit" (the largest double)."""
@@ -42,6 +43,9 @@ class Joint:
         low, high: position limits, rad or m; ∓UNBOUNDED where there is none.
         effort: limit, N·m or N; infinite where the URDF has 0 or none.
         damping: viscous, N·m·s/rad or N·s/m.
+        leader: the joint that it mimics, and that mimics none: q = ratio·q_leader + offset; its
+            own name where it moves on its own.
+        ratio, offset: of that.
     """
 
     name: str
@@ -55,6 +59,9 @@ class Joint:
     high: float
     effort: float
     damping: float
+    leader: str
+    ratio: float = 1.0
+    offset: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -125,6 +132,7 @@ def read_urdf(text: str) -> Urdf:
             _check_numbers(element, f"{tag} '{name}'")
     root = _check_tree(links, elements)
     joints = {name: _joint(name, element) for name, element in elements.items()}
+    joints = {name: _following(joint, joints) for name, joint in joints.items()}
     frictional = [n for n, e in elements.items() if attribute(e, "dynamics", "friction", 0.0)]
     warnings = (f"friction is not modelled and is ignored: {_listed('joint', frictional)}",)
     return Urdf(
@@ -193,7 +201,43 @@ def _joint(name: str, element: ET.Element) -> Joint:
         high=high,
         effort=effort or math.inf,
         damping=damping,
+        **_mimicry(name, element if kind != "fixed" else None),
     )
+
+
+def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
+    """What a joint's <mimic> says; nothing where there is none."""
+    mimic = None if element is None else element.find("mimic")
+    if mimic is None:
+        return {"leader": name}
+    factors = {"ratio": ("multiplier", "1"), "offset": ("offset", "0")}
+    try:
+        read = {field: number(mimic.get(*key).strip()) for field, key in factors.items()}
+    except ValueError:
+        read = {"ratio": math.inf}
+    if not all(abs(value) <= LARGEST for value in read.values()):
+        raise RobotError(f"joint '{name}': its <mimic> has a factor or offset that is no number")
+    if mimic.get("joint") == name:
+        raise RobotError(f"joint '{name}' mimics itself")
+    return {"leader": mimic.get("joint", ""), **read}
+
+
+def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:
+    """The joint, with the one that its <mimic> leads to in the end, and how it follows that."""
+    seen = [joint.name]
+    while joint.leader != seen[-1]:
+        leader = joints.get(joint.leader)
+        if leader is None or not leader.moves or leader.name in seen:
+            reason = (
+                "does not exist" if leader is None
+                else f"is fixed: make '{seen[-1]}' fixed too" if not leader.moves
+                else "follows it"
+            )  # fmt: skip
+            raise RobotError(f"joint '{seen[-1]}' mimics '{joint.leader}', which {reason}")
+        seen.append(leader.name)
+        ratio, offset = joint.ratio * leader.ratio, joint.ratio * leader.offset + joint.offset
+        joint = replace(joint, leader=leader.leader, ratio=ratio, offset=offset)
+    return joint
 
 
 def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:

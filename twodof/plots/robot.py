@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple
@@ -54,7 +55,7 @@ class Robot(NamedTuple):
     Attributes:
         urdf: the robot; its masses need not make sense.
         kinematics: of the joints in ``moving``.
-        moving: all joints that move, mimic joints too, which move on their own in a bag.
+        moving: joints that move on their own; those that mimic one too where a bag has them.
         frame: the end effector's link.
         axes: the task's, of "xyz".
     """
@@ -71,15 +72,25 @@ class Robot(NamedTuple):
         return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
 
 
-def load_robot(text: str, frame: str, axes: str) -> Robot:
+def load_robot(text: str, frame: str, axes: str, names: Sequence[str]) -> Robot:
     """A URDF's robot; without a frame, its "EndEffector", or the link behind most joints.
+
+    Args:
+        text: XML text.
+        frame: the end effector's link.
+        axes: the task's, of "xyz".
+        names: joints whose positions are known.
 
     Raises:
         RobotError: it is not sound, or no joint moves the frame.
     """
     check_axes(axes)
     urdf = read_urdf(text)
-    moving = tuple(joint for joint in urdf.joints.values() if joint.moves)
+    moving = tuple(
+        joint
+        for joint in urdf.joints.values()
+        if joint.moves and (joint.leader == joint.name or joint.name in names)
+    )
     if not frame:
         depths = {link: sum(j.moves for j in urdf.chain(link)) for link in urdf.links}
         last = max(enumerate(urdf.links), key=lambda link: (depths[link[1]], link[0]))[1]

@@ -157,7 +157,8 @@ def _with_robot(
     robot = None
     if urdf is not None:
         try:
-            robot = load_robot(urdf, frame or run.get("frame") or "", run.get("axes") or "xyz")
+            at = frame or run.get("frame") or ""
+            robot = load_robot(urdf, at, run.get("axes") or "xyz", names)
         except RobotError as error:
             raise PlotError(f"{source}: {error}") from error
     joints = _joints(bag, names, robot)
@@ -196,12 +197,12 @@ def _in_robot_order(bag: Recording, robot: Robot, names: Sequence[str], values: 
         PlotError: a joint that moves the frame is not in the bag.
     """
     ordered = np.zeros((len(values), len(robot.moving)))
-    needed = robot.chain
+    needed = {j.name if j.name in names else j.leader for j in robot.chain}
     for j, joint in enumerate(robot.moving):
         if joint.name in names:
             if values.shape == bag.q.shape:
                 ordered[:, j] = values[:, names.index(joint.name)]
-        elif joint in needed:
+        elif joint.name in needed:
             raise PlotError(
                 f"'{bag.path}' has no joint '{joint.name}', which the robot '{robot.urdf.name}'"
                 f" needs to move '{robot.frame}'; its joints are: {', '.join(names)}"
@@ -256,7 +257,7 @@ def _disturbances(
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
         "singularities": astray and is_singular(robot, q, float(first.get("rcond", 0.0))),
-        "damping": any(joint.damping for joint in robot.moving),
+        "damping": any(joint.damping for joint in robot.urdf.joints.values() if joint.moves),
         "unknown payload": bool(first.get("payload")) and not first.get("payload_known"),
         "external torque": any(values[name] for _, values in schedule for name in external),
     }

@@ -39,7 +39,7 @@ class Scene:
 
     Args:
         urdf: XML text whose meshes are named ``package://meshes/…``.
-        joints: names of the moving joints in the order of q.
+        joints: names of the joints whose positions q has, in its order.
         frame: the end effector's link.
         read: gives the bytes of a mesh by its name ``meshes/…``, None where it is missing.
 
@@ -63,9 +63,13 @@ class Scene:
         if frame not in robot.links:
             raise RobotError(f"it has no link '{frame}'")
         self._kinematics, self._frame = Kinematics(robot, joints), frame
-        self._moving = [joint for joint in robot.joints.values() if joint.name in joints]
-        fixed = [joint for joint in robot.joints.values() if joint.name not in joints]
-        self.fixed = [self._transform(joint, [0.0] * len(joints)) for joint in fixed]
+        rest, self._moving = [0.0] * len(joints), []
+        self.fixed: list[Transform] = []
+        for joint in robot.joints.values():
+            if self._kinematics.moves(joint):
+                self._moving.append(joint)
+            else:
+                self.fixed.append(self._transform(joint, rest))
         _replace_meshes(robot.tree, read)
         self.description = ET.tostring(robot.tree, encoding="unicode")
 

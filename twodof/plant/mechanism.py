@@ -1,0 +1,97 @@
+"""Kinematics and dynamics of a robot, in the coordinates of the joints that move on their own.
+
+Joints that mimic others follow exactly: with the positions G q + c of all joints,
+
+    M(q) = Gᵀ M_all G,    h(q, v) = Gᵀ h_all,    J(q) = J_all G.
+
+Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2; M_all, h_all and J_all
+are Pinocchio's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from .integrator import Array
+from .robot import Robot
+
+# looked up once: an attribute of the module costs as much as a call's arithmetic
+forward_kinematics = pin.forwardKinematics
+frame_jacobian = pin.computeFrameJacobian
+frame_acceleration = pin.getFrameClassicalAcceleration
+WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+class Mechanism:
+    """A robot with a gravity and a point mass in its task frame; n joints move on their own.
+
+    Args:
+        robot: the robot.
+        gravity: in the root's axes, m/s².
+        payload: the point mass, kg.
+        place: where it is, in the task frame, m.
+    """
+
+    def __init__(
+        self, robot: Robot, gravity: Sequence[float], payload: float, place: Sequence[float]
+    ) -> None:
+        model = robot.model.copy()
+        model.gravity.linear = np.array(gravity)
+        self._frame = robot.frame_id
+        if payload:
+            frame = model.frames[self._frame]
+            mass = pin.Inertia(payload, frame.placement.act(np.array(place)), np.zeros((3, 3)))
+            model.inertias[frame.parentJoint] += mass
+        self._model, self._data = model, model.createData()
+        self._G, self._c = robot.coupling, robot.offset
+        self._still = np.zeros(model.nv)
+        self._placement: Any = self._data.oMf[self._frame]  # it follows what Pinocchio computes
+
+    def observe(self, q: Array, v: Array) -> tuple[Any, list[list[float]], Any]:
+        """The task frame's placement, Jacobian (6 × n: linear, angular), and drift J̇ v.
+
+        In the root's axes; the placement and the drift are Pinocchio's objects.
+        """
+        if self._G is not None:
+            q, v = self._G @ q + self._c, self._G @ v
+        model, data, frame = self._model, self._data, self._frame
+        forward_kinematics(model, data, q, v, self._still)
+        J = frame_jacobian(model, data, q, frame, WORLD_ALIGNED)
+        if self._G is not None:
+            J = J @ self._G
+        # with q̈ = 0 the frame's acceleration is the drift
+        drift = frame_acceleration(model, data, frame, WORLD_ALIGNED)
+        return self._placement, J.reshape(6, -1).tolist(), drift
+
+    def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        """τ = M(q) a + h(q, v), N·m or N, n values."""
+        G = self._G
+        if G is None:
+            return np.asarray(pin.rnea(self._model, self._data, q, v, a))
+        tau = pin.rnea(self._model, self._data, G @ q + self._c, G @ v, G @ a)
+        return np.asarray(G.T @ tau)
+
+    def forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        """q̈ = M(q)⁻¹ (τ − h(q, v)), rad/s² or m/s², n values."""
+        if self._G is None:
+            return np.asarray(pin.aba(self._model, self._data, q, v, tau))
+        h = self.inverse_dynamics(q, v, np.zeros(len(q)))
+        return np.asarray(np.linalg.solve(self.mass_matrix(q), tau - h))
+
+    def mass_matrix(self, q: Array) -> Array:
+        """M(q), n × n."""
+        G = self._G
+        M = pin.crba(self._model, self._data, q if G is None else G @ q + self._c)
+        M = np.triu(M) + np.triu(M, 1).T
+        return M if G is None else np.asarray(G.T @ M @ G)
+
+    def inverse_mass(self, q: Sequence[float]) -> Array:
+        """M(q)⁻¹, n × n."""
+        if self._G is not None:
+            return np.asarray(np.linalg.inv(self.mass_matrix(np.array(q))))
+        inverse = pin.computeMinverse(self._model, self._data, np.array(q))
+        return np.asarray(np.triu(inverse) + np.triu(inverse, 1).T)
