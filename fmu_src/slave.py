@@ -182,7 +182,11 @@ class TwoDofSlave(fmi.Fmi2Slave):
 
     def _output(self, group):
         if group not in self._outputs:
-            self._outputs[group] = getattr(self._plant, group)
+            try:
+                self._outputs[group] = getattr(self._plant, group)
+            except self._plant_module.DiscardError as error:
+                self._refuse(str(error))
+                return [float("nan")] * len(self._plant.q)
         return self._outputs[group]
 
     def _set(self, vrs, values, kind):

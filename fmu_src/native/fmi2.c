@@ -180,6 +180,8 @@ fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
     if (point + h > state->stop_time && is_far(point + h, state->stop_time))
         return report(instance, fmi2Error, "fmi2DoStep: the step of %.12g s from %.12g s ends after"
                       " the stop time, %.12g s", h, point, state->stop_time);
+    if (check_inputs(instance) != fmi2OK)
+        return fmi2Error;
     Obstacle obstacle;
     if (!advance_plant(&state->plant, h, &obstacle)) {
         state->phase = STEP_FAILED;

@@ -96,6 +96,19 @@ void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
+fmi2Status check_inputs(Instance *instance)
+{
+#if N_ROWS > N_AXES
+    const double *quat = &instance->state.plant.value[QUAT_DES];
+    if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
+        return report(instance, fmi2Error, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
+                      " turns nothing");
+#else
+    (void)instance;
+#endif
+    return fmi2OK;
+}
+
 fmi2Status check_parameters(Instance *instance)
 {
     const double *value = instance->state.plant.value;
@@ -132,7 +145,7 @@ fmi2Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
-    if (check_parameters(instance) != fmi2OK)
+    if (check_parameters(instance) != fmi2OK || check_inputs(instance) != fmi2OK)
         return fmi2Error;
     for (int i = 0; i < N_JOINTS; i++) {
         const double start = value[Q_START + i];

@@ -51,6 +51,9 @@ INTERNAL fmi2Status report(Instance *instance, fmi2Status status, const char *fo
 /* Set the state to that of a new instance. */
 INTERNAL void reset_state(State *state);
 
+/* Whether the control law can follow the inputs; a refusal is logged. */
+INTERNAL fmi2Status check_inputs(Instance *instance);
+
 /* Whether the parameters make sense; a refusal is logged. */
 INTERNAL fmi2Status check_parameters(Instance *instance);
 

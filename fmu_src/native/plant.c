@@ -12,6 +12,9 @@
 
 #include "control.h"
 #include "dynamics.h"
+#if N_ROWS > N_AXES
+#include "orientation.h"
+#endif
 
 static double saturated(double tau, double limit)
 {
@@ -128,6 +131,14 @@ void compute_position(Plant *plant)
         for (int i = 0; i < N_JOINTS; i++)
             plant->value[XD + k] += task.J[AXIS[k]][i] * plant->value[V + i];
     }
+#if N_ROWS > N_AXES
+    quaternion(task.R, &plant->value[QUAT]);
+    for (int k = 0; k < 3; k++) {
+        plant->value[OMEGA + k] = 0.0;
+        for (int i = 0; i < N_JOINTS; i++)
+            plant->value[OMEGA + k] += task.J[3 + k][i] * plant->value[V + i];
+    }
+#endif
 }
 
 void compute_effort(Plant *plant)

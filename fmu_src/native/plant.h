@@ -16,7 +16,7 @@ typedef struct {
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                           double a[N_JOINTS]);
 
-/* The outputs x and xd at the plant's state. */
+/* The outputs x and xd, and quat and omega where there are such, at the plant's state. */
 INTERNAL void compute_position(Plant *plant);
 
 /* Columns of M(q)⁻¹, of so many joints: what an effort of 1 there does to all. */

@@ -1,4 +1,4 @@
-/* J⁺ b for one to three rows; the rules and thresholds are those of plant/controller.py. */
+/* J⁺ b; the rules and thresholds are those of plant/pseudo_inverse.py. */
 #include "pseudo_inverse.h"
 
 #include <math.h>
@@ -19,10 +19,10 @@ static double dot(const double a[N_JOINTS], const double b[N_JOINTS])
 }
 
 /* y = (J Jᵀ)⁻¹ b by cofactors; false where a singular value may have to be dropped. */
-static int solve_normal_equations(double J[N_AXES][N_JOINTS], const double b[N_AXES],
-                                  double smallest, double y[N_AXES])
+static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_ROWS],
+                                  double smallest, double y[N_ROWS])
 {
-#if N_AXES == 2
+#if N_ROWS == 2
     const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g11 = dot(J[1], J[1]);
     const double determinant = g00 * g11 - g01 * g01;
     const double trace = g00 + g11;
@@ -31,7 +31,7 @@ static int solve_normal_equations(double J[N_AXES][N_JOINTS], const double b[N_A
     y[0] = (g11 * b[0] - g01 * b[1]) / determinant;
     y[1] = (g00 * b[1] - g01 * b[0]) / determinant;
     return 1;
-#elif N_AXES == 3
+#elif N_ROWS == 3
     const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g02 = dot(J[0], J[2]);
     const double g11 = dot(J[1], J[1]), g12 = dot(J[1], J[2]), g22 = dot(J[2], J[2]);
     const double c00 = g11 * g22 - g12 * g12, c01 = g02 * g12 - g01 * g22;
@@ -53,13 +53,13 @@ static int solve_normal_equations(double J[N_AXES][N_JOINTS], const double b[N_A
 
 /* One-sided Jacobi: rotations from the left make the rows orthogonal, row k becomes σ_k v_kᵀ and
    b_k becomes u_kᵀ b. Source: Hestenes, J. SIAM 6(1), 1958. */
-static void orthogonalise(double J[N_AXES][N_JOINTS], double b[N_AXES])
+static void orthogonalise(double J[N_ROWS][N_JOINTS], double b[N_ROWS])
 {
     int rotated = 1;
     for (int sweep = 0; sweep < MAX_SWEEPS && rotated; sweep++) {
         rotated = 0;
-        for (int i = 0; i < N_AXES; i++)
-            for (int j = i + 1; j < N_AXES; j++) {
+        for (int i = 0; i < N_ROWS; i++)
+            for (int j = i + 1; j < N_ROWS; j++) {
                 const double ii = dot(J[i], J[i]), ij = dot(J[i], J[j]), jj = dot(J[j], J[j]);
                 if (!(fabs(ij) > ORTHOGONAL * sqrt(ii * jj)))
                     continue;
@@ -80,26 +80,26 @@ static void orthogonalise(double J[N_AXES][N_JOINTS], double b[N_AXES])
     }
 }
 
-int apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
+int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
                          double result[N_JOINTS])
 {
-    double y[N_AXES]; /* J⁺ b = Jᵀ y */
-    int rank = N_AXES;
+    double y[N_ROWS]; /* J⁺ b = Jᵀ y */
+    int rank = N_ROWS;
     if (!solve_normal_equations(J, b, fmax(rcond * rcond, WELL_CONDITIONED), y)) {
-        double square[N_AXES], largest = 0.0;
+        double square[N_ROWS], largest = 0.0;
         orthogonalise(J, b);
-        for (int k = 0; k < N_AXES; k++) {
+        for (int k = 0; k < N_ROWS; k++) {
             square[k] = dot(J[k], J[k]);
             largest = fmax(largest, square[k]);
         }
-        for (int k = 0; k < N_AXES; k++) {
+        for (int k = 0; k < N_ROWS; k++) {
             const int kept = square[k] > rcond * rcond * largest;
             y[k] = kept ? b[k] / square[k] : 0.0;
             rank -= !kept;
         }
     }
     memset(result, 0, N_JOINTS * sizeof *result);
-    for (int k = 0; k < N_AXES; k++)
+    for (int k = 0; k < N_ROWS; k++)
         for (int i = 0; i < N_JOINTS; i++)
             result[i] += y[k] * J[k][i];
     return rank;

@@ -7,7 +7,7 @@
 
 /* result = J⁺ b, singular values σ ≤ rcond·σ_max dropped: the least-squares solution of smallest
    norm. The rank: how many were not dropped. J and b are used as working memory. */
-INTERNAL int apply_pseudo_inverse(double J[N_AXES][N_JOINTS], double b[N_AXES], double rcond,
+INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
                                   double result[N_JOINTS]);
 
 #endif

@@ -1,30 +1,58 @@
 /* Operational-space control by resolved acceleration:
 
        a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)
+       α_cmd = alpha_des + Kd_rot ∘ (omega_des − ω) + Kp_rot ∘ log(R_des Rᵀ)   with an orientation
        q̈_cmd = J⁺ (a_cmd − J̇ v + Kn J v) − Kn v
 
    Source: Luh, Walker & Paul, IEEE TAC 25(3), 1980; Khatib, IEEE J-RA 3(1), 1987. */
 #include "control.h"
 
 #include "pseudo_inverse.h"
+#if N_ROWS > N_AXES
+#include "orientation.h"
+#endif
+
+/* A row of the law: of which row of the frame, value references of its inputs, and its error. */
+typedef struct {
+    int of, xd_des, xdd_des, Kp, Kd;
+    double error;
+} Row;
+
+static void law(const double value[N_VARIABLES], TaskFrame *task, Row row[N_ROWS])
+{
+    for (int k = 0; k < N_AXES; k++) {
+        const Row linear = {AXIS[k], XD_DES + k, XDD_DES + k, KP + k, KD + k,
+                            value[X_DES + k] - task->x[AXIS[k]]};
+        row[k] = linear;
+    }
+#if N_ROWS > N_AXES
+    double error[3];
+    rotation_error(&value[QUAT_DES], task->R, error);
+    for (int k = 0; k < 3; k++) {
+        const Row angular = {3 + k, OMEGA_DES + k, ALPHA_DES + k, KP_ROT + k, KD_ROT + k, error[k]};
+        row[N_AXES + k] = angular;
+    }
+#endif
+}
 
 int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const double q[N_JOINTS],
             const double v[N_JOINTS], double given[N_JOINTS])
 {
     TaskFrame task;
-    double J[N_AXES][N_JOINTS], wanted[N_AXES];
+    Row row[N_ROWS];
+    double J[N_ROWS][N_JOINTS], wanted[N_ROWS];
     const double Kn = value[KN];
     (void)q;
     task_frame(joint, v, &task);
-    for (int k = 0; k < N_AXES; k++) {
-        const int row = AXIS[k];
+    law(value, &task, row);
+    for (int k = 0; k < N_ROWS; k++) {
         double xd = 0.0;
         for (int i = 0; i < N_JOINTS; i++) {
-            J[k][i] = task.J[row][i];
+            J[k][i] = task.J[row[k].of][i];
             xd += J[k][i] * v[i];
         }
-        wanted[k] = value[XDD_DES + k] + value[KD + k] * (value[XD_DES + k] - xd)
-                    + value[KP + k] * (value[X_DES + k] - task.x[row]) - task.drift[row] + Kn * xd;
+        wanted[k] = value[row[k].xdd_des] + value[row[k].Kd] * (value[row[k].xd_des] - xd)
+                    + value[row[k].Kp] * row[k].error - task.drift[row[k].of] + Kn * xd;
     }
     const int rank = apply_pseudo_inverse(J, wanted, value[RCOND], given);
     for (int i = 0; i < N_JOINTS; i++)

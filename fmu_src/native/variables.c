@@ -63,6 +63,8 @@ static fmi2Status update(Instance *instance, fmi2ValueReference vr)
         state->has_x = 1;
     }
     if (vr >= TAU && !state->has_tau) {
+        if (check_inputs(instance) != fmi2OK)
+            return fmi2Error;
         compute_effort(&state->plant);
         state->has_tau = 1;
     }

@@ -43,6 +43,10 @@ def add(verbs: Any) -> None:
         help="what drives the robot: a target of the frame, one for each joint, or efforts"
         " (%(default)s)",
     )  # fmt: skip
+    build.add_argument(
+        "--orientation", action="store_true",
+        help="of the frame too: a target orientation beside the position",
+    )  # fmt: skip
     build.add_argument("--name", default="TwoDof", help="name of the model (%(default)s)")
     build.add_argument(
         "--link-environment", action="store_true",
@@ -62,6 +66,8 @@ def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     if options.urdf and options.robot:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
+    if options.orientation and options.control != "task":
+        raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
     from ..export.package import FmuOptions, build_fmu
 
     gravity = None if options.gravity is None else tuple(options.gravity)
@@ -74,7 +80,7 @@ def call(options: argparse.Namespace) -> int:
         axes=options.axes,
         gravity=gravity,
         q_start=None if options.q_start is None else tuple(options.q_start),
-        control=options.control,
+        control="pose" if options.orientation else options.control,
         name=options.name,
         link_environment=options.link_environment,
         native=options.native,

@@ -18,6 +18,12 @@ LAWS = {
 a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)          task-space PD
 q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v     J⁺ drops singular values up to rcond·σ_max
 τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
+    "pose": """x, R    position and orientation of $frame; J its Jacobian, LOCAL_WORLD_ALIGNED:
+        rows of the task axes, and three of the angular velocity ω
+a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)          task-space PD
+α_cmd = alpha_des + Kd_rot ∘ (omega_des − ω) + Kp_rot ∘ log(R_des Rᵀ)
+q̈_cmd = J⁺ ((a_cmd, α_cmd) − J̇ v) − Kn (I − J⁺J) v   J⁺ drops singular values up to rcond·σ_max
+τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
     "joint": """q̈_cmd = a_des + Kd ∘ (v_des − v) + Kp ∘ (q_des − q)               joint-space PD
 τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
     "effort": "τ     = tau_cmd",

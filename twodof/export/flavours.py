@@ -95,8 +95,10 @@ def python_flavour(
 
 def engine_sources(control: str) -> Files:
     """The engine's C files with one control law: a bare plant has no code of another."""
-    left_out = {f"{other}_control.c" for other in CONTROLS if other != control}
-    left_out |= set() if control == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
+    law = "task" if control == "pose" else control
+    left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
+    left_out |= set() if law == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
+    left_out |= set() if control == "pose" else {"orientation.c", "orientation.h"}
     return {
         path.name: path.read_bytes()
         for path in data_file("fmu_src", "native").iterdir()

@@ -167,9 +167,9 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
             return known(START, joint=variable.index)
         if variable.group == "v":
             return known(IMPACT)
-        if variable.group == "x":
+        if variable.group in ("x", "quat"):
             return known(START, of_frame=True)
-        if variable.group == "xd":
+        if variable.group in ("xd", "omega"):
             return known(IMPACT)
         if control.commands == "effort":
             return known(("limit_effort", *control.inputs), joint=variable.index)

@@ -57,7 +57,8 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
         f"#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n} /* that move on their own */\n"
-        f"#define N_BODIES {len(parents)}\n#define N_AXES {m}\n"
+        f"#define N_BODIES {len(parents)}\n"
+        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
         f"#define COMMANDS_ACCELERATION {int(control.commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),

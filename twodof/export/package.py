@@ -50,7 +50,8 @@ class FmuOptions:
             (0, 0, −9.81).
         q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
             else 0 where the limits allow and their middle where not.
-        control: what drives the robot, a key of ``CONTROLS``: "task", "joint" or "effort".
+        control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
+            frame's orientation), "joint" or "effort".
         name: model name and identifier.
         link_environment: remember the folders of this Python's packages in the FMU; not for the
             native flavour, which needs none.
@@ -191,6 +192,11 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     for warning in robot.warnings:
         logger.warning("%s: %s", options.urdf, warning)
+    if options.control == "pose" and sum(robot.moves_frame()) < len(axes) + 3:
+        logger.warning(
+            "%d joints move '%s': not every position and orientation of it can be reached together",
+            sum(robot.moves_frame()), robot.frame,
+        )  # fmt: skip
     starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": _rest(robot)}
     for key in ("gravity", "q_start"):
         given = getattr(options, key)
@@ -205,12 +211,15 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         )
     if shipped and axes != "xy":
         raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
-    if options.control != "task":
+    if "x_des" not in CONTROLS[options.control].inputs:
         starts.pop("x_des", None)
-    elif not shipped:
-        plant = Plant(robot, variable_table(robot, {**starts, "x_des": (0.0,) * len(axes)}))
+    else:
+        at_rest = {"x_des": (0.0,) * len(axes), "quat_des": (0.0, 0.0, 0.0, 1.0), **starts}
+        plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
         plant.initialise()
-        starts["x_des"] = tuple(plant.x)
+        starts.setdefault("x_des", tuple(plant.x))
+        if options.control == "pose":
+            starts["quat_des"] = tuple(plant.quat)
     return robot, variable_table(robot, starts, options.control), starts
 
 

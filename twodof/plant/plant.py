@@ -20,11 +20,17 @@ import numpy as np
 from . import effort_control, joint_control, task_control
 from .integrator import BUDGET, STAGES, Array, Response, StepError, advance
 from .mechanism import Mechanism
+from .orientation import quaternion
 from .robot import Robot
 from .stops import Stops
 from .variables import CONTROLS, Variable
 
-LAWS = {"task": task_control, "joint": joint_control, "effort": effort_control}
+LAWS = {
+    "task": task_control,
+    "pose": task_control,
+    "joint": joint_control,
+    "effort": effort_control,
+}
 
 
 class ParameterError(ValueError):
@@ -54,6 +60,11 @@ class Plant:
     x_des: list[float]
     xd_des: list[float]
     xdd_des: list[float]
+    quat_des: list[float]
+    omega_des: list[float]
+    alpha_des: list[float]
+    Kp_rot: list[float]
+    Kd_rot: list[float]
     q_des: list[float]
     v_des: list[float]
     a_des: list[float]
@@ -132,9 +143,11 @@ class Plant:
         """Advance the state by one communication step of h seconds, inputs held.
 
         Raises:
-            DiscardError: the motion is too fast for the integrator, or its values would no longer
-                be finite; the state is left as it was.
+            DiscardError: the motion is too fast for the integrator, its values would no longer be
+                finite, or an input is none that the control law can follow; the state is left as it
+                was.
         """
+        self._check_target()
         if STAGES * h > BUDGET * self.max_step:
             raise DiscardError(
                 f"max_step = {self.max_step:g} s divides a step of {h:g} s into more than"
@@ -172,8 +185,23 @@ class Plant:
         return [sum(map(mul, jacobian[axis], self.v)) for axis in self._axes]
 
     @property
+    def quat(self) -> list[float]:
+        """Orientation of the task frame in the root's, a unit quaternion x, y, z, w with w ≥ 0."""
+        return quaternion(self._observed()[0].rotation)
+
+    @property
+    def omega(self) -> list[float]:
+        """Angular velocity of the task frame about the root's axes, rad/s."""
+        return [sum(map(mul, row, self.v)) for row in self._observed()[1][3:]]
+
+    @property
     def tau(self) -> list[float]:
-        """Control effort applied at the current state and inputs, N·m or N."""
+        """Control effort applied at the current state and inputs, N·m or N.
+
+        Raises:
+            DiscardError: an input that the control law cannot follow.
+        """
+        self._check_target()
         effort, _ = self._control_effort(self._law(self), np.array(self.q), np.array(self.v))
         tau: list[float] = effort.tolist()
         return tau
@@ -212,13 +240,23 @@ class Plant:
 
         return acceleration
 
+    def _check_target(self) -> None:
+        if self.control == "pose" and not any(self.quat_des):
+            raise DiscardError(
+                "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing"
+            )
+
     def _check_parameters(self) -> None:
+        try:
+            self._check_target()
+        except DiscardError as error:
+            raise ParameterError(str(error)) from error
         for name in ("rtol", "atol", "max_step"):
             if not getattr(self, name) > 0.0:
                 raise ParameterError(f"{name} = {getattr(self, name):g} must be > 0")
         if not self.payload >= 0.0:
             raise ParameterError(f"payload = {self.payload:g} must be >= 0")
-        if self.control == "task" and not 0.0 <= self.rcond < 1.0:
+        if "rcond" in CONTROLS[self.control].parameters and not 0.0 <= self.rcond < 1.0:
             raise ParameterError(f"rcond = {self.rcond:g} must be in [0, 1)")
         for i, (low, high) in enumerate(zip(self.q_min, self.q_max)):
             if low > high:

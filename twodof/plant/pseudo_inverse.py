@@ -1,13 +1,15 @@
 """The truncated pseudo-inverse of a task Jacobian.
 
-J has at most three rows here. At that size a call into a linear-algebra library costs more than
-the arithmetic, so rows are plain lists of floats.
+With three rows or fewer a call into a linear-algebra library costs more than the arithmetic, so
+rows are plain lists of floats.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+
+import numpy as np
 
 WELL_CONDITIONED = 1e-3
 """Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12."""
@@ -25,7 +27,7 @@ def apply_pseudo_inverse(
     The rule is that of ``numpy.linalg.pinv``.
 
     Args:
-        rows: J, m ≤ 3 rows of n.
+        rows: J, m rows of n.
         b: m values.
         rcond: in [0, 1).
 
@@ -60,6 +62,11 @@ def apply_pseudo_inverse(
             y1 = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant
             y2 = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / determinant
             return [y0 * x0 + y1 * x1 + y2 * x2 for x0, x1, x2 in zip(r0, r1, r2)], 3
+    elif len(rows) > 3:
+        U, sigma, Vt = np.linalg.svd(rows, full_matrices=False)
+        kept = sigma > rcond * sigma[0]
+        y = (U.T @ b)[kept] / sigma[kept]
+        return (y @ Vt[kept]).tolist(), int(kept.sum())
     return _by_singular_values(list(rows), list(b), rcond)
 
 

@@ -1,6 +1,7 @@
 """Operational-space control by resolved acceleration.
 
     a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)
+    α_cmd = alpha_des + Kd_rot ∘ (omega_des − ω) + Kp_rot ∘ log(R_des Rᵀ)      with an orientation
     q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v
           = J⁺ (a_cmd − J̇ v + Kn J v) − Kn v
 
@@ -14,6 +15,7 @@ from operator import mul
 from typing import Any
 
 from .integrator import Array, Response
+from .orientation import rotation_error
 from .pseudo_inverse import apply_pseudo_inverse
 
 
@@ -21,21 +23,27 @@ def command(plant: Any) -> Response:
     """q̈_cmd as a function of the state, n values, and the rank of its J⁺; inputs held."""
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]
-    task = list(zip(axes, plant.x_des, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))
+    law = list(zip(axes, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))
+    place = list(zip(axes, plant.x_des))
+    quat_des = plant.quat_des if plant.control == "pose" else None
+    if quat_des is not None:
+        turn = (plant.omega_des, plant.alpha_des, plant.Kp_rot, plant.Kd_rot)
+        law.extend(zip((3, 4, 5), *turn))
     Kn, rcond = plant.Kn, plant.rcond
 
     def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
         placement, jacobian, acceleration = observe(q, v)
-        x, drift = placement.translation.tolist(), acceleration.linear.tolist()
+        x, drift = placement.translation.tolist(), acceleration.vector.tolist()
         velocity = v.tolist()
+        errors = [x_des - x[axis] for axis, x_des in place]
+        if quat_des is not None:
+            errors += rotation_error(quat_des, placement.rotation)
         rows, command = [], []
-        for axis, x_des, xd_des, xdd_des, Kp, Kd in task:
+        for (axis, xd_des, xdd_des, Kp, Kd), error in zip(law, errors):
             row = jacobian[axis]
             xd = sum(map(mul, row, velocity))
             rows.append(row)
-            command.append(
-                xdd_des + Kd * (xd_des - xd) + Kp * (x_des - x[axis]) - drift[axis] + Kn * xd
-            )
+            command.append(xdd_des + Kd * (xd_des - xd) + Kp * error - drift[axis] + Kn * xd)
         qdd, rank = apply_pseudo_inverse(rows, command, rcond)
         return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd, rank
 

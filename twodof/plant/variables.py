@@ -57,6 +57,7 @@ class Control:
         parameters: groups of its parameters.
         commands: what the law gives, "acceleration" (q̈_cmd, by inverse dynamics) or "effort" (τ).
         rigid_stops: whether stops have a reaction, where nothing else is said.
+        outputs: groups of outputs that other laws do not have.
     """
 
     title: str
@@ -64,6 +65,7 @@ class Control:
     parameters: tuple[str, ...]
     commands: str
     rigid_stops: bool
+    outputs: tuple[str, ...] = ()
 
 
 CONTROLS = {
@@ -72,13 +74,25 @@ CONTROLS = {
         ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn"), ("rcond", "payload_known"),
         "acceleration", False,
     ),
+    "pose": Control(
+        "operational-space control of {frame}, with its orientation",
+        (
+            "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des",
+            "Kp", "Kd", "Kp_rot", "Kd_rot", "Kn",
+        ),
+        ("rcond", "payload_known"), "acceleration", False, ("quat", "omega"),
+    ),
     "joint": Control(
         "joint-space control",
         ("q_des", "v_des", "a_des", "Kp", "Kd"), ("payload_known",), "acceleration", True,
     ),
     "effort": Control("effort control, the bare plant", ("tau_cmd",), (), "effort", True),
 }  # fmt: skip
-"""By name. The law is in the file <name>_control, of Python here and of C in the native engine."""
+"""By name. The law is in the file <name>_control, of Python here and of C in the native engine;
+"pose" is "task" with three more rows."""
+
+DISTURBANCES = ("tau_ext", "f_ext")
+OF_A_LAW = {group for law in CONTROLS.values() for group in law.outputs}
 
 Row = tuple[str, str, list[str], list[str], str]
 Starts = Mapping[str, Value | tuple[float, ...]]
@@ -90,7 +104,7 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
     Args:
         robot: the robot; n joints and m task axes give the vectors' lengths.
         starts: start values that differ from the defaults, by group; needs "q_start" (n values),
-            and "x_des" (m values) where there is one: no default suits every robot.
+            and "x_des" (m values) and "quat_des" (4) where there are such: no default suits all.
         control: the control law, a key of ``CONTROLS``.
     """
     law = CONTROLS[control]
@@ -100,7 +114,8 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
         default.setdefault("q_des", default["q_start"])
     table: list[Variable] = []
     for group, causality, size, units, text in _rows(robot, control):
-        if causality != "input" or group in (*law.inputs, "tau_ext", "f_ext"):
+        own = group in (*law.inputs, *law.outputs)
+        if own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES:
             start = default.get(group) if causality != "output" else None
             for i, (unit, owner) in enumerate(zip(units, size)):
                 value = start[i] if isinstance(start, tuple) else None
@@ -113,10 +128,13 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
 
 def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]]:
     n, m = len(robot.joints), len(robot.axes)
-    controlled = m if control == "task" else n
+    rows = m + 3 * ("quat_des" in CONTROLS[control].inputs)
+    controlled = m if "x_des" in CONTROLS[control].inputs else n
     return {
         "xd_des": (0.0,) * m, "xdd_des": (0.0,) * m, "v_des": (0.0,) * n, "a_des": (0.0,) * n,
-        "Kp": (50.0,) * controlled, "Kd": (40.0,) * controlled, "Kn": 10.0 if n > m else 0.0,
+        "omega_des": (0.0,) * 3, "alpha_des": (0.0,) * 3, "Kp_rot": (50.0,) * 3,
+        "Kd_rot": (40.0,) * 3, "Kp": (50.0,) * controlled, "Kd": (40.0,) * controlled,
+        "Kn": 10.0 if n > rows else 0.0,
         "tau_cmd": (0.0,) * n, "tau_ext": (0.0,) * n, "f_ext": (0.0,) * 3,
         "v_start": (0.0,) * n, "q_min": robot.q_min, "q_max": robot.q_max,
         "gravity": (0.0, 0.0, -9.81), "payload": 0.0, "payload_com": (0.0,) * 3,
@@ -132,7 +150,8 @@ def _rows(robot: Robot, control: str) -> list[Row]:
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
     root = [f"axis {letter} of {robot.root}" for letter in "xyz"]
     frame = [f"axis {letter} of {robot.frame}" for letter in "xyz"]
-    gained = axis if control == "task" else joint
+    turn = [f"about axis {letter} of {robot.root}" for letter in "xyz"]
+    gained = axis if "x_des" in CONTROLS[control].inputs else joint
 
     def units(sliding: str, turning: str) -> list[str]:
         return [sliding if prismatic else turning for prismatic in robot.prismatic]
@@ -148,11 +167,16 @@ def _rows(robot: Robot, control: str) -> list[Row]:
         ("x_des", "input", axis, ["m"] * 3, "target position"),
         ("xd_des", "input", axis, ["m/s"] * 3, "target velocity"),
         ("xdd_des", "input", axis, ["m/s2"] * 3, "target acceleration"),
+        ("quat_des", "input", list("xyzw"), [""] * 4, f"target orientation of {robot.frame}"),
+        ("omega_des", "input", turn, ["rad/s"] * 3, "target angular velocity"),
+        ("alpha_des", "input", turn, ["rad/s2"] * 3, "target angular acceleration"),
         ("q_des", "input", joint, position, "target position"),
         ("v_des", "input", joint, velocity, "target velocity"),
         ("a_des", "input", joint, acceleration, "target acceleration"),
         ("Kp", "input", gained, ["1/s2"] * len(gained), "proportional gain"),
         ("Kd", "input", gained, ["1/s"] * len(gained), "derivative gain"),
+        ("Kp_rot", "input", turn, ["1/s2"] * 3, "proportional gain of the orientation"),
+        ("Kd_rot", "input", turn, ["1/s"] * 3, "derivative gain of the orientation"),
         ("tau_cmd", "input", joint, effort, "effort of the controller"),
         ("tau_ext", "input", joint, effort, "external effort"),
         ("f_ext", "input", root, ["N"] * 3, f"external force at {robot.frame}"),
@@ -161,6 +185,8 @@ def _rows(robot: Robot, control: str) -> list[Row]:
         ("v", "output", joint, velocity, "velocity"),
         ("x", "output", axis, ["m"] * 3, "position"),
         ("xd", "output", axis, ["m/s"] * 3, "velocity"),
+        ("quat", "output", list("xyzw"), [""] * 4, f"orientation of {robot.frame}"),
+        ("omega", "output", turn, ["rad/s"] * 3, f"angular velocity of {robot.frame}"),
         ("tau", "output", joint, effort, "control effort applied"),
         ("q_start", "parameter", joint, position, "position at the start"),
         ("v_start", "parameter", joint, velocity, "velocity at the start"),
