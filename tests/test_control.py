@@ -14,7 +14,7 @@ import twodof
 from twodof.export.package import FmuOptions, build_fmu
 
 EVERY_ROBOT = ("twodof", *ROBOTS)
-CONTROLS = ("task", "joint", "effort")
+CONTROLS = ("task", "pose", "joint", "effort")
 
 
 def deviation(a, b):

@@ -1,0 +1,219 @@
+"""Control of a frame's orientation: against a closed form, SciPy's Rotation and DOP853."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from harness import Driver, in_child_process
+from native_models import robots_folder
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import twodof
+from twodof import FmuOptions
+from twodof.plant.orientation import quaternion, rotation_error
+from twodof.plant.robot import load_robot
+
+BENT = (0.3, -1.2, 1.4, -0.7, 1.1, 0.2)
+FLAVOURS = pytest.mark.parametrize("native", [False, True], ids=["python", "native"])
+TIGHT = {"rtol": 1e-11, "atol": 1e-13}
+UR = "ur_description/urdf/ur10_joint_limited_robot.urdf"
+PANDA = "panda_description/urdf/panda.urdf"
+BENT_PANDA = (0.1, -0.5, 0.2, -2.0, 0.3, 1.6, 0.5, 0.02)
+
+
+@pytest.fixture(scope="module")
+def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, bool], twodof.Fmu]:
+    folder = tmp_path_factory.mktemp("pose")
+    of = {"ur10": (UR, "tool0", BENT), "panda": (PANDA, "panda_hand_tcp", BENT_PANDA)}
+    return {
+        (name, native): twodof.load_fmu(
+            twodof.build_fmu(
+                folder / f"{name}{native:d}.fmu",
+                FmuOptions(
+                    urdf=robots_folder() / urdf, frame=frame, control="pose", native=native,
+                    meshes=False, q_start=start,
+                ),
+            )
+        )
+        for name, (urdf, frame, start) in of.items()
+        for native in (False, True)
+    }  # fmt: skip
+
+
+def starts(fmu: twodof.Fmu, group: str) -> np.ndarray:
+    return np.array([float(fmu.variables[name].start) for name in fmu.vector(group)])
+
+
+def orientations(run: twodof.Experiment) -> list[Rotation]:
+    """By Pinocchio, at the samples' joint positions."""
+    robot = load_robot(run.fmu.urdf, run.fmu.frame, "xyz")
+    data, G = robot.model.createData(), robot.coupling
+    turns = []
+    for sample in twodof.samples(run):
+        q = np.array(sample.q) if G is None else G @ sample.q + robot.offset
+        pin.framesForwardKinematics(robot.model, data, q)
+        turns.append(Rotation.from_matrix(data.oMf[robot.frame_id].rotation))
+    return turns
+
+
+def errors_after_a_turn(fmu: twodof.Fmu, turn: np.ndarray, sign: float = 1.0) -> np.ndarray:
+    """log(R_des Rᵀ) over 1 s, the target turned from the start by a rotation vector."""
+    target = Rotation.from_rotvec(turn) * Rotation.from_quat(starts(fmu, "quat_des"))
+    settings = {"quat_des": tuple(sign * target.as_quat()), "Kp_rot": 30.0, "Kd_rot": 7.0, **TIGHT}
+    settings |= {"q_min[6]": -7.0, "q_max[6]": 7.0}
+    run = twodof.experiment(fmu, stop_time=1.0, settings=settings)
+    return np.array([(target * R.inv()).as_rotvec() for R in orientations(run)])
+
+
+@FLAVOURS
+def test_a_turn_about_a_fixed_axis_obeys_the_closed_form(fmus, native: bool) -> None:
+    """φ'' + Kd φ' + Kp φ = 0 from rest: φ = φ₀ e^(−Kd t/2) (cos ωt + Kd/(2ω) sin ωt)."""
+    turn = np.array([0.5, -0.6, 0.7])
+    found = errors_after_a_turn(fmus["ur10", native], turn)
+    np.testing.assert_allclose(found, closed_form(turn), atol=1e-9)
+
+
+def closed_form(turn: np.ndarray) -> np.ndarray:
+    t, half = 0.01 * np.arange(101), 3.5
+    omega = math.sqrt(30.0 - half**2)
+    share = np.exp(-half * t) * (np.cos(omega * t) + half / omega * np.sin(omega * t))
+    return share[:, None] * turn
+
+
+@FLAVOURS
+@pytest.mark.parametrize("name", ["ur10", "panda"])
+def test_a_pose_target_against_an_integration_of_its_own(fmus, name: str, native: bool) -> None:
+    """With the Panda's damping, and its fingers, of which one follows the other."""
+    fmu = fmus[name, native]
+    goal = Rotation.from_rotvec([0.4, 0.3, -0.5]) * Rotation.from_quat(starts(fmu, "quat_des"))
+    place = starts(fmu, "x_des") + np.array([0.05, -0.04, -0.06])
+    settings = {"x_des": tuple(place), "quat_des": tuple(goal.as_quat()), **TIGHT}
+    run = twodof.experiment(fmu, stop_time=0.3, settings=settings)
+    samples = list(twodof.samples(run))
+
+    robot = load_robot(fmu.urdf, fmu.frame, "xyz")
+    model, n = robot.model, len(robot.joints)
+    model.gravity.linear = starts(fmu, "gravity")
+    data, frame = model.createData(), robot.frame_id
+    G = np.eye(n) if robot.coupling is None else robot.coupling
+    Kn = starts(fmu, "Kn") if fmu.vector("Kn") else float(fmu.variables["Kn"].start)
+    still = np.zeros(model.nv)
+
+    def motion(t: float, y: np.ndarray) -> np.ndarray:
+        q, v = y[:n], y[n:]
+        Q, V = G @ q + robot.offset, G @ v
+        pin.forwardKinematics(model, data, Q, V, still)
+        J = pin.computeFrameJacobian(model, data, Q, frame, pin.LOCAL_WORLD_ALIGNED) @ G
+        drift = pin.getFrameClassicalAcceleration(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        at = data.oMf[frame]
+        turn = pin.log3(goal.as_matrix() @ at.rotation.T)
+        wanted = -40.0 * J @ v + 50.0 * np.concatenate([place - at.translation, turn])
+        inverse = np.linalg.pinv(J, rcond=0.01)
+        a = inverse @ (wanted - drift.vector) - Kn * (v - inverse @ (J @ v))
+        M = pin.crba(model, data, Q)
+        M = G.T @ (np.triu(M) + np.triu(M, 1).T) @ G
+        return np.concatenate([v, a - np.linalg.solve(M, np.array(robot.damping) * v)])
+
+    y0 = np.concatenate([starts(fmu, "q_start"), np.zeros(n)])
+    times = [sample.t for sample in samples]
+    exact = solve_ivp(motion, (0, times[-1]), y0, "DOP853", times, rtol=1e-12, atol=1e-13).y.T
+    np.testing.assert_allclose([(*s.q, *s.v) for s in samples], exact, rtol=0.0, atol=1e-9)
+
+
+@FLAVOURS
+def test_almost_half_a_turn_is_finite_and_the_short_way(fmus, native: bool) -> None:
+    axis = Rotation.from_quat(starts(fmus["ur10", native], "quat_des")).apply([0.0, 0.0, 1.0])
+    for degrees, way in ((179.999, 179.999), (180.0, None), (180.001, -179.999)):
+        found = errors_after_a_turn(fmus["ur10", native], math.radians(degrees) * axis)
+        short = np.sign(found[1] @ axis) * 180.0 if way is None else way
+        np.testing.assert_allclose(
+            found[1:], closed_form(math.radians(short) * axis)[1:], atol=1e-9
+        )
+
+
+@FLAVOURS
+def test_a_quaternion_and_its_negative_are_one_target_and_its_length_is_none(fmus, native) -> None:
+    turn = np.array([0.5, -0.6, 0.7])
+    found = errors_after_a_turn(fmus["ur10", native], turn)
+    for factor in (-1.0, 1e-200, -3.0, 1e150):
+        again = errors_after_a_turn(fmus["ur10", native], turn, factor)
+        np.testing.assert_allclose(again, found, atol=1e-12)
+
+
+@FLAVOURS
+def test_the_present_pose_as_target_moves_nothing(fmus, native: bool) -> None:
+    run = twodof.experiment(fmus["ur10", native], stop_time=0.5)
+    for sample in twodof.samples(run):
+        np.testing.assert_allclose(sample.q, BENT, atol=1e-12)
+
+
+@FLAVOURS
+def test_outputs_are_the_frames_orientation_and_angular_velocity(fmus, native: bool) -> None:
+    fmu, rng = fmus["ur10", native], np.random.default_rng(5)
+    robot = load_robot(fmu.urdf, fmu.frame, "xyz")
+    data = robot.model.createData()
+    names = (*fmu.vector("q_start"), *fmu.vector("v_start"))
+    with twodof.fmu.instantiate(fmu) as instance:
+        read = instance.reader((*fmu.vector("quat"), *fmu.vector("omega")))
+        for _ in range(200):
+            q, v = rng.uniform(-3.0, 3.0, 6), rng.normal(size=6)
+            instance.reset()
+            instance.initialise(0.0, math.inf, dict(zip(names, map(float, (*q, *v)))))
+            found = read()
+            pin.forwardKinematics(robot.model, data, q, v)
+            turned = pin.updateFramePlacement(robot.model, data, robot.frame_id).rotation
+            spin = pin.getFrameVelocity(
+                robot.model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
+            ).angular
+            np.testing.assert_allclose(
+                found, [*Rotation.from_matrix(turned).as_quat(canonical=True), *spin], atol=1e-12
+            )
+
+
+def test_the_error_is_scipys_rotation_vector() -> None:
+    rng = np.random.default_rng(6)
+    half = [Rotation.from_rotvec(math.pi * axis) for axis in np.eye(3)]
+    for k in range(2000):
+        R = half[k] if k < 3 else Rotation.random(random_state=rng)
+        target = Rotation.random(random_state=rng).as_quat()
+        expected = (Rotation.from_quat(target) * R.inv()).as_rotvec()
+        error = rotation_error((rng.choice([-2.0, 3.0]) * target).tolist(), R.as_matrix())
+        np.testing.assert_allclose(error, expected, atol=1e-12)
+        own = quaternion(R.as_matrix())
+        assert own[3] >= 0.0 and abs(np.dot(own, R.as_quat())) == pytest.approx(1.0, abs=1e-14)
+
+
+@FLAVOURS
+@in_child_process
+def test_a_zero_quaternion_is_refused_wherever_it_would_be_followed(fmus, native: bool) -> None:
+    message = "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing"
+    driver = Driver(fmus["ur10", native].path).initialise()
+    assert driver.step(0.0) == 0
+    before = driver.get("q", "v", "x", "quat", "omega", "tau")
+    driver.set(quat_des=(0.0, 0.0, 0.0, 0.0))
+    driver.call("getReal", driver.references("tau"))
+    assert any(message in text for _, text in driver.log)
+    assert driver.get("q", "v", "x", "quat", "omega") == before[:-6], "these do not depend on it"
+    driver.log.clear()
+    assert driver.step(0.01) != 0 and any(message in text for _, text in driver.log)
+    driver.set(quat_des=(0.0, 0.0, 0.0, 2.0))
+    assert driver.step(0.01) == 0
+    with pytest.raises(twodof.TwoDofError, match=re.escape(message)):
+        run = twodof.experiment(fmus["ur10", native], settings={"quat_des": 0.0})
+        list(twodof.samples(run))
+
+
+def test_few_joints_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "twodof"):
+        fmu = twodof.build_fmu(tmp_path / "arm.fmu", FmuOptions(control="pose"))
+    (record,) = caplog.records
+    assert "2 joints move 'EndEffector': not every position and orientation" in record.getMessage()
+    samples = list(twodof.samples(twodof.experiment(fmu, stop_time=0.2)))
+    assert all(np.isfinite((*s.q, *s.v, *s.tau)).all() for s in samples)
