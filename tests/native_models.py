@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import math
 import os
 import subprocess
 import tempfile
@@ -84,6 +85,7 @@ def model(name: str, control: str = "task") -> Model:
     if name == "twodof":
         robot = load_robot((ROOT / "urdf" / "2dof.urdf").read_text(), "EndEffector", "xy")
         starts = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
+        starts["quat_des"] = (0.0, 0.0, math.sin(0.425), math.cos(0.425))
         return Model(robot, variable_table(robot, starts, control), starts, control)
     path, frame, axes = ROBOTS[name]
     text = (robots_folder() / path).read_text()
@@ -111,6 +113,32 @@ def coupling(name: str) -> tuple[np.ndarray, np.ndarray]:
     return G, c
 
 
+class Reduced:
+    """Pinocchio's answers in the coordinates of the joints that move on their own."""
+
+    def __init__(self, reference: pin.Model, name: str) -> None:
+        self.model, self.data = reference, reference.createData()
+        self.G, self.c = coupling(name)
+
+    def mass_matrix(self, q):
+        M = pin.crba(self.model, self.data, self.G @ q + self.c)
+        return self.G.T @ (np.triu(M) + np.triu(M, 1).T) @ self.G
+
+    def forward_dynamics(self, q, v, tau):
+        h = self.G.T @ pin.nonLinearEffects(self.model, self.data, self.G @ q + self.c, self.G @ v)
+        return np.linalg.solve(self.mass_matrix(q), tau - h)
+
+    def jacobian(self, q, frame):
+        Q = self.G @ q + self.c
+        J = pin.computeFrameJacobian(self.model, self.data, Q, frame, pin.LOCAL_WORLD_ALIGNED)
+        return J @ self.G
+
+    def energy(self, q, v):
+        Q, V = self.G @ q + self.c, self.G @ v
+        kinetic = pin.computeKineticEnergy(self.model, self.data, Q, V)
+        return kinetic + pin.computePotentialEnergy(self.model, self.data, Q)
+
+
 def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
     robot = load_robot(urdf, frame, axes)
     rest = tuple(
@@ -121,6 +149,7 @@ def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
     plant = Plant(robot, variable_table(robot, starts))
     plant.initialise()
     starts["x_des"] = tuple(plant.x)
+    starts["quat_des"] = tuple(plant.quat)
     return Model(robot, variable_table(robot, starts, control), starts, control)
 
 
@@ -180,7 +209,7 @@ class Engine:
         """All variables of a Python plant by value reference; x, xd and tau are 0."""
         row = []
         for variable in self.model.table:
-            if variable.group in ("x", "xd", "tau"):
+            if variable.group in ("x", "xd", "quat", "omega", "tau"):
                 row.append(0.0)
                 continue
             value = getattr(plant, variable.group)
