@@ -247,7 +247,7 @@ def test_times_are_those_of_the_fmus_default_experiment(native_path: Path, tmp_p
 def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path: Path) -> None:
     (tmp_path / "in.csv").write_text("time,Kp,x_des[1]\n0,50,0.2\n0.05,80,0.1\n")
     run = twodof.experiment(native_path, stop_time=0.1, input_file=tmp_path / "in.csv")
-    assert run.changes[1] == (0.05, {"Kp[1]": 80.0, "Kp[2]": 80.0, "x_des[1]": 0.1})
+    assert run.changes[0] == (0.05, {"Kp[1]": 80.0, "Kp[2]": 80.0, "x_des[1]": 0.1})
     (tmp_path / "in.csv").write_text("time,Kp,Kp[2]\n0,50,60\n")
     with pytest.raises(twodof.TwoDofError, match=r"two columns for 'Kp\[2\]'"):
         twodof.experiment(native_path, input_file=tmp_path / "in.csv")

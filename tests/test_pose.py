@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import re
+import shutil
+import subprocess
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from harness import Driver, in_child_process
+from harness import Driver, in_child_process, wait_until
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from native_models import robots_folder
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -217,3 +224,130 @@ def test_few_joints_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     assert "2 joints move 'EndEffector': not every position and orientation" in record.getMessage()
     samples = list(twodof.samples(twodof.experiment(fmu, stop_time=0.2)))
     assert all(np.isfinite((*s.q, *s.v, *s.tau)).all() for s in samples)
+
+
+# --- the bag and the network ---
+
+
+@pytest.fixture(scope="module")
+def bag(fmus, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose target orientation, not of length 1, changes after 0.1 s."""
+    folder = tmp_path_factory.mktemp("bag")
+    run = twodof.experiment(fmus["ur10", True], stop_time=0.2)
+    change: dict = {"quat_des": (0.0, 2.0, 0.0, 0.0), "x_des": (0.5, 0.2, 0.7)}
+    asked = iter([None] * 10 + [change] + [None] * 20)
+    twodof.simulate(run, twodof.Bag(folder / "bag", scene=True), steer=partial(next, asked))
+    return folder / "bag"
+
+
+def poses(bag: Path, topic: str) -> np.ndarray:
+    """Position and orientation of each PoseStamped of a topic, by another reader."""
+    with (bag / "bag.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        rows = []
+        for schema, _, _, message in reader.iter_decoded_messages(topics=[topic]):
+            assert schema.name == "geometry_msgs/msg/PoseStamped"
+            p, q = message.pose.position, message.pose.orientation
+            rows.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    return np.array(rows)
+
+
+def test_target_and_end_effector_are_poses_in_the_bag(fmus, bag: Path) -> None:
+    fmu, recording = fmus["ur10", True], twodof.read_bag(bag)
+    target, end = poses(bag, "/target"), poses(bag, "/end_effector")
+    assert len(target) == len(end) == 21
+    first = [*starts(fmu, "x_des"), *starts(fmu, "quat_des")]
+    np.testing.assert_allclose(target[:11], [first] * 11, atol=1e-15)
+    np.testing.assert_allclose(target[11:], [(0.5, 0.2, 0.7, 0.0, 1.0, 0.0, 0.0)] * 10, atol=0)
+    np.testing.assert_allclose(end[:, :3], recording.x, atol=1e-14)
+    robot = load_robot(fmu.urdf, fmu.frame, "xyz")
+    data = robot.model.createData()
+    for q, quat in zip(recording.q, end[:, 3:]):
+        pin.framesForwardKinematics(robot.model, data, q)
+        turned = Rotation.from_matrix(data.oMf[robot.frame_id].rotation)
+        np.testing.assert_allclose(quat, turned.as_quat(canonical=True), atol=1e-12)
+    np.testing.assert_allclose(recording.target, target[:, :3])
+    np.testing.assert_allclose(recording.target_quat[11:], [(0.0, 2.0, 0.0, 0.0)] * 10)
+
+
+def test_without_provenance_the_target_is_that_of_the_poses(bag: Path, tmp_path: Path) -> None:
+    shutil.copytree(bag, tmp_path / "bag")
+    (tmp_path / "bag" / "run.json").unlink()
+    metadata = (tmp_path / "bag/metadata.yaml").read_text()
+    (tmp_path / "bag/metadata.yaml").write_text(
+        re.sub("custom_data:.*", "custom_data: {}", metadata, flags=re.S)
+    )
+    found = twodof.read_bag(tmp_path / "bag").target
+    np.testing.assert_allclose(found, twodof.read_bag(bag).target, atol=1e-15)
+
+
+def test_errors_of_a_sample_are_distance_and_angle(fmus) -> None:
+    turn = Rotation.from_rotvec([0.3, -0.4, 1.2])
+    goal = turn * Rotation.from_quat(starts(fmus["ur10", True], "quat_des"))
+    settings = {"quat_des": tuple(-2.0 * goal.as_quat())}
+    sample = next(twodof.samples(fmus["ur10", True], settings=settings, stop_time=0.1))
+    assert sample.turn_error == pytest.approx(turn.magnitude(), abs=1e-12)
+    assert sample.error == pytest.approx(0.0, abs=1e-12)
+
+
+TALKER = """
+import sys, time
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+from twodof.ros.messages import POSE, STORE, STREAM, Message, _place
+from twodof.ros.network import network, open_domain
+from twodof.ros.publisher import dds_qos, dds_type
+
+domain, _ = open_domain(network())
+participant = DomainParticipant(network().domain)
+writer = DataWriter(
+    participant, Topic(participant, "rt/target_command", dds_type(POSE)), dds_qos(STREAM, POSE)
+)
+said = [eval(line) for line in sys.stdin]
+print("ready", flush=True)
+while not writer.get_matched_subscriptions():
+    time.sleep(0.01)
+for frame, xyz, quat in said:
+    writer.write(writer.data_type(STORE.serialize_cdr(_place(0, frame, xyz, quat), POSE)))
+    time.sleep(0.3)
+time.sleep(60)
+"""
+
+
+def test_a_pose_on_the_network_is_the_target(
+    fmus, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of four that come, one is in another frame, one has no orientation, one is not finite."""
+    from twodof.ros.publisher import Publisher
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    run = twodof.experiment(fmus["ur10", True], stop_time=math.inf)
+    root, asked = run.fmu.root, []
+    messages = [
+        ("elsewhere", (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 1.0)),
+        (root, (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0)),
+        (root, (9.0, 9.0, 9.0), (0.0, 0.0, math.inf, 0.0)),
+        ("", (0.5, 0.2, 0.7), (0.0, 2.0, 0.0, 0.0)),
+    ]
+    text = "".join(
+        f"({f!r}, {p!r}, {q!r})\n".replace("inf", "float('inf')") for f, p, q in messages
+    )
+    with (
+        caplog.at_level(logging.WARNING, "twodof"), Publisher(scene=True).begin(run) as wire,
+        subprocess.Popen(
+            [sys.executable, "-c", TALKER], stdin=subprocess.PIPE, text=True
+        ) as talker,
+    ):  # fmt: skip
+        assert talker.stdin is not None
+        talker.stdin.write(text)
+        talker.stdin.close()
+        wait_until(lambda: asked.append(wire.command()) or asked[-1])
+        talker.kill()
+    assert [command for command in asked if command] == [
+        {"x_des": (0.5, 0.2, 0.7), "quat_des": (0.0, 2.0, 0.0, 0.0)}
+    ]
+    told = [record.getMessage() for record in caplog.records]
+    assert "a pose on /target_command is in frame 'elsewhere'" in told[0]
+    assert "has the orientation 0, 0, 0, 0: ignored" in told[1] and "not finite" in told[2]

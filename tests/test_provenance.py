@@ -23,7 +23,7 @@ import twodof
 from twodof.pages.loop import Loop
 from twodof.plots.track import read_tracks
 
-TARGETS = {0: (0.2, 0.05), 20: (0.15, 0.1), 45: (0.1, 0.2)}  # by the step that they hold from
+TARGETS = {0: (0.22, 0.08), 20: (0.15, 0.1), 45: (0.1, 0.2)}  # by the step that they hold from
 STEPS = 80
 
 
@@ -100,7 +100,7 @@ def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
     # the recording's own samples are not told: run again with what it says, by the master
     stored = twodof.read_bag(bag)
     changes = [(t, dict(values)) for t, values in stored.provenance["input_changes"]]
-    assert len(changes) == len(TARGETS) - 1  # the first is where it starts
+    assert len(changes) == len(TARGETS)
     start = stored.provenance["start_time"]
     again = twodof.experiment(
         fmu, start_time=start, stop_time=start + (len(stored.t) - 1) / 100,
@@ -133,7 +133,8 @@ def test_the_distance_shown_is_that_of_the_samples(
     assert track.task is not None and track.task.departure is not None
     x = np.array([sample.x for sample in samples])
     targets = np.array([[sample.inputs[f"x_des[{k}]"] for k in (1, 2)] for sample in samples])
-    assert len(np.unique(targets, axis=0)) == (1 if way is by_settings else len(TARGETS))
+    different = len(np.unique(targets, axis=0))  # an answer to a sample comes after its own target
+    assert different == 1 if way is by_settings else different >= len(TARGETS)
     np.testing.assert_allclose(track.task.error, np.linalg.norm(x - targets, axis=1), rtol=1e-9)
     assert track.task.departure <= 1e-9
 

@@ -43,7 +43,7 @@ class Experiment:
         steps: N, the number of communication steps; infinite for a run without end.
         start_values: all inputs and parameters with the values they start with.
         given: those of them that differ from the model description on purpose.
-        changes: inputs over time.
+        changes: inputs over time, after the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
     """
 
@@ -116,6 +116,8 @@ def experiment(
     for name in changes[0][1] if changes else ():
         if name in given:
             raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
+    while changes and changes[0][0] <= start_time + TIME_TOLERANCE * step:
+        given |= changes.pop(0)[1]
     if stamp_start is not None and not isfinite(stamp_start):
         raise InputError(f"stamp_start = {stamp_start} is not finite")
     run = Experiment(

@@ -93,15 +93,19 @@ class Kinematics:
         return {link: self.along(self.urdf.chain(link), q)[-1] for link in self.urdf.links}
 
     def jacobian(self, link: str, q: ArrayLike) -> Array:
-        """Of the link's origin in the root's axes, N × 3 × joints: its velocity is J v."""
+        """Of the link in the root's axes, N × 6 × joints: linear, then angular velocity is J v."""
         chain = self.urdf.chain(link)
         places = self.along(chain, q)
         end = places[-1].translation
-        jacobian = np.zeros((len(end), 3, len(self._columns)))
+        jacobian = np.zeros((len(end), 6, len(self._columns)))
         for joint, place in zip(chain, places[1:]):
             column, ratio, _ = self._column(joint)
             if column is not None:
                 axis = ratio * place.rotation.apply(joint.axis)
                 arm = end - place.translation
-                jacobian[:, :, column] += axis if joint.prismatic else np.cross(axis, arm)
+                if joint.prismatic:
+                    jacobian[:, :3, column] += axis
+                else:
+                    jacobian[:, :3, column] += np.cross(axis, arm)
+                    jacobian[:, 3:, column] += axis
         return jacobian

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from itertools import accumulate, chain, count
-from math import dist, isfinite
+from math import asin, dist, hypot, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
-OUTPUTS = ("q", "v", "x", "tau")
+OUTPUTS = ("q", "v", "x", "tau", "quat")
 
 
 class Sample(NamedTuple):
@@ -49,6 +49,8 @@ class Sample(NamedTuple):
         inputs: values of all inputs by name, as they are at t.
         since: the communication point from which on the inputs have had these values, s.
         stamp: of the messages that tell of it, ns since the epoch.
+        quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has
+            none.
     """
 
     k: int
@@ -60,17 +62,39 @@ class Sample(NamedTuple):
     inputs: Mapping[str, Value]
     since: float
     stamp: int
+    quat: tuple[float, ...] = ()
 
     @property
     def target(self) -> tuple[float, ...] | None:
         """x_des, m, one value for each of x; None where the FMU has no such inputs."""
-        values = [self.inputs.get(f"x_des[{k + 1}]") for k in range(len(self.x))]
+        return self._given("x_des", len(self.x))
+
+    @property
+    def target_quat(self) -> tuple[float, ...] | None:
+        """quat_des at length 1; None where the FMU has no such inputs, or they are 0."""
+        given = self._given("quat_des", len(self.quat)) or ()
+        length = hypot(*given)
+        return tuple(value / length for value in given) if length else None
+
+    def _given(self, group: str, size: int) -> tuple[float, ...] | None:
+        values = [self.inputs.get(f"{group}[{k + 1}]") for k in range(size)]
         return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
 
     @property
     def error(self) -> float | None:
         """Distance of the end effector from its target, m; None where there is no target."""
         return None if self.target is None else dist(self.x, self.target)
+
+    @property
+    def turn_error(self) -> float | None:
+        """Angle between the end effector's orientation and its target, rad; None without one."""
+        if self.target_quat is None:
+            return None
+        apart = (
+            dist(self.quat, self.target_quat),
+            hypot(*map(sum, zip(self.quat, self.target_quat))),
+        )
+        return 4.0 * asin(min(1.0, 0.5 * min(apart)))
 
 
 class Sink:
@@ -169,9 +193,7 @@ def samples(
         run = experiment(run, **options)
     inputs, due = _inputs(run), deque(run.changes)
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
-        first = _changes_until(run.start_time, due, run)
-        inputs.update(first)
-        instance.initialise(run.start_time, run.time(run.steps), {**run.given, **first})
+        instance.initialise(run.start_time, run.time(run.steps), run.given)
         ready()
         take, since = _sampler(instance, run), run.start_time
         for k in count():
@@ -227,9 +249,9 @@ def _sampler(
         if not all(map(isfinite, values)):
             text = f"the FMU gave a value that is not finite at t = {t:g} s"
             raise SimulationError(text, k, "diverged")
-        q, v, x, tau = (values[part] for part in slices)
+        q, v, x, tau, quat = (values[part] for part in slices)
         stamp = first_stamp + round(k * run.step * NANOSECONDS)
-        return Sample(k, t, q, v, x, tau, inputs, since, stamp)
+        return Sample(k, t, q, v, x, tau, inputs, since, stamp, quat)
 
     return take
 
@@ -254,6 +276,8 @@ def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
     not the variables.
     """
     values = {"q_start": sample.q, "v_start": (0.0,) * len(sample.v), "x_des": sample.x}
+    if sample.quat:
+        values["quat_des"] = sample.quat
     return values if all(fmu.vector(group) for group in values) else None
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import BagError
 from ..files import is_being_written
 from ..ros.cdr import JointStateLayout, MixtureError, unpack_point
-from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, STORE, TARGET
+from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, STORE, TARGET
 from .provenance import read_provenance
 from .recording import Array, Heard, Recording, Stamps, TopicCount
 from .records import Allowance, Channel, DamageError, read_messages, storage_files
@@ -55,7 +55,11 @@ def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tup
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamp, data)
-                elif targets is not None and (channel.topic, channel.type) == (TARGET, POINT):
+                elif (
+                    targets is not None
+                    and channel.topic == TARGET
+                    and channel.type in (POINT, POSE)
+                ):
                     targets.add(stamp, data)
     except OSError as error:
         raise BagError(f"cannot read the bag '{path}': {error.strerror}") from error
@@ -178,7 +182,7 @@ class _Targets:
         self._stamps, self._points = array("q"), array("d")
 
     def add(self, stamp: int, data: bytes) -> None:
-        """Take a PointStamped."""
+        """Take a PointStamped, or a PoseStamped, which begins alike."""
         try:
             frame, point = unpack_point(data)
         except (IndexError, struct.error):

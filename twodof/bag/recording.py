@@ -129,18 +129,36 @@ class Recording:
         Raises:
             BagError: the provenance does not fit the samples.
         """
-        if self.axes and "x_des[1]" in self.schedule[0][1] and KNOWN_UNTIL not in self.provenance:
-            m = range(1, len(self.axes) + 1)
-            begins = np.array([k for k, _ in self.schedule])
-            targets = np.array(
-                [[float(held[f"x_des[{i}]"]) for i in m] for _, held in self.schedule]
-            )
-            # at its own communication point a change has not been at work yet
-            return cast(Array, targets[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
+        held = self.held("x_des", len(self.axes))
+        if held.size:
+            return held
         root = self.provenance.get("root")
         if self.heard is None or root not in (None, self.heard.frame):
             return np.empty((len(self.stamps), 0))
         return self.heard.points[:, ["xyz".index(axis) for axis in self.axes or "xyz"]]
+
+    @property
+    def target_quat(self) -> Array:
+        """Target orientation in effect up to each sample, quat_des, N × 4; N × 0 without one.
+
+        Raises:
+            BagError: the provenance does not fit the samples.
+        """
+        return self.held("quat_des", 4)
+
+    def held(self, group: str, size: int) -> Array:
+        """A vector of inputs in effect up to each sample, N × size; N × 0 where it is not known.
+
+        Raises:
+            BagError: the provenance does not fit the samples.
+        """
+        names = [f"{group}[{i + 1}]" for i in range(size)]
+        if not size or names[0] not in self.schedule[0][1] or KNOWN_UNTIL in self.provenance:
+            return np.empty((len(self.stamps), 0))
+        begins = [k for k, _ in self.schedule]
+        values = np.array([[float(held[name]) for name in names] for _, held in self.schedule])
+        # at its own communication point a change has not been at work yet
+        return cast(Array, values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
 
     @cached_property
     def x(self) -> Array:
@@ -193,7 +211,7 @@ class Recording:
             steps = (time - self.provenance["start_time"]) / self.provenance["step"]
             k = max(0, ceil(steps - TIME_TOLERANCE))
             changed = {**changed, **values}
-            if k == schedule[-1][0]:
+            if k == schedule[-1][0] and len(schedule) > 1:  # the first sample is before any
                 schedule.pop()
             schedule.append((k, ChainMap(changed, starts)))
         last = self.steps[-1] if self.provenance else 0

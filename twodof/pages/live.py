@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from math import inf, isfinite, pi
+from math import degrees, inf, isfinite, pi
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Lock
@@ -27,7 +27,7 @@ from ..plant.urdf import Joint, RobotError, read_urdf
 from .loop import IDLE, Loop, News
 from .page import HOST, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
 from .robot import PageRobot
-from .widgets import Plot, Readout, Switch
+from .widgets import Plot, Readout, Switch, add_sliders
 
 PLOTTED = 10.0  # s
 PLOT_POINTS = 250  # while it plays: drawing holds a browser up
@@ -35,6 +35,7 @@ AWAITED = 0.3  # s after a change for which the arm comes first,
 LONGEST = 1.0  # s, and the plots wait at most
 TRAIL_POINTS = 45
 WINDOW = 1.0  # s over which the real-time factor is taken
+GAINS = {"Kp": "s⁻²", "Kd": "s⁻¹", "Kp_rot": "s⁻²", "Kd_rot": "s⁻¹"}
 
 
 class Controls:
@@ -132,8 +133,12 @@ class Controls:
         size = self._page.frame(around, fmu.axes, gravity if any(gravity) else (0.0, 0.0, 1.0))
         self._target: Any = None
         if sample.target:
-            self._target = self._page.add_target(size, fmu.axes, draggable=True)
+            turns = sample.target_quat is not None
+            self._target = self._page.add_target(size, fmu.axes, draggable=True, turns=turns)
             self._target.position = self._target_place
+            if sample.target_quat:
+                self._target.wxyz = np.roll(sample.target_quat, 1)
+                self._robot.show_axes(self._page, size)
         self._trail = self._page.add_line("/trail", TRAIL, 4.0)
         self._robot.pose(sample.q)
 
@@ -151,7 +156,7 @@ class Controls:
             self._add_target_fields(self._target)
         if fmu.vector("Kp"):
             with gui.add_folder("Gains"):
-                for group, unit in (("Kp", "s⁻²"), ("Kd", "s⁻¹")):
+                for group, unit in GAINS.items():
                     self._add_gain(group, unit)
         self._add_joint_inputs(joints)
         self._units = ["m" if joint.prismatic else "rad" for joint in joints]
@@ -175,7 +180,10 @@ class Controls:
         moving = Lock()  # viser calls from several threads
 
         def move(place: Array) -> None:
-            self._change({"x_des": tuple(float(place[k]) for k in axes.values())})
+            asked = {"x_des": tuple(float(place[k]) for k in axes.values())}
+            if self._fmu.vector("quat_des"):
+                asked["quat_des"] = tuple(np.roll(target.wxyz, -1).tolist())
+            self._change(asked)
 
         def dragged(event: Any) -> None:
             with moving:
@@ -210,43 +218,26 @@ class Controls:
         self._add_sliders("Force", "f_ext", force, [(-10.0, 10.0)] * 3, "No force")
 
     def _add_sliders(
-        self,
-        title: str,
-        group: str,
-        labels: Sequence[str],
-        ranges: Sequence[tuple[float, float]],
-        release: str,
-    ) -> None:
-        """A folder of sliders for a vector; with a button that sets all to 0."""
-        names, gui = self._fmu.vector(group), self._page.gui
-        sliders = {}
-        if not names:
-            return
-        with gui.add_folder(title, expand_by_default=len(names) <= 3 and group != "f_ext"):
-            for name, label, (low, high) in zip(names, labels, ranges):
-                start = float(self._starts[name])
-                low, high = min(low, start), max(high, start)
-                sliders[name] = gui.add_slider(label, low, high, (high - low) / 200, start)
-            button = gui.add_button(release) if release else None
-
-        def pushed(event: Any) -> None:
-            self._change({name: float(slider.value) for name, slider in sliders.items()})
-
-        def released(event: Any) -> None:
-            for slider in sliders.values():
-                slider.value = 0.0
-
-        for slider in sliders.values():
-            slider.on_update(pushed)
-        if button is not None:
-            button.on_click(released)
+        self, title: str, group: str, labels: Sequence[str],
+        ranges: Sequence[tuple[float, float]], release: str,
+    ) -> None:  # fmt: skip
+        """A folder of sliders for a vector, if there is one; with a button that sets all to 0."""
+        names = self._fmu.vector(group)
+        if names:
+            starts = [float(self._starts[name]) for name in names]
+            opened = len(names) <= 3 and group != "f_ext"
+            with self._page.gui.add_folder(title, expand_by_default=opened):
+                add_sliders(
+                    self._page, labels, ranges, starts, release,
+                    lambda values: self._change(dict(zip(names, values))),
+                )  # fmt: skip
 
     def _add_gain(self, group: str, unit: str) -> None:
         names = self._fmu.vector(group)
         if not names:
             return
         start = float(self._starts[names[0]])
-        most = max(4 * start, 200.0 if group == "Kp" else 100.0)
+        most = max(4 * start, 200.0 if group.startswith("Kp") else 100.0)
         slider = self._page.gui.add_slider(f"{group}, {unit}", 0.0, most, most / 400, start)
         slider.on_update(lambda event: self._change({group: float(slider.value)}))
 
@@ -271,6 +262,8 @@ class Controls:
         if sample.target:
             rows["target"] = f"({', '.join(f'{value:+.5f}' for value in sample.target)}) m"
             rows["error"] = f"{1e3 * (sample.error or 0.0):.4g} mm"
+        if sample.turn_error is not None:
+            rows["orientation error"] = f"{degrees(sample.turn_error):.4g}°"
         for name, q, unit in zip(self._fmu.joints, sample.q, self._units):
             rows[name] = f"{q:+.5f} {unit}"
         self._readout.show(rows)

@@ -160,17 +160,22 @@ class Page:
             section_color=(196, 204, 212), fade_distance=12 * size, shadow_opacity=0.0,
         )  # fmt: skip
 
-    def add_target(self, size: float, axes: str, draggable: bool) -> Any:
-        """The target's marker; where ``draggable``, with handles along the task axes."""
+    def add_target(self, size: float, axes: str, draggable: bool, turns: bool) -> Any:
+        """The target's marker; where ``draggable``, with handles along the task axes.
+
+        Where it ``turns``, it has axes of its own, and rings to turn it by.
+        """
         active = ("x" in axes, "y" in axes, "z" in axes)
         handle: Any
         if draggable:
             handle = self.scene.add_transform_controls(
-                "/target", scale=0.17 * size, active_axes=active, disable_rotations=True,
+                "/target", scale=0.17 * size, active_axes=active, disable_rotations=not turns,
                 depth_test=False, line_width=4.0, opacity=0.85,
             )  # fmt: skip
         else:
             handle = self.scene.add_frame("/target", show_axes=False)
+        if turns:
+            self.add_axes("/target/axes", size)
         front = np.zeros(3)
         circles = [(0, 1), (1, 2), (2, 0)]
         if len(axes) == 2:
@@ -188,6 +193,10 @@ class Page:
             circle[:, b] += 0.035 * size * np.sin(angles)
             self.add_line(f"/target/circle{i}", TARGET, 3.0).show(circle)
         return handle
+
+    def add_axes(self, name: str, size: float) -> None:
+        """The axes x, y, z of a node of the scene, red, green, blue."""
+        self.scene.add_frame(name, axes_length=0.1 * size, axes_radius=0.002 * size)
 
     def add_line(self, name: str, colour: tuple[int, int, int], width: float) -> Line:
         """A line through points that are yet to come; width in pixels."""

@@ -137,7 +137,13 @@ class Replay:
             up = gravity if any(gravity) else (0.0, 0.0, 1.0)
             size = page.frame(np.vstack(points), track.task.axes if track.task else "", up)
             if track.task is not None:
-                self._target = page.add_target(size, track.task.axes, draggable=False)
+                turns = track.recording.target_quat
+                self._turns = np.roll(turns, 1, axis=1)
+                self._target = page.add_target(
+                    size, track.task.axes, draggable=False, turns=bool(turns.size)
+                )
+                if turns.size:
+                    self._figure.show_axes(page, size)
             chosen = np.unique(np.linspace(0, len(q) - 1, PATH_POINTS).astype(int))
             page.add_line("/path", PATH, 1.5).show(motion.path[chosen])
             self._trail = page.add_line("/trail", TRAIL, 4.0)
@@ -191,6 +197,8 @@ class Replay:
                 self._trail.show(track.motion.path[chosen])
             if self._target is not None:
                 self._target.position = self._targets[k]
+                if self._turns.size:
+                    self._target.wxyz = self._turns[k]
 
     def _tell(self, k: int) -> None:
         track = self._track

@@ -68,6 +68,10 @@ class PageRobot:
         """Show it at joint positions q, rad or m."""
         self._place(self._moving, q)
 
+    def show_axes(self, page: Page, size: float) -> None:
+        """Draw the axes of the end effector's frame."""
+        page.add_axes(f"{self._names[self._frame]}/axes", size)
+
     def points(self, q: Sequence[float]) -> Array:
         """Origins of all links in the root frame, L × 3, m."""
         return np.array([place.translation[0] for place in self._kinematics.links([q]).values()])

@@ -1,4 +1,4 @@
-"""What a page's control panel is made of: switches, a readout, plots."""
+"""What a page's control panel is made of: switches, sliders, a readout, plots."""
 
 from __future__ import annotations
 
@@ -70,6 +70,29 @@ class Readout:
             '<table style="font-size:12.5px;font-variant-numeric:tabular-nums;margin:2px 10px">'
             f"{lines}</table>"
         )
+
+
+def add_sliders(
+    page: Page, labels: Sequence[str], ranges: Sequence[tuple[float, float]],
+    starts: Sequence[float], release: str, change: Callable[[list[float]], None],
+) -> None:  # fmt: skip
+    """Sliders whose values go to ``change``; with a button ``release`` that sets all to 0."""
+    sliders = []
+    for label, (low, high), start in zip(labels, ranges, starts):
+        low, high = min(low, start), max(high, start)
+        sliders.append(page.gui.add_slider(label, low, high, (high - low) / 200, start))
+
+    def pushed(event: Any) -> None:
+        change([float(slider.value) for slider in sliders])
+
+    def released(event: Any) -> None:
+        for slider in sliders:
+            slider.value = 0.0
+
+    for slider in sliders:
+        slider.on_update(pushed)
+    if release:
+        page.gui.add_button(release).on_click(released)
 
 
 class Plot:

@@ -109,6 +109,7 @@ def task_error(
 
     x, xd = np.array(x0, dtype=np.float64), np.array(xd0, dtype=np.float64)
     error = np.empty((steps + 1, len(x)))
+    error[0] = x - np.array(schedule[0][1].x_des)
     ends = [k for k, _ in schedule[1:]] + [steps]
     with np.errstate(over="ignore", invalid="ignore"):  # with negative gains it explodes
         for (k, held), end in zip(schedule, ends):
@@ -118,8 +119,6 @@ def task_error(
                 e0, v0 = x[i] - x_des, xd[i]
                 e = phi * e0 + psi * v0 + gamma * a
                 error[k + 1 : end + 1, i] = e[1:]
-                if k == 0:
-                    error[0, i] = e[0]
                 x[i] = x_des + e[-1]
                 xd[i] = -Kp * psi[-1] * e0 + psi_rate[-1] * v0 + psi[-1] * a
     return error

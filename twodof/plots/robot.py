@@ -150,9 +150,12 @@ def _reach(robot: Robot) -> Reach | None:
     return Reach(points[0], float(np.linalg.norm(links, axis=1).sum()), normal)
 
 
-def is_singular(robot: Robot, q: Array, rcond: float) -> bool:
-    """Whether the arm has been where it cannot follow any command: σ_min ≤ rcond·σ_max of J."""
-    axes = ["xyz".index(axis) for axis in robot.axes]
+def is_singular(robot: Robot, q: Array, rcond: float, turns: bool) -> bool:
+    """Whether the arm has been where it cannot follow any command: σ_min ≤ rcond·σ_max of J.
+
+    That has the rows of the task axes, and where an orientation is followed three of the turning.
+    """
+    axes = ["xyz".index(axis) for axis in robot.axes] + [3, 4, 5] * turns
     J = robot.kinematics.jacobian(robot.frame, q[:: ceil(len(q) / LOOKS)])[:, axes]
     sigma = np.linalg.svd(J, compute_uv=False)
     return sigma.shape[1] < len(axes) or bool((sigma[:, -1] <= rcond * sigma[:, 0]).any())

@@ -23,6 +23,7 @@ NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
 MAX_URDF = 8 * 1024**2
 UNITS = {
     "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
+    "omega_des": "rad/s", "alpha_des": "rad/s²", "Kp_rot": "s⁻²", "Kd_rot": "s⁻¹",
     "gravity": "m/s²", "max_step": "s", "payload": "kg", "payload_com": "m", "f_ext": "N",
 }  # fmt: skip
 """Units of variables, where they do not depend on the joint."""
@@ -256,7 +257,8 @@ def _disturbances(
     at_work = {
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
-        "singularities": astray and is_singular(robot, q, float(first.get("rcond", 0.0))),
+        "singularities": astray
+        and is_singular(robot, q, float(first.get("rcond", 0.0)), "quat_des[1]" in first),
         "damping": any(joint.damping for joint in robot.urdf.joints.values() if joint.moves),
         "unknown payload": bool(first.get("payload")) and not first.get("payload_known"),
         "external torque": any(values[name] for _, values in schedule for name in external),

@@ -9,7 +9,8 @@ from .track import Track, number
 
 TOLD = {
     "x_des": "", "q_des": "", "tau_cmd": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²",
-    "Kp": "", "Kd": "", "Kn": "0 s⁻¹",
+    "quat_des": "", "omega_des": "0 rad/s", "alpha_des": "0 rad/s²",
+    "Kp": "", "Kd": "", "Kp_rot": "", "Kd_rot": "", "Kn": "0 s⁻¹",
     "tau_ext": "0", "f_ext": "0 N", "payload": "0 kg", "limit_effort": "false", "step": "",
     "FMU": "",
 }  # fmt: skip
@@ -67,7 +68,7 @@ def summary(track: Track) -> dict[str, str]:
     """The main numbers of a run in words, by what they are."""
     settings = {
         key: track.settings[key]
-        for key in ("FMU", "step", "x_des", "q_des", "tau_cmd", "Kp", "Kd")
+        for key in ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
         if key in track.settings
     }
     stopped = [joint.name for joint in track.joints if joint.at_limit]

@@ -108,7 +108,7 @@ class JointStateLayout:
 
 
 def unpack_point(message: bytes) -> tuple[bytes, tuple[float, float, float]]:
-    """Frame and coordinates of a PointStamped.
+    """Frame and coordinates of a PointStamped, or of a PoseStamped, which begins alike.
 
     Raises:
         IndexError, struct.error: it is damaged.

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TARGET = "/target"
+END_EFFECTOR = "/end_effector"
 POINT = "geometry_msgs/msg/PointStamped"
+POSE = "geometry_msgs/msg/PoseStamped"
 FOREVER = QosTime(9223372036, 854775807)
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -64,7 +66,7 @@ SCENE_TOPICS = {
     "/tf_static": Topic("tf2_msgs/msg/TFMessage", LATCHED),
     "/tf": Topic("tf2_msgs/msg/TFMessage", _qos(100, QosDurability.VOLATILE)),
     TARGET: Topic(POINT, STREAM),
-    "/end_effector": Topic(POINT, STREAM),
+    END_EFFECTOR: Topic(POINT, STREAM),
 }
 
 
@@ -95,6 +97,8 @@ class Messages:
         self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM)}
         if scene:
             self.topics |= SCENE_TOPICS
+            if run.fmu.vector("quat_des"):
+                self.topics |= dict.fromkeys((TARGET, END_EFFECTOR), Topic(POSE, STREAM))
             if not run.fmu.vector("x_des"):
                 del self.topics[TARGET]
 
@@ -104,7 +108,7 @@ class Messages:
         state = self._joint_state.pack(sample.stamp, sample.q, sample.v, effort)
         messages: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
         if self._scene is not None:
-            messages += map(_serialise, self._of_scene(self._scene, sample))
+            messages += map(self._serialise, self._of_scene(self._scene, sample))
         return messages
 
     def latched(self, stamp: int) -> list[tuple[str, Serialised]]:
@@ -116,7 +120,12 @@ class Messages:
             return []
         description = Message["std_msgs/msg/String"](data=self._scene.description)
         fixed = _tf_message(stamp, self._scene.fixed)
-        return [_serialise(("/robot_description", description)), _serialise(("/tf_static", fixed))]
+        told = (("/robot_description", description), ("/tf_static", fixed))
+        return [*map(self._serialise, told)]
+
+    def _serialise(self, topic_and_message: tuple[str, Any]) -> tuple[str, Serialised]:
+        topic, message = topic_and_message
+        return topic, STORE.serialize_cdr(message, self.topics[topic].type)
 
     def _of_scene(self, scene: Scene, sample: Sample) -> Iterator[tuple[str, Any]]:
         stamp = sample.stamp
@@ -126,8 +135,8 @@ class Messages:
             target = list(end_effector)  # the target leaves an axis that is not controlled as it is
             for axis, value in zip(self._axes, sample.target or ()):
                 target["xyz".index(axis)] = value
-            yield TARGET, _point(stamp, self._root, target)
-        yield "/end_effector", _point(stamp, self._root, end_effector)
+            yield TARGET, _place(stamp, self._root, target, sample.target_quat)
+        yield END_EFFECTOR, _place(stamp, self._root, end_effector, sample.quat)
 
 
 def _load_scene(run: Experiment) -> Scene:
@@ -142,11 +151,6 @@ def _load_scene(run: Experiment) -> Scene:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
 
 
-def _serialise(topic_and_message: tuple[str, Any]) -> tuple[str, Serialised]:
-    topic, message = topic_and_message
-    return topic, STORE.serialize_cdr(message, SCENE_TOPICS[topic].type)
-
-
 def _header(stamp: int, frame: str) -> Any:
     seconds, nanoseconds = divmod(stamp, NANOSECONDS)
     time_type = Message["builtin_interfaces/msg/Time"]
@@ -155,10 +159,16 @@ def _header(stamp: int, frame: str) -> Any:
     )
 
 
-def _point(stamp: int, frame: str, xyz: Sequence[float]) -> Any:
+def _place(stamp: int, frame: str, xyz: Sequence[float], quat: Sequence[float] | None) -> Any:
+    """A PointStamped, or with an orientation a PoseStamped."""
     x, y, z = xyz
     point = Message["geometry_msgs/msg/Point"](x=x, y=y, z=z)
-    return Message[POINT](header=_header(stamp, frame), point=point)
+    if not quat:
+        return Message[POINT](header=_header(stamp, frame), point=point)
+    qx, qy, qz, qw = quat
+    turn = Message["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw)
+    pose = Message["geometry_msgs/msg/Pose"](position=point, orientation=turn)
+    return Message[POSE](header=_header(stamp, frame), pose=pose)
 
 
 def _tf_message(stamp: int, transforms: Sequence[Transform]) -> Any:

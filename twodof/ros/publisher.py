@@ -19,7 +19,7 @@ from ..errors import PublishError, SimulationError
 from ..experiments import Experiment, Setting, experiment
 from ..fmu import Fmu
 from ..master import RealTime, Sample, Sink, Summary, at_rest, simulate
-from .messages import POINT, STORE, STREAM, Messages, Serialised
+from .messages import POINT, POSE, STORE, STREAM, Messages, Serialised
 from .network import Network, network, open_domain
 
 # isort: split
@@ -134,6 +134,8 @@ class Publisher(Sink):
         self._messages = Messages(run, scene=self._scene, effort=self._effort)
         self.topics = tuple(self._messages.topics)
         self.commands = COMMANDS if self._axes and run.fmu.vector("x_des") else ()
+        turns = bool(run.fmu.vector("quat_des"))
+        self._heard = dict(zip(self.commands, (POSE if turns else POINT, POINT)))
         return self
 
     def __enter__(self) -> Publisher:
@@ -147,8 +149,8 @@ class Publisher(Sink):
                 for name, said in self._messages.topics.items()
             }
             self._readers = [
-                sub.DataReader(self._participant, self._topic(name, POINT), dds_qos(STREAM, POINT))
-                for name in self.commands
+                sub.DataReader(self._participant, self._topic(name, kind), dds_qos(STREAM, kind))
+                for name, kind in self._heard.items()
             ]
         except core.DDSException as error:
             raise PublishError(f"DDS domain {self.place.domain} fails: {error}") from error
@@ -176,15 +178,15 @@ class Publisher(Sink):
     def command(self) -> dict[str, tuple[float, ...]] | None:
         """The target that was asked for since the last call, as inputs of the FMU, if one was.
 
-        Points are in the frame of the robot's root, which an empty frame_id means too. One in
-        another frame, or whose numbers are not finite, is ignored.
+        Points and poses are in the frame of the robot's root, which an empty frame_id means too.
+        One in another frame, or whose numbers are not finite or no orientation, is ignored.
         """
-        target = None
-        for name, reader in zip(self.commands, self._readers):
+        target: dict[str, tuple[float, ...]] = {}
+        for (name, kind), reader in zip(self._heard.items(), self._readers):
             for message in reader.take(STREAM.depth):
                 if message.sample_info.valid_data:
-                    target = self._target(name, message.cdr) or target
-        return None if target is None else {"x_des": target}
+                    target |= self._target(name, kind, message.cdr)
+        return target or None
 
     def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
         """What a run goes on with where a step was discarded: who asks for targets ends no run."""
@@ -193,21 +195,30 @@ class Publisher(Sink):
             self._warn_once("rest", f"{error}: the robot is stopped, and its target is where it is")
         return rest
 
-    def _target(self, name: str, cdr: Serialised) -> tuple[float, ...] | None:
+    def _target(self, name: str, kind: str, cdr: Serialised) -> dict[str, tuple[float, ...]]:
+        """What a message asks for, as inputs of the FMU; nothing where it is ignored."""
+        what = "a pose" if kind == POSE else "a point"
         try:
-            message: Any = STORE.deserialize_cdr(cdr, POINT)
+            message: Any = STORE.deserialize_cdr(cdr, kind)
         except Exception as error:  # the bytes are anybody's
-            self._warn_once("bytes", f"a point on {name} cannot be read ({error}): ignored")
-            return None
-        frame, point = message.header.frame_id, message.point
+            self._warn_once("bytes", f"{what} on {name} cannot be read ({error}): ignored")
+            return {}
+        frame = message.header.frame_id
+        point = message.pose.position if kind == POSE else message.point
+        turn = message.pose.orientation if kind == POSE else None
+        quat = () if turn is None else (turn.x, turn.y, turn.z, turn.w)
         if frame not in ("", self._root):
             told = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
-            self._warn_once("frame", f"a point on {name} is in frame {told}: ignored")
-            return None
-        if not all(map(isfinite, (point.x, point.y, point.z))):
-            self._warn_once("finite", f"a point on {name} is not finite: ignored")
-            return None
-        return tuple(getattr(point, axis) for axis in self._axes)
+            self._warn_once("frame", f"{what} on {name} is in frame {told}: ignored")
+            return {}
+        if not all(map(isfinite, (point.x, point.y, point.z, *quat))):
+            self._warn_once("finite", f"{what} on {name} is not finite: ignored")
+            return {}
+        if quat and not any(quat):
+            self._warn_once("turn", f"{what} on {name} has the orientation 0, 0, 0, 0: ignored")
+            return {}
+        place = {"x_des": tuple(getattr(point, axis) for axis in self._axes)}
+        return place | ({"quat_des": quat} if quat else {})
 
     def _warn_once(self, kind: str, text: str) -> None:
         if kind not in self._warned:
