@@ -384,6 +384,7 @@ def test_a_target_that_no_step_can_follow_ends_no_run(
     node = listen("/joint_states", "/target", *COMMANDS)
     options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
     with published(number, native_path, *options) as process:
+        node.hears("/target")
         for x in (1e308, -1e308, 1e200, 1e30):
             node.point("/target_command", "world", x, 1e308, 0.0)
             node.hears("/target", 10)

@@ -560,7 +560,7 @@ PROGRAM = """
 import sys
 import twodof
 def run():
-    return twodof.sweep(sys.argv[-1], grid={"Kp": [20.0, 60.0]}, stop_time=0.1, workers=2)
+    return twodof.sweep(sys.argv[-1], grid={"Kp": [20.0, 60.0]}, stop_time=0.1, workers=1)
 expected = run()
 sys.path.append(sys.argv[-2])
 from harness import lay_traps
