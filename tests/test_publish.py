@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
-from harness import cannot_run, needs
+from harness import cannot_run, needs, wait_until
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -521,8 +521,11 @@ def test_range(
     inside = isolated(CABLE)
     with published(number, native_path, *options, inside=inside, **variables) as process:
         assert f"on {reach}\n" in process.told[1], process.told
-        time.sleep(2.5)
-        assert (packets(process) > 0) == outside
+        if outside:
+            wait_until(lambda: packets(process) > 0)
+        else:
+            time.sleep(2.5)
+            assert packets(process) == 0
         node = listen(
             "--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid))
         )

@@ -96,13 +96,18 @@ def truth(folder: Path) -> np.ndarray:
     return np.column_stack([(table[:, 0] - table[0, 0]) / 1e9, table[:, 1:]]).astype(float)
 
 
-def scrub(page: Page, time: float) -> dict[str, str]:
-    """What the page says after a time was typed; while it plays, the field is not still."""
-    page.evaluate(  # found and pressed in one go: at the end of the bag the button is another
+def pause(page: Page) -> None:
+    """Press the button if it is there: found and pressed in one go, as the bag may end between."""
+    page.evaluate(
         "() => [...document.querySelectorAll('button')]"
         ".find((button) => button.textContent.trim() === 'Pause')?.click()"
     )
     page.get_by_role("button", name="Play").wait_for()
+
+
+def scrub(page: Page, time: float) -> dict[str, str]:
+    """What the page says after a time was typed; while it plays, the field is not still."""
+    pause(page)
     browser.type_into(page, "time, s", time)
     return until(page, lambda found: found["time"] == f"{time:.3f} s")
 
@@ -137,8 +142,7 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     assert float(browser.field_of(page, "time, s").input_value()) == 0.0
     press(page, "Play")
     until(page, lambda found: numbers(found["time"])[0] > 0.4)
-    press(page, "Pause")
-    page.get_by_role("button", name="Play").wait_for()
+    pause(page)
     page.wait_for_timeout(500)
     paused = pytest.approx(numbers(rows(page)["time"])[0], abs=0.006)
     slider = browser.field_of(page, "time, s")
@@ -205,8 +209,7 @@ def slope(page: Page) -> float:
     while not seen or seen[-1][0] < seen[0][0] + 1.5:
         page.wait_for_timeout(30)
         seen.append((clock.monotonic(), *numbers(rows(page)["time"])))
-    press(page, "Pause")
-    page.get_by_role("button", name="Play").wait_for()
+    pause(page)
     return float(np.polyfit(*np.transpose(seen), 1)[0])
 
 
