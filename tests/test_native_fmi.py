@@ -507,6 +507,7 @@ def test_no_memory_is_allocated_and_no_global_is_written():
             assert not re.search(r"^static (?!const|inline)[^()]*[;=]", text, re.M), file
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", range(4))
 def test_random_calls_under_sanitizers(part, length):
     """Legal and illegal calls, with NaN, infinities and more; in full, 100,000 sequences."""
