@@ -31,9 +31,16 @@ def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
     return lambda full, short: full if request.config.getoption("full") else short
 
 
+LONGEST = (
+    "native_platforms", "live", "sweep", "view", "publish", "mutations", "docs", "plot", "ends",
+    "native_fmi", "recovery", "states", "bag", "control", "plant", "master", "scene",
+)  # fmt: skip
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the file whose first compilation for another platform takes minutes."""
-    items.sort(key=lambda item: item.path.name != "test_native_platforms.py")
+    """Start with the files that take longest, so that the processes end at about one time."""
+    place = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
 
 @pytest.fixture(scope="session")

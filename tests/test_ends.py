@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bags import START, assert_consistent, both_storages, logging, read_with_rosbags
+from bags import START, STORAGES, assert_consistent, both_storages, logging, read_with_rosbags
 
 from twodof.bag.records import Allowance, DamageError, read_messages, storage_files
 from twodof.cli import info
@@ -63,11 +63,16 @@ SIGNALS = {
 }
 
 
-@both_storages
-@pytest.mark.parametrize("pace", ["", "--realtime"])
-@pytest.mark.parametrize("signals", SIGNALS.values(), ids=SIGNALS)
+PAIRS = [  # each two of a signal, a storage and a pace meet
+    pytest.param(signals, storage, pace, id=" ".join([name, storage, pace]).strip())
+    for i, (name, signals) in enumerate(SIGNALS.items())
+    for storage, pace in zip(STORAGES, ("", "--realtime") if i % 2 else ("--realtime", ""))
+]
+
+
+@pytest.mark.parametrize(("signals", "storage", "pace"), PAIRS)
 def test_signals_leave_a_complete_bag(
-    native_path: Path, tmp_path: Path, storage: str, pace: str, signals: list[signal.Signals]
+    native_path: Path, tmp_path: Path, signals: list[signal.Signals], storage: str, pace: str
 ) -> None:
     bag = tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, *pace.split())

@@ -219,9 +219,14 @@ def test_target_is_dragged_in_the_scene(
         page.mouse.move(x - 12 * i, y + 6 * i)
         page.wait_for_timeout(60)
     page.mouse.up()
-    page.wait_for_timeout(150)
     dragged = targets[1] + np.array([-60, 30]) * follows / metre
-    fields = [float(browser.field_of(page, axis).input_value()) for axis in "xy"]
+
+    def values(page: Page) -> list[float]:
+        return [float(browser.field_of(page, axis).input_value()) for axis in "xy"]
+
+    until(page, lambda found: found == pytest.approx(dragged, abs=0.003), values)
+    page.wait_for_timeout(150)
+    fields = values(page)
     assert fields == pytest.approx(dragged, abs=0.003)
     seen = play(page, 1.0)
     target = np.array(numbers(seen[-1]["target"]))

@@ -507,16 +507,18 @@ def test_no_memory_is_allocated_and_no_global_is_written():
             assert not re.search(r"^static (?!const|inline)[^()]*[;=]", text, re.M), file
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", range(4))
-def test_random_calls_under_sanitizers(part):
-    """100,000 random sequences of legal and illegal calls, with NaN, infinities and more."""
+def test_random_calls_under_sanitizers(part, length):
+    """Legal and illegal calls, with NaN, infinities and more; in full, 100,000 sequences."""
+    count = length(25_000, 6_000)
     program = executable(
         model("twodof"), HERE / "fuzz.c",
         flags=("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     )  # fmt: skip
-    done = subprocess.run([program, "25000", str(part)], capture_output=True, text=True)
+    done = subprocess.run([program, str(count), str(part)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("25000 sequences")
+    assert done.stdout.startswith(f"{count} sequences")
 
 
 def test_run_under_valgrind():

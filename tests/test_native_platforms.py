@@ -227,8 +227,9 @@ def drive(unzipped: Path, platform: str, folder: Path, settings: dict[str, float
     importer = folder / ("host.exe" if windows else "host")
     if not importer.exists():
         zig = [sys.executable, "-m", needs("ziglang"), "cc", "-target", *TARGETS[platform]]
-        flags = ["-std=c99", "-O1", "-I", unzipped / "sources", "-o", importer, HOST]
-        subprocess.run([*zig, *flags, *([] if windows else ["-ldl"])], check=True)
+        flags = ["-std=c99", "-O2", "-I", unzipped / "sources", "-o", importer, HOST]
+        # -O2 and a folder apart from zig's: else it compiles Windows' C runtime once more
+        subprocess.run([*zig, *flags, *([] if windows else ["-ldl"])], cwd=folder, check=True)
     library = shutil.copy(unzipped / BINARIES[platform], folder)
     guid, references = variables(unzipped)
     first, last = references["q[1]"], references["tau[2]"]

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
-from harness import cannot_run, needs
+from harness import cannot_run, needs, wait_until
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -384,6 +384,7 @@ def test_a_target_that_no_step_can_follow_ends_no_run(
     node = listen("/joint_states", "/target", *COMMANDS)
     options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
     with published(number, native_path, *options) as process:
+        node.hears("/target")
         for x in (1e308, -1e308, 1e200, 1e30):
             node.point("/target_command", "world", x, 1e308, 0.0)
             node.hears("/target", 10)
@@ -520,8 +521,11 @@ def test_range(
     inside = isolated(CABLE)
     with published(number, native_path, *options, inside=inside, **variables) as process:
         assert f"on {reach}\n" in process.told[1], process.told
-        time.sleep(2.5)
-        assert (packets(process) > 0) == outside
+        if outside:
+            wait_until(lambda: packets(process) > 0)
+        else:
+            time.sleep(2.5)
+            assert packets(process) == 0
         node = listen(
             "--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid))
         )
@@ -627,8 +631,8 @@ print(memory.growth)
 def test_an_hour_has_flat_memory(
     native_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
 ) -> None:
-    """Half a minute without pace; in full, an hour in real time."""
-    steps = length(360_000, 40_000)
+    """Seconds without pace; in full, an hour in real time."""
+    steps = length(360_000, 10_000)
     listen("/joint_states", "/tf", "/robot_description")
     command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
     done = subprocess.run(
@@ -637,7 +641,7 @@ def test_an_hour_has_flat_memory(
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     print(f"{steps} samples: memory grew by {int(done.stdout) / 2**20:.1f} MiB")
-    assert int(done.stdout) <= 10e6
+    assert int(done.stdout) <= min(10e6, 250 * steps)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
 STEP, STOP = 0.01, 5.0
 COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
 SMALL = {"Kp": (20.0, 60.0, 180.0), "Kd": (8.0, 30.0)}
-GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
+GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "5"]
 
 
 def table_of(path: Path) -> pandas.DataFrame:
@@ -407,7 +407,7 @@ def test_what_is_interrupted_is_resumed(
         while not any(path.glob("part-000001*")):
             assert process.poll() is None, process.communicate()
             time.sleep(0.01)
-        time.sleep(rng.uniform(0.0, 1.0))
+        time.sleep(rng.uniform(0.0, 0.5))
         if i % 2:
             process.kill()
             process.communicate()
@@ -560,7 +560,7 @@ PROGRAM = """
 import sys
 import twodof
 def run():
-    return twodof.sweep(sys.argv[-1], grid={"Kp": [20.0, 60.0]}, stop_time=0.1, workers=2)
+    return twodof.sweep(sys.argv[-1], grid={"Kp": [20.0, 60.0]}, stop_time=0.1, workers=1)
 expected = run()
 sys.path.append(sys.argv[-2])
 from harness import lay_traps
@@ -647,7 +647,7 @@ def test_workers_that_are_killed_cost_no_run(
 ) -> None:
     runs, pause, part = length(2000, 100), length(5, 0), length(1, 30)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
-    expected = sweep(native_path, grid=grid, stop_time=20)
+    expected = sweep(native_path, grid=grid, stop_time=8)
     killed = [(time.monotonic(), 0)]
     rng = random.Random(1)
 
@@ -659,7 +659,7 @@ def test_workers_that_are_killed_cost_no_run(
             os.kill(rng.choice(workers), signal.SIGKILL)
             killed.append((now, done))
 
-    found = sweep(native_path, grid=grid, stop_time=20, progress=kill)
+    found = sweep(native_path, grid=grid, stop_time=8, progress=kill)
     print(f"{len(killed) - 1} workers killed during {runs} runs")
     assert len(killed) > 2
     assert list(found["run"]) == list(range(runs))

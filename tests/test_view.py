@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import shutil
 import socket
-import subprocess
 import time as clock
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import browser
 import numpy as np
@@ -42,6 +43,7 @@ from playwright.sync_api import Browser, Page
 
 import twodof
 import twodof.pages.page
+from twodof.cli.main import main
 from twodof.files import data_file
 from twodof.pages.replay import nearest
 from twodof.pages.widgets import BUCKETS, outline
@@ -94,13 +96,18 @@ def truth(folder: Path) -> np.ndarray:
     return np.column_stack([(table[:, 0] - table[0, 0]) / 1e9, table[:, 1:]]).astype(float)
 
 
-def scrub(page: Page, time: float) -> dict[str, str]:
-    """What the page says after a time was typed; while it plays, the field is not still."""
-    page.evaluate(  # found and pressed in one go: at the end of the bag the button is another
+def pause(page: Page) -> None:
+    """Press the button if it is there: found and pressed in one go, as the bag may end between."""
+    page.evaluate(
         "() => [...document.querySelectorAll('button')]"
         ".find((button) => button.textContent.trim() === 'Pause')?.click()"
     )
     page.get_by_role("button", name="Play").wait_for()
+
+
+def scrub(page: Page, time: float) -> dict[str, str]:
+    """What the page says after a time was typed; while it plays, the field is not still."""
+    pause(page)
     browser.type_into(page, "time, s", time)
     return until(page, lambda found: found["time"] == f"{time:.3f} s")
 
@@ -135,8 +142,7 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     assert float(browser.field_of(page, "time, s").input_value()) == 0.0
     press(page, "Play")
     until(page, lambda found: numbers(found["time"])[0] > 0.4)
-    press(page, "Pause")
-    page.get_by_role("button", name="Play").wait_for()
+    pause(page)
     page.wait_for_timeout(500)
     paused = pytest.approx(numbers(rows(page)["time"])[0], abs=0.006)
     slider = browser.field_of(page, "time, s")
@@ -203,8 +209,7 @@ def slope(page: Page) -> float:
     while not seen or seen[-1][0] < seen[0][0] + 1.5:
         page.wait_for_timeout(30)
         seen.append((clock.monotonic(), *numbers(rows(page)["time"])))
-    press(page, "Pause")
-    page.get_by_role("button", name="Play").wait_for()
+    pause(page)
     return float(np.polyfit(*np.transpose(seen), 1)[0])
 
 
@@ -240,13 +245,12 @@ def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:
     scrub(page, 1.5)
 
 
-def test_exported_file_replays_offline(shown: Browser, folder: Path, truth: np.ndarray) -> None:
+def test_exported_file_replays_offline(
+    shown: Browser, folder: Path, truth: np.ndarray, run_view: View
+) -> None:
     """Each picture, small, for that it is rendered at all, is the arm at a moment of the bag."""
-    done = subprocess.run(
-        [*browser.COMMAND, "view", "bag", "--export", "replay.html"],
-        cwd=folder, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert done.stderr == ""
+    done = run_view("bag", "--export", "replay.html", cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
     with shown.new_context(viewport={"width": 450, "height": 280}, offline=True) as context:
         context.set_default_timeout(1e3 * browser.PATIENCE)
         page = context.new_page()
@@ -292,6 +296,30 @@ def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(
     assert errors == "WARNING: 'foreign' carries no robot; give one with --urdf\n"
 
 
+class Done(NamedTuple):
+    """How a command ended, and what it wrote."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+View = Callable[..., Done]
+
+
+@pytest.fixture
+def run_view(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> View:
+    """``twodof view`` in a folder."""
+
+    def run(*arguments: str | Path, cwd: Path) -> Done:
+        monkeypatch.chdir(cwd)
+        monkeypatch.setattr(logging.root, "handlers", [])  # as in a process of its own
+        capsys.readouterr()
+        return Done(main(["view", *map(str, arguments), "--no-browser"]), *capsys.readouterr())
+
+    return run
+
+
 @pytest.fixture(scope="module")
 def painted(folder: Path) -> Path:
     """A folder with the bag of a robot whose meshes, magenta, are elsewhere."""
@@ -327,7 +355,7 @@ def magenta(r: np.ndarray, g: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (r > 150) & (g < 60) & (b > 150)
 
 
-def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path) -> None:
+def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path, run_view: View) -> None:
     done = run_view("bag", "--export", "sticks.html", cwd=painted)
     assert done.returncode == 0
     assert re.fullmatch(
@@ -371,7 +399,9 @@ def test_text_of_a_bag_is_text(shown: Browser, hostile: Path) -> None:
         assert page.get_by_text(f"twodof - {hostile.name}").count() > 0
 
 
-def test_text_of_a_bag_is_text_in_an_exported_file(shown: Browser, hostile: Path) -> None:
+def test_text_of_a_bag_is_text_in_an_exported_file(
+    shown: Browser, hostile: Path, run_view: View
+) -> None:
     done = run_view(hostile.name, "--export", "hostile.html", cwd=hostile.parent)
     assert done.returncode == 0
     with shown.new_context() as context:
@@ -439,7 +469,9 @@ def test_link_cannot_have_the_page_listen_to_another_server(
             other.accept()
 
 
-def test_bag_whose_name_is_no_text_is_shown(shown: Browser, folder: Path, tmp_path: Path) -> None:
+def test_bag_whose_name_is_no_text_is_shown(
+    shown: Browser, folder: Path, tmp_path: Path, run_view: View
+) -> None:
     name = os.fsdecode(b"bag\xff")
     shutil.copytree(folder / "bag", tmp_path / name)
     with served("view", name, cwd=tmp_path) as command, opened(shown, command.url) as page:
@@ -457,7 +489,9 @@ def test_bag_whose_name_is_no_text_is_shown(shown: Browser, folder: Path, tmp_pa
         '<geometry><box/></geometry><material name="red"><color rgba="1"/></material>',
     ],
 )
-def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path: Path) -> None:
+def test_shape_without_numbers_gets_one_line(
+    shape: str, folder: Path, tmp_path: Path, run_view: View
+) -> None:
     shutil.copytree(folder / "bag", tmp_path / "bag")
     made = json.loads((tmp_path / "bag/run.json").read_text())
     made["urdf"] = made["urdf"].replace("<visual>", f"<visual>{shape}</visual><visual>", 1)
@@ -467,14 +501,7 @@ def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path:
     assert re.fullmatch(r"twodof: error: [^\n]*link 'link1'[^\n]+\n", done.stderr)
 
 
-def run_view(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [*browser.COMMAND, "view", *map(str, arguments), "--no-browser"]
-    return subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False
-    )
-
-
-def test_port_in_use(folder: Path) -> None:
+def test_port_in_use(folder: Path, run_view: View) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = run_view("bag", "--port", f"{port}", cwd=folder)
@@ -495,7 +522,9 @@ def test_port_in_use(folder: Path) -> None:
         (["bag", "--export", "no/where.html"], "cannot write 'no/where.html'"),
     ],
 )
-def test_bad_input_gets_one_line(arguments: list[str], said: str, folder: Path) -> None:
+def test_bad_input_gets_one_line(
+    arguments: list[str], said: str, folder: Path, run_view: View
+) -> None:
     urdf = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text()
     (folder / "other.urdf").write_text(urdf.replace('"joint1"', '"shoulder"'))
     done = run_view(*arguments, "--port", "0", cwd=folder)
