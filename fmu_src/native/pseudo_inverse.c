@@ -104,3 +104,18 @@ int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rc
             result[i] += y[k] * J[k][i];
     return rank;
 }
+
+void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
+{
+    double nothing[N_ROWS] = {0};
+    orthogonalise(J, nothing);
+    for (int k = 0; k < N_ROWS; k++) { /* by insertion, the largest first */
+        const double sigma = sqrt(dot(J[k], J[k]));
+        int place = k;
+        for (; place > 0 && ratio[place - 1] < sigma; place--)
+            ratio[place] = ratio[place - 1];
+        ratio[place] = sigma;
+    }
+    for (int k = N_ROWS - 1; k >= 0; k--)
+        ratio[k] = ratio[0] > 0.0 ? ratio[k] / ratio[0] : 0.0;
+}

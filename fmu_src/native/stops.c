@@ -160,10 +160,14 @@ void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
     restrain(plant, stops, y, a, pressed);
 }
 
+int is_above(const Plant *plant, double q, int i)
+{
+    return plant->value[Q_MAX + i] - q <= q - plant->value[Q_MIN + i];
+}
+
 void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], double a[N_JOINTS],
               double pressed[N_JOINTS])
 {
-    const double *high = &plant->value[Q_MAX];
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
     Contacts contacts;
     double z[N_JOINTS], columns[N_JOINTS][N_JOINTS];
@@ -183,7 +187,7 @@ void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], 
     }
     for (int k = 0; k < contacts.count; k++) {
         const int i = contacts.joint[k];
-        const double outwards = q[i] >= high[i] ? 1.0 : -1.0;
+        const double outwards = is_above(plant, q[i], i) ? 1.0 : -1.0;
         pressed[i] = outwards * (rigid ? -z[k] : a[i]);
         a[i] = 0.0;
     }
