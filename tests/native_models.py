@@ -236,8 +236,8 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
             (folder / file).write_bytes(content)
         subprocess.run(
             ["gcc", "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
-             "-Werror", "-fno-math-errno", "-fvisibility=hidden", *flags, "-o", output,
-             *sorted(f for f in files if f.endswith(".c")), "-lm"],
+             "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
+             "-o", output, *sorted(f for f in files if f.endswith(".c")), "-lm"],
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
     return output

@@ -12,6 +12,7 @@ import pytest
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Model
 from fmpy.validation import validate_fmu
+from harness import Driver
 from native_models import robots_folder
 
 from twodof import FmuOptions, build_fmu
@@ -350,3 +351,36 @@ def test_a_state_is_restored_bit_for_bit_and_is_of_its_kind(fmus):
         model.setFMUState(state)
         assert (model.rates(), model.indicators()) == (rates, indicators)
         model.event()
+
+
+def test_directional_derivatives_are_those_of_the_rates_in_both_kinds(fmus):
+    model = Model(fmus["effort"], v_start=[0.4, -0.3])
+    arm = Driver(fmus["effort"]).initialise(v_start=(0.4, -0.3))
+    model.go()
+    y, vr = model.y, model.vr
+    unknown = [vr[f"der({s}[{i}])"] for s in "qv" for i in (1, 2)]
+    for k, name in enumerate(states(fmus["effort"])):
+        ends = []
+        for h in (1e-5, -1e-5):
+            model.y = [value + h * (i == k) for i, value in enumerate(y)]
+            ends.append(np.array(model.rates()))
+        model.y = y
+        expected = (ends[0] - ends[1]) / 2e-5
+        for instance in (model, arm.slave):
+            found = instance.getDirectionalDerivative(unknown, [vr[name]], [1.0])
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+    arm.free()
+
+
+def test_a_derivative_of_what_has_none_is_refused(fmus):
+    model = Model(fmus["task"])
+    call, vr = "getDirectionalDerivative", model.vr
+    refused = [
+        ("x_des[1] is not computed", ["x_des[1]"], ["q[1]"], [1.0]),
+        ("rcond is neither a state nor an input", ["x[1]"], ["rcond"], [1.0]),
+        ("tau[1] is neither a state nor an input", ["x[1]"], ["tau[1]"], [1.0]),
+        ("the change of q[2] is not finite", ["x[1]"], ["q[2]"], [np.nan]),
+        ("limit_effort is of type Boolean", ["x[1]"], ["limit_effort"], [1.0]),
+    ]
+    for message, unknown, known, seed in refused:
+        model.refused(message, call, [vr[n] for n in unknown], [vr[n] for n in known], seed)

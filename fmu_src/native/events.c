@@ -36,14 +36,6 @@ void find_stops(const Plant *plant, Stops *stops)
     hold(plant, y, a, kept, stops);
 }
 
-void compute_rates(Plant *plant, const Stops *stops)
-{
-    double *value = plant->value, pressed[N_JOINTS];
-    memcpy(&value[DER_Q], &value[V], N_JOINTS * sizeof *value);
-    acceleration(plant, &value[Q], &value[V], &value[DER_V]);
-    restrain(plant, stops, &value[Q], &value[DER_V], pressed);
-}
-
 /* Distance to a place past a limit; 1 where that is no limit. */
 static double room(double limit, double outwards)
 {

@@ -8,9 +8,6 @@
 /* The joints that rest at the plant's state, by the rules of stops.h. */
 INTERNAL void find_stops(const Plant *plant, Stops *stops);
 
-/* The derivatives of the plant's state, joints that rest being held. */
-INTERNAL void compute_rates(Plant *plant, const Stops *stops);
-
 /* One indicator of each joint's upper limit, then of each lower one, then of the singular values that
    J⁺ may drop, all but the largest. An event is where one changes its sign. */
 INTERNAL void event_indicators(const Plant *plant, const Stops *stops,

@@ -61,6 +61,7 @@ static const struct {
     [GET_DERIVATIVES] = {"fmi2GetDerivatives", I | E | C | T, EXCHANGE},
     [GET_EVENT_INDICATORS] = {"fmi2GetEventIndicators", I | E | C | T, EXCHANGE},
     [GET_CONTINUOUS_STATES] = {"fmi2GetContinuousStates", I | E | C | T, EXCHANGE},
+    [GET_DIRECTIONAL_DERIVATIVE] = {"fmi2GetDirectionalDerivative", I | S | F | E | C | T},
     [GET_NOMINALS] = {"fmi2GetNominalsOfContinuousStates", N | I | E | C | T, EXCHANGE},
 };
 

@@ -28,4 +28,7 @@ INTERNAL int is_above(const Plant *plant, double q, int i);
 INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
                        double a[N_JOINTS], double pressed[N_JOINTS]);
 
+/* The derivatives of the plant's state, joints that rest being held. */
+INTERNAL void compute_rates(Plant *plant, const Stops *stops);
+
 #endif

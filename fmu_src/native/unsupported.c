@@ -8,14 +8,6 @@ static fmi2Status refuse(fmi2Component component, const char *function)
                      : fmi2Error;
 }
 
-fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2ValueReference unknown[],
-                                        size_t n_unknown, const fmi2ValueReference given[],
-                                        size_t n_given, const fmi2Real seed[], fmi2Real result[])
-{
-    (void)unknown, (void)n_unknown, (void)given, (void)n_given, (void)seed, (void)result;
-    return refuse(component, "fmi2GetDirectionalDerivative");
-}
-
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component component, const fmi2ValueReference vr[],
                                        size_t count, const fmi2Integer order[],
                                        const fmi2Real value[])

@@ -2,6 +2,7 @@
 #include <math.h>
 #include <stddef.h>
 
+#include "directional.h"
 #include "instance.h"
 
 /* Types of variables; there are no integers and no strings. */
@@ -112,6 +113,52 @@ fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference vr[], s
         }
     for (size_t i = 0; i < count; i++)
         value[i] = instance->state.plant.value[vr[i]];
+    return fmi2OK;
+}
+
+/* What of the computed variables the derivative of one needs. */
+static int wants(fmi2ValueReference vr)
+{
+    return vr >= DER_Q ? WANTS_RATES : vr >= TAU ? WANTS_TAU : vr >= X ? WANTS_X : 0;
+}
+
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2ValueReference unknown[],
+                                        size_t n_unknown, const fmi2ValueReference given[],
+                                        size_t n_given, const fmi2Real seed[], fmi2Real result[])
+{
+    const Call call = GET_DIRECTIONAL_DERIVATIVE;
+    Instance *instance = enter(component, call);
+    double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
+    int wanted = 0;
+    if (!instance || !known(instance, call, REAL, unknown, n_unknown, result)
+        || !known(instance, call, REAL, given, n_given, seed))
+        return fmi2Error;
+    for (size_t i = 0; i < n_unknown; i++) {
+        if (unknown[i] < FIRST_OUTPUT || unknown[i] >= FIRST_PARAMETER)
+            return report(instance, fmi2Error, "%s: %s is not computed, it has no derivative",
+                          call_name(call), VARIABLE_NAME[unknown[i]]);
+        wanted |= wants(unknown[i]);
+    }
+    for (size_t i = 0; i < n_given; i++) {
+        if (given[i] >= X)
+            return report(instance, fmi2Error, "%s: %s is neither a state nor an input",
+                          call_name(call), VARIABLE_NAME[given[i]]);
+        if (!isfinite(seed[i]))
+            return report(instance, fmi2Error, "%s: the change of %s is not finite",
+                          call_name(call), VARIABLE_NAME[given[i]]);
+        change[given[i]] += seed[i];
+    }
+    if (!instance->state.initialised && initialise(instance, 0) != fmi2OK)
+        return fmi2Error;
+    update_stops(&instance->state);
+    differentiate(instance->state.plant.value, instance->state.stops.held, wanted, change,
+                  derivative);
+    for (size_t i = 0; i < n_unknown; i++)
+        if (!isfinite(derivative[unknown[i]]))
+            return report(instance, fmi2Discard, "%s: that of %s is not finite", call_name(call),
+                          VARIABLE_NAME[unknown[i]]);
+    for (size_t i = 0; i < n_unknown; i++)
+        result[i] = derivative[unknown[i]];
     return fmi2OK;
 }
 

@@ -199,6 +199,13 @@ static fmi2Status exchange(Instance *c)
         x[i] = pick(60) ? (pick(2001) - 1000.0) * 4e-3 : number();
         finite = finite && (i >= N_STATES || isfinite(x[i]));
     }
+    if (pick(8) == 0) {
+        const fmi2ValueReference unknown = pick(N_VARIABLES + 1), known = pick(N_VARIABLES + 1);
+        const int right = unknown >= FIRST_OUTPUT && unknown < FIRST_PARAMETER && known < X;
+        status = fmi2GetDirectionalDerivative(c, &unknown, 1, &known, 1, x, x + 1);
+        CHECK(status == fmi2Error || (right && isfinite(x[0]) && phase != INSTANTIATED));
+        return status;
+    }
     double *given = pick(30) ? x : NULL;
     const size_t wrong = pick(30) == 0;
     const int right = given && !wrong;

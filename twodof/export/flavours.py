@@ -131,7 +131,7 @@ def native_flavour(
         return files
 
     return Flavour(
-        attributes={"needsExecutionTool": "false"},
+        attributes={"needsExecutionTool": "false", "providesDirectionalDerivative": "true"},
         exchanges=True,
         files={f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
         source_files=sorted(path for path in sources if path.endswith(".c")),
