@@ -76,6 +76,8 @@ def test_the_bare_plants_are_pinocchios(name):
     engine = Derivatives(model(name, "effort"))
     robot, rng = engine.model.robot, np.random.default_rng(1)
     reference = robot.model.copy()
+    if reference.nv > engine.n:
+        pytest.skip("Pinocchio has no derivatives of joints that follow others")
     for _ in range(100 if engine.n < 15 else 10):
         values = at_random(engine, rng, f_ext=[0.0, 0.0, 0.0])
         reference.gravity.linear = engine.group(values, "gravity")
@@ -128,6 +130,9 @@ CASES = {
     "ur5 dropped": ("ur5", "task", {"rcond": 0.7}),
     "ur5 dropped two": ("ur5", "task", {"rcond": 0.95, "Kn": 1.0}),
     "sliding joints": ("tiago", "task", {"Kn": 1.0, "limit_effort": True}),
+    "pose": ("ur5", "pose", {"payload": 1.0}),
+    "pose, dropped": ("ur5", "pose", {"rcond": 0.3}),
+    "pose, mimic": ("panda", "pose", {"Kn": 1.0}),
     "panda": ("panda", "effort", {"payload": 1.0}),
     "panda joint": ("panda", "joint", {"limit_effort": True, "payload": 1.0}),
     "anymal, a tree": ("anymal_c", "task", {"Kn": 2.0}),

@@ -60,7 +60,7 @@ def test_an_equilibrium_holds_still(bare):
     [
         ("bare", {"q": [0.0, np.pi]}, "joint 'joint2' is at its limit 3.14159"),
         ("bare", {"tau_cmd": 90.0}, "there is no equilibrium near q_start = "),
-        ("bare", {"Kp": 1.0}, "it is of control 'task' or 'joint'"),
+        ("bare", {"Kp": 1.0}, "it is of control 'task' or "),
         ("task", {"q": [0.3, 0.8], "rcond": "ratio"}, "jumps here"),
         ("python", {}, "gives no derivatives; a native FMU does"),
     ],
