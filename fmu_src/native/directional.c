@@ -124,14 +124,16 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], int wanted)
 void differentiate(const Real value[], const int held[], int wanted, const Real change[],
                    Real derivative[])
 {
-    const Real largest = largest_of(change, FIRST_PARAMETER); /* whatever its size, a step is small */
+    const Real largest = largest_of(change, X); /* whatever its size, a step is small */
+    const Real inverse = 1.0 / largest, up = 1.0 / STEP;
     Plant plant;
     for (int i = 0; i < N_VARIABLES; i++)
-        plant.value[i] = i < FIRST_PARAMETER ? value[i] + UNIT * (STEP * (change[i] / largest))
-                                             : value[i];
+        plant.value[i] = value[i];
+    for (int i = 0; i < X; i++)
+        plant.value[i] += UNIT * (change[i] * inverse * STEP);
     evaluate(&plant, held, wanted);
     for (int i = 0; i < FIRST_PARAMETER; i++)
-        derivative[i] = cimag(plant.value[i]) / STEP * largest;
+        derivative[i] = cimag(plant.value[i]) * up * largest;
 }
 #else
 /* ∛ε: where the errors of truncation and rounding are alike. */
@@ -140,10 +142,10 @@ static const Real NUDGE = 6e-6;
 void differentiate(const Real value[], const int held[], int wanted, const Real change[],
                    Real derivative[])
 {
-    const Real largest = largest_of(change, FIRST_PARAMETER);
+    const Real largest = largest_of(change, X);
     Plant after, before;
     for (int i = 0; i < N_VARIABLES; i++) {
-        const Real nudge = i < FIRST_PARAMETER ? NUDGE * (change[i] / largest) : 0.0;
+        const Real nudge = i < X ? NUDGE * (change[i] / largest) : 0.0;
         after.value[i] = value[i] + nudge;
         before.value[i] = value[i] - nudge;
     }
