@@ -2,8 +2,10 @@
 
 import json
 
+import fmpy
 import numpy as np
 import pytest
+from harness import needs
 from scipy.linalg import expm
 
 import twodof
@@ -99,3 +101,20 @@ def test_the_command_prints_the_model(bare, capsys):
     assert "q[1]        1.5708 rad" in text and "eigenvalue, 1/s" in text
     assert main(["linearise", str(bare), "--at", "q"]) == 2
     assert "--at q: expected NAME=VALUE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("control", ["task", "effort"])
+def test_casadi_takes_the_fmu_and_has_the_same_jacobian(control, bare, native_path, tmp_path):
+    """Its states by fmi2SetReal, from their start attributes, and derivatives by fmi2GetReal."""
+    needs("casadi")
+    import casadi
+
+    path = bare if control == "effort" else native_path
+    fmpy.extract(str(path), str(tmp_path))
+    dae = casadi.DaeBuilder("arm", str(tmp_path), {})
+    assert [dae.start(name)[0] for name in dae.x()] == [0.5, 0.35, 0.0, 0.0]
+    jacobian = dae.create("f", ["x", "u"], ["ode"]).factory("J", ["x", "u"], ["jac:ode:x"])
+    state, inputs = [0.4, 0.3, 0.1, -0.2], [dae.start(name)[0] for name in dae.u()]
+    model = twodof.linearise(path, {"q": state[:2], "v": state[2:]})
+    theirs = np.array(jacobian(state, inputs))
+    assert np.abs(theirs - model.A).max() <= 1e-9 * np.abs(model.A).max()
