@@ -123,6 +123,7 @@ CASES = {
     "payload": ("twodof", "task", {"payload": 0.7, "payload_com": [0.02, 0.01, 0.03]}),
     "known payload": ("twodof", "task", {"payload": 0.7, "payload_known": True}),
     "dropped": ("twodof", "task", {"rcond": 0.9}),
+    "orthogonal rows, dropped": ("twodof", "task", {"q": [0.0, 0.0]}),
     "by the sweeps": ("twodof", "task", {"rcond": 0.0, "q": [0.3, 0.01]}),
     "clamped effort": ("twodof", "joint", {"limit_effort": True, "Kp": [4000.0, 1.0]}),
     "joint": ("twodof", "joint", {"payload": 0.2}),
