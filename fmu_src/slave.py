@@ -34,6 +34,7 @@ ALLOWED = {
     "fmi2Set of an input": {INSTANTIATED, INITIALIZATION, STEP},
 }
 PHASES = (INSTANTIATED, INITIALIZATION, STEP, TERMINATED, ERROR)
+COMPUTED = ("output", "local")  # causalities
 TIME_TOLERANCE = 1e-9
 MAX_STATE = 64 * 1024  # bytes, of a serialised state; that of 128 joints has half of them
 UNSOUND = "the state is none that an instance can be in"
@@ -173,7 +174,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             variable = self._variable(vr, kind, f"fmi2Get{kind}")
             if variable is None:
                 values.append(nothing)
-            elif variable.causality == "output":
+            elif variable.causality in COMPUTED:
                 values.append(self._output(variable.group)[variable.index])
             else:
                 value = getattr(self._plant, variable.group)
@@ -202,14 +203,15 @@ class TwoDofSlave(fmi.Fmi2Slave):
         if self._phase == INITIALIZATION:
             self._outputs.clear()
         else:
-            self._outputs.pop("tau", None)
+            for group in ("tau", "der_v"):
+                self._outputs.pop(group, None)
 
     def _settable(self, vr, value, kind):
         variable = self._variable(vr, kind, f"fmi2Set{kind}")
         if variable is None:
             return None
-        if variable.causality == "output":
-            self._refuse(f"fmi2Set{kind}: {variable.name} is an output and cannot be set")
+        if variable.causality in COMPUTED:
+            self._refuse(f"fmi2Set{kind}: {variable.name} is computed and cannot be set")
             return None
         article = "a" if variable.causality == "parameter" else "an"
         if not self._allowed(f"fmi2Set of {article} {variable.causality}", variable.name):
@@ -232,7 +234,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
     # --- state ---
 
     def _get_fmu_state(self):
-        groups = {variable.group for variable in self._table if variable.causality != "output"}
+        groups = {variable.group for variable in self._table if variable.causality not in COMPUTED}
         values = {group: getattr(self._plant, group) for group in sorted(groups | {"q", "v"})}
         return {
             "identity": self._identity, "phase": self._phase, "time": self._time,

@@ -22,7 +22,7 @@ from twodof.export.flavours import engine_sources
 from twodof.export.native import model_header
 from twodof.plant.plant import Plant
 from twodof.plant.robot import Robot, load_robot
-from twodof.plant.variables import CONTROLS, Variable, variable_table
+from twodof.plant.variables import Variable, variable_table
 
 ROOT = Path(__file__).parents[1]
 HERE = Path(__file__).parent / "native"
@@ -74,8 +74,7 @@ class Model:
         headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
         files = engine_sources(self.control)
         files |= {path.name: path.read_bytes() for path in (*headers, *more)}
-        law = CONTROLS[self.control]
-        files["model.h"] = model_header(self.robot, self.table, law, GUID).encode()
+        files["model.h"] = model_header(self.robot, self.table, self.control, GUID).encode()
         return files
 
 
@@ -206,10 +205,10 @@ class Engine:
         return int(row[0]), int(row[1]), float(row[2])
 
     def values(self, plant: Plant) -> np.ndarray:
-        """All variables of a Python plant by value reference; x, xd and tau are 0."""
+        """All variables of a Python plant by value reference; what is computed is 0."""
         row = []
         for variable in self.model.table:
-            if variable.group in ("x", "xd", "quat", "omega", "tau"):
+            if variable.causality in ("output", "local") and variable.group not in ("q", "v"):
                 row.append(0.0)
                 continue
             value = getattr(plant, variable.group)
@@ -237,8 +236,8 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
             (folder / file).write_bytes(content)
         subprocess.run(
             ["gcc", "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
-             "-Werror", "-fno-math-errno", "-fvisibility=hidden", *flags, "-o", output,
-             *sorted(f for f in files if f.endswith(".c")), "-lm"],
+             "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
+             "-o", output, *sorted(f for f in files if f.endswith(".c")), "-lm"],
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
     return output

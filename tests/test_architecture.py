@@ -22,6 +22,7 @@ ROOMS = {
     "export": "makes an FMU of the plant, and runs none",
     "fmu": "an FMU's file and an instance of it, whoever made it",
     "experiments": "what an FMU is to do, checked",
+    "linear": "an FMU's derivatives, at an operating point that is checked",
     "master": "does it",
     "kinematics": "of a URDF, for all that shows or transforms",
     "ros": "what ROS 2 is told of a run",

@@ -210,16 +210,25 @@ def test_every_call_in_every_phase(phase, call):
 
 def test_functions_that_are_not_supported_return_an_error():
     arm = Arm()
-    for function in (
-        "EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode", "CompletedIntegratorStep",
-        "SetTime", "SetContinuousStates", "GetDerivatives", "GetEventIndicators",
-        "GetContinuousStates", "GetNominalsOfContinuousStates", "GetDirectionalDerivative",
-        "SetRealInputDerivatives", "GetRealOutputDerivatives",
-    ):  # fmt: skip
+    for function in ("SetRealInputDerivatives", "GetRealOutputDerivatives"):
         arm.messages.clear()
         null = ctypes.c_void_p()
         assert arm.dll[f"fmi2{function}"](ctypes.c_void_p(arm.component), *[null] * 6) == ERROR
         assert arm.messages == [(ERROR, f"fmi2{function} is not supported by this FMU")]
+
+
+def test_calls_of_model_exchange_are_refused_in_co_simulation():
+    arm = Arm()
+    for function in (
+        "EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode",
+        "CompletedIntegratorStep", "SetContinuousStates", "GetDerivatives", "GetEventIndicators",
+        "GetContinuousStates", "GetNominalsOfContinuousStates",
+    ):  # fmt: skip
+        arm.messages.clear()
+        null = ctypes.c_void_p()
+        assert arm.dll[f"fmi2{function}"](ctypes.c_void_p(arm.component), *[null] * 3) == ERROR
+        text = f"fmi2{function} is a call of Model Exchange, and the instance is one of"
+        assert arm.messages == [(ERROR, f"{text} co-simulation")]
 
 
 # --- refusals ---
@@ -239,7 +248,7 @@ def test_refusals_name_the_culprit():
     beyond = len(arm.of.table)
     arm.refused(f"no variable with value reference {beyond}", "getReal", [0, beyond])
     arm.refused("no variable with value reference 4294967295", "setReal", [2**32 - 1], [0.0])
-    arm.refused(r"q\[1\] is an output and cannot be set", "setReal", [vr("q[1]")], [0.0])
+    arm.refused(r"q\[1\] is computed and cannot be set", "setReal", [vr("q[1]")], [0.0])
     arm.refused(r"parameter \(max_step\) is not allowed", "setReal", [vr("max_step")], [0.1])
     arm.refused(r"x_des\[1\] is of type Real", "getInteger", [0])
     arm.refused(r"x_des\[1\] is of type Real", "setString", [0], ["a"])
@@ -375,9 +384,13 @@ def forged(arm, field, value):
     blob = arm.snapshot()
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
-    layout = struct.Struct(f"={head}s{n + 2}d4iQ")
+    joints = len(arm.of.robot.joints)
+    layout = struct.Struct(f"={head}s{n + 2}d{2 * joints + 2}i6iQ")
     fields = list(layout.unpack(blob))
-    names = ["time", "stop_time", "phase", "initialised", "has_x", "has_tau"]
+    names = ["time", "stop_time"]
+    names += [f"{what}[{i + 1}]" for what in ("held", "watched") for i in range(joints)]
+    names += ["any_held", "any_watched", "phase", "initialised"]
+    names += ["has_x", "has_tau", "has_stops", "has_rates"]
     place = n + 1 + names.index(field) if field in names else 1 + arm.of.reference(field)
     fields[place] = value
     fields[-1] = fnv(layout.pack(*fields)[:-8])
@@ -394,7 +407,9 @@ def fnv(content):
 
 UNSOUND = "fmi2DeSerializeFMUstate: the state is none that an instance can be in"
 FORGERIES = {
-    "phase": ((-1, 5, 77, 2**31 - 1, -(2**31)), UNSOUND),
+    "held[1]": ((2, -1), UNSOUND),
+    "watched[2]": ((1, 7), UNSOUND),  # of a joint that is not held
+    "phase": ((-1, 4, 5, 7, 77, 2**31 - 1, -(2**31)), UNSOUND),
     "time": ((np.nan, np.inf, -np.inf), UNSOUND),
     "stop_time": ((np.nan, -np.inf), UNSOUND),
     "x_des[1]": ((np.nan, np.inf), UNSOUND),
@@ -420,7 +435,13 @@ def test_a_state_with_a_right_checksum_and_a_wrong_field_is_refused(field):
         arm.refused(message, "deSerializeFMUstate", forged(arm, field, value))
 
 
-@pytest.mark.parametrize("field", ["initialised", "has_x", "has_tau", "x[1]", "tau[1]"])
+@pytest.mark.parametrize(
+    "field",
+    [
+        "initialised", "has_x", "has_tau", "has_stops", "has_rates", "any_held", "x[1]", "tau[1]",
+        "der(v[1])",
+    ],
+)  # fmt: skip
 def test_what_a_state_computes_on_demand_is_not_taken_from_its_bytes(field):
     arm, other = Arm(), Arm(start=False)
     arm.step()

@@ -367,7 +367,7 @@ def refuse_second_initialisation(driver):
 REFUSALS = {
     refuse_nan_input: "x_des[1] = nan is not finite",
     refuse_infinite_input: "Kn = inf is not finite",
-    refuse_output: "fmi2SetReal: q[1] is an output and cannot be set",
+    refuse_output: "fmi2SetReal: q[1] is computed and cannot be set",
     refuse_parameter: "fmi2Set of a parameter (rtol) is not allowed in the state 'step mode'",
     refuse_unknown_reference: "fmi2SetReal: there is no variable with value reference 999",
     refuse_huge_reference: "fmi2SetReal: there is no variable with value reference -1",

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from .export.package import build_fmu as build_fmu
     from .fmu import Fmu as Fmu
     from .fmu import load_fmu as load_fmu
+    from .linear import LinearModel as LinearModel
+    from .linear import linearise as linearise
     from .master import RealTime as RealTime
     from .master import Sample as Sample
     from .master import Sink as Sink
@@ -47,6 +49,7 @@ _HOMES = {
     "experiments": ("Experiment", "experiment"),
     "export.package": ("FmuOptions", "build_fmu"),
     "fmu": ("Fmu", "load_fmu"),
+    "linear": ("LinearModel", "linearise"),
     "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
     "pages.live": ("live",),
     "pages.replay": ("view",),

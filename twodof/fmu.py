@@ -18,10 +18,12 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import fmpy
+import numpy as np
 from fmpy import fmi2
 from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
 from fmpy.model_description import ModelDescription, ScalarVariable
+from numpy.typing import NDArray
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
 from .export.python_wrapper import check_python_wrapper
@@ -213,6 +215,15 @@ class Instance:
             return tuple(values)
 
         return read
+
+    def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
+        """∂unknown/∂known at the instance's state, a row each of the unknown."""
+        references = [[self._fmu.variables[n].valueReference for n in u] for u in (unknown, known)]
+        columns = [
+            self._slave.getDirectionalDerivative(references[0], [k], [1.0]) for k in references[1]
+        ]
+        matrix: NDArray[np.float64] = np.array(columns).reshape(len(known), len(unknown)).T
+        return matrix
 
     def free(self) -> None:
         """End the instance; after a fatal failure the standard allows no further call."""

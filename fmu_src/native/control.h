@@ -11,4 +11,9 @@
 INTERNAL int command(const double value[N_VARIABLES], Placement joint[N_BODIES],
                      const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS]);
 
+#ifdef HAS_RCOND
+/* The singular values of J at a position over the largest, which comes first. */
+INTERNAL void conditioning(const double q[N_JOINTS], double ratio[N_ROWS]);
+#endif
+
 #endif

@@ -1,4 +1,4 @@
-/* FMI 2.0 co-simulation: the life of an instance and its steps. */
+/* FMI 2.0: the life of an instance, and the steps of co-simulation. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -29,8 +29,8 @@ static const char *why_not(fmi2String name, fmi2Type type, fmi2String guid)
 {
     if (!name || !*name)
         return "fmi2Instantiate: the instance has no name";
-    if (type != fmi2CoSimulation)
-        return "fmi2Instantiate: this FMU is for co-simulation only";
+    if (type != fmi2CoSimulation && type != fmi2ModelExchange)
+        return "fmi2Instantiate: the type is neither co-simulation nor Model Exchange";
     if (!guid || strcmp(guid, MODEL_GUID) != 0)
         return "fmi2Instantiate: the GUID is not that of this FMU, " MODEL_GUID;
     return NULL;
@@ -43,7 +43,8 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     (void)resources, (void)visible;
     if (!functions)
         return NULL;
-    Instance draft = {.log = functions->logger,
+    Instance draft = {.kind = type,
+                      .log = functions->logger,
                       .environment = functions->componentEnvironment,
                       .name = name ? name : "",
                       .verbose = logging_on};
@@ -121,7 +122,7 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component component)
     Instance *instance = enter(component, EXIT_INITIALIZATION);
     if (!instance || initialise(instance, 1) != fmi2OK)
         return fmi2Error;
-    instance->state.phase = STEP;
+    instance->state.phase = instance->kind == fmi2ModelExchange ? EVENT : STEP;
     return fmi2OK;
 }
 
@@ -188,7 +189,7 @@ fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
         return discard(instance, point, h, &obstacle);
     }
     state->time = point + h;
-    state->has_x = state->has_tau = 0;
+    state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
     return fmi2OK;
 }
 

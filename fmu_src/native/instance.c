@@ -1,6 +1,6 @@
-/* The state machine of FMI 2.0 co-simulation, messages, and initialisation. */
+/* The state machine of FMI 2.0, messages, and initialisation. */
 #include "instance.h"
-#include "stops.h"
+#include "events.h"
 
 #include <math.h>
 #include <stdarg.h>
@@ -8,42 +8,61 @@
 #include <string.h>
 
 static const char *const PHASE_NAME[N_PHASES] = {
-    "instantiated", "initialization mode", "step mode", "step failed", "terminated"};
+    "instantiated", "initialization mode", "step mode", "step failed", "event mode",
+    "continuous-time mode", "terminated"};
 
 enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
-       T = 1 << TERMINATED, ANY = N | I | S | F | T };
+       E = 1 << EVENT, C = 1 << CONTINUOUS_TIME, T = 1 << TERMINATED,
+       ANY = N | I | S | F | E | C | T };
 
-/* FMI 2.0.4, section 4.2.4: each call and the phases in which it is allowed. A refused call
-   changes nothing, so there is no error phase. */
+/* Of which kind of instance a call is. */
+typedef enum { BOTH, SIMULATION, EXCHANGE } Kind;
+static const char *const KIND_NAME[] = {"", "co-simulation", "Model Exchange"};
+
+/* FMI 2.0.4, sections 3.2.3 and 4.2.4: each call, the phases in which it is allowed, and where it is of
+   one kind alone. A refused call changes nothing, so there is no error phase. */
 static const struct {
     const char *name;
     int phases;
+    Kind kind;
 } CALLS[N_CALLS] = {
     [SET_DEBUG_LOGGING] = {"fmi2SetDebugLogging", ANY},
     [SETUP_EXPERIMENT] = {"fmi2SetupExperiment", N},
     [ENTER_INITIALIZATION] = {"fmi2EnterInitializationMode", N},
     [EXIT_INITIALIZATION] = {"fmi2ExitInitializationMode", I},
-    [TERMINATE] = {"fmi2Terminate", S | F},
+    [TERMINATE] = {"fmi2Terminate", S | F | E | C},
     [RESET] = {"fmi2Reset", ANY},
-    [DO_STEP] = {"fmi2DoStep", S},
-    [CANCEL_STEP] = {"fmi2CancelStep", 0}, /* no step is ever pending */
-    [GET_STATUS] = {"fmi2GetStatus", S | F | T},
-    [GET_REAL] = {"fmi2GetReal", I | S | F | T},
-    [GET_INTEGER] = {"fmi2GetInteger", I | S | F | T},
-    [GET_BOOLEAN] = {"fmi2GetBoolean", I | S | F | T},
-    [GET_STRING] = {"fmi2GetString", I | S | F | T},
-    [SET_REAL] = {"fmi2SetReal", N | I | S},
-    [SET_INTEGER] = {"fmi2SetInteger", N | I | S},
-    [SET_BOOLEAN] = {"fmi2SetBoolean", N | I | S},
-    [SET_STRING] = {"fmi2SetString", N | I | S},
-    [SET_INPUT] = {"fmi2Set of an input", N | I | S},
+    [DO_STEP] = {"fmi2DoStep", S, SIMULATION},
+    [CANCEL_STEP] = {"fmi2CancelStep", 0, SIMULATION}, /* no step is ever pending */
+    [GET_STATUS] = {"fmi2GetStatus", S | F | T, SIMULATION},
+    [GET_REAL] = {"fmi2GetReal", I | S | F | E | C | T},
+    [GET_INTEGER] = {"fmi2GetInteger", I | S | F | E | C | T},
+    [GET_BOOLEAN] = {"fmi2GetBoolean", I | S | F | E | C | T},
+    [GET_STRING] = {"fmi2GetString", I | S | F | E | C | T},
+    [SET_REAL] = {"fmi2SetReal", N | I | S | E | C},
+    [SET_INTEGER] = {"fmi2SetInteger", N | I | S | E | C},
+    [SET_BOOLEAN] = {"fmi2SetBoolean", N | I | S | E | C},
+    [SET_STRING] = {"fmi2SetString", N | I | S | E | C},
+    [SET_INPUT] = {"fmi2Set of an input", N | I | S | E | C},
     [SET_PARAMETER] = {"fmi2Set of a parameter", N | I},
+    [SET_Q_V] = {"fmi2Set of a state", E | C},
     [GET_STATE] = {"fmi2GetFMUstate", ANY},
     [SET_STATE] = {"fmi2SetFMUstate", ANY},
     [FREE_STATE] = {"fmi2FreeFMUstate", ANY},
     [SIZE_OF_STATE] = {"fmi2SerializedFMUstateSize", ANY},
     [SERIALIZE] = {"fmi2SerializeFMUstate", ANY},
     [DESERIALIZE] = {"fmi2DeSerializeFMUstate", ANY},
+    [ENTER_EVENT_MODE] = {"fmi2EnterEventMode", C, EXCHANGE},
+    [NEW_DISCRETE_STATES] = {"fmi2NewDiscreteStates", E, EXCHANGE},
+    [ENTER_CONTINUOUS_TIME_MODE] = {"fmi2EnterContinuousTimeMode", E, EXCHANGE},
+    [COMPLETED_INTEGRATOR_STEP] = {"fmi2CompletedIntegratorStep", C, EXCHANGE},
+    [SET_TIME] = {"fmi2SetTime", E | C, EXCHANGE},
+    [SET_CONTINUOUS_STATES] = {"fmi2SetContinuousStates", C, EXCHANGE},
+    [GET_DERIVATIVES] = {"fmi2GetDerivatives", I | E | C | T, EXCHANGE},
+    [GET_EVENT_INDICATORS] = {"fmi2GetEventIndicators", I | E | C | T, EXCHANGE},
+    [GET_CONTINUOUS_STATES] = {"fmi2GetContinuousStates", I | E | C | T, EXCHANGE},
+    [GET_DIRECTIONAL_DERIVATIVE] = {"fmi2GetDirectionalDerivative", I | S | F | E | C | T},
+    [GET_NOMINALS] = {"fmi2GetNominalsOfContinuousStates", N | I | E | C | T, EXCHANGE},
 };
 
 const char *call_name(Call call)
@@ -54,11 +73,23 @@ const char *call_name(Call call)
 int allowed(Instance *instance, Call call, const char *culprit)
 {
     const int phase = instance->state.phase;
+    const Kind kind = instance->kind == fmi2ModelExchange ? EXCHANGE : SIMULATION;
+    if (CALLS[call].kind != BOTH && CALLS[call].kind != kind) {
+        report(instance, fmi2Error, "%s is a call of %s, and the instance is one of %s",
+               CALLS[call].name, KIND_NAME[CALLS[call].kind], KIND_NAME[kind]);
+        return 0;
+    }
     if (CALLS[call].phases >> phase & 1)
         return 1;
     report(instance, fmi2Error, "%s%s%s%s is not allowed in the state '%s'", CALLS[call].name,
            culprit ? " (" : "", culprit ? culprit : "", culprit ? ")" : "", PHASE_NAME[phase]);
     return 0;
+}
+
+int can_be_in(fmi2Type kind, int phase)
+{
+    const int other = kind == fmi2ModelExchange ? S | F : E | C;
+    return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
 }
 
 Instance *enter(fmi2Component component, Call call)
@@ -160,6 +191,21 @@ fmi2Status initialise(Instance *instance, int warn)
     }
     stop_at_start(&state->plant);
     state->initialised = 1;
-    state->has_x = state->has_tau = 0;
+    state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
     return fmi2OK;
+}
+
+void update_stops(State *state)
+{
+    if (!state->has_stops)
+        find_stops(&state->plant, &state->stops);
+    state->has_stops = 1;
+}
+
+void update_rates(State *state)
+{
+    update_stops(state);
+    if (!state->has_rates)
+        compute_rates(&state->plant, &state->stops);
+    state->has_rates = 1;
 }

@@ -9,4 +9,7 @@
 #define INTERNAL
 #endif
 
+/* The real part of what is compared: numbers are complex where the engine is compiled for derivatives. */
+#define RE(x) (x)
+
 #endif

@@ -8,12 +8,12 @@ void quaternion(double R[3][3], double q[4])
 {
     const double trace = R[0][0] + R[1][1] + R[2][2];
     int i = 0; /* the largest of the axis' components */
-    if (R[1][1] > R[0][0])
+    if (RE(R[1][1]) > RE(R[0][0]))
         i = 1;
-    if (R[2][2] > R[i][i])
+    if (RE(R[2][2]) > RE(R[i][i]))
         i = 2;
     const int j = (i + 1) % 3, k = (i + 2) % 3;
-    if (trace > 0.0) { /* w is large enough to divide by */
+    if (RE(trace) > 0.0) { /* w is large enough to divide by */
         const double twice = sqrt(trace + 1.0);
         q[3] = 0.5 * twice;
         q[0] = (R[2][1] - R[1][2]) * 0.5 / twice;
@@ -26,7 +26,7 @@ void quaternion(double R[3][3], double q[4])
         q[k] = (R[k][i] + R[i][k]) * 0.5 / twice;
         q[3] = (R[k][j] - R[j][k]) * 0.5 / twice;
     }
-    const double sign = q[3] < 0.0 ? -1.0 : 1.0;
+    const double sign = RE(q[3]) < 0.0 ? -1.0 : 1.0;
     for (int c = 0; c < 4; c++)
         q[c] *= sign;
 }
@@ -45,7 +45,7 @@ void rotation_error(const double target[4], double R[3][3], double error[3])
     const double w = a[3] * b[3] + a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     const double sine = sqrt(x * x + y * y + z * z);
     const double angle = 2.0 * atan2(sine, fabs(w));
-    const double factor = sine == 0.0 ? 0.0 : w >= 0.0 ? angle / sine : -angle / sine;
+    const double factor = (RE(w) >= 0.0 ? 1.0 : -1.0) * (RE(sine) == 0.0 ? 2.0 : angle / sine);
     error[0] = factor * x;
     error[1] = factor * y;
     error[2] = factor * z;

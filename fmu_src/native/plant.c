@@ -18,7 +18,7 @@
 
 static double saturated(double tau, double limit)
 {
-    return tau > limit ? limit : tau < -limit ? -limit : tau;
+    return RE(tau) > RE(limit) ? limit : RE(tau) < -RE(limit) ? -limit : tau;
 }
 
 /* The robot as it is, or as its control law knows it. */

@@ -26,7 +26,7 @@ static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_R
     const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g11 = dot(J[1], J[1]);
     const double determinant = g00 * g11 - g01 * g01;
     const double trace = g00 + g11;
-    if (!(determinant > smallest * trace * trace)) /* ≤ σ_min²/σ_max² */
+    if (!(RE(determinant) > RE(smallest * trace * trace))) /* ≤ σ_min²/σ_max² */
         return 0;
     y[0] = (g11 * b[0] - g01 * b[1]) / determinant;
     y[1] = (g00 * b[1] - g01 * b[0]) / determinant;
@@ -39,7 +39,7 @@ static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_R
     const double c12 = g01 * g02 - g00 * g12, c22 = g00 * g11 - g01 * g01;
     const double determinant = g00 * c00 + g01 * c01 + g02 * c02;
     const double trace = g00 + g11 + g22;
-    if (!(4.0 * determinant > smallest * trace * trace * trace)) /* as λ₁λ₂ ≤ (λ₁ + λ₂)²/4 */
+    if (!(RE(4.0 * determinant) > RE(smallest * trace * trace * trace))) /* as λ₁λ₂ ≤ (λ₁ + λ₂)²/4 */
         return 0;
     y[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant;
     y[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant;
@@ -61,13 +61,13 @@ static void orthogonalise(double J[N_ROWS][N_JOINTS], double b[N_ROWS])
         for (int i = 0; i < N_ROWS; i++)
             for (int j = i + 1; j < N_ROWS; j++) {
                 const double ii = dot(J[i], J[i]), ij = dot(J[i], J[j]), jj = dot(J[j], J[j]);
-                if (!(fabs(ij) > ORTHOGONAL * sqrt(ii * jj)))
+                if (!(RE(fabs(ij)) > RE(ORTHOGONAL * sqrt(ii * jj))))
                     continue;
                 rotated = 1;
                 const double zeta = (jj - ii) / (2.0 * ij);
                 const double t = 1.0 / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
                 const double c = 1.0 / sqrt(1.0 + t * t);
-                const double s = zeta >= 0.0 ? c * t : -c * t;
+                const double s = RE(zeta) >= 0.0 ? c * t : -c * t;
                 for (int k = 0; k < N_JOINTS; k++) {
                     const double x = J[i][k], y = J[j][k];
                     J[i][k] = c * x - s * y;
@@ -80,6 +80,35 @@ static void orthogonalise(double J[N_ROWS][N_JOINTS], double b[N_ROWS])
     }
 }
 
+#ifdef IS_COMPLEX
+/* The rows are orthogonal, their variations are not yet: what is dropped is turned out of what is kept,
+   and b makes up for the rest, to first order. */
+static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double square[N_ROWS],
+                 const int kept[N_ROWS])
+{
+    double part[N_ROWS];
+    for (int i = 0; i < N_ROWS; i++)
+        for (int j = 0; j < N_ROWS && kept[i]; j++) {
+            if (kept[j])
+                continue;
+            const double t = dot(J[i], J[j]) / (square[i] - square[j]), old = b[i];
+            for (int k = 0; k < N_JOINTS; k++) {
+                const double x = J[i][k];
+                J[i][k] += t * J[j][k];
+                J[j][k] -= t * x;
+            }
+            b[i] += t * b[j];
+            b[j] -= t * old;
+        }
+    for (int k = 0; k < N_ROWS; k++)
+        part[k] = kept[k] ? b[k] / square[k] : 0.0;
+    for (int i = 0; i < N_ROWS; i++)
+        for (int j = 0; j < N_ROWS; j++)
+            if (i != j)
+                b[i] -= dot(J[i], J[j]) * part[j];
+}
+#endif
+
 int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
                          double result[N_JOINTS])
 {
@@ -87,20 +116,40 @@ int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rc
     int rank = N_ROWS;
     if (!solve_normal_equations(J, b, fmax(rcond * rcond, WELL_CONDITIONED), y)) {
         double square[N_ROWS], largest = 0.0;
+        int kept[N_ROWS];
         orthogonalise(J, b);
         for (int k = 0; k < N_ROWS; k++) {
             square[k] = dot(J[k], J[k]);
             largest = fmax(largest, square[k]);
         }
         for (int k = 0; k < N_ROWS; k++) {
-            const int kept = square[k] > rcond * rcond * largest;
-            y[k] = kept ? b[k] / square[k] : 0.0;
-            rank -= !kept;
+            kept[k] = RE(square[k]) > RE(rcond * rcond * largest);
+            rank -= !kept[k];
         }
+#ifdef IS_COMPLEX
+        vary(J, b, square, kept);
+#endif
+        for (int k = 0; k < N_ROWS; k++)
+            y[k] = kept[k] ? b[k] / square[k] : 0.0;
     }
     memset(result, 0, N_JOINTS * sizeof *result);
     for (int k = 0; k < N_ROWS; k++)
         for (int i = 0; i < N_JOINTS; i++)
             result[i] += y[k] * J[k][i];
     return rank;
+}
+
+void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
+{
+    double nothing[N_ROWS] = {0};
+    orthogonalise(J, nothing);
+    for (int k = 0; k < N_ROWS; k++) { /* by insertion, the largest first */
+        const double sigma = sqrt(dot(J[k], J[k]));
+        int place = k;
+        for (; place > 0 && RE(ratio[place - 1]) < RE(sigma); place--)
+            ratio[place] = ratio[place - 1];
+        ratio[place] = sigma;
+    }
+    for (int k = N_ROWS - 1; k >= 0; k--)
+        ratio[k] = RE(ratio[0]) > 0.0 ? ratio[k] / ratio[0] : 0.0;
 }

@@ -10,4 +10,8 @@
 INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
                                   double result[N_JOINTS]);
 
+/* The singular values of J over the largest, which comes first; 0 where that is 0. J is used as
+   working memory. */
+INTERNAL void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS]);
+
 #endif

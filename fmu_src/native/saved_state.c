@@ -15,6 +15,8 @@ static const char NULL_POINTER[] = "null pointer";
 static const char FOREIGN[] = "the state is not one of this FMU";
 static const char UNSOUND[] = "the state is none that an instance can be in";
 
+static const char OTHER_KIND[] = "the state is one of the FMU's other kind of instance";
+
 static int is_own(const State *state)
 {
     return memcmp(state->guid, MODEL_GUID, sizeof MODEL_GUID) == 0;
@@ -42,6 +44,20 @@ static int are_booleans(const double value[])
     return 1;
 }
 
+/* Whether the joints that are said to rest are so by truth values; what these amount to is counted. */
+static int are_stops(Stops *stops)
+{
+    int sound = 1;
+    stops->any_held = stops->any_watched = 0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const int held = stops->held[i], watched = stops->watched[i];
+        sound = sound && (held == 0 || held == 1) && (watched == 0 || watched == held);
+        stops->any_held |= held;
+        stops->any_watched |= watched;
+    }
+    return sound;
+}
+
 /* Take over a state from bytes that may be anybody's, with whatever checksum: each field is checked,
    and what follows from others is computed anew. A refusal is logged. */
 static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
@@ -49,15 +65,18 @@ static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
     State *state = &instance->state;
     const double *value = state->plant.value;
     memcpy(state, bytes, sizeof *state);
-    int sound = state->phase >= 0 && state->phase < N_PHASES && isfinite(state->time)
-                && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN]);
+    int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
+                && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN])
+                && are_stops(&state->stops);
     const int runs = state->phase >= STEP; /* before, what is wrong is told where it begins */
+    const int steps = runs && instance->kind == fmi2CoSimulation; /* solvers try what they like */
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));
-    for (int i = 0; i < N_JOINTS && runs; i++)
+    for (int i = 0; i < N_JOINTS && steps; i++)
         sound = sound && value[Q + i] >= value[Q_MIN + i] && value[Q + i] <= value[Q_MAX + i];
     state->initialised = runs;
-    state->has_x = state->has_tau = 0;
+    state->has_x = state->has_tau = state->has_rates = 0;
+    state->has_stops = runs && !steps && state->has_stops != 0;
     if (!sound)
         return refuse(instance, DESERIALIZE, UNSOUND);
     return runs ? check_parameters(instance) : fmi2OK;
@@ -87,6 +106,8 @@ fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate saved)
         return refuse(instance, SET_STATE, NULL_POINTER);
     if (!is_own(saved))
         return refuse(instance, SET_STATE, FOREIGN);
+    if (!can_be_in(instance->kind, ((const State *)saved)->phase))
+        return refuse(instance, SET_STATE, OTHER_KIND);
     memcpy(&instance->state, saved, sizeof(State));
     return fmi2OK;
 }

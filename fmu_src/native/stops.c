@@ -24,8 +24,9 @@ static void find_contacts(const Plant *plant, const double q[N_JOINTS], Contacts
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     contacts->count = 0;
     for (int i = 0; i < N_JOINTS; i++)
-        if (q[i] >= high[i] || q[i] <= low[i]) {
-            contacts->side[contacts->count] = low[i] == high[i] ? 0.0 : q[i] >= high[i] ? -1.0 : 1.0;
+        if (RE(q[i]) >= RE(high[i]) || RE(q[i]) <= RE(low[i])) {
+            contacts->side[contacts->count] =
+                low[i] == high[i] ? 0.0 : RE(q[i]) >= RE(high[i]) ? -1.0 : 1.0;
             contacts->joint[contacts->count++] = i;
         }
 }
@@ -69,7 +70,7 @@ static void complementary(const Contacts *contacts, const int fixed[N_JOINTS],
                           int active[N_JOINTS], double z[N_JOINTS])
 {
     for (int k = 0; k < contacts->count; k++)
-        active[k] = fixed[k] || contacts->side[k] * b[contacts->joint[k]] < 0.0;
+        active[k] = fixed[k] || RE(contacts->side[k] * b[contacts->joint[k]]) < 0.0;
     for (int pivot = 0; pivot < MOST_PIVOTS; pivot++) {
         int wrong = -1;
         solve(contacts, active, columns, b, z);
@@ -77,7 +78,7 @@ static void complementary(const Contacts *contacts, const int fixed[N_JOINTS],
             double w = b[contacts->joint[k]];
             for (int c = 0; c < contacts->count; c++)
                 w += columns[c][contacts->joint[k]] * z[c];
-            if (!fixed[k] && contacts->side[k] * (active[k] ? z[k] : w) < 0.0)
+            if (!fixed[k] && RE(contacts->side[k] * (active[k] ? z[k] : w)) < 0.0)
                 wrong = k;
         }
         if (wrong < 0)
@@ -104,7 +105,7 @@ void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[N_JOINTS]
     for (int k = 0; k < contacts.count; k++) {
         const double speed = v[contacts.joint[k]];
         fixed[k] = contacts.side[k] == 0.0;
-        into[k] = fixed[k] ? speed != 0.0 : contacts.side[k] * speed < 0.0;
+        into[k] = fixed[k] ? speed != 0.0 : RE(contacts.side[k] * speed) < 0.0;
         any |= into[k];
         fixed[k] |= kept[contacts.joint[k]];
     }
@@ -136,7 +137,7 @@ void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
             contacts.joint[count] = contacts.joint[k];
             contacts.side[count] = contacts.side[k];
             fixed[count] = kept[contacts.joint[k]] || contacts.side[k] == 0.0;
-            active[count] = fixed[count] || contacts.side[k] * a[contacts.joint[k]] <= 0.0;
+            active[count] = fixed[count] || RE(contacts.side[k] * a[contacts.joint[k]]) <= 0.0;
             count++;
         }
     contacts.count = count;
@@ -160,10 +161,14 @@ void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
     restrain(plant, stops, y, a, pressed);
 }
 
+int is_above(const Plant *plant, double q, int i)
+{
+    return RE(plant->value[Q_MAX + i] - q) <= RE(q - plant->value[Q_MIN + i]);
+}
+
 void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], double a[N_JOINTS],
               double pressed[N_JOINTS])
 {
-    const double *high = &plant->value[Q_MAX];
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
     Contacts contacts;
     double z[N_JOINTS], columns[N_JOINTS][N_JOINTS];
@@ -183,8 +188,16 @@ void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], 
     }
     for (int k = 0; k < contacts.count; k++) {
         const int i = contacts.joint[k];
-        const double outwards = q[i] >= high[i] ? 1.0 : -1.0;
+        const double outwards = is_above(plant, q[i], i) ? 1.0 : -1.0;
         pressed[i] = outwards * (rigid ? -z[k] : a[i]);
         a[i] = 0.0;
     }
+}
+
+void compute_rates(Plant *plant, const Stops *stops)
+{
+    double *value = plant->value, pressed[N_JOINTS];
+    memcpy(&value[DER_Q], &value[V], N_JOINTS * sizeof *value);
+    acceleration(plant, &value[Q], &value[V], &value[DER_V]);
+    restrain(plant, stops, &value[Q], &value[DER_V], pressed);
 }

@@ -21,8 +21,14 @@ INTERNAL void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[
 INTERNAL void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
                    const int kept[N_JOINTS], Stops *stops);
 
+/* Whether a joint is nearer to its upper limit than to its lower one. */
+INTERNAL int is_above(const Plant *plant, double q, int i);
+
 /* Make the acceleration of held joints 0; how each is pressed into its limit. */
 INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
                        double a[N_JOINTS], double pressed[N_JOINTS]);
+
+/* The derivatives of the plant's state, joints that rest being held. */
+INTERNAL void compute_rates(Plant *plant, const Stops *stops);
 
 #endif

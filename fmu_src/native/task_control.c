@@ -7,6 +7,8 @@
    Source: Luh, Walker & Paul, IEEE TAC 25(3), 1980; Khatib, IEEE J-RA 3(1), 1987. */
 #include "control.h"
 
+#include <string.h>
+
 #include "pseudo_inverse.h"
 #if N_ROWS > N_AXES
 #include "orientation.h"
@@ -58,4 +60,17 @@ int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const do
     for (int i = 0; i < N_JOINTS; i++)
         given[i] -= Kn * v[i];
     return rank;
+}
+
+void conditioning(const double q[N_JOINTS], double ratio[N_ROWS])
+{
+    const double still[N_JOINTS] = {0};
+    Placement joint[N_BODIES];
+    TaskFrame task;
+    double J[N_ROWS][N_JOINTS];
+    place_joints(q, joint);
+    task_frame(joint, still, &task);
+    for (int k = 0; k < N_ROWS; k++)
+        memcpy(J[k], task.J[k < N_AXES ? AXIS[k] : 3 + k - N_AXES], sizeof J[k]);
+    singular_ratios(J, ratio);
 }

@@ -2,6 +2,7 @@
 #include <math.h>
 #include <stddef.h>
 
+#include "directional.h"
 #include "instance.h"
 
 /* Types of variables; there are no integers and no strings. */
@@ -32,11 +33,22 @@ static int known(Instance *instance, Call call, Type type, const fmi2ValueRefere
     return 1;
 }
 
+/* Before the run q and v are guesses, by their start attributes: what they begin with is theirs to
+   compute. */
+static int is_guess(const Instance *instance, fmi2ValueReference vr)
+{
+    return vr >= Q && vr < X && instance->state.phase <= INITIALIZATION;
+}
+
 /* Whether a variable may be set now. */
 static int settable(Instance *instance, Call call, fmi2ValueReference vr)
 {
+    if (is_guess(instance, vr))
+        return 1;
+    if (vr >= Q && vr < X && instance->kind == fmi2ModelExchange)
+        return allowed(instance, SET_Q_V, VARIABLE_NAME[vr]);
     if (vr >= FIRST_OUTPUT && vr < FIRST_PARAMETER) {
-        report(instance, fmi2Error, "%s: %s is an output and cannot be set", call_name(call),
+        report(instance, fmi2Error, "%s: %s is computed and cannot be set", call_name(call),
                VARIABLE_NAME[vr]);
         return 0;
     }
@@ -44,10 +56,23 @@ static int settable(Instance *instance, Call call, fmi2ValueReference vr)
 }
 
 /* Take over a value; outputs that follow from it are computed anew when they are read. */
-static void set(State *state, fmi2ValueReference vr, double value)
+static void set(Instance *instance, fmi2ValueReference vr, double value)
 {
+    State *state = &instance->state;
+    if (is_guess(instance, vr)) {
+        const int start = Q_START + (int)vr - Q;
+        if (value != state->plant.value[start])
+            report(instance, fmi2Warning, "%s = %g is ignored before the run: the start is %s = %g",
+                   VARIABLE_NAME[vr], value, VARIABLE_NAME[start], state->plant.value[start]);
+        return;
+    }
+    const int is_state = vr >= Q && vr < X;
     state->plant.value[vr] = value;
-    state->has_tau = 0;
+    state->has_tau = state->has_rates = 0;
+    if (is_state)
+        state->has_x = 0;
+    if (is_state || instance->kind == fmi2CoSimulation) /* there a stop is decided at each point */
+        state->has_stops = 0;
     if (vr >= FIRST_PARAMETER)
         state->initialised = 0;
 }
@@ -58,13 +83,14 @@ static fmi2Status update(Instance *instance, fmi2ValueReference vr)
     State *state = &instance->state;
     if (!state->initialised && initialise(instance, 0) != fmi2OK)
         return fmi2Error;
-    if (vr >= X && vr < TAU && !state->has_x) {
+    if (vr >= TAU && check_inputs(instance) != fmi2OK)
+        return fmi2Error;
+    if (vr >= DER_Q) {
+        update_rates(state);
+    } else if (vr >= X && vr < TAU && !state->has_x) {
         compute_position(&state->plant);
         state->has_x = 1;
-    }
-    if (vr >= TAU && !state->has_tau) {
-        if (check_inputs(instance) != fmi2OK)
-            return fmi2Error;
+    } else if (vr >= TAU && !state->has_tau) {
         compute_effort(&state->plant);
         state->has_tau = 1;
     }
@@ -90,6 +116,52 @@ fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference vr[], s
     return fmi2OK;
 }
 
+/* What of the computed variables the derivative of one needs. */
+static int wants(fmi2ValueReference vr)
+{
+    return vr >= DER_Q ? WANTS_RATES : vr >= TAU ? WANTS_TAU : vr >= X ? WANTS_X : 0;
+}
+
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2ValueReference unknown[],
+                                        size_t n_unknown, const fmi2ValueReference given[],
+                                        size_t n_given, const fmi2Real seed[], fmi2Real result[])
+{
+    const Call call = GET_DIRECTIONAL_DERIVATIVE;
+    Instance *instance = enter(component, call);
+    double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
+    int wanted = 0;
+    if (!instance || !known(instance, call, REAL, unknown, n_unknown, result)
+        || !known(instance, call, REAL, given, n_given, seed))
+        return fmi2Error;
+    for (size_t i = 0; i < n_unknown; i++) {
+        if (unknown[i] < FIRST_OUTPUT || unknown[i] >= FIRST_PARAMETER)
+            return report(instance, fmi2Error, "%s: %s is not computed, it has no derivative",
+                          call_name(call), VARIABLE_NAME[unknown[i]]);
+        wanted |= wants(unknown[i]);
+    }
+    for (size_t i = 0; i < n_given; i++) {
+        if (given[i] >= X)
+            return report(instance, fmi2Error, "%s: %s is neither a state nor an input",
+                          call_name(call), VARIABLE_NAME[given[i]]);
+        if (!isfinite(seed[i]))
+            return report(instance, fmi2Error, "%s: the change of %s is not finite",
+                          call_name(call), VARIABLE_NAME[given[i]]);
+        change[given[i]] += seed[i];
+    }
+    if (!instance->state.initialised && initialise(instance, 0) != fmi2OK)
+        return fmi2Error;
+    update_stops(&instance->state);
+    differentiate(instance->state.plant.value, instance->state.stops.held, wanted, change,
+                  derivative);
+    for (size_t i = 0; i < n_unknown; i++)
+        if (!isfinite(derivative[unknown[i]]))
+            return report(instance, fmi2Discard, "%s: that of %s is not finite", call_name(call),
+                          VARIABLE_NAME[unknown[i]]);
+    for (size_t i = 0; i < n_unknown; i++)
+        result[i] = derivative[unknown[i]];
+    return fmi2OK;
+}
+
 fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference vr[], size_t count,
                        const fmi2Real value[])
 {
@@ -104,7 +176,7 @@ fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference vr[], s
                           isnan(value[i]) ? "nan" : value[i] > 0.0 ? "inf" : "-inf");
     }
     for (size_t i = 0; i < count; i++)
-        set(&instance->state, vr[i], value[i]);
+        set(instance, vr[i], value[i]);
     return fmi2OK;
 }
 
@@ -129,7 +201,7 @@ fmi2Status fmi2SetBoolean(fmi2Component component, const fmi2ValueReference vr[]
         if (!settable(instance, SET_BOOLEAN, vr[i]))
             return fmi2Error;
     for (size_t i = 0; i < count; i++)
-        set(&instance->state, vr[i], value[i] ? 1.0 : 0.0);
+        set(instance, vr[i], value[i] ? 1.0 : 0.0);
     return fmi2OK;
 }
 

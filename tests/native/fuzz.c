@@ -53,7 +53,8 @@ static const fmi2CallbackFunctions CALLBACKS = {log_message, calloc, free, NULL,
 
 static Instance *instantiate(void)
 {
-    return fmi2Instantiate("fuzz", fmi2CoSimulation, MODEL_GUID, "", &CALLBACKS, 0, (int)pick(2));
+    const fmi2Type kind = pick(2) ? fmi2CoSimulation : fmi2ModelExchange;
+    return fmi2Instantiate("fuzz", kind, MODEL_GUID, "", &CALLBACKS, 0, (int)pick(2));
 }
 
 static fmi2Status variables(Instance *c)
@@ -93,7 +94,8 @@ static void forge(fmi2Byte *bytes)
     uint64_t sum = UINT64_C(0xcbf29ce484222325);
     const unsigned vr = pick(N_VARIABLES);
     memcpy(&state, bytes, sizeof state);
-    switch (pick(6)) {
+    switch (pick(7)) {
+    case 6: state.stops.held[pick(N_JOINTS)] = (int)pick(4) - 1, state.has_stops = (int)pick(3); break;
     case 0: state.phase = pick(2) ? (int)pick(N_PHASES + 4) - 2 : (int)(pick(1u << 31) << 1); break;
     case 1: state.time = number(); break;
     case 2: state.stop_time = number(); break;
@@ -182,22 +184,75 @@ static fmi2Status ask(Instance *c)
     }
 }
 
-static fmi2Status unsupported(Instance *c)
+/* The calls of Model Exchange: with what is right they are done where the standard allows them. */
+static fmi2Status exchange(Instance *c)
 {
+    enum { N_STATES = 2 * N_JOINTS, ROOM = N_STATES + N_INDICATORS };
+    const int phase = c->state.phase, of_kind = c->kind == fmi2ModelExchange;
+    const int event = of_kind && phase == EVENT, runs = of_kind && phase == CONTINUOUS_TIME;
+    const int reads = event || runs || (of_kind && (phase == INITIALIZATION || phase == TERMINATED));
+    double x[ROOM];
+    int flags[2], finite = 1;
+    fmi2EventInfo info;
+    fmi2Status status;
+    for (int i = 0; i < ROOM; i++) {
+        x[i] = pick(60) ? (pick(2001) - 1000.0) * 4e-3 : number();
+        finite = finite && (i >= N_STATES || isfinite(x[i]));
+    }
+    if (pick(8) == 0) {
+        const fmi2ValueReference unknown = pick(N_VARIABLES + 1), known = pick(N_VARIABLES + 1);
+        const int right = unknown >= FIRST_OUTPUT && unknown < FIRST_PARAMETER && known < X;
+        status = fmi2GetDirectionalDerivative(c, &unknown, 1, &known, 1, x, x + 1);
+        CHECK(status == fmi2Error || (right && isfinite(x[0]) && phase != INSTANTIATED));
+        return status;
+    }
+    double *given = pick(30) ? x : NULL;
+    const size_t wrong = pick(30) == 0;
+    const int right = given && !wrong;
     switch (pick(13)) {
-    case 0: return fmi2GetDirectionalDerivative(c, NULL, 0, NULL, 0, NULL, NULL);
-    case 1: return fmi2SetRealInputDerivatives(c, NULL, 0, NULL, NULL);
-    case 2: return fmi2GetRealOutputDerivatives(c, NULL, 0, NULL, NULL);
-    case 3: return fmi2EnterEventMode(c);
-    case 4: return fmi2NewDiscreteStates(c, NULL);
-    case 5: return fmi2EnterContinuousTimeMode(c);
-    case 6: return fmi2CompletedIntegratorStep(c, 0, NULL, NULL);
-    case 7: return fmi2SetTime(c, number());
-    case 8: return fmi2SetContinuousStates(c, NULL, 0);
-    case 9: return fmi2GetDerivatives(c, NULL, 0);
-    case 10: return fmi2GetEventIndicators(c, NULL, 0);
-    case 11: return fmi2GetContinuousStates(c, NULL, 0);
-    default: return fmi2GetNominalsOfContinuousStates(c, NULL, 0);
+    case 0: return fmi2SetRealInputDerivatives(c, NULL, 0, NULL, NULL);
+    case 1: return fmi2GetRealOutputDerivatives(c, NULL, 0, NULL, NULL);
+    case 2:
+        status = fmi2EnterEventMode(c);
+        CHECK((status == fmi2OK) == runs && c->state.phase == (runs ? EVENT : phase));
+        return status;
+    case 3:
+    case 4:
+        status = fmi2NewDiscreteStates(c, given ? &info : NULL);
+        CHECK((status == fmi2OK) == (event && given));
+        for (int i = 0; i < N_JOINTS && status == fmi2OK; i++)
+            CHECK(c->state.plant.value[Q + i] >= c->state.plant.value[Q_MIN + i]
+                  && c->state.plant.value[Q + i] <= c->state.plant.value[Q_MAX + i]);
+        return status;
+    case 5:
+        status = fmi2EnterContinuousTimeMode(c);
+        CHECK((status == fmi2OK) == event && c->state.phase == (event ? CONTINUOUS_TIME : phase));
+        return status;
+    case 6:
+        status = fmi2CompletedIntegratorStep(c, 0, flags, given ? flags + 1 : NULL);
+        CHECK((status == fmi2OK) == (runs && given));
+        return status;
+    case 7:
+        status = fmi2SetTime(c, x[0]);
+        CHECK((status == fmi2OK) == ((runs || event) && isfinite(x[0])));
+        return status;
+    case 8:
+        status = fmi2SetContinuousStates(c, given, N_STATES + wrong);
+        CHECK((status == fmi2OK) == (runs && right && finite));
+        return status;
+    case 9:
+        status = fmi2GetDerivatives(c, given, N_STATES + wrong);
+        CHECK(status == fmi2Error || (reads && right));
+        return status;
+    case 10:
+        status = fmi2GetEventIndicators(c, given, N_INDICATORS + wrong);
+        CHECK(status == fmi2Error || (reads && right));
+        return status;
+    case 11:
+        status = fmi2GetContinuousStates(c, given, N_STATES + wrong);
+        CHECK(status == fmi2Error || (reads && right));
+        return status;
+    default: return fmi2GetNominalsOfContinuousStates(c, given, N_STATES + wrong);
     }
 }
 
@@ -223,13 +278,14 @@ static fmi2Status move(Instance *c)
     case 3:
         status = fmi2ExitInitializationMode(c);
         CHECK(status == fmi2Error || phase == INITIALIZATION);
-        CHECK(c->state.phase == (status == fmi2OK ? STEP : phase));
+        CHECK(c->state.phase == (status != fmi2OK ? phase
+                                 : c->kind == fmi2ModelExchange ? EVENT : STEP));
         return status;
     case 4:
         if (pick(4))
             return fmi2OK;
         status = fmi2Terminate(c);
-        CHECK((status == fmi2OK) == (phase == STEP || phase == STEP_FAILED));
+        CHECK((status == fmi2OK) == (phase != TERMINATED && phase >= STEP));
         return status;
     default:
         if (pick(4))
@@ -246,10 +302,10 @@ static void sequence(void)
     for (unsigned i = 0, length = 1 + pick(LONGEST); i < length; i++) {
         const State before = c->state;
         fmi2Status status;
-        switch (pick(10)) {
+        switch (c->kind == fmi2ModelExchange && pick(2) ? 2 : pick(10)) {
         case 0: status = ask(c); break;
         case 1: status = saved_states(c, &saved); break;
-        case 2: status = unsupported(c); CHECK(status == fmi2Error); break;
+        case 2: status = exchange(c); break;
         case 3:
         case 4: status = variables(c); break;
         case 5:
@@ -278,7 +334,7 @@ int main(int count, char *argument[])
     seed = count > 2 ? strtoull(argument[2], NULL, 10) * UINT64_C(0x9e3779b97f4a7c15) + 1 : 1;
     CHECK(!fmi2Instantiate("x", fmi2CoSimulation, "wrong", "", &CALLBACKS, 0, 0));
     CHECK(!fmi2Instantiate("x", fmi2CoSimulation, NULL, NULL, &CALLBACKS, 0, 0));
-    CHECK(!fmi2Instantiate("x", fmi2ModelExchange, MODEL_GUID, "", &CALLBACKS, 0, 0));
+    CHECK(!fmi2Instantiate("x", (fmi2Type)2, MODEL_GUID, "", &CALLBACKS, 0, 0));
     CHECK(!fmi2Instantiate("", fmi2CoSimulation, MODEL_GUID, "", &CALLBACKS, 0, 0));
     CHECK(!fmi2Instantiate("x", fmi2CoSimulation, MODEL_GUID, "", NULL, 0, 0));
     CHECK(fmi2DoStep(NULL, 0.0, 0.01, 0) == fmi2Error);

@@ -1,6 +1,7 @@
 /* Hands the engine's inner functions to the tests. */
 #include <string.h>
 
+#include "directional.h"
 #include "dynamics.h"
 #include "fmi2Functions.h"
 #include "integrator.h"
@@ -91,4 +92,25 @@ FMI2_Export void probe_outputs(double value[])
 {
     compute_position((Plant *)value);
     compute_effort((Plant *)value);
+}
+
+/* How all computed variables change where q, v and inputs do. */
+FMI2_Export void probe_differentiate(const double value[], const int held[], const double change[],
+                                     double derivative[])
+{
+    differentiate(value, held, WANTS_X | WANTS_TAU | WANTS_RATES, change, derivative);
+    for (int i = 0; i < N_JOINTS; i++) {
+        derivative[Q + i] = change[Q + i];
+        derivative[V + i] = change[V + i];
+    }
+}
+
+/* All computed variables. */
+FMI2_Export void probe_compute(double value[], const int held[])
+{
+    Stops stops = {.any_held = 1};
+    memcpy(stops.held, held, sizeof stops.held);
+    compute_position((Plant *)value);
+    compute_effort((Plant *)value);
+    compute_rates((Plant *)value, &stops);
 }

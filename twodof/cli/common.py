@@ -45,17 +45,17 @@ def in_options(text: str) -> str:
     return ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text)
 
 
-def parse_settings(texts: Iterable[str]) -> dict[str, Setting]:
-    """NAME=VALUE texts of a command line: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
+def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
+    """NAME=VALUE texts of an option: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
     settings: dict[str, Setting] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         name = name.strip()
         if not equals or not name:
-            raise CommandLineError(f"--set {text}: expected NAME=VALUE")
+            raise CommandLineError(f"{option} {text}: expected NAME=VALUE")
         if name in settings:
-            raise CommandLineError(f"--set {name} is given twice")
-        settings[name] = _parse_value(name, value.strip())
+            raise CommandLineError(f"{option} {name} is given twice")
+        settings[name] = _parse_value(f"{option} {name}", value.strip())
     return settings
 
 
@@ -65,7 +65,7 @@ def _parse_value(name: str, text: str) -> Setting:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise CommandLineError(f"--set {name}={text}: '{text}' is not a number") from None
+        raise CommandLineError(f"{name}={text}: '{text}' is not a number") from None
     return numbers[0] if len(numbers) == 1 else numbers
 
 

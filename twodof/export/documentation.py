@@ -64,6 +64,7 @@ def documentation(
         law=LAWS[control].replace("$frame", html.escape(robot.frame)),
         root=html.escape(robot.root),
         variables=rows,
+        kinds="co-simulation and Model Exchange" if flavour.exchanges else "co-simulation",
         limitations=flavour.limitations,
         version=version,
         guid=guid,

@@ -37,7 +37,8 @@ class Flavour:
     """What one flavour adds.
 
     Attributes:
-        attributes: of <CoSimulation> in the model description.
+        attributes: of <CoSimulation> in the model description, and of <ModelExchange>.
+        exchanges: whether it has Model Exchange too.
         files: resources and sources; the GUID is a digest of them.
         source_files: names under sources/ that a tool compiles.
         platforms: FMI platforms of the binaries.
@@ -48,6 +49,7 @@ class Flavour:
     """
 
     attributes: Mapping[str, str]
+    exchanges: bool
     files: Files
     source_files: Sequence[str]
     platforms: Sequence[str]
@@ -83,6 +85,7 @@ def python_flavour(
     wrapper = _pythonfmu() / "resources/binaries/linux64/libpythonfmu-export.so"
     return Flavour(
         attributes={"needsExecutionTool": "true"},
+        exchanges=False,
         files={f"resources/{path}": content for path, content in resources.items()},
         source_files=(),
         platforms=("linux64",),
@@ -117,7 +120,7 @@ def native_flavour(
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
 
     def header(guid: str) -> Files:
-        return {"model.h": model_header(robot, table, CONTROLS[control], guid).encode()}
+        return {"model.h": model_header(robot, table, control, guid).encode()}
 
     def finish(guid: str) -> Files:
         files = {f"sources/{path}": content for path, content in header(guid).items()}
@@ -128,7 +131,8 @@ def native_flavour(
         return files
 
     return Flavour(
-        attributes={"needsExecutionTool": "false"},
+        attributes={"needsExecutionTool": "false", "providesDirectionalDerivative": "true"},
+        exchanges=True,
         files={f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
         source_files=sorted(path for path in sources if path.endswith(".c")),
         platforms=platforms,

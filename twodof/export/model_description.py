@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Control, Variable
+from ..plant.variables import CONTROLS, Control, Variable, count_event_indicators
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
@@ -34,6 +34,7 @@ LOG_CATEGORIES = {
 DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
 VENDOR = "twodof"
 
+STATES = ("q", "v")
 START = ("q_start", "q_min", "q_max")
 """What q depends on at the start."""
 IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
@@ -49,6 +50,7 @@ def model_description(
     guid: str,
     version: str,
     flavour: Mapping[str, str],
+    exchanges: bool = False,
     source_files: Sequence[str] = (),
 ) -> bytes:
     """The XML text.
@@ -59,6 +61,7 @@ def model_description(
         guid: as it shall stand in the file; "" while it is being computed.
         version: version of this package.
         flavour: further attributes of <CoSimulation>, needsExecutionTool among them.
+        exchanges: whether there is <ModelExchange> too.
         source_files: names under sources/ that a tool compiles.
     """
     root = ET.Element(
@@ -75,17 +78,17 @@ def model_description(
     )
     capabilities = {
         "modelIdentifier": name,
-        "canHandleVariableCommunicationStepSize": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
         "canNotUseMemoryManagementFunctions": "true",
         **flavour,
     }
-    simulation = ET.SubElement(root, "CoSimulation", capabilities)
-    if source_files:
-        files = ET.SubElement(simulation, "SourceFiles")
-        for file in source_files:
-            ET.SubElement(files, "File", name=file)
+    if exchanges:
+        root.set("numberOfEventIndicators", str(count_event_indicators(robot, control)))
+        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
+        _source_files(ET.SubElement(root, "ModelExchange", exchange), source_files)
+    capabilities["canHandleVariableCommunicationStepSize"] = "true"
+    _source_files(ET.SubElement(root, "CoSimulation", capabilities), source_files)
     _units(root, table)
     categories = ET.SubElement(root, "LogCategories")
     for category, description in LOG_CATEGORIES.items():
@@ -98,11 +101,18 @@ def model_description(
         stepSize=repr(DEFAULT_STEP),
     )
     _vendor_annotation(root, robot, control)
-    _variables(root, table)
+    _variables(root, table, exchanges)
     _structure(root, robot, table, CONTROLS[control])
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
+
+
+def _source_files(interface: ET.Element, names: Sequence[str]) -> None:
+    if names:
+        files = ET.SubElement(interface, "SourceFiles")
+        for name in names:
+            ET.SubElement(files, "File", name=name)
 
 
 def _units(root: ET.Element, table: Sequence[Variable]) -> None:
@@ -126,9 +136,11 @@ def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
         ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
 
 
-def _variables(root: ET.Element, table: Sequence[Variable]) -> None:
+def _variables(root: ET.Element, table: Sequence[Variable], exchanges: bool) -> None:
     variables = ET.SubElement(root, "ModelVariables")
+    at = {(variable.group, variable.index): i for i, variable in enumerate(table, start=1)}
     for reference, variable in enumerate(table):
+        state = exchanges and variable.group in STATES
         attributes = {
             "name": variable.name,
             "valueReference": str(reference),
@@ -136,21 +148,30 @@ def _variables(root: ET.Element, table: Sequence[Variable]) -> None:
             "causality": variable.causality,
             "variability": "fixed" if variable.causality == "parameter" else "continuous",
         }
-        if variable.causality == "output":
-            attributes["initial"] = "calculated"
+        if variable.causality in ("output", "local"):
+            attributes["initial"] = "approx" if state else "calculated"
         elif variable.causality == "parameter":
             attributes["initial"] = "exact"
         scalar = ET.SubElement(variables, "ScalarVariable", attributes)
         typed = ET.SubElement(scalar, variable.type)
         if variable.unit:
             typed.set("unit", variable.unit)
-        if variable.start is not None:
+        start = variable.start
+        if state:  # FMI allows these two of an FMU for co-simulation alone neither
+            start = table[at[f"{variable.group}_start", variable.index] - 1].start
+            typed.set("reinit", "true")
+        if start is not None:
             boolean = variable.type == "Boolean"
-            typed.set("start", str(variable.start).lower() if boolean else repr(variable.start))
+            typed.set("start", str(start).lower() if boolean else repr(start))
+        if variable.derivative_of:
+            typed.set("derivative", str(at[variable.derivative_of, variable.index]))
 
 
 def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], control: Control) -> None:
     moves = robot.moves_frame()
+    effort = control.commands == "effort"
+    inputs = (*control.inputs, "tau_ext", "f_ext")
+    law = ("gravity", *control.parameters, "limit_effort")
 
     def known(groups: Sequence[str], joint: int | None = None, of_frame: bool = False) -> str:
         """1-based indices of variables, for one joint, for those that move the frame, or all."""
@@ -162,26 +183,47 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
             and (not of_frame or (variable.index is not None and moves[variable.index]))
         )
 
+    def now(variable: Variable) -> str:
+        """During the run: on states and inputs."""
+        own = variable.index
+        groups = {
+            "q": known(("q",), joint=own),
+            "v": known(("v",), joint=own),
+            "x": known(("q",), of_frame=True),
+            "quat": known(("q",), of_frame=True),
+            "omega": known(STATES, of_frame=True),
+            "xd": known(STATES, of_frame=True),
+            "tau": known(control.inputs, joint=own)
+            if effort
+            else known((*STATES, *control.inputs)),
+            "der_q": known(("v",), joint=own),
+            "der_v": known((*STATES, *inputs)),
+        }
+        return groups[variable.group]
+
     def at_the_start(variable: Variable) -> str:
-        if variable.group == "q":
-            return known(START, joint=variable.index)
-        if variable.group == "v":
-            return known(IMPACT)
-        if variable.group in ("x", "quat"):
-            return known(START, of_frame=True)
-        if variable.group in ("xd", "omega"):
-            return known(IMPACT)
-        if control.commands == "effort":
-            return known(("limit_effort", *control.inputs), joint=variable.index)
-        mechanics = (*IMPACT, "gravity", *control.parameters)
-        return known((*mechanics, "limit_effort", *control.inputs))
+        own = variable.index
+        groups = {
+            "q": known(START, joint=own),
+            "v": known(IMPACT),
+            "x": known(START, of_frame=True),
+            "quat": known(START, of_frame=True),
+            "omega": known(IMPACT),
+            "xd": known(IMPACT),
+            "tau": known(("limit_effort", *control.inputs), joint=own)
+            if effort
+            else known((*IMPACT, *law, *control.inputs)),
+            "der_q": known(IMPACT),
+            "der_v": known((*IMPACT, *law, *inputs)),
+        }
+        return groups[variable.group]
 
     structure = ET.SubElement(root, "ModelStructure")
     outputs = ET.SubElement(structure, "Outputs")
+    derivatives = ET.SubElement(structure, "Derivatives")
     initial = ET.SubElement(structure, "InitialUnknowns")
     for i, variable in enumerate(table, start=1):
-        if variable.causality == "output":
-            own = variable.index if control.commands == "effort" else None
-            now = known(control.inputs, joint=own) if variable.group == "tau" else ""
-            ET.SubElement(outputs, "Unknown", index=str(i), dependencies=now)
+        if variable.causality in ("output", "local"):
+            kind = outputs if variable.causality == "output" else derivatives
+            ET.SubElement(kind, "Unknown", index=str(i), dependencies=now(variable))
             ET.SubElement(initial, "Unknown", index=str(i), dependencies=at_the_start(variable))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
-from ..plant.variables import Control, Variable
+from ..plant.variables import CONTROLS, Variable, count_event_indicators
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "li
 """Where the table's parts begin: inputs, outputs, parameters, truth values among these."""
 
 
-def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid: str) -> str:
+def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: str) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
 
     Names from the URDF, which may be anybody's, are string literals and nothing else.
@@ -32,7 +32,7 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
     Args:
         robot: the robot, n joints in Pinocchio's order.
         table: its variables; a variable's place is its value reference.
-        control: what drives it.
+        control: what drives it, a key of ``CONTROLS``.
         guid: as the modelDescription has it.
 
     Raises:
@@ -60,7 +60,8 @@ def model_header(robot: Robot, table: Sequence[Variable], control: Control, guid
         f"#define N_BODIES {len(parents)}\n"
         f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
-        f"#define COMMANDS_ACCELERATION {int(control.commands == 'acceleration')}\n"
+        f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
+        f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
         _value_references(groups),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),

@@ -130,6 +130,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
             guid=guid,
             version=__version__,
             flavour=flavour.attributes,
+            exchanges=flavour.exchanges,
             source_files=flavour.source_files,
         )
 

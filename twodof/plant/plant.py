@@ -46,7 +46,8 @@ class Plant:
 
     Every variable of the table is an attribute of its group's name: lists of floats for vectors
     (SI units; task vectors in the root frame), floats and bools for scalars. ``q`` and ``v`` are
-    the state; ``x``, ``xd`` and ``tau`` are computed when read.
+    the state; ``x``, ``xd``, ``tau`` and the state's derivatives ``der_q`` and ``der_v`` are
+    computed when read.
 
     Args:
         robot: the robot.
@@ -93,7 +94,7 @@ class Plant:
         self.robot, self.control = robot, control
         self._law, self._commands = LAWS[control].command, CONTROLS[control].commands
         for variable in table:
-            if variable.causality == "output":
+            if variable.causality in ("output", "local"):
                 continue
             if variable.index is None:
                 setattr(self, variable.group, variable.start)
@@ -205,6 +206,24 @@ class Plant:
         effort, _ = self._control_effort(self._law(self), np.array(self.q), np.array(self.v))
         tau: list[float] = effort.tolist()
         return tau
+
+    @property
+    def der_q(self) -> list[float]:
+        """Derivative of q: v."""
+        return list(self.v)
+
+    @property
+    def der_v(self) -> list[float]:
+        """Derivative of v at the current state and inputs, joints that rest at a limit included.
+
+        Raises:
+            DiscardError: an input that the control law cannot follow.
+        """
+        self._check_target()
+        acceleration, _ = self._equations_of_motion()(np.array(self.q), np.array(self.v))
+        rates = list(acceleration)
+        self._stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
+        return rates
 
     def _observed(self) -> tuple[Any, list[list[float]], Any]:
         return self._real.observe(np.array(self.q), np.array(self.v))

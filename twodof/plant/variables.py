@@ -22,10 +22,11 @@ class Variable:
 
     Attributes:
         group: the vector's name and the plant's attribute, e.g. "x_des"; ``index`` its 0-based
-            element, None for a scalar.
-        causality: "input", "output" or "parameter" (all parameters are fixed).
+            element, None for a scalar. "der_q" is the derivative of "q".
+        causality: "input", "output", "local" (the derivatives of the states q and v) or
+            "parameter" (all parameters are fixed).
         unit: FMI unit name, "" where there is none.
-        start: start value; None for outputs.
+        start: start value; None for what is computed.
         description: one line.
     """
 
@@ -39,7 +40,14 @@ class Variable:
     @property
     def name(self) -> str:
         """FMI name, e.g. "x_des[1]"."""
-        return self.group if self.index is None else f"{self.group}[{self.index + 1}]"
+        group = self.derivative_of or self.group
+        name = group if self.index is None else f"{group}[{self.index + 1}]"
+        return f"der({name})" if self.derivative_of else name
+
+    @property
+    def derivative_of(self) -> str:
+        """Group of the state that it is the derivative of, "" where it is none."""
+        return self.group.removeprefix("der_") if self.causality == "local" else ""
 
     @property
     def type(self) -> str:
@@ -116,7 +124,7 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
     for group, causality, size, units, text in _rows(robot, control):
         own = group in (*law.inputs, *law.outputs)
         if own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES:
-            start = default.get(group) if causality != "output" else None
+            start = default.get(group) if causality in ("input", "parameter") else None
             for i, (unit, owner) in enumerate(zip(units, size)):
                 value = start[i] if isinstance(start, tuple) else None
                 table.append(Variable(group, i, causality, unit, value, f"{text}, {owner}"))
@@ -188,6 +196,8 @@ def _rows(robot: Robot, control: str) -> list[Row]:
         ("quat", "output", list("xyzw"), [""] * 4, f"orientation of {robot.frame}"),
         ("omega", "output", turn, ["rad/s"] * 3, f"angular velocity of {robot.frame}"),
         ("tau", "output", joint, effort, "control effort applied"),
+        ("der_q", "local", joint, velocity, "velocity, the position's derivative"),
+        ("der_v", "local", joint, acceleration, "acceleration"),
         ("q_start", "parameter", joint, position, "position at the start"),
         ("v_start", "parameter", joint, velocity, "velocity at the start"),
         ("q_min", "parameter", joint, position, "lower limit"),
@@ -206,3 +216,10 @@ def _rows(robot: Robot, control: str) -> list[Row]:
         ("rigid_stops", "parameter", [], [""], "joint stops act on the other joints too"),
         *([known] if "payload_known" in parameters else []),
     ]  # fmt: skip
+
+
+def count_event_indicators(robot: Robot, control: str) -> int:
+    """Of Model Exchange: two limits a joint, and the singular values that J⁺ may drop."""
+    law = CONTROLS[control]
+    rows = len(robot.axes) + 3 * ("quat_des" in law.inputs) if "rcond" in law.parameters else 1
+    return 2 * len(robot.joints) + rows - 1

@@ -1,0 +1,157 @@
+/* Derivatives along a direction, exact to rounding, by the complex step:
+
+       f(x + i h d) = f(x) + i h f'(x) d,   h = 1e-100
+
+   The engine's own files are compiled once more, their numbers complex. Parts that have no complex
+   numbers, of C compilers too, take central differences.
+   Source: Squire & Trapp, SIAM Review 40(1), 1998. */
+#include <float.h>
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "directional.h"
+
+typedef double Real;
+
+/* Of the changes, and no less than what can be divided by. */
+static Real largest_of(const Real change[], int count)
+{
+    Real largest = DBL_MIN;
+    for (int i = 0; i < count; i++)
+        largest = fmax(largest, fabs(change[i]));
+    return largest;
+}
+
+#if defined _MSC_VER || defined __STDC_NO_COMPLEX__ || defined NO_COMPLEX
+#define COMPLEX 0
+#include "plant.h"
+#include "stops.h"
+#else
+#define COMPLEX 1
+#include <complex.h>
+#undef I /* a name like others */
+
+static const Real STEP = 1e-100;
+static const double _Complex UNIT = (double _Complex)_Complex_I;
+
+/* x + i y, where a function of x has such a value and derivative. */
+static inline double _Complex analytic(double _Complex x, Real value, Real derivative)
+{
+    return value + UNIT * (derivative * cimag(x));
+}
+
+static inline double _Complex complex_sin(double _Complex x)
+{
+    return analytic(x, sin(creal(x)), cos(creal(x)));
+}
+
+static inline double _Complex complex_cos(double _Complex x)
+{
+    return analytic(x, cos(creal(x)), -sin(creal(x)));
+}
+
+static inline double _Complex complex_sqrt(double _Complex x)
+{
+    const Real root = sqrt(creal(x));
+    return analytic(x, root, root > 0.0 ? 0.5 / root : 0.0);
+}
+
+static inline double _Complex complex_atan2(double _Complex y, double _Complex x)
+{
+    const Real a = creal(x), b = creal(y), square = a * a + b * b;
+    return atan2(b, a) + UNIT * ((a * cimag(y) - b * cimag(x)) / square);
+}
+
+static inline double _Complex complex_fabs(double _Complex x)
+{
+    return creal(x) < 0.0 ? -x : x;
+}
+
+static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
+{
+    return creal(a) < creal(b) ? b : a;
+}
+
+/* From here on the engine has complex numbers, and none of its functions is seen elsewhere. The headers
+   of the standard that it includes are there already. */
+#define double double _Complex
+#define sin complex_sin
+#define cos complex_cos
+#define sqrt complex_sqrt
+#define atan2 complex_atan2
+#define fabs complex_fabs
+#define fmax complex_fmax
+#undef RE
+#define RE(x) creal(x)
+#define IS_COMPLEX
+#undef INTERNAL
+#define INTERNAL static inline
+
+#include "dynamics.c"
+#include "kinematics.c"
+#include "plant.c"
+#include "stops.c"
+#if N_ROWS > N_AXES
+#include "orientation.c"
+#endif
+#if !COMMANDS_ACCELERATION
+#include "effort_control.c"
+#elif defined HAS_RCOND
+#include "pseudo_inverse.c"
+#include "task_control.c"
+#else
+#include "joint_control.c"
+#endif
+#endif
+
+/* Compute what is wanted. */
+static void evaluate(Plant *plant, const int held[N_JOINTS], int wanted)
+{
+    if (wanted & WANTS_X)
+        compute_position(plant);
+    if (wanted & WANTS_TAU)
+        compute_effort(plant);
+    if (wanted & WANTS_RATES) {
+        Stops stops = {.any_held = 0};
+        for (int i = 0; i < N_JOINTS; i++)
+            stops.any_held |= stops.held[i] = held[i];
+        compute_rates(plant, &stops);
+    }
+}
+
+#if COMPLEX
+void differentiate(const Real value[], const int held[], int wanted, const Real change[],
+                   Real derivative[])
+{
+    const Real largest = largest_of(change, X); /* whatever its size, a step is small */
+    const Real inverse = 1.0 / largest, up = 1.0 / STEP;
+    Plant plant;
+    for (int i = 0; i < N_VARIABLES; i++)
+        plant.value[i] = value[i];
+    for (int i = 0; i < X; i++)
+        plant.value[i] += UNIT * (change[i] * inverse * STEP);
+    evaluate(&plant, held, wanted);
+    for (int i = 0; i < FIRST_PARAMETER; i++)
+        derivative[i] = cimag(plant.value[i]) * up * largest;
+}
+#else
+/* ∛ε: where the errors of truncation and rounding are alike. */
+static const Real NUDGE = 6e-6;
+
+void differentiate(const Real value[], const int held[], int wanted, const Real change[],
+                   Real derivative[])
+{
+    const Real largest = largest_of(change, X);
+    Plant after, before;
+    for (int i = 0; i < N_VARIABLES; i++) {
+        const Real nudge = i < X ? NUDGE * (change[i] / largest) : 0.0;
+        after.value[i] = value[i] + nudge;
+        before.value[i] = value[i] - nudge;
+    }
+    evaluate(&after, held, wanted);
+    evaluate(&before, held, wanted);
+    for (int i = 0; i < FIRST_PARAMETER; i++)
+        derivative[i] = (after.value[i] - before.value[i]) / (2.0 * NUDGE) * largest;
+}
+#endif

@@ -1,0 +1,179 @@
+"""Directional derivatives: against Pinocchio's, closed forms, and central differences."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from native_models import ROBOTS, Engine, model
+
+
+class Derivatives(Engine):
+    """An engine with the function that gives derivatives."""
+
+    def __init__(self, of, flags=()):
+        super().__init__(of, flags)
+        self.count = len(of.table)
+        self.names = [v.name for v in of.table]
+        self.computed = [i for i, v in enumerate(of.table) if v.causality in ("output", "local")]
+        self.known = [i for i in range(self.count) if i < of.reference("x")]
+
+    def jacobian(self, values, held=None):
+        """∂ computed/∂ known, a row each of the variables from q on up to the parameters."""
+        held = np.zeros(self.n, dtype=np.int32) if held is None else held
+        columns = []
+        for k in self.known:
+            change, derivative = np.zeros(self.count), np.zeros(self.count)
+            change[k] = 1.0
+            self.call("differentiate", values, held, change, derivative)
+            columns.append(derivative[self.computed])
+        return np.array(columns).T
+
+    def differences(self, values, held=None):
+        """The same by central differences, extrapolated."""
+        held = np.zeros(self.n, dtype=np.int32) if held is None else held
+
+        def slope(k, h):
+            ends = []
+            for sign in (1.0, -1.0):
+                near = values.copy()
+                near[k] += sign * h
+                self.call("compute", near, held)
+                ends.append(near[self.computed])
+            return (ends[0] - ends[1]) / (2.0 * h)
+
+        h = 1e-4
+        return np.array([(4.0 * slope(k, h / 2) - slope(k, h)) / 3.0 for k in self.known]).T
+
+    def part(self, jacobian, rows, columns):
+        names = [self.names[i] for i in self.computed]
+        known = [self.names[i] for i in self.known]
+        r = [i for i, name in enumerate(names) if re.fullmatch(rows, name)]
+        c = [i for i, name in enumerate(known) if re.fullmatch(columns, name)]
+        return jacobian[np.ix_(r, c)]
+
+
+def at_random(engine, rng, **settings):
+    """Values of all variables, amid the joints' ranges."""
+    of = engine.model
+    plant = of.plant()
+    low, high = np.maximum(plant.q_min, -2.0), np.minimum(plant.q_max, 2.0)
+    plant.q = rng.uniform(low, high).tolist()
+    plant.v = rng.uniform(-1.5, 1.5, engine.n).tolist()
+    for group in {v.group for v in of.table if v.causality == "input"}:
+        value = getattr(plant, group)
+        if isinstance(value, list):
+            setattr(plant, group, (np.array(value) + rng.uniform(-0.3, 0.3, len(value))).tolist())
+    for name, value in settings.items():
+        setattr(plant, name, value)
+    return engine.values(plant)
+
+
+@pytest.mark.parametrize("name", ["twodof", *ROBOTS])
+def test_the_bare_plants_are_pinocchios(name):
+    engine = Derivatives(model(name, "effort"))
+    robot, rng = engine.model.robot, np.random.default_rng(1)
+    reference = robot.model.copy()
+    if reference.nv > engine.n:
+        pytest.skip("Pinocchio has no derivatives of joints that follow others")
+    for _ in range(100 if engine.n < 15 else 10):
+        values = at_random(engine, rng, f_ext=[0.0, 0.0, 0.0])
+        reference.gravity.linear = engine.group(values, "gravity")
+        q, v = engine.group(values, "q"), engine.group(values, "v")
+        damping = np.array(robot.damping)
+        effort = engine.group(values, "tau_cmd") + engine.group(values, "tau_ext") - damping * v
+        data = reference.createData()
+        by_q, by_v, by_tau = pin.computeABADerivatives(reference, data, q, v, effort)
+        by_tau = np.triu(by_tau) + np.triu(by_tau, 1).T
+        ours = engine.jacobian(values)
+        for columns, theirs in (
+            (r"q\[\d+\]", by_q), (r"v\[\d+\]", by_v - by_tau * damping), (r"tau_cmd.*", by_tau),
+        ):  # fmt: skip
+            part = engine.part(ours, r"der\(v.*", columns)
+            assert np.abs(part - theirs).max() <= 1e-10 * max(1.0, np.abs(theirs).max())
+        J = pin.computeFrameJacobian(reference, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED)[
+            :3
+        ]
+        by_force = engine.part(ours, r"der\(v.*", r"f_ext.*")
+        assert np.abs(by_force - by_tau @ J.T).max() <= 1e-9 * np.abs(by_tau).max()
+
+
+def test_task_control_at_rest_has_the_poles_of_its_gains():
+    """s² + Kd s + Kp, on both axes of the default arm and three of the UR5 with six joints."""
+    for name, extra in (("twodof", 0), ("ur5", 3)):
+        engine = Derivatives(model(name))
+        plant = engine.model.plant()
+        plant.x_des, plant.Kp = list(plant.x), [50.0 + 10.0 * k for k in range(engine.m)]
+        if name == "twodof":
+            plant.Kn = 0.0
+        values = engine.values(plant)
+        ours = engine.jacobian(values)
+        A = engine.part(ours, r"der.*", r"[qv]\[\d+\]")
+        poles = np.linalg.eigvals(A)
+        expected = [root for Kp, Kd in zip(plant.Kp, plant.Kd) for root in np.roots([1.0, Kd, Kp])]
+        for root in expected:
+            assert np.abs(poles - root).min() <= 1e-10 * abs(root)
+        assert len(poles) == len(expected) + 2 * extra
+
+
+CASES = {
+    "twodof task": ("twodof", "task", {}),
+    "payload": ("twodof", "task", {"payload": 0.7, "payload_com": [0.02, 0.01, 0.03]}),
+    "known payload": ("twodof", "task", {"payload": 0.7, "payload_known": True}),
+    "dropped": ("twodof", "task", {"rcond": 0.9}),
+    "orthogonal rows, dropped": ("twodof", "task", {"q": [0.0, 0.0]}),
+    "by the sweeps": ("twodof", "task", {"rcond": 0.0, "q": [0.3, 0.01]}),
+    "clamped effort": ("twodof", "joint", {"limit_effort": True, "Kp": [4000.0, 1.0]}),
+    "joint": ("twodof", "joint", {"payload": 0.2}),
+    "ur5 task": ("ur5", "task", {"Kn": 3.0, "payload": 2.0}),
+    "ur5 dropped": ("ur5", "task", {"rcond": 0.7}),
+    "ur5 dropped two": ("ur5", "task", {"rcond": 0.95, "Kn": 1.0}),
+    "sliding joints": ("tiago", "task", {"Kn": 1.0, "limit_effort": True}),
+    "pose": ("ur5", "pose", {"payload": 1.0}),
+    "pose, dropped": ("ur5", "pose", {"rcond": 0.3}),
+    "pose, mimic": ("panda", "pose", {"Kn": 1.0}),
+    "panda": ("panda", "effort", {"payload": 1.0}),
+    "panda joint": ("panda", "joint", {"limit_effort": True, "payload": 1.0}),
+    "anymal, a tree": ("anymal_c", "task", {"Kn": 2.0}),
+    "z1, two axes": ("z1", "task", {"Kn": 2.0, "rcond": 0.3}),
+}
+
+
+@pytest.mark.parametrize("complex_numbers", [True, False])
+@pytest.mark.parametrize("case", CASES)
+def test_derivatives_are_those_of_central_differences(case, complex_numbers):
+    name, control, settings = CASES[case]
+    flags = () if complex_numbers else ("-DNO_COMPLEX",)
+    engine = Derivatives(model(name, control), flags)
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        values = at_random(engine, rng, **settings)
+        ours, theirs = engine.jacobian(values), engine.differences(values)
+        scale = np.maximum(1.0, np.abs(theirs).max(axis=1, keepdims=True))
+        assert (np.abs(ours - theirs) / scale).max() <= (1e-6 if complex_numbers else 1e-5)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
+    engine = Derivatives(model("ur5", "effort"))
+    values = at_random(engine, np.random.default_rng(4), rigid_stops=rigid)
+    held = np.array([0, 1, 0, 0, 1, 0], dtype=np.int32)
+    ours, theirs = engine.jacobian(values, held), engine.differences(values, held)
+    assert np.abs(ours - theirs).max() <= 1e-6 * max(1.0, np.abs(theirs).max())
+    rates = engine.part(ours, r"der\(v.*", r".*")
+    assert not rates[[1, 4]].any() and rates[0].any()
+
+
+def test_a_direction_of_any_size_has_its_derivative():
+    engine = Derivatives(model("twodof", "effort"))
+    values = at_random(engine, np.random.default_rng(5))
+    held, k = np.zeros(2, dtype=np.int32), engine.model.reference("q")
+    results = []
+    for size in (1.0, 1e-250, 1e250):
+        change, derivative = np.zeros(engine.count), np.zeros(engine.count)
+        change[k] = size
+        engine.call("differentiate", values, held, change, derivative)
+        results.append(derivative[engine.computed] / size)
+    np.testing.assert_allclose(results[1:], [results[0]] * 2, rtol=1e-12)

@@ -1,0 +1,386 @@
+"""Model Exchange of the native FMU: in FMPy by CVode and by Euler, and call by call."""
+
+from __future__ import annotations
+
+import ctypes
+import xml.etree.ElementTree as ET
+import zipfile
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi2 import FMU2Model
+from fmpy.validation import validate_fmu
+from harness import Driver
+from native_models import robots_folder
+
+from twodof import FmuOptions, build_fmu
+from twodof.plant.variables import CONTROLS
+
+OK, WARNING, DISCARD, ERROR = range(4)
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+NARROW = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0}
+
+
+@pytest.fixture(scope="session")
+def fmus(tmp_path_factory):
+    """The default arm under each control, and the UR5 as a bare plant."""
+    folder = tmp_path_factory.mktemp("exchange")
+    ur5 = robots_folder() / "ur_description/urdf/ur5_robot.urdf"
+    options = {c: FmuOptions(native=True, control=c) for c in CONTROLS}
+    options["ur5"] = FmuOptions(
+        native=True, control="effort", urdf=ur5, frame="tool0", meshes=False
+    )
+    return {name: build_fmu(folder / f"{name}.fmu", o) for name, o in options.items()}
+
+
+def states(fmu):
+    names = [v.name for v in fmpy.read_model_description(str(fmu)).modelVariables]
+    return [name for name in names if name[:2] in ("q[", "v[")]
+
+
+def run(fmu, kind, starts, stop_time=2.0, interval=0.01, **named):
+    """States at each interval, as an array with a column each."""
+    result = fmpy.simulate_fmu(
+        str(fmu), fmi_type=kind, stop_time=stop_time, start_values={**TIGHT, **starts},
+        output=states(fmu), output_interval=interval, record_events=False, **named,
+    )  # fmt: skip
+    return np.array([result[name] for name in states(fmu)]).T
+
+
+class FMU2Exchange(FMU2Model):
+    """An instance for Model Exchange that keeps its messages and gives the status of a call."""
+
+    def __init__(self, fmu, **starts):
+        self.description = fmpy.read_model_description(str(fmu))
+        self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
+        self.n = self.description.numberOfContinuousStates
+        identifier = self.description.modelExchange.modelIdentifier
+        super().__init__(
+            guid=self.description.guid, modelIdentifier=identifier, instanceName="model",
+            unzipDirectory=fmpy.extract(str(fmu)),
+        )  # fmt: skip
+        self.messages = []
+        functions = fmpy.fmi2.fmi2CallbackFunctions()
+        functions.logger = fmpy.fmi2.fmi2CallbackLoggerTYPE(
+            lambda _, name, status, category, text: self.messages.append((status, text.decode()))
+        )
+        functions.allocateMemory = fmpy.fmi2.fmi2CallbackAllocateMemoryTYPE()
+        functions.freeMemory = fmpy.fmi2.fmi2CallbackFreeMemoryTYPE()
+        self.instantiate(callbacks=functions)
+        self.set(**starts)
+        self.setupExperiment(startTime=0.0)
+        self.enterInitializationMode()
+        self.exitInitializationMode()
+
+    def set(self, **values):
+        for group, value in values.items():
+            names = [n for n in self.vr if n == group or n.startswith(f"{group}[")]
+            setter = self.setBoolean if isinstance(value, bool) else self.setReal
+            setter([self.vr[n] for n in names], np.atleast_1d(value).tolist())
+
+    def get(self, group):
+        names = [n for n in self.vr if n.startswith(f"{group}[")]
+        return self.getReal([self.vr[n] for n in names])
+
+    @property
+    def y(self):
+        x = (ctypes.c_double * self.n)()
+        self.getContinuousStates(x, self.n)
+        return list(x)
+
+    @y.setter
+    def y(self, values):
+        self.setContinuousStates((ctypes.c_double * self.n)(*values), self.n)
+
+    def rates(self):
+        dx = (ctypes.c_double * self.n)()
+        self.getDerivatives(dx, self.n)
+        return list(dx)
+
+    def indicators(self):
+        count = self.description.numberOfEventIndicators
+        z = (ctypes.c_double * count)()
+        self.getEventIndicators(z, count)
+        return list(z)
+
+    def event(self):
+        """An event, wanted or not; whether the state changed."""
+        self.enterEventMode()
+        return self.go()
+
+    def go(self):
+        changed = self.newDiscreteStates()[3]
+        self.enterContinuousTimeMode()
+        return changed
+
+    def refused(self, message, call, *arguments):
+        before, self.messages = self.serializeFMUState(self.getFMUState()), []
+        with pytest.raises(FMICallException) as caught:
+            getattr(self, call)(*arguments)
+        assert caught.value.status == ERROR
+        assert [status for status, _ in self.messages] == [ERROR]
+        assert message in self.messages[0][1]
+        assert self.serializeFMUState(self.getFMUState()) == before
+
+
+Model = FMU2Exchange  # FMPy finds the standard's version in the class's name
+
+
+@pytest.mark.parametrize("name", ["task", "joint", "effort", "ur5"])
+def test_the_description_is_valid(fmus, name):
+    assert validate_fmu(str(fmus[name])) == []
+    description = fmpy.read_model_description(str(fmus[name]))
+    with zipfile.ZipFile(fmus[name]) as archive:
+        xml = ET.fromstring(archive.read("modelDescription.xml"))
+    reinit = [v.get("name") for v in xml.iter("ScalarVariable") if v[0].get("reinit") == "true"]
+    assert reinit == states(fmus[name])
+    n = description.numberOfContinuousStates // 2
+    assert description.numberOfEventIndicators == 2 * n + (name == "task")
+    variables = {v.name: v for v in description.modelVariables}
+    for i in range(n):
+        for state in ("q", "v"):
+            variable = variables[f"{state}[{i + 1}]"]
+            assert variable.initial == "approx"
+            assert variable.start == variables[f"{state}_start[{i + 1}]"].start
+            assert variables[f"der({state}[{i + 1}])"].derivative is variable
+
+
+RUNS = {
+    ("effort", "swings into its stops"): {**NARROW, "v_start[1]": 2.0},
+    ("effort", "clamped"): {**NARROW, "v_start[1]": 2.0, "rigid_stops": False},
+    ("effort", "tau"): {"tau_cmd[1]": 0.3, "tau_cmd[2]": -0.1, "payload": 0.2},
+    ("joint", "stops"): {**NARROW, "q_max[1]": 0.6, "q_des[1]": 0.7, "q_des[2]": 0.9},
+    ("joint", "saturated"): {"limit_effort": True, "q_des[1]": 1.0, "Kp[1]": 4e3, "payload": 1.0},
+    ("task", "free"): {},
+    ("task", "stops"): {"q_min[1]": -0.2, "q_max[1]": 0.8, "q_min[2]": 0.8, "q_max[2]": 1.9,
+                        "q_start[1]": 0.3, "q_start[2]": 1.3, "Kp[1]": 400.0, "Kp[2]": 400.0,
+                        "x_des[1]": 0.14, "x_des[2]": -0.03},
+    ("task", "rigid"): {"q_max[1]": 0.52, "v_start[1]": 1.0, "rigid_stops": True},
+    ("task", "forces"): {"tau_ext[1]": 0.2, "f_ext[2]": -0.5, "limit_effort": True},
+    ("ur5", "falls into its stops"): {
+        **{f"q_min[{i}]": -0.3 for i in (2, 3, 4)}, **{f"q_max[{i}]": 0.4 for i in (2, 3, 4)}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name, what", RUNS, ids=" ".join)
+def test_cvode_gives_the_trajectories_of_co_simulation(fmus, name, what):
+    stop_time = 2.0 if "stop" in what and name != "ur5" else 1.0
+    ours = run(fmus[name], "CoSimulation", RUNS[name, what], stop_time)
+    theirs = run(fmus[name], "ModelExchange", RUNS[name, what], stop_time, relative_tolerance=1e-10)
+    n = ours.shape[1] // 2
+    assert ours.shape == theirs.shape
+    assert np.abs(ours - theirs)[:, :n].max() <= 1e-7
+    if "stop" in what:
+        limits = [RUNS[name, what].get(f"q_{side}[{i + 1}]", np.nan)
+                  for i in range(n) for side in ("min", "max")]  # fmt: skip
+        assert np.isin(ours[:, :n], limits).any()
+
+
+def test_euler_converges_at_first_order_to_the_same_stops_included(fmus):
+    starts = RUNS["task", "stops"]
+    exact = run(fmus["task"], "CoSimulation", starts)
+    error = []
+    for step in (1e-3, 5e-4, 2.5e-4):
+        rough = run(
+            fmus["task"], "ModelExchange", starts, 2.0, step, solver="Euler", step_size=step
+        )
+        error.append(np.abs(rough[:: round(0.01 / step)] - exact)[:, :2].max())
+    assert error[0] < 5e-3
+    assert 1.7 < error[0] / error[1] < 2.4 and 1.7 < error[1] / error[2] < 2.4
+
+
+def test_a_joint_that_rests_at_its_stop_for_ten_seconds_has_one_event(fmus, monkeypatch):
+    events = []
+    enter = FMU2Model.enterEventMode
+    monkeypatch.setattr(FMU2Model, "enterEventMode", lambda s: events.append(1) or enter(s))
+    run(fmus["effort"], "ModelExchange", {"q_min[1]": 0.0, "q_min[2]": 0.0}, 10.0,
+        relative_tolerance=1e-10)  # fmt: skip
+    assert 2 <= len(events) <= 6  # two joints, and a bounce or two until both rest
+    events.clear()
+    starts = {"q_min[1]": 0.5, "q_min[2]": 0.35}  # both at rest from the start
+    run(fmus["effort"], "ModelExchange", starts, 10.0)
+    assert not events
+
+
+# --- events: early, late, at zero and for nothing ---
+
+
+@pytest.fixture
+def falling(fmus):
+    """The bare arm without gravity, its first joint on its way to a limit at 1 rad/s."""
+    model = Model(
+        fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[0.5, 0.0], v_start=[0.0, 0.0],
+        q_max=[1.0, 2.0], rigid_stops=False,
+    )  # fmt: skip
+    model.go()
+    return model
+
+
+def test_an_early_event_changes_nothing_and_the_indicator_goes_on(falling):
+    falling.y = [1.0 - 1e-9, 0.0, 1.0, 0.0]
+    z = falling.indicators()
+    assert not falling.event()
+    assert falling.indicators() == z and z[0] > 0.0
+    falling.y = [1.0 + 1e-9, 0.0, 1.0, 0.0]
+    assert falling.indicators()[0] < 0.0
+
+
+@pytest.mark.parametrize("past", [0.0, 1e-13, 1e-9, 0.01])
+def test_an_event_at_the_limit_or_late_puts_the_joint_onto_it(falling, past):
+    falling.y = [1.0 + past, 0.0, 1.0, 0.3]
+    assert falling.event()
+    assert falling.y == [1.0, 0.0, 0.0, 0.3]
+    assert not falling.event()  # for nothing
+
+
+def test_a_late_event_of_a_joint_that_is_on_its_way_back_keeps_its_velocity(falling):
+    falling.y = [1.01, 0.0, -1.0, 0.0]
+    assert falling.event()
+    assert falling.y == [1.0, 0.0, -1.0, 0.0]
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_a_held_joint_is_let_go_where_it_is_pulled_off_and_no_sooner(fmus, rigid):
+    model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0],
+                  tau_cmd=[0.5, 0.0], rigid_stops=rigid)  # fmt: skip
+    model.go()
+    assert model.rates()[2] == 0.0 and model.indicators()[0] > 0.0
+    model.set(tau_cmd=[1e-12, 0.0])
+    assert model.indicators()[0] > 0.0 and not model.event() and model.rates()[2] == 0.0
+    model.set(tau_cmd=[-0.5, 0.0])
+    assert model.indicators()[0] < 0.0 and model.rates()[2] == 0.0  # until its event
+    assert not model.event()  # of the state; what is held is another
+    assert model.rates()[2] < 0.0 < model.indicators()[0]
+
+
+def test_a_solvers_rounding_does_not_let_a_held_joint_go(fmus):
+    model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0],
+                  tau_cmd=[0.5, 0.0])  # fmt: skip
+    model.go()
+    model.y = [1.0 - 1e-12, 0.0, -1e-17, 0.0]
+    assert model.indicators()[0] > 0.0 and model.rates()[2] == 0.0
+    assert model.event() and model.y == [1.0, 0.0, 0.0, 0.0] and model.rates()[2] == 0.0
+
+
+def test_two_joints_that_drive_each_other_off_have_few_events(fmus, monkeypatch):
+    """As the feet of a rocking block; both come to rest."""
+    events = []
+    enter = FMU2Model.enterEventMode
+    monkeypatch.setattr(FMU2Model, "enterEventMode", lambda s: events.append(1) or enter(s))
+    starts = {"q_min[1]": 0.0, "q_min[2]": 0.0, "q_start[1]": 0.0, "q_start[2]": 0.4}
+    theirs = run(fmus["effort"], "ModelExchange", starts, 3.0, relative_tolerance=1e-8)
+    assert len(events) <= 60
+    assert np.abs(theirs[-1]).max() == 0.0
+
+
+def test_the_jump_of_the_pseudo_inverse_is_an_event(fmus):
+    """The stretched arm's J has the ratio of singular values rcond there, and nowhere else near."""
+    model = Model(fmus["task"], rcond=0.05)
+    model.go()
+    signs = []
+    for angle in np.linspace(0.3, 0.01, 50):
+        model.y = [0.3, angle, 0.0, 0.0]
+        c, s = np.cos(0.3), np.sin(0.3)
+        c2, s2 = np.cos(0.3 + angle), np.sin(0.3 + angle)
+        sigma = np.linalg.svd(0.15 * np.array([[-s - s2, -s2], [c + c2, c2]]))[1]
+        assert model.indicators()[4] == pytest.approx(sigma[1] / sigma[0] - 0.05, abs=1e-12)
+        signs.append(model.indicators()[4] > 0.0)
+    assert signs[0] and not signs[-1] and np.count_nonzero(np.diff(signs)) == 1
+
+
+# --- calls ---
+
+
+def test_states_by_real_variables_and_derivatives_by_real_variables(fmus):
+    """As CasADi does; in event mode too."""
+    model, other = Model(fmus["task"]), Model(fmus["task"])
+    other.go()
+    y = [0.3, 0.9, -0.4, 0.2]
+    model.set(q=y[:2], v=y[2:])
+    other.y = y
+    assert [*model.get("q"), *model.get("v")] == y == model.y
+    rates = model.getReal([model.vr[f"der({s}[{i}])"] for s in "qv" for i in (1, 2)])
+    assert rates == other.rates() and rates[:2] == y[2:]
+
+
+def test_a_state_that_is_set_by_hand_decides_anew_what_rests(fmus):
+    model = Model(fmus["effort"], q_start=[0.5, 0.0], q_min=[0.5, -1.0])
+    assert model.getReal([model.vr["der(v[1])"]]) == [0.0]  # it rests
+    model.set(q=[0.6, 0.0])
+    assert model.getReal([model.vr["der(v[1])"]])[0] < -1.0
+
+
+def test_a_guess_of_the_state_before_the_run_is_ignored_with_a_warning(fmus):
+    model = Model(fmus["task"], q=[0.5, 0.9])
+    text = "q[2] = 0.9 is ignored before the run: the start is q_start[2] = 0.35"
+    assert model.messages == [(WARNING, text)]
+    assert model.get("q") == [0.5, 0.35]
+
+
+def test_what_is_out_of_turn_or_wrong_is_refused_and_changes_nothing(fmus):
+    model = Model(fmus["task"])
+    four = (ctypes.c_double * 4)(0.1, 0.2, np.nan, 0.0)
+    model.refused("is not allowed in the state 'event mode'", "enterEventMode")
+    model.refused("is not allowed in the state 'event mode'", "setContinuousStates", four, 4)
+    step = (model.component, ctypes.c_double(0.0), ctypes.c_double(0.01), 0)
+    assert model.dll["fmi2DoStep"](ctypes.c_void_p(step[0]), *step[1:]) == ERROR
+    assert "fmi2DoStep is a call of co-simulation" in model.messages.pop()[1]
+    model.refused("wrong number of values, 4 are wanted", "getDerivatives", four, 3)
+    model.refused(
+        "der(q[1]) is computed and cannot be set", "setReal", [model.vr["der(q[1])"]], [0]
+    )
+    model.go()
+    model.refused("is not allowed in the state 'continuous-time mode'", "newDiscreteStates")
+    model.refused("v[1] is not finite", "setContinuousStates", four, 4)
+    model.refused("the time is not finite", "setTime", np.nan)
+    model.refused("fmi2Set of a parameter (rcond)", "setReal", [model.vr["rcond"]], [0.1])
+
+
+def test_a_state_is_restored_bit_for_bit_and_is_of_its_kind(fmus):
+    model = Model(fmus["effort"], q_start=[1.0, 0.0], q_max=[1.0, 2.0], tau_cmd=[5.0, 0.0])
+    model.go()
+    model.y = [1.0, 0.2, 0.0, 0.3]
+    saved, rates, indicators = model.getFMUState(), model.rates(), model.indicators()
+    blob = model.serializeFMUState(saved)
+    model.y = [0.2, 0.2, 1.0, 0.0]
+    model.event()
+    assert model.rates() != rates
+    for state in (saved, model.deSerializeFMUstate(blob)):
+        model.setFMUState(state)
+        assert (model.rates(), model.indicators()) == (rates, indicators)
+        model.event()
+
+
+def test_directional_derivatives_are_those_of_the_rates_in_both_kinds(fmus):
+    model = Model(fmus["effort"], v_start=[0.4, -0.3])
+    arm = Driver(fmus["effort"]).initialise(v_start=(0.4, -0.3))
+    model.go()
+    y, vr = model.y, model.vr
+    unknown = [vr[f"der({s}[{i}])"] for s in "qv" for i in (1, 2)]
+    for k, name in enumerate(states(fmus["effort"])):
+        ends = []
+        for h in (1e-5, -1e-5):
+            model.y = [value + h * (i == k) for i, value in enumerate(y)]
+            ends.append(np.array(model.rates()))
+        model.y = y
+        expected = (ends[0] - ends[1]) / 2e-5
+        for instance in (model, arm.slave):
+            found = instance.getDirectionalDerivative(unknown, [vr[name]], [1.0])
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+    arm.free()
+
+
+def test_a_derivative_of_what_has_none_is_refused(fmus):
+    model = Model(fmus["task"])
+    call, vr = "getDirectionalDerivative", model.vr
+    refused = [
+        ("x_des[1] is not computed", ["x_des[1]"], ["q[1]"], [1.0]),
+        ("rcond is neither a state nor an input", ["x[1]"], ["rcond"], [1.0]),
+        ("tau[1] is neither a state nor an input", ["x[1]"], ["tau[1]"], [1.0]),
+        ("the change of q[2] is not finite", ["x[1]"], ["q[2]"], [np.nan]),
+        ("limit_effort is of type Boolean", ["x[1]"], ["limit_effort"], [1.0]),
+    ]
+    for message, unknown, known, seed in refused:
+        model.refused(message, call, [vr[n] for n in unknown], [vr[n] for n in known], seed)

@@ -1,0 +1,120 @@
+"""Linear models: of closed forms, at equilibria, and what has none."""
+
+import json
+
+import fmpy
+import numpy as np
+import pytest
+from harness import needs
+from scipy.linalg import expm
+
+import twodof
+from twodof import FmuOptions, build_fmu
+from twodof.cli.main import main
+
+UPRIGHT = [np.pi / 2, 0.0]
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    return build_fmu(
+        tmp_path_factory.mktemp("bare") / "Bare.fmu", FmuOptions(native=True, control="effort")
+    )
+
+
+def test_a_target_reached_has_the_poles_of_its_gains(native_path):
+    """s² + Kd s + Kp, found from a start that is elsewhere."""
+    at = {"Kp": [50.0, 80.0], "Kd": [10.0, 30.0]}
+    model = twodof.linearise(native_path, at)
+    expected = [*np.roots([1.0, 10.0, 50.0]), *np.roots([1.0, 30.0, 80.0])]
+    found = [mode.eigenvalue for mode in model.modes]
+    assert max(np.abs(np.array(found) - root).min() for root in expected) <= 1e-9
+    mode = min(model.modes, key=lambda m: abs(m.eigenvalue - expected[0]))
+    assert mode.damping == pytest.approx(10.0 / (2.0 * np.sqrt(50.0)))
+    assert mode.frequency == pytest.approx(np.sqrt(50.0))
+    assert np.abs(model.rates).max() <= 1e-8 and model.remarks == ()
+    x = model.outputs.index("x[1]")  # follows its target: unit gain at s = 0
+    gain = model.D - model.C @ np.linalg.solve(model.A, model.B)
+    assert gain[x, model.inputs.index("x_des[1]")] == pytest.approx(1.0, abs=1e-9)
+    assert model.units["x_des[1]"] == "m" and model.units["v[2]"] == "rad/s"
+
+
+def test_the_linear_model_predicts_the_first_tenth_of_a_second(bare):
+    model = twodof.linearise(bare, {"q": UPRIGHT}, inputs=["tau_cmd"], outputs=["q"])
+    assert model.A.shape == (4, 4) and model.B.shape == (4, 2) and model.C.shape == (2, 4)
+    starts = {"q_start": [UPRIGHT[0] + 0.01, 0.0], "rtol": 1e-9, "atol": 1e-9}
+    last = [*twodof.samples(bare, stop_time=0.1, settings=starts)][-1]
+    moved = np.array(last.q) - UPRIGHT
+    predicted = (expm(0.1 * model.A) @ [0.01, 0.0, 0.0, 0.0])[:2]
+    assert np.abs(moved - predicted).max() <= 0.01 * np.abs(moved).max()
+
+
+def test_an_equilibrium_holds_still(bare):
+    model = twodof.linearise(bare, {"tau_cmd": [0.02, 0.01]})
+    q = [model.point[f"q[{i}]"] for i in (1, 2)]
+    starts = {"q_start": q, "tau_cmd": [0.02, 0.01]}
+    last = [*twodof.samples(bare, stop_time=0.05, settings=starts)][-1]
+    assert np.abs(np.array(last.q) - q).max() <= 1e-9
+
+
+@pytest.mark.parametrize(
+    "fmu, at, message",
+    [
+        ("bare", {"q": [0.0, np.pi]}, "joint 'joint2' is at its limit 3.14159"),
+        ("bare", {"tau_cmd": 90.0}, "there is no equilibrium near q_start = "),
+        ("bare", {"Kp": 1.0}, "it is of control 'task' or "),
+        ("task", {"q": [0.3, 0.8], "rcond": "ratio"}, "jumps here"),
+        ("python", {}, "gives no derivatives; a native FMU does"),
+    ],
+)
+def test_what_has_no_linear_model_is_refused(fmu, at, message, bare, native_path, fmu_path):
+    path = {"bare": bare, "task": native_path, "python": fmu_path}[fmu]
+    if at.get("rcond") == "ratio":
+        s, c = np.sin([0.3, 1.1]), np.cos([0.3, 1.1])
+        sigma = np.linalg.svd([[-s[0] - s[1], -s[1]], [c[0] + c[1], c[1]]])[1]
+        at = {**at, "rcond": sigma[1] / sigma[0]}
+    with pytest.raises(twodof.TwoDofError, match=message):
+        twodof.linearise(path, at)
+
+
+def test_a_singular_pose_and_a_motion_are_remarked(native_path):
+    model = twodof.linearise(native_path, {"q": [0.3, 0.001]})
+    assert [remark[:15] for remark in model.remarks] == ["a singular pose", "no equilibrium:"]
+
+
+def test_groups_that_are_chosen(bare):
+    model = twodof.linearise(bare, {"q": UPRIGHT}, inputs=["tau_cmd"], outputs=["x", "tau"])
+    assert model.inputs == ("tau_cmd[1]", "tau_cmd[2]")
+    assert model.outputs == ("x[1]", "x[2]", "tau[1]", "tau[2]")
+    with pytest.raises(twodof.TwoDofError, match="there is no 'Kp'; there are tau_cmd"):
+        twodof.linearise(bare, inputs=["Kp"])
+
+
+def test_the_command_prints_the_model(bare, capsys):
+    assert main(["linearise", str(bare), "--at", f"q={UPRIGHT[0]},0", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    model = twodof.linearise(bare, {"q": UPRIGHT})
+    assert printed["A"] == model.A.tolist() and printed["inputs"] == [*model.inputs]
+    assert printed["modes"][0]["frequency"] == model.modes[0].frequency
+    assert main(["linearise", str(bare), "--at", f"q={UPRIGHT[0]},0"]) == 0
+    text = capsys.readouterr().out
+    assert "q[1]        1.5708 rad" in text and "eigenvalue, 1/s" in text
+    assert main(["linearise", str(bare), "--at", "q"]) == 2
+    assert "--at q: expected NAME=VALUE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("control", ["task", "effort"])
+def test_casadi_takes_the_fmu_and_has_the_same_jacobian(control, bare, native_path, tmp_path):
+    """Its states by fmi2SetReal, from their start attributes, and derivatives by fmi2GetReal."""
+    needs("casadi")
+    import casadi
+
+    path = bare if control == "effort" else native_path
+    fmpy.extract(str(path), str(tmp_path))
+    dae = casadi.DaeBuilder("arm", str(tmp_path), {})
+    assert [dae.start(name)[0] for name in dae.x()] == [0.5, 0.35, 0.0, 0.0]
+    jacobian = dae.create("f", ["x", "u"], ["ode"]).factory("J", ["x", "u"], ["jac:ode:x"])
+    state, inputs = [0.4, 0.3, 0.1, -0.2], [dae.start(name)[0] for name in dae.u()]
+    model = twodof.linearise(path, {"q": state[:2], "v": state[2:]})
+    theirs = np.array(jacobian(state, inputs))
+    assert np.abs(theirs - model.A).max() <= 1e-9 * np.abs(model.A).max()

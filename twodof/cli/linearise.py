@@ -1,0 +1,73 @@
+"""linearise: an FMU as a linear system about an operating point."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from .common import parse_settings, print_json, print_table
+from .options import add_json_option
+
+if TYPE_CHECKING:
+    from ..linear import LinearModel
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    linearise = verbs.add_parser(
+        "linearise", help="show the linear model of a native FMU about an operating point"
+    )
+    linearise.add_argument("fmu", metavar="FMU")
+    linearise.add_argument(
+        "--at", action="append", default=[], metavar="NAME=VALUE",
+        help="of the point: q=0.5,0.35, v=0, and inputs and parameters, as tau_cmd=0.1,0; without q"
+        " and v it is the equilibrium near q_start",
+    )  # fmt: skip
+    add_json_option(linearise)
+    linearise.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from ..linear import linearise
+
+    model = linearise(options.fmu, parse_settings(options.at, "--at"))
+    (_print_json if options.json else _print)(model)
+    return 0
+
+
+def _print_json(model: LinearModel) -> None:
+    values = model._asdict()
+    for name in "ABCD":
+        values[name] = values[name].tolist()
+    modes = [
+        {"eigenvalue": [z.real, z.imag], "damping": damping, "frequency": frequency}
+        for z, damping, frequency in model.modes
+    ]
+    print_json(kind="linear model", **values, modes=modes)
+
+
+def _print(model: LinearModel) -> None:
+    print_table(
+        *((name, f"{value:.6g} {model.units[name]}".strip()) for name, value in model.point.items())
+    )
+    for remark in model.remarks:
+        print(f"note: {remark}")
+    print("\neigenvalue, 1/s          damping  frequency, rad/s")
+    for z, damping, frequency in model.modes:
+        number = f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.6g}"
+        print(f"{number:<24} {damping:7.4f}  {frequency:.6g}")
+    for name in "ABCD":
+        print(f"\n{name}")
+        rows = model.states if name in "AB" else model.outputs
+        columns = model.states if name in "AC" else model.inputs
+        _print_matrix(getattr(model, name).tolist(), rows, columns)
+
+
+def _print_matrix(
+    matrix: list[list[float]], rows: tuple[str, ...], columns: tuple[str, ...]
+) -> None:
+    cells = [["", *columns], *([row, *(f"{x:.6g}" for x in r)] for row, r in zip(rows, matrix))]
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    for line in cells:
+        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths)).rstrip())

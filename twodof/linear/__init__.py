@@ -1,0 +1,209 @@
+"""An FMU as a linear system about an operating point.
+
+    ẏ = A y + B u,    z = C y + D u,    y = (q, v)
+
+A, B, C and D are the FMU's own directional derivatives, exact to rounding; deviations of states y,
+inputs u and outputs z from the operating point. An eigenvalue λ of A has the frequency |λ| and the
+damping ratio −Re λ/|λ|.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, SimulationError
+from ..experiments import Setting, Value, resolve
+from ..fmu import Fmu, Instance, instantiate, load_fmu
+
+Array = NDArray[np.float64]
+
+MOST_ITERATIONS = 50
+SETTLED, AT_REST = 1e-11, 1e-6
+"""Rates, beside the largest that a change of a state by one makes: where a search ends, and below
+which a point is called an equilibrium."""
+NEAR_JUMP = 1e-6
+
+
+class Mode(NamedTuple):
+    """An eigenvalue, 1/s, with its damping ratio and frequency, rad/s."""
+
+    eigenvalue: complex
+    damping: float
+    frequency: float
+
+
+class LinearModel(NamedTuple):
+    """A linear system; ``control.ss(*model[:4])`` is it in python-control.
+
+    Attributes:
+        A, B, C, D: the matrices, SI units.
+        states, inputs, outputs: names of their rows and columns, as the FMU has them.
+        units: of all of these, by name.
+        point: values of states and inputs at the operating point, by name.
+        rates: derivatives of the states there; 0 at an equilibrium.
+        remarks: what is to be known of the point, a line each.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: dict[str, str]
+    point: dict[str, float]
+    rates: tuple[float, ...]
+    remarks: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        n, m, p = len(self.states), len(self.inputs), len(self.outputs)
+        return f"<LinearModel: {n} states, {m} inputs, {p} outputs>"
+
+    @property
+    def modes(self) -> list[Mode]:
+        """Eigenvalues of A, the slowest first."""
+        values = sorted(np.linalg.eigvals(self.A).tolist(), key=lambda z: (abs(z), -z.imag))
+        return [Mode(complex(z), -z.real / abs(z) if z else 1.0, abs(z)) for z in values]
+
+
+def linearise(
+    fmu: Fmu | str | Path,
+    at: Mapping[str, Setting] | None = None,
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+) -> LinearModel:
+    """The linear model of an FMU about an operating point.
+
+    Args:
+        fmu: an FMU that gives directional derivatives, as the native flavour does.
+        at: values of inputs and parameters, and of the states ``q`` and ``v``. Without ``q`` and
+            ``v`` the point is an equilibrium that is looked for from ``q_start``.
+        inputs, outputs: groups of variables, e.g. ``["tau_cmd"]``; None: all.
+
+    Raises:
+        InputError: a name or value is wrong, or the FMU gives no derivatives.
+        SimulationError: there is no equilibrium near, or the model is not linear at the point.
+    """
+    fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
+    if not fmu.description.coSimulation.providesDirectionalDerivative or "der(q[1])" not in (
+        fmu.variables
+    ):
+        raise InputError(
+            f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`"
+        )
+    given = dict(at or {})
+    fixed = "q" in given or "v" in given
+    if fixed:
+        given.setdefault("v", 0.0)
+    settings = {{"q": "q_start", "v": "v_start"}.get(k, k): value for k, value in given.items()}
+    values = resolve(fmu, settings)
+    with instantiate(fmu) as instance:
+        point = _Point(fmu, instance, values)
+        if not fixed:
+            point.settle()
+        return point.model(
+            _chosen(fmu, "input", inputs, "inputs"), _chosen(fmu, "output", outputs, "outputs")
+        )
+
+
+def _chosen(fmu: Fmu, causality: str, wanted: Sequence[str] | None, argument: str) -> list[str]:
+    groups = fmu.groups(causality)
+    for group in wanted or ():
+        if group not in groups:
+            raise InputError(f"`{argument}`: there is no '{group}'; there are {', '.join(groups)}")
+    return [name for group in (groups if wanted is None else wanted) for name in groups[group]]
+
+
+class _Point:
+    """An instance that is put to one state after another."""
+
+    def __init__(self, fmu: Fmu, instance: Instance, values: Mapping[str, Value]) -> None:
+        self._fmu, self._instance, self._values = fmu, instance, dict(values)
+        self._q, self._v = fmu.vector("q"), fmu.vector("v")
+        self._starts = fmu.vector("q_start"), fmu.vector("v_start")
+        self._accelerations = [f"der({name})" for name in self._v]
+        self._instance.initialise(0.0, np.inf, self._values)
+
+    def _read(self, names: Sequence[str]) -> Array:
+        return np.array(self._instance.reader(names)())
+
+    def _move(self, q: Array) -> None:
+        q = np.clip(q, *(self._read(self._fmu.vector(name)) for name in ("q_min", "q_max")))
+        still = dict.fromkeys(self._starts[1], 0.0)
+        self._values.update({**dict(zip(self._starts[0], q.tolist())), **still})
+        self._instance.reset()
+        self._instance.initialise(0.0, np.inf, self._values)
+
+    def settle(self) -> None:
+        """Move to an equilibrium, by Newton's method with halved steps."""
+        first = q = self._read(self._q)
+        self._move(q)
+        for _ in range(MOST_ITERATIONS):
+            a = self._read(self._accelerations)
+            slope = self._instance.derivatives(self._accelerations, self._q)
+            if np.abs(a).max() <= SETTLED * max(1.0, np.abs(slope).max()):
+                return
+            step = np.linalg.lstsq(slope, -a, rcond=1e-10)[0]
+            for halving in range(30):
+                self._move(q + 0.5**halving * step)
+                if np.linalg.norm(self._read(self._accelerations)) < np.linalg.norm(a):
+                    break
+            q = self._read(self._q)
+        raise SimulationError(
+            f"there is no equilibrium near q_start = ({', '.join(f'{x:g}' for x in first)}): it"
+            f" still accelerates by {np.abs(a).max():.3g}; give another q_start, other inputs,"
+            " or the state, q"
+        )
+
+    def model(self, inputs: list[str], outputs: list[str]) -> LinearModel:
+        """The linear model at the point."""
+        states = [*self._q, *self._v]
+        rates = [f"der({name})" for name in states]
+        known = [*states, *inputs]
+        remarks = self._remarks()
+        whole = self._instance.derivatives([*rates, *outputs], known)
+        n = len(states)
+        moving = self._read(rates)
+        if np.abs(moving).max() > AT_REST * max(1.0, np.abs(whole[:n, :n]).max()):
+            remarks.append(f"no equilibrium: the rates are up to {np.abs(moving).max():.3g}")
+        variables = self._fmu.variables
+        return LinearModel(
+            *(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:]),
+            *(tuple(states), tuple(inputs), tuple(outputs)),
+            units={name: variables[name].unit or "" for name in [*known, *outputs]},
+            point=dict(zip(known, self._read(known).tolist())),
+            rates=tuple(moving.tolist()),
+            remarks=tuple(remarks),
+        )
+
+    def _remarks(self) -> list[str]:
+        """What is said of a singular pose. Raises where there is no linear model."""
+        limits = [self._read(self._fmu.vector(name)) for name in ("q", "q_min", "q_max")]
+        for joint, q, low, high in zip(self._fmu.joints, *limits):
+            if q in (low, high):
+                raise SimulationError(
+                    f"joint '{joint}' is at its limit {q:g}, where the model is not linear: move"
+                    " it off, or widen q_min and q_max"
+                )
+        if "rcond" not in self._fmu.variables:
+            return []
+        jacobian = self._instance.derivatives(self._fmu.vector("x"), self._q)
+        sigma, (rcond,) = np.linalg.svd(jacobian)[1], self._read(["rcond"])
+        ratio = sigma / sigma[0] if sigma[0] else 0.0 * sigma
+        if np.abs(ratio[1:] - rcond).min(initial=1.0) < NEAR_JUMP:
+            raise SimulationError(
+                f"J⁺ jumps here: σ_min/σ_max = {ratio[-1]:.6g} is rcond; choose another q or rcond"
+            )
+        if ratio[-1] <= rcond:
+            return [
+                f"a singular pose: σ_min/σ_max = {ratio[-1]:.3g} is below rcond = {rcond:g}, so"
+                " that a direction of the frame is not controlled"
+            ]
+        return []
