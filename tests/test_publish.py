@@ -331,9 +331,9 @@ def test_a_point_is_the_target_within_two_steps(
                 break
         process.send_signal(signal.SIGINT)
         ended(process, 130)
-    sent = [it[2] for it in node.told if it[0] == "sent"][-1]
     heard = next(m for m in node.messages("/target") if m[1][0] == 0.125)
-    assert 0 < stamp_of(heard[0]) - sent <= 2 * step * SECOND
+    delays = [stamp_of(heard[0]) - it[2] for it in node.told if it[0] == "sent"]
+    assert 0 < min(delay for delay in delays if delay > 0) <= 2 * step * SECOND
     ((t, values),) = json.loads((bag / "run.json").read_text())["input_changes"]
     assert values == {"x_des[1]": 0.125, "x_des[2]": 0.17}
     states = recorded(bag)["/joint_states"]

@@ -31,16 +31,21 @@ def read_text(path: Path) -> str:
         raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
 
 
-def end_effector(urdf: Urdf) -> str:
-    """The link that is controlled where none is named."""
-    if DEFAULT_FRAME in urdf.links:
-        return DEFAULT_FRAME
+def last_links(urdf: Urdf) -> list[str]:
+    """Those without a child that a joint moves."""
     parents = {joint.parent for joint in urdf.joints.values()}
-    leaves = [
+    return [
         link
         for link in urdf.links
         if link not in parents and any(joint.moves for joint in urdf.chain(link))
     ]
+
+
+def end_effector(urdf: Urdf) -> str:
+    """The link that is controlled where none is named."""
+    leaves = last_links(urdf)
+    if DEFAULT_FRAME in urdf.links:
+        return DEFAULT_FRAME
     if len(leaves) == 1:
         return leaves[0]
     others = [link for link in urdf.links if link not in leaves]
