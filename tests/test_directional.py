@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from native_models import ROBOTS, Engine, model
+from native_models import ROBOTS, Engine, Reduced, model
 
 
 class Derivatives(Engine):
@@ -71,31 +71,39 @@ def at_random(engine, rng, **settings):
     return engine.values(plant)
 
 
+def derivatives(reduced: Reduced, q, v, effort):
+    """Of q̈ by q, v and τ: Pinocchio's of the forward dynamics, or where joints follow others those
+    of the inverse dynamics, in the coordinates of the joints that move on their own."""
+    model, data, G = reduced.model, reduced.data, reduced.G
+    if model.nv == len(q):
+        by_q, by_v, by_tau = pin.computeABADerivatives(model, data, q, v, effort)
+        return by_q, by_v, np.triu(by_tau) + np.triu(by_tau, 1).T
+    Q, A = G @ q + reduced.c, G @ reduced.forward_dynamics(q, v, effort)
+    tau_by_q, tau_by_v, _ = pin.computeRNEADerivatives(model, data, Q, G @ v, A)
+    by_tau = np.linalg.inv(reduced.mass_matrix(q))
+    return -by_tau @ G.T @ tau_by_q @ G, -by_tau @ G.T @ tau_by_v @ G, by_tau
+
+
 @pytest.mark.parametrize("name", ["twodof", *ROBOTS])
 def test_the_bare_plants_are_pinocchios(name):
     engine = Derivatives(model(name, "effort"))
     robot, rng = engine.model.robot, np.random.default_rng(1)
     reference = robot.model.copy()
-    if reference.nv > engine.n:
-        pytest.skip("Pinocchio has no derivatives of joints that follow others")
+    reduced = Reduced(reference, name)
     for _ in range(100 if engine.n < 15 else 10):
         values = at_random(engine, rng, f_ext=[0.0, 0.0, 0.0])
         reference.gravity.linear = engine.group(values, "gravity")
         q, v = engine.group(values, "q"), engine.group(values, "v")
         damping = np.array(robot.damping)
         effort = engine.group(values, "tau_cmd") + engine.group(values, "tau_ext") - damping * v
-        data = reference.createData()
-        by_q, by_v, by_tau = pin.computeABADerivatives(reference, data, q, v, effort)
-        by_tau = np.triu(by_tau) + np.triu(by_tau, 1).T
+        by_q, by_v, by_tau = derivatives(reduced, q, v, effort)
         ours = engine.jacobian(values)
         for columns, theirs in (
             (r"q\[\d+\]", by_q), (r"v\[\d+\]", by_v - by_tau * damping), (r"tau_cmd.*", by_tau),
         ):  # fmt: skip
             part = engine.part(ours, r"der\(v.*", columns)
             assert np.abs(part - theirs).max() <= 1e-10 * max(1.0, np.abs(theirs).max())
-        J = pin.computeFrameJacobian(reference, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED)[
-            :3
-        ]
+        J = reduced.jacobian(q, robot.frame_id)[:3]
         by_force = engine.part(ours, r"der\(v.*", r"f_ext.*")
         assert np.abs(by_force - by_tau @ J.T).max() <= 1e-9 * np.abs(by_tau).max()
 

@@ -73,10 +73,20 @@ def test_files_and_description(shipped, fmu_path):
     assert binaries == set(BINARIES.values())
     with zipfile.ZipFile(fmu_path) as archive:
         theirs = ET.fromstring(archive.read("modelDescription.xml"))
-    simulation = ours.find("CoSimulation")
-    assert simulation.get("needsExecutionTool") == "false"
-    files = [file.get("name") for file in simulation.iter("File")]
-    assert files == sorted(name for name in sources if name.endswith(".c"))
+    for kind in ("CoSimulation", "ModelExchange"):
+        element = ours.find(kind)
+        assert element.get("needsExecutionTool") == "false"
+        assert element.get("providesDirectionalDerivative") == "true"
+        files = [file.get("name") for file in element.iter("File")]
+        assert files == sorted(name for name in sources if name.endswith(".c"))
+    for scalar in ours.iter("ScalarVariable"):  # states, which may start and be set anew
+        if scalar.get("initial") == "approx":
+            assert scalar.get("name")[:2] in ("q[", "v[")
+            scalar.set("initial", "calculated")
+            assert scalar[0].attrib.pop("reinit") == "true" and scalar[0].attrib.pop("start")
+    ours.remove(ours.find("ModelExchange"))
+    del ours.attrib["numberOfEventIndicators"]
+    del ours.find("CoSimulation").attrib["providesDirectionalDerivative"]
     for tree in (ours, theirs):
         assert tree.attrib.pop("guid") and tree.attrib.pop("generationTool")
         simulation = tree.find("CoSimulation")

@@ -481,7 +481,7 @@ def programs(arm):
     )
     refused = choice(
         one("set", st.just("x_des"), st.sampled_from([(*arm.target[1:], nan), (inf,) * m])),
-        one("set", st.just("q"), st.just(arm.rest)),
+        one("set", st.just("x"), st.just((0.1,) * m)),
         parameters,  # in step mode
         one("step", st.sampled_from([0.0, -0.01, nan, inf])),
         one("step", h, st.sampled_from([1e-3, -0.5, nan])),
