@@ -31,6 +31,7 @@ from twodof.plant.urdf import read_urdf
 REFUSED = (
     "of type 'floating'", "of type 'planar'", "of type 'spherical'", "has no moving joint",
     "but has no mass", "no inertia about its axis", "which does not exist", "not physical",
+    "has no links",
 )  # fmt: skip
 FALL = 0.1  # s
 
@@ -56,9 +57,10 @@ def robots_folder() -> Path:
 
 
 def frame_of(text: str) -> str:
-    """The last link that most joints move, the first of several."""
+    """The last link that most joints move, the first of several; the root where none moves."""
     urdf = read_urdf(text)
-    return max(last_links(urdf), key=lambda link: sum(j.moves for j in urdf.chain(link)))
+    ends = last_links(urdf) or [urdf.root]
+    return max(ends, key=lambda link: sum(joint.moves for joint in urdf.chain(link)))
 
 
 def fall_apart(fmu: Path, robot: Robot) -> float:

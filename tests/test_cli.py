@@ -506,7 +506,7 @@ def test_build_says_what_it_built_and_what_to_do_next(session: dict[str, str]) -
     size = (Path(session["cwd"]) / "TwoDof.fmu").stat().st_size / 1024
     assert found["FMU"] == f"TwoDof.fmu ({size:.0f} KB, linux64)"
     assert found["robot"] == "2dof: joint1, joint2"
-    assert found["controlled"] == "EndEffector, axes x y of world"
+    assert found["controlled"] == "EndEffector, axes x y of world; task control"
     assert "twodof run TwoDof.fmu" in session["build"].partition("\nnext\n")[2]
 
 

@@ -224,7 +224,10 @@ def length(metres: float) -> str:
 
 def controlled(fmu: Fmu) -> str:
     """What an FMU controls."""
-    return f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}" if fmu.frame else "unknown"
+    if not fmu.frame:
+        return "unknown"
+    of = f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}"
+    return f"{of}; {fmu.control} control" if fmu.control else of
 
 
 def open_page(
