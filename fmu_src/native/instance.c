@@ -127,6 +127,18 @@ void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
+fmi2Status check_range(Instance *instance, int variable, double value)
+{
+    for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
+        const int index = variable - RANGE[k].first;
+        if (index >= 0 && index < RANGE[k].count
+            && !(value >= RANGE[k].low && value <= RANGE[k].high))
+            return report(instance, fmi2Error, "%s = %g must be %s", VARIABLE_NAME[variable],
+                          value, RANGE[k].words);
+    }
+    return fmi2OK;
+}
+
 fmi2Status check_inputs(Instance *instance)
 {
 #if N_ROWS > N_AXES
@@ -140,20 +152,9 @@ fmi2Status check_inputs(Instance *instance)
     return fmi2OK;
 }
 
-fmi2Status check_parameters(Instance *instance)
+fmi2Status check_limits(Instance *instance)
 {
     const double *value = instance->state.plant.value;
-    const int positive[] = {RTOL, ATOL, MAX_STEP};
-    for (int i = 0; i < 3; i++)
-        if (!(value[positive[i]] > 0.0))
-            return report(instance, fmi2Error, "%s = %g must be > 0", VARIABLE_NAME[positive[i]],
-                          value[positive[i]]);
-    if (!(value[PAYLOAD] >= 0.0))
-        return report(instance, fmi2Error, "payload = %g must be >= 0", value[PAYLOAD]);
-#ifdef HAS_RCOND
-    if (!(value[RCOND] >= 0.0 && value[RCOND] < 1.0))
-        return report(instance, fmi2Error, "rcond = %g must be in [0, 1)", value[RCOND]);
-#endif
     for (int i = 0; i < N_JOINTS; i++)
         if (value[Q_MIN + i] > value[Q_MAX + i])
             return report(instance, fmi2Error, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
@@ -176,7 +177,7 @@ fmi2Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
-    if (check_parameters(instance) != fmi2OK || check_inputs(instance) != fmi2OK)
+    if (check_limits(instance) != fmi2OK || check_inputs(instance) != fmi2OK)
         return fmi2Error;
     for (int i = 0; i < N_JOINTS; i++) {
         const double start = value[Q_START + i];

@@ -67,11 +67,14 @@ INTERNAL fmi2Status report(Instance *instance, fmi2Status status, const char *fo
 /* Set the state to that of a new instance. */
 INTERNAL void reset_state(State *state);
 
+/* Whether a variable may have a value; a refusal is logged. */
+INTERNAL fmi2Status check_range(Instance *instance, int variable, double value);
+
 /* Whether the control law can follow the inputs; a refusal is logged. */
 INTERNAL fmi2Status check_inputs(Instance *instance);
 
-/* Whether the parameters make sense; a refusal is logged. */
-INTERNAL fmi2Status check_parameters(Instance *instance);
+/* Whether the joints' limits make ranges; a refusal is logged. */
+INTERNAL fmi2Status check_limits(Instance *instance);
 
 /* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
    clamped is logged too. */

@@ -79,7 +79,10 @@ static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
     state->has_stops = runs && !steps && state->has_stops != 0;
     if (!sound)
         return refuse(instance, DESERIALIZE, UNSOUND);
-    return runs ? check_parameters(instance) : fmi2OK;
+    for (int i = 0; i < N_VARIABLES; i++)
+        if (check_range(instance, i, value[i]) != fmi2OK)
+            return fmi2Error;
+    return runs ? check_limits(instance) : fmi2OK;
 }
 
 fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)

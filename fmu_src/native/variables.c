@@ -174,6 +174,8 @@ fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference vr[], s
         if (!isfinite(value[i]))
             return report(instance, fmi2Error, "%s = %s is not finite", VARIABLE_NAME[vr[i]],
                           isnan(value[i]) ? "nan" : value[i] > 0.0 ? "inf" : "-inf");
+        if (check_range(instance, (int)vr[i], value[i]) != fmi2OK)
+            return fmi2Error;
     }
     for (size_t i = 0; i < count; i++)
         set(instance, vr[i], value[i]);

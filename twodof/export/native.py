@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Variable, count_event_indicators
+from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
 Array = NDArray[np.float64]
 
@@ -66,6 +66,7 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
         _value_references(groups),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
+        _ranges(groups),
         _table("char *const JOINT_NAME", robot.joints),
         "/* The tree: parents are -1 for the root; joints from the root to the task frame. */\n"
         + _table("int PARENT", (parent - 1 for parent in parents)),
@@ -130,6 +131,20 @@ def _value_references(groups: Sequence[str]) -> str:
     lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
     body = "\n".join(lines)
     return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
+
+
+def _ranges(groups: Sequence[str]) -> str:
+    rows = "".join(
+        f"\n    {{{group.upper()}, {groups.count(group)}, {_literal(within.low)},"
+        f" {_literal(within.high)}, {_quoted(within.words)}}},"
+        for group, within in RANGES.items()
+        if group in groups
+    )
+    return (
+        "/* Values that variables may have; others may be any number. */\nstatic const struct {\n"
+        "    int first, count;\n    double low, high;\n    const char *words;\n"
+        f"}} RANGE[] = {{{rows}\n}};\n"
+    )
 
 
 def _table(declaration: str, values: Iterable[object]) -> str:
