@@ -96,7 +96,7 @@ def test_a_mimic_of_a_mimic_follows_the_joint_that_moves() -> None:
     np.testing.assert_allclose(np.ravel(J)[:2], r * across - along, atol=1e-15)
     assert J[5] == pytest.approx([3.0])
     expected = -2.0 * v**2 * across - r * v**2 * along
-    np.testing.assert_allclose(drift.linear[:2], expected, atol=1e-14)
+    np.testing.assert_allclose(drift[:2], expected, atol=1e-14)
     turning = 0.01 + 0.01 + 0.02 + 3.0**2 * 0.001  # a about its end, b, the tip thrice as fast
     M = turning + (2.0 + 0.5) * (r**2 + 1.0)
     assert mechanism.mass_matrix(np.array([q])) == pytest.approx(np.array([[M]]), rel=1e-14)
