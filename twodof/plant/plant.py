@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from operator import mul
-from typing import Any
 
 import numpy as np
 
@@ -176,7 +175,7 @@ class Plant:
     @property
     def x(self) -> list[float]:
         """Position of the task frame along the task axes, m, root frame."""
-        position = self._observed()[0].translation.tolist()
+        position = self._observed()[0]
         return [position[axis] for axis in self._axes]
 
     @property
@@ -188,7 +187,8 @@ class Plant:
     @property
     def quat(self) -> list[float]:
         """Orientation of the task frame in the root's, a unit quaternion x, y, z, w with w ≥ 0."""
-        return quaternion(self._observed()[0].rotation)
+        self._observed()
+        return quaternion(self._real.rotation)
 
     @property
     def omega(self) -> list[float]:
@@ -225,7 +225,7 @@ class Plant:
         self._stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
         return rates
 
-    def _observed(self) -> tuple[Any, list[list[float]], Any]:
+    def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
         return self._real.observe(np.array(self.q), np.array(self.v))
 
     def _stops(self) -> Stops:
