@@ -3,7 +3,8 @@
     python docs/make_screenshots.py
 
 The first is the replay of a real run of the default arm, whose target changes; the second a live
-arm, whose target has just been dragged, the third a Panda on its way to a pose. Needs chromium and the packages 'viser' and 'playwright'.
+arm, whose target has just been dragged, the third a Panda on its way to a pose.
+Needs chromium and the packages 'viser' and 'playwright'.
 """
 
 from __future__ import annotations

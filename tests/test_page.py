@@ -37,7 +37,7 @@ import twodof
 from twodof.errors import BagError, PageError
 from twodof.experiments import resolve
 from twodof.export.arm_page import FUNCTIONS, SCRIPTS
-from twodof.export.compiler import compile_web_module
+from twodof.export.compiler import UNITS, compile_web_module
 from twodof.fmu import instantiate
 from twodof.plots.track import read_tracks
 
@@ -357,7 +357,7 @@ def test_the_engine_imports_nothing(native_path, arm, tmp_path) -> None:
             if name.startswith("sources/")
         }
     module = compile_web_module(
-        {**sources, "engine.c": (ASSETS / "engine.c").read_bytes()}, FUNCTIONS
+        {**sources, "page.c": (ASSETS / "page.c").read_bytes()}, (*UNITS, "page.c"), FUNCTIONS
     )
     sections = set()
     position = 8

@@ -146,7 +146,7 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else that of the URDF or of the default arm, built if need be."""
-    if options.fmu and Path(options.fmu).suffix != ".urdf":
+    if options.fmu and Path(options.fmu).suffix not in (".urdf", ".xacro"):
         if options.native:
             raise CommandLineError(
                 "--native builds the default arm's FMU; leave it out beside an FMU"
@@ -161,7 +161,8 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
         print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
     if robot is None:
         return build_fmu(None, FmuOptions(native=native))
-    name = re.sub(r"\W", "_", robot.stem, flags=re.ASCII)
+    stem = robot.name.removesuffix(".xacro").removesuffix(".urdf")
+    name = re.sub(r"\W", "_", stem, flags=re.ASCII)
     name = name if name.isidentifier() else f"robot_{name}"
     return build_fmu(None, FmuOptions(urdf=robot, name=name, native=native))
 

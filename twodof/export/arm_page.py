@@ -23,7 +23,7 @@ from ..geometry.kinematics import Kinematics, Placement
 from ..geometry.shapes import ReadMesh, Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, Urdf, read_urdf
 from ..version import versions
-from .compiler import compile_web_module
+from .compiler import UNITS, compile_web_module
 
 SCRIPTS = (
     "engine.js", "session.js", "matrices.js", "robot.js", "camera.js", "scene.js", "handle.js",
@@ -35,7 +35,7 @@ FUNCTIONS = (
     "fmi2SetupExperiment", "fmi2EnterInitializationMode", "fmi2ExitInitializationMode",
     "fmi2Reset", "fmi2SetReal", "fmi2GetReal", "fmi2SetBoolean", "fmi2DoStep",
 )  # fmt: skip
-"""Of FMI and of engine.c, which the page calls."""
+"""Of FMI and of page.c, which the page calls."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
 POLICY = (
     "default-src 'none'; script-src 'sha256-{script}' 'wasm-unsafe-eval';"
@@ -90,8 +90,8 @@ def live_part(arm: Arm) -> LivePart:
         BuildError: the engine cannot be compiled.
         RobotError: the robot cannot be drawn.
     """
-    engine = data_file("fmu_src", "page", "engine.c").read_bytes()
-    module = compile_web_module({**arm.sources, "engine.c": engine}, FUNCTIONS)
+    around = data_file("fmu_src", "page", "page.c").read_bytes()
+    module = compile_web_module({**arm.sources, "page.c": around}, (*UNITS, "page.c"), FUNCTIONS)
     facts, meshes = _facts(arm)
     data = json.dumps(facts, sort_keys=True).replace("<", "\\u003c")
     script = "".join(_asset(name) for name in SCRIPTS)

@@ -22,6 +22,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 """zig's targets by FMI platform; several are joined into one universal library."""
 ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
+UNITS = ("directional.c", "fmu.c")
+"""The C files that are compiled; they include the others."""
 EXTENSIONS = {"linux64": ".so", "win64": ".dll", "darwin64": ".dylib"}
 FLAGS = (
     "-std=c99", "-O2", "-ffp-contract=off", "-fcx-limited-range", "-fno-math-errno",
@@ -36,6 +38,7 @@ def compile_library(
     platform: str,
     name: str,
     *,
+    units: Sequence[str] = UNITS,
     flags: Sequence[str] = (),
 ) -> bytes:
     """The shared library of an FMU.
@@ -45,6 +48,7 @@ def compile_library(
             the FMI standard among them.
         platform: FMI platform, a key of ``TARGETS``.
         name: model identifier, the library's name without extension.
+        units: the files that are compiled; they include others.
         flags: further flags for the compiler.
 
     Raises:
@@ -56,17 +60,18 @@ def compile_library(
     with temporary_folder() as folder:
         for file, content in sources.items():
             (folder / file).write_bytes(content)
-        files = sorted(file for file in sources if file.endswith(".c"))
         output = name + EXTENSIONS[platform]
         built = []
         for compiler in _compilers(platform):
-            _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *files], folder)
+            _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *units], folder)
             built.append((folder / output).read_bytes())
     return built[0] if len(built) == 1 else universal(built)
 
 
-def compile_web_module(sources: Mapping[str, bytes], functions: Sequence[str]) -> bytes:
-    """A WebAssembly module of C files that imports nothing and exports these functions.
+def compile_web_module(
+    sources: Mapping[str, bytes], units: Sequence[str], functions: Sequence[str]
+) -> bytes:
+    """A WebAssembly module of these of the C files, that imports nothing and exports functions.
 
     Its ``_initialize`` is to be called first.
 
@@ -81,10 +86,9 @@ def compile_web_module(sources: Mapping[str, bytes], functions: Sequence[str]) -
     with temporary_folder() as folder:
         for file, content in sources.items():
             (folder / file).write_bytes(content)
-        files = sorted(file for file in sources if file.endswith(".c"))
-        link = ["-mexec-model=reactor", "-s", "-o", "engine.wasm", *exports]
-        _run([*ZIG, "wasm32-wasi", *FLAGS, *link, *files], folder)
-        return (folder / "engine.wasm").read_bytes()
+        link = ["-mexec-model=reactor", "-s", "-o", "module.wasm", *exports]
+        _run([*ZIG, "wasm32-wasi", *FLAGS, *link, *units], folder)
+        return (folder / "module.wasm").read_bytes()
 
 
 def compiles_for_the_web() -> bool:
