@@ -30,7 +30,7 @@ def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     from ..pages.arm import page
 
-    options.native = not options.fmu or Path(options.fmu).suffix == ".urdf"
+    options.native = not options.fmu or Path(options.fmu).suffix in (".urdf", ".xacro")
     fmu = chosen_fmu(options)
     output = options.output or fmu.with_suffix(".html").name
     path = page(fmu, output, step=options.step, settings=parse_settings(options.settings))
