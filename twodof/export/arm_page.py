@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from ..files import data_file
 from ..geometry.kinematics import Kinematics, Placement
-from ..geometry.shapes import ReadMesh, Shape, link_shapes, sphere
+from ..geometry.meshes import ReadMesh
+from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, Urdf, read_urdf
 from ..version import versions
 from .compiler import UNITS, compile_web_module

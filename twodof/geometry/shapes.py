@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..files import temporary_folder
 from ..plant.urdf import RobotError, Urdf
 from .kinematics import Array, Placement
+from .meshes import Colour, Part, ReadMesh, mesh_parts
 
-ReadMesh = Callable[[str], bytes | None]
-"""The bytes of a mesh by its name ``meshes/…``, None where it is missing."""
-Colour = tuple[float, float, float]
 Indices = NDArray[np.uint32]
 
-MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
-"""Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
 NO_MATERIAL = (0.62, 0.66, 0.70)
 STICKS = ((0.0, 0.447, 0.698), (0.835, 0.369, 0.0), (0.0, 0.620, 0.451), (0.8, 0.475, 0.655))
 BALL = (0.275, 0.306, 0.345)
@@ -61,43 +54,32 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
             element = geometry[0]
             try:
                 place, colour = origin(visual.find("origin")), _colour(robot.tree, visual)
-                drawn = _triangles(element, read)
+                parts = _parts(element, read)
             except ValueError as error:
                 raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
-            if drawn is not None:
-                shapes.append(Shape(name, place, colour, *drawn))
-            elif element.tag == "mesh":
+            shapes += [Shape(name, place, p.colour or colour, *p[:2]) for p in parts]
+            if element.tag == "mesh" and not parts:
                 missing.append(element.get("filename", "").removeprefix("package://"))
     return shapes or _sticks(robot), missing
 
 
-def _triangles(element: ET.Element, read: ReadMesh) -> tuple[Array, Indices] | None:
-    """Of a URDF's geometry; None where it is of an unknown kind or its mesh is not at hand."""
+def _parts(element: ET.Element, read: ReadMesh) -> list[Part]:
+    """Of a URDF's geometry; none where it is of an unknown kind or its mesh is not at hand."""
 
     def number(key: str) -> float:
         return float(element.get(key, 1))
 
+    if element.tag == "mesh":
+        name = element.get("filename", "").removeprefix("package://")
+        return mesh_parts(name, read, floats(element, "scale", "1 1 1"))
     if element.tag == "box":
         corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
-        return corners * floats(element, "size", "1 1 1"), BOX.copy()
+        return [Part(corners * floats(element, "size", "1 1 1"), BOX, None)]
     if element.tag == "sphere":
-        return sphere(number("radius"))
+        return [Part(*sphere(number("radius")), None)]
     if element.tag == "cylinder":
-        return cylinder(number("radius"), number("length"))
-    if element.tag != "mesh":
-        return None
-    name = element.get("filename", "").removeprefix("package://")
-    content = read(name)
-    if content is None:
-        return None
-    scale = floats(element, "scale", "1 1 1")
-    try:
-        mesh = load_mesh(name, content, scale)
-    except ValueError:
-        return None
-    faces = (mesh.tri_indices(i) for i in range(mesh.num_tris))
-    triangles = [(face[0], face[1], face[2]) for face in faces]
-    return np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32).reshape(-1, 3)
+        return [Part(*cylinder(number("radius"), number("length")), None)]
+    return []
 
 
 BOX = np.array(
@@ -158,28 +140,6 @@ def _colour(tree: ET.Element, visual: ET.Element) -> Colour:
                 r, g, b = floats(colour, "rgba", "1 1 1 1")[:3].tolist()
                 return r, g, b
     return NO_MATERIAL
-
-
-def load_mesh(name: str, content: bytes, scale: Array | Sequence[float]) -> Any:
-    """A mesh file as coal's model, its vertices in m.
-
-    Raises:
-        ValueError: it cannot be read, or is of a format that has other files read beside it.
-    """
-    try:
-        import coal
-    except ImportError as missing:
-        raise ValueError(f"{missing}; install the package 'coal'") from missing
-    suffix = Path(name).suffix.lower()
-    if suffix not in MESH_FORMATS:
-        raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
-    if suffix == ".obj":
-        content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
-    with temporary_folder() as folder:
-        file = folder / Path(name).name
-        file.write_bytes(content)
-        # boxes along the axes: others take longer, and complain on stderr of odd triangles
-        return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
 
 
 def floats(element: ET.Element | None, key: str, default: str) -> Array:

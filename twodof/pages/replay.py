@@ -18,7 +18,7 @@ from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
 from ..files import data_file, refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
-from ..geometry.shapes import ReadMesh
+from ..geometry.meshes import ReadMesh
 from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks
 from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Array, Page

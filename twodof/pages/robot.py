@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import PageError
 from ..geometry.kinematics import Array, Kinematics
-from ..geometry.shapes import ReadMesh, link_shapes
+from ..geometry.meshes import ReadMesh
+from ..geometry.shapes import link_shapes
 from ..plant.urdf import Joint, RobotError, read_urdf
 from .page import Page
 

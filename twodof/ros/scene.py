@@ -15,7 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..geometry.kinematics import Array, Kinematics, Placement
-from ..geometry.shapes import floats, load_mesh, origin
+from ..geometry.meshes import load_mesh
+from ..geometry.shapes import floats, origin
 from ..plant.urdf import Joint, RobotError, read_urdf
 
 LARGEST = 1e6  # m
