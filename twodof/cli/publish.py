@@ -22,6 +22,7 @@ from .common import (
 from .options import add_run_options
 
 if TYPE_CHECKING:
+    from ..ros.foxglove import Foxglove
     from ..ros.publisher import Publisher
 
 
@@ -42,6 +43,12 @@ def add(verbs: Any) -> None:
     )
     publish.add_argument(
         "--subnet", action="store_true", help="for other hosts too, not for this one alone"
+    )
+    publish.add_argument(
+        "--foxglove", action="store_true", help="serve Foxglove too, on this machine alone"
+    )
+    publish.add_argument(
+        "--foxglove-port", dest="port", type=int, default=8765, metavar="PORT", help="(%(default)s)"
     )
     _add_loop_options(publish)
     add_run_options(publish)
@@ -99,12 +106,25 @@ def call(options: argparse.Namespace) -> int:
     )  # fmt: skip
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
+    viewer = _foxglove(options) if options.foxglove else None
     with asked_to_stop() as asked:
-        summary = publish(run, *filter(None, [bag]), wire=wire, pace=pace, stop=asked)
+        summary = publish(
+            run, *filter(None, [viewer, bag]), wire=wire, pace=pace, stop=asked,
+            steer=viewer.command if viewer else dict,
+        )  # fmt: skip
     print_summary(options, run, bag, summary, pace)
     if bag is not None and not options.json:
         print_next(f"twodof plot {quote(bag.path)}", f"ros2 bag play {quote(bag.path)}")
     return INTERRUPTED if summary.stopped else 0
+
+
+def _foxglove(options: argparse.Namespace) -> Foxglove:
+    from ..ros.foxglove import Foxglove
+
+    def tell(server: Foxglove) -> None:
+        print(f"open  Foxglove, Open connection, Foxglove WebSocket: {server.url}", flush=True)
+
+    return Foxglove(options.port, scene=options.scene, effort=options.effort, opened=tell)
 
 
 def _print_network(wire: Publisher) -> None:

@@ -254,6 +254,7 @@ def publish(
     wire: Publisher | None = None,
     pace: RealTime | None = None,
     stop: Callable[[], bool] = lambda: False,
+    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
     **options: Any,
 ) -> Summary:
     """Step an FMU in real time on a ROS 2 network, until it is asked to stop.
@@ -264,7 +265,7 @@ def publish(
         sinks: what consumes the samples too, a bag for instance.
         wire: the publisher; None: one of the joint states.
         pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
-        stop: as of ``simulate``.
+        stop, steer: as of ``simulate``; commands from the network have the last word.
 
     Raises:
         FmuError, InputError, PublishError: before the first sample.
@@ -276,7 +277,9 @@ def publish(
     wire = wire or Publisher()
     if pace is None and not wire.lockstep:
         pace = RealTime()
-    return simulate(
-        run, wire, *sinks, pace=pace, stop=stop, steer=lambda: wire.command(stop, pace),
-        resume=wire.resume,
-    )  # fmt: skip
+
+    def asked() -> Mapping[str, Setting]:
+        commands = wire.command(stop, pace) or {}
+        return {**(steer() or {}), **commands}
+
+    return simulate(run, wire, *sinks, pace=pace, stop=stop, steer=asked, resume=wire.resume)
