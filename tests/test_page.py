@@ -109,7 +109,8 @@ def stepped(path: Path, parameters: dict, script: dict[int, dict], steps: int) -
 
 def played(page: Page, parameters: dict, script: dict[int, dict], steps: int) -> np.ndarray:
     """The same by the page."""
-    press(page, "Pause")
+    if page.locator("#arm-play").text_content() == "Pause":
+        press(page, "Pause")
     columns = page.evaluate(
         """([parameters, script, steps]) => {
             arm.startAgain(true);
