@@ -88,8 +88,7 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 #undef INTERNAL
 #define INTERNAL static inline
 
-#include "dynamics.c"
-#include "kinematics.c"
+#include "mechanism.c"
 #include "plant.c"
 #include "stops.c"
 #if N_ROWS > N_AXES

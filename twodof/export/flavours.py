@@ -19,7 +19,7 @@ from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, compile_library
-from .native import model_header
+from .native import mechanism_source, model_header
 
 LOG = logging.getLogger(__name__)
 
@@ -117,6 +117,7 @@ def native_flavour(
     assert fmpy is not None and fmpy.origin is not None
     headers = Path(fmpy.origin).parent / "c-code"
     sources = engine_sources(control)
+    sources["mechanism.c"] = mechanism_source(robot, table).encode()
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
 
     def header(guid: str) -> Files:

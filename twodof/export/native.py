@@ -10,13 +10,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable, count_event_indicators
-
-Array = NDArray[np.float64]
+from .recursions import (
+    Array,
+    Body,
+    Mechanism,
+    inverse_dynamics,
+    mass_matrix,
+    mechanism,
+    solve_by_factors,
+    solve_by_recursion,
+    task_frame,
+)
+from .straight_line import Expression, Value, c_function, cosine, operations, sine
 
 MAX_JOINTS = 128
 """The engine's working memory is on the stack: 0.2 MB at this number."""
@@ -42,24 +51,13 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
     if n > MAX_JOINTS:
         raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
     groups = [variable.group for variable in table]
-    model = robot.model
-    subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
-    to_z = [_rotation_to_z(axis[:3] + axis[3:]) for axis in subspaces]
-    turned = [np.eye(3), *to_z]  # by Pinocchio's joint index, 0 the root
-    parents = [int(parent) for parent in list(model.parents)[1:]]
-    placements = list(model.jointPlacements)[1:]
-    inertias = list(model.inertias)[1:]
-    frame = model.frames[robot.frame_id]
-    path = [int(i) - 1 for i in model.supports[frame.parentJoint]][1:]
     sections = [
-        "/* Constants of a robot, generated from its URDF. SI units. Each joint turns about, or\n"
-        "   slides along, the z axis of its own frame. */\n"
+        "/* Constants of a robot, generated from its URDF. SI units. */\n"
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
         f"#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n} /* that move on their own */\n"
-        f"#define N_BODIES {len(parents)}\n"
-        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n"
-        f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
+        f"#define N_BODIES {robot.model.njoints - 1} /* of which some may follow others */\n"
+        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n",
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
@@ -67,29 +65,6 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
         _table("char *const JOINT_NAME", robot.joints),
-        "/* The tree: parents are -1 for the root; joints from the root to the task frame. */\n"
-        + _table("int PARENT", (parent - 1 for parent in parents)),
-        _table("int PRISMATIC", (int(axis[:3].any()) for axis in subspaces)),
-        _following(robot),
-        _table("int PATH", path or [0]),
-        _table("int AXIS", ("xyz".index(axis) for axis in robot.axes)),
-        "/* Joint frames in their parents' at q = 0; the task frame in its joint's. */\n"
-        + _table(
-            "double JOINT_R",
-            (turned[p].T @ M.rotation @ R for p, M, R in zip(parents, placements, to_z)),
-        ),
-        _table(
-            "double JOINT_P", (turned[p].T @ M.translation for p, M in zip(parents, placements))
-        ),
-        f"static const double FRAME_P[3] = "
-        f"{_literal(turned[frame.parentJoint].T @ frame.placement.translation)};\n"
-        f"static const double FRAME_R[3][3] = "
-        f"{_literal(turned[frame.parentJoint].T @ frame.placement.rotation)};\n"
-        f"enum {{ CARRIER = {int(frame.parentJoint) - 1} }}; /* the joint that carries it */\n",
-        "/* Bodies: mass, centre of mass, inertia about it, in the joint's frame. */\n"
-        + _table("double MASS", (inertia.mass for inertia in inertias)),
-        _table("double COM", (R.T @ inertia.lever for R, inertia in zip(to_z, inertias))),
-        _table("double INERTIA", (R.T @ inertia.inertia @ R for R, inertia in zip(to_z, inertias))),
         "/* Effort limits, HUGE_VAL where there is none, and viscous damping of the joints. */\n"
         + _table("double EFFORT", robot.effort),
         _table("double DAMPING", robot.damping),
@@ -98,30 +73,94 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
     return "\n".join(sections)
 
 
-def _subspace(joint: object) -> Array:
-    """Velocity of a joint with one coordinate, in its own frame: linear, angular; one is zero."""
-    data = joint.createData()  # type: ignore[attr-defined]
-    joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
-    return np.asarray(data.S).reshape(6)
+def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
+    """The text of ``mechanism.c``: the robot's kinematics and dynamics, without loops."""
+    n, constants = len(robot.joints), mechanism(robot)
+    joint = np.array(
+        [
+            (Expression(f"joint[{i}].c"), 0.0 if slides else Expression(f"joint[{i}].s"))
+            for i, slides in enumerate(constants.prismatic)
+        ]
+    )
+    a, tau, force = _variables("a", n), _variables("tau", n), _variables("force", 3)
+    x, R, J, drift = task_frame(constants, joint, _variables("v", n))
+    rows = ["xyz".index(axis) for axis in robot.axes]
+    frame = _elements("task->x", x[rows])
+    if any(variable.group == "quat_des" for variable in table):
+        rows += [3, 4, 5]
+        frame |= _elements("task->R", R)
+    frame |= _elements("task->J", J[rows]) | _elements("task->drift", drift[rows])
+    bodies, load = _loaded(constants)
+    effort = inverse_dynamics(
+        constants, bodies, joint, _variables("v", n), a, _variables("gravity", 3)
+    )
+    ways = [solve_by_factors(mass_matrix(constants, bodies, joint), tau)]
+    if robot.coupling is None:
+        ways.append(solve_by_recursion(constants, bodies, joint, tau))
+    in_all = "const JointPosition joint[N_BODIES]"
+    functions = {
+        f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
+        f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
+        f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements(
+            "tau", J[:3].T.dot(force)
+        ),
+        "load_carrier(double payload, const double place[3], Carrier *carrier)": load,
+        f"inverse_dynamics({in_all}, const Carrier *carrier, const double v[N_JOINTS],"
+        " const double a[N_JOINTS], const double gravity[3], double tau[N_JOINTS])": _elements(
+            "tau", effort
+        ),
+        f"acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
+        " double a[N_JOINTS])": _elements("a", min(ways, key=operations)),
+    }
+    return MECHANISM + "".join(
+        "\n" + c_function(f"void {head}", results) for head, results in functions.items()
+    )
 
 
-def _following(robot: Robot) -> str:
-    """Which of the joints that move on their own each body's joint follows, and how."""
-    G = np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling
-    tables = _table("double OFFSET", robot.offset.tolist())
-    if robot.coupling is not None:
-        tables += _table("double RATIO", G.sum(axis=1).tolist())
-        tables += _table("int LEADER", (int(np.argmax(np.abs(row))) for row in G))
-    return "/* A joint's position is RATIO q[LEADER] + OFFSET. */\n" + tables
+MECHANISM = """\
+/* The robot's kinematics and dynamics, generated from its URDF: recursions over its joints,
+   done with expressions, so that what its constants make 0 or 1 costs nothing. */
+#include "mechanism.h"
+
+#include <math.h>
+"""
+LOWER = np.tril_indices(3)
 
 
-def _rotation_to_z(axis: Array) -> Array:
-    """A rotation R with R e_z = axis; a permutation, so exact, where the axis is x, y or z."""
-    k = int(np.argmax(np.abs(axis)))
-    x = np.roll(np.eye(3)[0], k + 1)  # the coordinate axis after the largest component
-    x -= axis * axis.dot(x)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])
+def _places(robot: Mechanism) -> dict[str, Value]:
+    angles = robot.G.dot(_variables("q", robot.G.shape[1])) + robot.c
+    places: dict[str, Value] = {}
+    for i, (angle, slides) in enumerate(zip(angles, robot.prismatic)):
+        places[f"joint[{i}].c"] = angle if slides else cosine(angle)
+        places[f"joint[{i}].s"] = 0.0 if slides else sine(angle)
+    return places
+
+
+def _loaded(robot: Mechanism) -> tuple[list[Body], dict[str, Value]]:
+    """The bodies, that with the payload as variables; and what these are."""
+    carrier, place = robot.path[-1], _variables("place", 3)
+    loaded = robot.body[carrier].with_point(
+        Expression("payload"), robot.frame_p + robot.frame_R.dot(place)
+    )
+    load = {"carrier->mass": loaded.mass}
+    load |= _elements("carrier->moment", loaded.moment)
+    load |= _elements("carrier->inertia", loaded.inertia[LOWER])
+    inertia = np.zeros((3, 3), dtype=object)
+    inertia[LOWER] = inertia.T[LOWER] = _variables("carrier->inertia", 6)
+    bodies = list(robot.body)
+    bodies[carrier] = Body(Expression("carrier->mass"), _variables("carrier->moment", 3), inertia)
+    return bodies, load
+
+
+def _variables(name: str, count: int) -> Array:
+    return np.array([Expression(f"{name}[{i}]") for i in range(count)], dtype=object)
+
+
+def _elements(name: str, values: Array) -> dict[str, Value]:
+    """Each element of an array by its name in C."""
+    return {
+        name + "".join(f"[{i}]" for i in place): value for place, value in np.ndenumerate(values)
+    }
 
 
 def _value_references(groups: Sequence[str]) -> str:
