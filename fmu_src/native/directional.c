@@ -25,8 +25,6 @@ static Real largest_of(const Real change[], int count)
 
 #if defined _MSC_VER || defined __STDC_NO_COMPLEX__ || defined NO_COMPLEX
 #define COMPLEX 0
-#include "plant.h"
-#include "stops.h"
 #else
 #define COMPLEX 1
 #include <complex.h>
@@ -39,16 +37,6 @@ static const double _Complex UNIT = (double _Complex)_Complex_I;
 static inline double _Complex analytic(double _Complex x, Real value, Real derivative)
 {
     return value + UNIT * (derivative * cimag(x));
-}
-
-static inline double _Complex complex_sin(double _Complex x)
-{
-    return analytic(x, sin(creal(x)), cos(creal(x)));
-}
-
-static inline double _Complex complex_cos(double _Complex x)
-{
-    return analytic(x, cos(creal(x)), -sin(creal(x)));
 }
 
 static inline double _Complex complex_sqrt(double _Complex x)
@@ -73,11 +61,9 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
     return creal(a) < creal(b) ? b : a;
 }
 
-/* From here on the engine has complex numbers, and none of its functions is seen elsewhere. The headers
-   of the standard that it includes are there already. */
+/* From here on the engine has complex numbers. The headers of the standard that it includes are there
+   already. */
 #define double double _Complex
-#define sin complex_sin
-#define cos complex_cos
 #define sqrt complex_sqrt
 #define atan2 complex_atan2
 #define fabs complex_fabs
@@ -85,24 +71,11 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 #undef RE
 #define RE(x) creal(x)
 #define IS_COMPLEX
-#undef INTERNAL
-#define INTERNAL static inline
+#endif
 
-#include "mechanism.c"
-#include "plant.c"
-#include "stops.c"
-#if N_ROWS > N_AXES
-#include "orientation.c"
-#endif
-#if !COMMANDS_ACCELERATION
-#include "effort_control.c"
-#elif defined HAS_RCOND
-#include "pseudo_inverse.c"
-#include "task_control.c"
-#else
-#include "joint_control.c"
-#endif
-#endif
+#undef INTERNAL
+#define INTERNAL static inline /* there is more than derivatives need */
+#include "engine.c"
 
 /* Compute what is wanted. */
 static void evaluate(Plant *plant, const int held[N_JOINTS], int wanted)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 WIDTH = 100
@@ -68,12 +68,12 @@ class Expression:
 Value = Expression | float
 
 
-def cosine(angle: Expression) -> Expression:
+def cosine(angle: Value) -> Value:
     """Of an angle, rad."""
     return Expression("cos", (angle,))
 
 
-def sine(angle: Expression) -> Expression:
+def sine(angle: Value) -> Value:
     """Of an angle, rad."""
     return Expression("sin", (angle,))
 
@@ -84,32 +84,85 @@ def operations(results: Iterable[Value]) -> int:
     return sum(1 for _, operands in nodes if operands)
 
 
-def c_function(head: str, results: Mapping[str, Value]) -> str:
-    """A function that assigns each result to the variable of its name.
+def c_function(head: str, results: Mapping[str, Value], held: Sequence[str] = ()) -> str:
+    """A function that assigns each result to the variable of its name, real or complex.
+
+    Complex numbers are x + i h dx with an h whose square vanishes, so that real parts are computed
+    as such, and imaginary ones by the rules of differentiation.
 
     Args:
         head: of the function.
         results: values by lvalue; no lvalue may be a variable of one of the values.
+        held: what names of variables begin with that have no imaginary part.
     """
-    nodes, names = _ordered(results.values())
-    uses = Counter(names) + Counter(operand for _, operands in nodes for operand in operands)
+    varied: dict[str, Value] = {}
+    with_variations = _with_variations(results.values(), tuple(held))
+    for value, variation in with_variations:
+        varied[f"const Real re{len(varied)}"] = value
+        varied[f"const Real im{len(varied)}"] = variation
+    combined = "".join(
+        f"\n    {target} = re{2 * i} + UNIT * im{2 * i + 1};" for i, target in enumerate(results)
+    )
+    body = f"#ifdef IS_COMPLEX\n{_statements(varied, 'Real')}{combined}\n#else\n"
+    body += f"{_statements(results, 'double')}\n#endif"
+    parameters = re.findall(r"(\w+)(?:\[\w+\])?[,)]", head)
+    unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
+    ignored = "".join(f"    (void){name};\n" for name in unused)
+    head = textwrap.fill(head, WIDTH, subsequent_indent="    ", break_on_hyphens=False)
+    return f"{head}\n{{\n{ignored}{body}\n}}\n"
+
+
+def _statements(results: Mapping[str, Value], kind: str) -> str:
+    nodes, places = _ordered(results.values())
+    uses = Counter(places) + Counter(operand for _, operands in nodes for operand in operands)
     texts: list[str] = []
     lines: list[str] = []
     for place, (operation, operands) in enumerate(nodes):
         text = _c(operation, [texts[operand] for operand in operands])
         if operands and (uses[place] > 1 or len(text) > WIDTH - 40):
-            lines.append(f"    const double t{place} = {_bare(text)};")
+            lines.append(f"    const {kind} t{place} = {_bare(text)};")
             text = f"t{place}"
         texts.append(text)
     lines += [
         f"    {target} = {_bare(texts[place])};"
-        for target, place in zip(results, names, strict=True)
+        for target, place in zip(results, places, strict=True)
     ]
-    body = "\n".join(lines)
-    parameters = re.findall(r"(\w+)(?:\[\w+\])?[,)]", head)
-    unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
-    ignored = "".join(f"    (void){name};\n" for name in unused)
-    return f"{textwrap.fill(head, WIDTH, subsequent_indent='    ')}\n{{\n{ignored}{body}\n}}\n"
+    return "\n".join(lines)
+
+
+def _with_variations(results: Iterable[Value], held: tuple[str, ...]) -> list[tuple[Value, Value]]:
+    """The real parts of values, and how these vary with the imaginary parts of variables."""
+    nodes, places = _ordered(results)
+    pairs: list[tuple[Value, Value]] = []
+    for operation, operands in nodes:
+        (a, da), (b, db) = ([pairs[operand] for operand in operands] + [(0.0, 0.0)] * 2)[:2]
+        if operation == "+":
+            pair = a + b, da + db
+        elif operation == "-":
+            pair = a - b, da - db
+        elif operation == "*":
+            pair = a * b, a * db + da * b
+        elif operation == "/":
+            quotient = a / b
+            pair = quotient, (da - quotient * db) / b
+        elif operation == "neg":
+            pair = -a, -da
+        elif operation == "cos":
+            pair = cosine(a), -(sine(a) * da)
+        elif operation == "sin":
+            pair = sine(a), cosine(a) * da
+        elif _is_number(operation):
+            pair = float(operation), 0.0
+        elif operation.startswith(held):
+            pair = Expression(f"creal({operation})"), 0.0
+        else:
+            pair = Expression(f"creal({operation})"), Expression(f"cimag({operation})")
+        pairs.append(pair)
+    return [pairs[place] for place in places]
+
+
+def _is_number(operation: str) -> bool:
+    return operation[0] in "-.0123456789"
 
 
 def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]], list[int]]:
