@@ -29,7 +29,7 @@ FLAGS = (
     "-fno-tree-slp-vectorize", "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic", "-shared",
 )  # fmt: skip
 """Multiplications are never fused with additions, so that platforms agree; complex ones are so
-without a thought for infinities. Pairing scalars into vectors takes long, and gains nothing here."""
+without a thought for infinities. Pairing scalars into vectors takes long and gains nothing."""
 
 
 def compile_library(

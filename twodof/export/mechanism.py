@@ -8,13 +8,10 @@ import numpy as np
 
 from ..plant.robot import Robot
 from ..plant.variables import Variable
+from .bodies import Array, Body, Mechanism, mechanism
 from .recursions import (
-    Array,
-    Body,
-    Mechanism,
     inverse_dynamics,
     mass_matrix,
-    mechanism,
     solve_by_factors,
     solve_by_recursion,
     task_frame,

@@ -8,93 +8,10 @@ of its joint, whose axis is z.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..plant.robot import Robot
-
-Array = NDArray[Any]
-"""Of numbers, or of numbers and expressions."""
-Rotations = Sequence[Array]
-"""Of each joint's frame in its parent's."""
-
-
-@dataclass(frozen=True)
-class Body:
-    """A rigid body: what is linear in the masses that it consists of.
-
-    Attributes:
-        mass: kg.
-        moment: mass times the place of its centre, kg·m, 3 values.
-        inertia: about the frame's origin, kg·m², 3 × 3.
-    """
-
-    mass: Any
-    moment: Array
-    inertia: Array
-
-    def with_point(self, mass: Any, place: Array) -> Body:
-        """Together with a point mass."""
-        points = place * mass
-        tensor = np.eye(3) * place.dot(points) - np.outer(place, points)
-        return Body(self.mass + mass, self.moment + points, self.inertia + tensor)
-
-
-@dataclass(frozen=True)
-class Mechanism:
-    """The constants of a robot whose N joints have axes along z; n of them move on their own.
-
-    Attributes:
-        parent: of each joint, −1 for the root.
-        prismatic: whether it slides.
-        R, p: placement of its frame in its parent's at q = 0.
-        body: what it moves.
-        path: joints from the root to the task frame.
-        frame_R, frame_p: placement of the task frame in that of the last of these.
-        G, c: positions of all joints are G q + c.
-    """
-
-    parent: tuple[int, ...]
-    prismatic: tuple[bool, ...]
-    R: Array
-    p: Array
-    body: tuple[Body, ...]
-    path: tuple[int, ...]
-    frame_R: Array
-    frame_p: Array
-    G: Array
-    c: Array
-
-
-def mechanism(robot: Robot) -> Mechanism:
-    """The constants of a robot, read by Pinocchio, with frames turned so that axes are z."""
-    model = robot.model
-    subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
-    to_z = [_rotation_to_z(axis[:3] + axis[3:]) for axis in subspaces]
-    turned = [np.eye(3), *to_z]  # by Pinocchio's joint index, 0 the root
-    parents = [int(parent) for parent in list(model.parents)[1:]]
-    placements = list(model.jointPlacements)[1:]
-    frame = model.frames[robot.frame_id]
-    to_frame = turned[frame.parentJoint].T
-    bodies = []
-    for R, inertia in zip(to_z, list(model.inertias)[1:]):
-        centred = Body(0.0, np.zeros(3), R.T @ inertia.inertia @ R)
-        bodies.append(centred.with_point(inertia.mass, R.T @ inertia.lever))
-    return Mechanism(
-        parent=tuple(parent - 1 for parent in parents),
-        prismatic=tuple(bool(axis[:3].any()) for axis in subspaces),
-        R=np.array([turned[p].T @ M.rotation @ R for p, M, R in zip(parents, placements, to_z)]),
-        p=np.array([turned[p].T @ M.translation for p, M in zip(parents, placements)]),
-        body=tuple(bodies),
-        path=tuple(int(i) - 1 for i in model.supports[frame.parentJoint])[1:],
-        frame_R=to_frame @ frame.placement.rotation,
-        frame_p=to_frame @ frame.placement.translation,
-        G=np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling,
-        c=robot.offset,
-    )
+from .bodies import Array, Body, Mechanism
 
 
 def placements(robot: Mechanism, joint: Array) -> tuple[list[Array], list[Array]]:
@@ -196,7 +113,8 @@ def inverse_dynamics(
             f = rotations[i].dot(force[i])
             force[parent] = force[parent] + f
             moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + cross(origins[i], f)
-    return robot.G.T.dot(tau)
+    effort: Array = robot.G.T.dot(tau)
+    return effort
 
 
 def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:
@@ -227,7 +145,8 @@ def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:
                 whole.moment + moved.moment,
                 whole.inertia + moved.inertia,
             )
-    return robot.G.T.dot(M).dot(robot.G)
+    reduced: Array = robot.G.T.dot(M).dot(robot.G)
+    return reduced
 
 
 def solve_by_factors(M: Array, tau: Array) -> Array:
@@ -235,21 +154,21 @@ def solve_by_factors(M: Array, tau: Array) -> Array:
 
     Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.5.
     """
-    H, a = M.copy(), tau.copy()
+    L, a = M.copy(), np.array(tau, dtype=object)  # M, row by row replaced by L
     n = len(a)
     inverse = [0.0] * n
     for k in reversed(range(n)):
-        inverse[k] = 1.0 / H[k, k]
-        for i in range(k):
-            share = H[k, i] * inverse[k]
+        inverse[k] = 1.0 / L[k, k]
+        for i in reversed(range(k)):
+            share = L[k, i] * inverse[k]
             for j in range(i + 1):
-                H[i, j] = H[i, j] - share * H[k, j]
+                L[i, j] = L[i, j] - share * L[k, j]
             a[i] = a[i] - share * a[k]
-            M[k, i] = share
+            L[k, i] = share
     for k in range(n):
         a[k] = a[k] * inverse[k]
         for i in range(k):
-            a[k] = a[k] - M[k, i] * a[i]
+            a[k] = a[k] - L[k, i] * a[i]
     return a
 
 
@@ -357,19 +276,3 @@ def _symmetric(S: Array) -> Array:
 def _skew(a: Array) -> Array:
     """[a]×, so that [a]× b = a × b."""
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-
-
-def _subspace(joint: object) -> Array:
-    """Velocity of a joint with one coordinate, in its own frame: linear, angular; one is zero."""
-    data = joint.createData()  # type: ignore[attr-defined]
-    joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
-    return np.asarray(data.S).reshape(6)
-
-
-def _rotation_to_z(axis: Array) -> Array:
-    """A rotation R with R e_z = axis; a permutation, so exact, where the axis is x, y or z."""
-    k = int(np.argmax(np.abs(axis)))
-    x = np.roll(np.eye(3)[0], k + 1)  # the coordinate axis after the largest component
-    x -= axis * axis.dot(x)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])
