@@ -30,6 +30,8 @@ class Expression:
     def __add__(self, other: Value) -> Value:
         if isinstance(other, Expression) and other.operation == "neg":
             return self - other.operands[0]
+        if self.operation == "neg" and other != 0.0:
+            return other - self.operands[0]
         return self if other == 0.0 else Expression("+", (self, other))
 
     def __sub__(self, other: Value) -> Value:
