@@ -39,6 +39,7 @@ LIBRARIES = {
     "cyclonedds": {"ros"},
     "distributed": {"sweeps"},
     "fmpy": {"fmu"},
+    "foxglove": {"ros"},
     "lz4": {"bag"},
     "matplotlib": {"plots"},
     "pandas": {"sweeps", "bag", "plots", "cli"},  # tables: made, of a recording, drawn, printed
@@ -54,6 +55,7 @@ LIBRARIES = {
     },  # its rotations: of joints that are locked, for all, to URDF's rpy, to viser's wxyz
     "simpleeval": {"export"},
     "tqdm": {"cli"},
+    "trimesh": {"pages"},
     "viser": {"pages"},
     "websockets": {"pages"},
     "xacro": {"export"},

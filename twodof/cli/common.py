@@ -42,7 +42,7 @@ class CommandLineError(InputError):
 
 def in_options(text: str) -> str:
     """A message of the library, which has its arguments in backticks, for the command line."""
-    return ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text)
+    return plain(ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text))
 
 
 def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
@@ -108,11 +108,18 @@ def experiment_of(
 ) -> Experiment:
     """The experiment that the options ask for."""
     from ..experiments import experiment
+    from ..fmu import load_fmu
 
+    fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
+    if table is not None:
+        folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
+        if Path(folder).is_dir() and folder:
+            from ..bag.commands import read_commands
+
+            table, changes = None, read_commands(fmu, folder, topic)
     return experiment(
-        chosen_fmu(options), stop_time=stop_time, step=step,
-        settings=parse_settings(options.settings), input_file=options.input,
-        stamp_start=options.stamp_start,
+        fmu, stop_time=stop_time, step=step, settings=parse_settings(options.settings),
+        input_file=table, changes=changes, stamp_start=options.stamp_start,
     )  # fmt: skip
 
 
@@ -264,7 +271,7 @@ def print_best(table: DataFrame) -> None:
     widths = [max(map(len, cells)) for cells in zip(best.columns, units, *rows)]
     print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
     for cells in [best.columns, units, *rows] if rows else []:
-        print("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
+        print(plain("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths))))
 
 
 def quote(path: Path) -> str:
@@ -289,7 +296,12 @@ def print_table(*rows: tuple[str, str]) -> None:
     """Labels and texts, one pair a line."""
     width = max(len(label) for label, _ in rows)
     for label, text in rows:
-        print(f"{label.ljust(width)}  {text}")
+        print(plain(f"{label.ljust(width)}  {text}"))
+
+
+def plain(text: str) -> str:
+    """A text with its control characters as escapes: files from elsewhere write on no terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def print_next(*commands: str) -> None:
