@@ -31,14 +31,11 @@ class Fmus(dict):
         self._folder = folder
 
     def __missing__(self, name):
-        robots = robots_folder()
-        ur5 = robots / "ur_description/urdf/ur5_robot.urdf"
-        panda = robots / "panda_description/urdf/panda.urdf"
+        ur5 = robots_folder() / "ur_description/urdf/ur5_robot.urdf"
         bare = FmuOptions(native=True, control="effort", meshes=False)
         options = {
             "ur5": replace(bare, urdf=ur5, frame="tool0"),
             "ur5 pose": replace(bare, control="pose", urdf=ur5, frame="tool0", q_start=UR5_START),
-            "panda": replace(bare, urdf=panda, frame="panda_hand_tcp"),
         }
         chosen = options[name] if name in options else FmuOptions(native=True, control=name)
         self[name] = build_fmu(self._folder / f"{name}.fmu", chosen)
@@ -177,8 +174,6 @@ RUNS = {
     ("ur5", "falls into its stops"): {
         **{f"q_min[{i}]": -0.3 for i in (2, 3, 4)}, **{f"q_max[{i}]": 0.4 for i in (2, 3, 4)}},
     ("ur5 pose", "turns"): {"omega_des[3]": 0.3, "quat_des[1]": 0.1, "payload": 1.0},
-    ("panda", "falls into its stops"): {
-        f"q_{end}[{i}]": x for i in (1, 2, 3) for end, x in (("min", -0.2), ("max", 0.2))},
 }  # fmt: skip
 
 
