@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import codecs
 import logging
 import os
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from ctypes import byref, c_double, c_uint
+from ctypes import Array, byref, c_double, c_uint
 from dataclasses import dataclass
 from itertools import count, takewhile
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree as ET
 
 import fmpy
@@ -27,12 +26,14 @@ from numpy.typing import NDArray
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
 from .export.python_wrapper import check_python_wrapper
-from .files import UnsafeArchiveError, check_archive, read_member, temporary_folder
+from .files import UnsafeArchiveError, check_archive, is_plain_xml, read_member, temporary_folder
 
 logger = logging.getLogger(__name__)
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 
+WARNING = fmi2.fmi2Warning
+Values = Array[c_double]
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
 MAX_RESOURCE = 256 * 1024**2
 
@@ -148,7 +149,7 @@ class Instance:
     """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
 
     FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
-    SimulationError with the FMU's own words.
+    SimulationError with the FMU's own words. What is called at each step goes past FMPy's checks.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
@@ -171,6 +172,7 @@ class Instance:
                 instanceName=identifier,
             )
             self._slave.instantiate(callbacks=self._callbacks, loggingOn=True)
+            self._do_step, self._component = self._slave.dll.fmi2DoStep, self._slave.component
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
         finally:
@@ -201,18 +203,22 @@ class Instance:
 
     def step(self, t: float, h: float) -> None:
         """One communication step from t to t + h."""
-        self._call(self._slave.doStep, t, h)
+        self._said = ""
+        if (status := self._do_step(self._component, t, h, 1)) > WARNING:
+            self._refuse(status)
 
-    def reader(self, names: Sequence[str]) -> Callable[[], tuple[float, ...]]:
-        """A function that reads these Real variables."""
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """A function that reads these Real variables, each time into the same place."""
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].valueReference for name in names))
         values = (c_double * n)()
-        get = self._slave.fmi2GetReal
+        get, component = self._slave.dll.fmi2GetReal, self._component
 
-        def read() -> tuple[float, ...]:
-            self._call(get, self._slave.component, references, n, values)
-            return tuple(values)
+        def read() -> Values:
+            self._said = ""
+            if (status := get(component, references, n, values)) > WARNING:
+                self._refuse(status)
+            return values
 
         return read
 
@@ -238,9 +244,13 @@ class Instance:
         try:
             function(*arguments, **named)
         except FMICallException as error:
-            self._fatal = error.status == fmi2.fmi2Fatal
-            outcome = "discarded" if error.status == fmi2.fmi2Discard else "failed"
-            raise SimulationError(self._said or str(error), outcome=outcome) from error
+            self._refuse(error.status)
+
+    def _refuse(self, status: int) -> NoReturn:
+        """Raise what a call's status means, in the FMU's own words where it said something."""
+        self._fatal = status == fmi2.fmi2Fatal
+        outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
+        raise SimulationError(self._said or f"a call failed, status {status}", outcome=outcome)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
@@ -252,7 +262,7 @@ class Instance:
         self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
     ) -> None:
         message = text.decode("utf-8", "replace").strip()
-        if status > fmi2.fmi2Warning:
+        if status > WARNING:
             self._said = message
         logger.log(LEVELS.get(status, logging.CRITICAL), message)
 
@@ -310,19 +320,9 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
         raise FmuError(f"'{path}': {error}") from error
     except ZIP_ERRORS as error:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
-    if not _is_plain(xml):
+    if not is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, archive.namelist()
-
-
-def _is_plain(xml: bytes) -> bool:
-    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
-    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
-    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
-    encoding = declared[1].lower() if declared else b"utf-8"
-    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
-    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
-    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
 
 
 def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:

@@ -27,10 +27,10 @@ UNITS = ("directional.c", "fmu.c")
 EXTENSIONS = {"linux64": ".so", "win64": ".dll", "darwin64": ".dylib"}
 FLAGS = (
     "-std=c99", "-O2", "-ffp-contract=off", "-fcx-limited-range", "-fno-math-errno",
-    "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic",
+    "-fno-tree-slp-vectorize", "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic",
 )  # fmt: skip
 """Multiplications are never fused with additions, so that platforms agree; complex ones are so
-without a thought for infinities."""
+without a thought for infinities. Pairing scalars into vectors takes long and gains nothing."""
 
 
 def compile_library(
