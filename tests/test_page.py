@@ -99,11 +99,11 @@ def stepped(path: Path, parameters: dict, script: dict[int, dict], steps: int) -
     with instantiate(fmu) as instance:
         instance.initialise(0.0, inf, resolve(fmu, parameters))
         read = instance.reader(names)
-        rows = [read()]
+        rows = [[*read()]]
         for k in range(steps):
             instance.set(resolve(fmu, script.get(k, {})))
             instance.step(k * 0.01, 0.01)
-            rows.append(read())
+            rows.append([*read()])
     return np.array(rows)
 
 
