@@ -62,7 +62,7 @@ def receive() -> None:
     from twodof.ros.messages import JOINT_STATE, STREAM
     from twodof.ros.network import Network, open_domain
 
-    _domain, _interfaces = open_domain(Network(DOMAIN, loopback=True))
+    _domain = open_domain(Network(DOMAIN, loopback=True))
     participant = DomainParticipant(DOMAIN)
     topic = Topic(participant, "rt/joint_states", dds_type(JOINT_STATE))
     reader = DataReader(participant, topic, dds_qos(STREAM, JOINT_STATE))

@@ -309,6 +309,37 @@ def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
     }  # fmt: skip
 
 
+def test_several_robots_are_in_step_and_apart(
+    bare: Callable[[int], Path], jointed: Path, tmp_path: Path, number: int, listen: Listen
+) -> None:
+    """One clock and its stamps for all, each at its time; who commands one moves one."""
+    robots = [f"left={jointed}", f"right={jointed}", str(bare(2))]
+    names = ("left", "right", "Bare2")
+    topics = [f"/{name}/joint_states" for name in names]
+    node = listen(*(f"{t}=state" for t in topics), "/clock=clock", "/right/joint_commands=command")
+    bag = tmp_path / "bag"
+    with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "6") as process:  # type: ignore[arg-type]
+        node.hears("/Bare2/joint_states", more=50)
+        node.say("/right/joint_commands 1 0 joint1,joint2 0.9,-0.6 0,0 -")
+        _, err = ended(process)
+    assert err.startswith("WARNING: no command for 0.5 s: the last one is held")
+    assert err.count("WARNING") == 1
+    bags = [recorded(tmp_path / f"bag_{name}")["/joint_states"] for name in names]
+    stamps = [stamp_of(state[0]) for state in bags[0]]
+    assert len(stamps) == 601 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
+    for topic, states in zip(topics, bags):
+        heard = node.messages(topic)
+        assert len(heard) > 500 and heard == states[-len(heard) :]
+    arrivals = [[it[2] for it in node.told if it[:2] == ["message", t]][-500:] for t in topics]
+    apart = np.ptp(arrivals, axis=0)
+    usual, most = np.quantile(apart, (0.5, 0.99)) / 1e6
+    print(f"three robots within {usual:.3f} ms, 99 % within {most:.3f} ms")
+    ends = [state[-1][2] for state in bags]
+    assert np.abs(np.subtract(ends[1], [0.9, -0.6])).max() < 1e-3
+    alone = [[*s.q] for s in twodof.samples(jointed, step=0.01, stop_time=6.0)]
+    assert [state[2] for state in bags[0]] == alone
+
+
 @pytest.mark.parametrize("speed", [0.1, 1.0, 10.0])
 def test_the_clock_is_that_of_the_simulation(
     native_path: Path, number: int, listen: Listen, speed: float

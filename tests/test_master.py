@@ -252,6 +252,7 @@ class Clock:
 def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr("twodof.master.time", clock)
+    monkeypatch.setattr("twodof.pace.time", clock)
     return clock
 
 

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from .fmu import load_fmu as load_fmu
     from .linear import LinearModel as LinearModel
     from .linear import linearise as linearise
-    from .master import RealTime as RealTime
     from .master import Sample as Sample
     from .master import Sink as Sink
     from .master import Summary as Summary
     from .master import samples as samples
     from .master import simulate as simulate
+    from .pace import RealTime as RealTime
     from .pages.arm import page as page
     from .pages.live import live as live
     from .pages.replay import view as view
@@ -54,7 +54,8 @@ _HOMES = {
     "export.package": ("FmuOptions", "build_fmu"),
     "fmu": ("Fmu", "load_fmu"),
     "linear": ("LinearModel", "linearise"),
-    "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
+    "master": ("Sample", "Sink", "Summary", "samples", "simulate"),
+    "pace": ("RealTime",),
     "pages.arm": ("page",),
     "pages.live": ("live",),
     "pages.replay": ("view",),

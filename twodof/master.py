@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from itertools import accumulate, chain, count
-from math import asin, dist, hypot, inf, isfinite
+from math import asin, dist, hypot, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,11 +29,11 @@ from .experiments import (
     resolve,
 )
 from .fmu import Fmu, Instance, instantiate
+from .pace import RealTime
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
 OUTPUTS = ("q", "v", "x", "tau", "quat")
 
 
@@ -123,58 +123,22 @@ class Sink:
         """Take one sample."""
 
 
+Stop = Callable[[], bool]
+Samples = Generator[Sample, Mapping[str, Setting] | None, None]
 Resume = Callable[[Sample, SimulationError], Mapping[str, Setting] | None]
 """What a run goes on with after a step that was discarded: the sample before it, and the reason."""
-
-
-class RealTime:
-    """Paces a run to the wall clock.
-
-    Args:
-        speed: s of the run in a second.
-
-    Attributes:
-        missed: samples that were ready only after their time.
-        worst: the largest delay, s.
-    """
-
-    def __init__(self, speed: float = 1.0) -> None:
-        if not 0.0 < speed < inf:
-            raise InputError(f"`speed` {speed:g} is no factor")
-        self._speed, self.missed = speed, 0
-        self.worst = 0.0
-        self._start: float | None = None
-
-    def restart(self) -> None:
-        """The next sample is due at once, and those after it by that."""
-        self._start = None
-
-    def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until ``elapsed`` s of the run are due since the first call, or ``stop`` is true."""
-        now = time.perf_counter()
-        elapsed /= self._speed
-        if self._start is None:
-            self._start = now - elapsed
-        due = self._start + elapsed
-        left = due - now
-        while left > 0.0 and not stop():
-            time.sleep(min(left, LONGEST_SLEEP))
-            left = due - time.perf_counter()
-        if due < now:
-            self.missed += 1
-            self.worst = max(self.worst, now - due)
 
 
 def samples(
     run: Experiment | Fmu | str | Path,
     *,
     pace: RealTime | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Stop = lambda: False,
     ready: Callable[[], object] = lambda: None,
     resume: Resume = lambda sample, error: None,
     instance: Instance | None = None,
     **options: Any,
-) -> Generator[Sample, Mapping[str, Setting] | None, None]:
+) -> Samples:
     """Run an FMU; the initial state, then one sample a communication step.
 
     A loop of one's own may answer a sample with new inputs, ``run.send({"x_des": (0.2, 0.1)})``,
@@ -227,8 +191,8 @@ def samples(
 
 
 def _inputs(run: Experiment) -> dict[str, Value]:
-    variables = run.fmu.variables
-    return {n: v for n, v in run.start_values.items() if variables[n].causality == "input"}
+    kinds = run.fmu.variables
+    return {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
 
 
 def _changes_until(
@@ -276,9 +240,8 @@ def _resumed(
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
     """Start values of a robot that rests where a sample has it, and is meant to be there.
 
-    With them a run can go on after a step that was discarded: across a singularity, speeds can
-    escape to infinity in finite time after a target that is out of reach. None where the FMU has
-    no such variables.
+    With them a run can go on after a discarded step: across a singularity, speeds can escape to
+    infinity in finite time. None where the FMU has no such variables.
     """
     still = (0.0,) * len(sample.v)
     start = {"q_start": sample.q, "v_start": still}
@@ -314,7 +277,7 @@ def simulate(
     run: Experiment | Fmu | str | Path,
     *sinks: Sink,
     pace: RealTime | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Stop = lambda: False,
     instance: Instance | None = None,
     steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
     resume: Resume = lambda sample, error: None,
@@ -329,21 +292,61 @@ def simulate(
     """
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
+    member = Member(run, sinks, steer, resume, instance)
+    return simulate_together([member], pace=pace, stop=stop)[0]
+
+
+class Member(NamedTuple):
+    """One of several runs that go on together; the fields are the arguments of ``simulate``."""
+
+    run: Experiment
+    sinks: Sequence[Sink]
+    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None
+    resume: Resume = lambda sample, error: None
+    instance: Instance | None = None
+
+
+def simulate_together(
+    members: Sequence[Member], *, pace: RealTime | None = None, stop: Stop = lambda: False
+) -> list[Summary]:
+    """Run FMUs in one loop: all reach a communication point before one goes on from it.
+
+    Args:
+        members: of one start time, step, stop time and, where there are several, first stamp.
+        pace, stop: as of ``simulate``, for all of them.
+
+    Raises:
+        InputError: their times differ.
+        FmuError, SimulationError: as of ``simulate``.
+    """
+    times = {(run.start_time, run.step, run.steps, run.stamp_start) for run, *_ in members}
+    if len(times) != 1 or (len(members) > 1 and members[0].run.stamp_start is None):
+        raise InputError("what runs together has one start time, step, stop time and first stamp")
+    ended, start = False, members[0].run.start_time
     with ExitStack() as stack:
 
-        def begin() -> None:
-            for sink in sinks:
-                stack.enter_context(sink.begin(run))
+        def source(member: Member) -> Samples:
+            def begin() -> None:
+                for sink in member.sinks:
+                    stack.enter_context(sink.begin(member.run))
 
-        source = samples(run, pace=pace, stop=stop, ready=begin, resume=resume, instance=instance)
-        sample = next(stack.enter_context(closing(source)))
+            run, _, _, resume, instance = member
+            return samples(run, stop=lambda: ended, ready=begin, resume=resume, instance=instance)
+
+        sources = [stack.enter_context(closing(source(member))) for member in members]
+        latest = [next(source) for source in sources]
         started = time.perf_counter()
         while True:
-            for sink in sinks:
-                sink.write(sample)
-            answer = steer()
+            if pace is not None:
+                pace.wait(latest[0].t - start, stop)
+            for member, sample in zip(members, latest):
+                for sink in member.sinks:
+                    sink.write(sample)
+            answers = [member.steer() for member in members]
+            ended = stop()
             try:
-                sample = source.send(answer)
+                latest = [source.send(answer) for source, answer in zip(sources, answers)]
             except StopIteration:
                 break
-        return Summary(sample, time.perf_counter() - started, sample.k < run.steps)
+        taken = time.perf_counter() - started
+    return [Summary(s, taken, s.k < run.steps) for s, (run, *_) in zip(latest, members)]
