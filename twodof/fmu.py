@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import logging
 import os
 import re
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from itertools import count, takewhile
 from math import inf
 from pathlib import Path
+from struct import Struct
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
 from .export.python_wrapper import check_python_wrapper
-from .files import UnsafeArchiveError, check_archive, read_member, temporary_folder
+from .files import (
+    UnsafeArchiveError,
+    check_archive,
+    is_plain_xml,
+    read_member,
+    temporary_folder,
+)
 
 logger = logging.getLogger(__name__)
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
@@ -148,7 +154,7 @@ class Instance:
     """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
 
     FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
-    SimulationError with the FMU's own words.
+    SimulationError with the FMU's own words. What is called at each step goes past FMPy's checks.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
@@ -201,18 +207,20 @@ class Instance:
 
     def step(self, t: float, h: float) -> None:
         """One communication step from t to t + h."""
-        self._call(self._slave.doStep, t, h)
+        self._said = ""
+        self._check(self._slave.dll.fmi2DoStep(self._slave.component, t, h, fmi2.fmi2True))
 
     def reader(self, names: Sequence[str]) -> Callable[[], tuple[float, ...]]:
         """A function that reads these Real variables."""
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].valueReference for name in names))
-        values = (c_double * n)()
-        get = self._slave.fmi2GetReal
+        values, as_tuple = (c_double * n)(), Struct(f"{n}d").unpack
+        get, component = self._slave.dll.fmi2GetReal, self._slave.component
 
         def read() -> tuple[float, ...]:
-            self._call(get, self._slave.component, references, n, values)
-            return tuple(values)
+            self._said = ""
+            self._check(get(component, references, n, values))
+            return as_tuple(values)
 
         return read
 
@@ -238,9 +246,14 @@ class Instance:
         try:
             function(*arguments, **named)
         except FMICallException as error:
-            self._fatal = error.status == fmi2.fmi2Fatal
-            outcome = "discarded" if error.status == fmi2.fmi2Discard else "failed"
-            raise SimulationError(self._said or str(error), outcome=outcome) from error
+            self._check(error.status)
+
+    def _check(self, status: int) -> None:
+        """Raise what a call's status means, in the FMU's own words where it said something."""
+        if status > fmi2.fmi2Warning:
+            self._fatal = status == fmi2.fmi2Fatal
+            outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
+            raise SimulationError(self._said or f"a call failed, status {status}", outcome=outcome)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
@@ -310,19 +323,9 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
         raise FmuError(f"'{path}': {error}") from error
     except ZIP_ERRORS as error:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
-    if not _is_plain(xml):
+    if not is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, archive.namelist()
-
-
-def _is_plain(xml: bytes) -> bool:
-    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
-    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
-    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
-    encoding = declared[1].lower() if declared else b"utf-8"
-    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
-    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
-    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
 
 
 def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:

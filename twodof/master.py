@@ -203,12 +203,13 @@ def samples(
             answer = yield sample
             if k == run.steps or stop():
                 return
-            asked = {**_changes_until(sample.t, due, run), **resolve(run.fmu, answer or {})}
-            latest = {name: value for name, value in asked.items() if value != inputs.get(name)}
             try:
-                if latest:
-                    instance.set(latest)
-                    inputs, since = {**inputs, **latest}, sample.t
+                if answer or due:
+                    asked = {**_changes_until(sample.t, due, run), **resolve(run.fmu, answer or {})}
+                    latest = {n: value for n, value in asked.items() if value != inputs.get(n)}
+                    if latest:
+                        instance.set(latest)
+                        inputs, since = {**inputs, **latest}, sample.t
                 instance.step(sample.t, run.step)
             except SimulationError as error:
                 again = _resumed(run, sample, error, resume)
@@ -240,18 +241,20 @@ def _sampler(
     """A function that reads the outputs after k steps, with the inputs and since when they hold."""
     groups = [run.fmu.vector(group) for group in OUTPUTS]
     ends = list(accumulate(map(len, groups)))
-    slices = [slice(a, b) for a, b in zip([0, *ends], ends)]
     read = instance.reader([*chain(*groups)])
-    first_stamp = run.first_stamp()
+    of_q, of_v, of_x, of_tau, of_quat = (slice(a, b) for a, b in zip([0, *ends], ends))
+    start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
-        t, values = run.time(k), read()
+        t, values = start + k * step, read()
         if not all(map(isfinite, values)):
             text = f"the FMU gave a value that is not finite at t = {t:g} s"
             raise SimulationError(text, k, "diverged")
-        q, v, x, tau, quat = (values[part] for part in slices)
-        stamp = first_stamp + round(k * run.step * NANOSECONDS)
-        return Sample(k, t, q, v, x, tau, inputs, since, stamp, quat)
+        stamp = first_stamp + round(k * step * NANOSECONDS)
+        return Sample(
+            k, t, values[of_q], values[of_v], values[of_x], values[of_tau],
+            inputs, since, stamp, values[of_quat],
+        )  # fmt: skip
 
     return take
 

@@ -84,7 +84,7 @@ class PageRobot:
     def _place(self, joints: Iterable[Joint], q: Sequence[float]) -> None:
         for joint in joints:
             place, node = self._kinematics.in_parent(joint, [q]), self._nodes[joint.child]
-            node.position, node.wxyz = place.translation[0], _wxyz(place.rotation)[0]
+            node.position, node.wxyz = place.translation[0], _wxyz(place.quat[0])
 
     def _draw(self, tree: ET.Element, link: ET.Element) -> int:
         """Add the shapes of a link; how many there are."""
@@ -98,7 +98,7 @@ class PageRobot:
                 look = {
                     "color": _colour(tree, visual), "side": "double", "cast_shadow": False,
                     "receive_shadow": False, "position": place.translation,
-                    "wxyz": _wxyz(place.rotation),
+                    "wxyz": _wxyz(place.quat),
                 }  # fmt: skip
                 count += self._add_shape(f"{self._names[name]}/visual{count}", geometry[0], look)
             except ValueError as error:
@@ -140,12 +140,12 @@ class PageRobot:
                 along = Rotation.align_vectors([joint.xyz], [(0.0, 0.0, 1.0)])[0]
                 self._scene.add_cylinder(
                     f"{name}/stick{i}", radius, length, color=(r, g, b),
-                    position=np.array(joint.xyz) / 2, wxyz=_wxyz(along),
+                    position=np.array(joint.xyz) / 2, wxyz=_wxyz(along.as_quat()),
                 )  # fmt: skip
 
 
-def _wxyz(rotation: Rotation) -> Array:
-    return np.roll(rotation.as_quat(), 1, axis=-1)
+def _wxyz(xyzw: Array) -> Array:
+    return np.roll(xyzw, 1)
 
 
 def _colour(tree: ET.Element, visual: ET.Element) -> tuple[float, float, float]:

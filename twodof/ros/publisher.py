@@ -19,7 +19,8 @@ from ..errors import PublishError, SimulationError
 from ..experiments import Experiment, Setting, experiment
 from ..fmu import Fmu
 from ..master import RealTime, Sample, Sink, Summary, at_rest, simulate
-from .messages import POINT, POSE, STORE, STREAM, Messages, Serialised
+from .cdr import Rows
+from .messages import POINT, POSE, STORE, STREAM, Messages
 from .network import Network, network, open_domain
 
 # isort: split
@@ -36,7 +37,7 @@ class Carrier:
     What the bytes mean is rosbags' business.
     """
 
-    def __init__(self, cdr: Serialised) -> None:
+    def __init__(self, cdr: bytes) -> None:
         self.cdr = cdr
 
     def serialize(self, **_options: object) -> bytes:
@@ -165,13 +166,13 @@ class Publisher(Sink):
         if not self._begun:
             self._begun = True
             self._publish(self._messages.latched(sample.stamp))
-        self._publish(self._messages.of(sample))
+        self._publish(self._messages.of(self._messages.numbers(sample))[1])
 
-    def _publish(self, messages: list[tuple[str, Serialised]]) -> None:
-        for name, cdr in messages:
+    def _publish(self, messages: Mapping[str, Rows]) -> None:
+        for name, rows in messages.items():
             writer = self._writers[name]
             try:
-                writer.write(writer.data_type(cdr))
+                writer.write(writer.data_type(rows.tobytes()))
             except core.DDSException as error:
                 self._warn_once(name, f"messages on {name} are lost: {error}")
 
@@ -195,7 +196,7 @@ class Publisher(Sink):
             self._warn_once("rest", f"{error}: the robot is stopped, and its target is where it is")
         return rest
 
-    def _target(self, name: str, kind: str, cdr: Serialised) -> dict[str, tuple[float, ...]]:
+    def _target(self, name: str, kind: str, cdr: bytes) -> dict[str, tuple[float, ...]]:
         """What a message asks for, as inputs of the FMU; nothing where it is ignored."""
         what = "a pose" if kind == POSE else "a point"
         try:
