@@ -8,12 +8,11 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from ctypes import byref, c_double, c_uint
+from ctypes import Array, byref, c_double, c_uint
 from dataclasses import dataclass
 from itertools import count, takewhile
 from math import inf
 from pathlib import Path
-from struct import Struct
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -27,18 +26,13 @@ from numpy.typing import NDArray
 
 from .errors import ZIP_ERRORS, FmuError, SimulationError
 from .export.python_wrapper import check_python_wrapper
-from .files import (
-    UnsafeArchiveError,
-    check_archive,
-    is_plain_xml,
-    read_member,
-    temporary_folder,
-)
+from .files import UnsafeArchiveError, check_archive, is_plain_xml, read_member, temporary_folder
 
 logger = logging.getLogger(__name__)
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 
+Values = Array[c_double]
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
 MAX_RESOURCE = 256 * 1024**2
 
@@ -210,17 +204,17 @@ class Instance:
         self._said = ""
         self._check(self._slave.dll.fmi2DoStep(self._slave.component, t, h, fmi2.fmi2True))
 
-    def reader(self, names: Sequence[str]) -> Callable[[], tuple[float, ...]]:
-        """A function that reads these Real variables."""
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """A function that reads these Real variables, each time into the same place."""
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].valueReference for name in names))
-        values, as_tuple = (c_double * n)(), Struct(f"{n}d").unpack
+        values = (c_double * n)()
         get, component = self._slave.dll.fmi2GetReal, self._slave.component
 
-        def read() -> tuple[float, ...]:
+        def read() -> Values:
             self._said = ""
             self._check(get(component, references, n, values))
-            return as_tuple(values)
+            return values
 
         return read
 

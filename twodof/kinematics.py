@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from .plant.urdf import Joint, Urdf
 
 Array = NDArray[np.float64]
+BLOCK = 50_000  # samples
 
 
 class Placement(NamedTuple):
@@ -99,7 +100,9 @@ class Kinematics:
 
     def path(self, link: str, q: ArrayLike) -> Array:
         """Positions of a link's origin in the root frame, N × 3, m."""
-        return self.along(self.urdf.chain(link), q)[-1].translation
+        q, chain = np.asarray(q, dtype=np.float64), self.urdf.chain(link)
+        blocks = [q[k : k + BLOCK] for k in range(0, len(q), BLOCK)]  # matrices take room
+        return np.concatenate([self.along(chain, block)[-1].translation for block in blocks])
 
     def links(self, q: ArrayLike) -> dict[str, Placement]:
         """Where all links are in the root frame."""

@@ -246,25 +246,31 @@ def _sampler(
     start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
-        t, values = start + k * step, read()
+        t, values = start + k * step, tuple(read())
         if not all(map(isfinite, values)):
-            text = f"the FMU gave a value that is not finite at t = {t:g} s"
-            raise SimulationError(text, k, "diverged")
+            raise diverged(k, t)
         stamp = first_stamp + round(k * step * NANOSECONDS)
-        return Sample(
-            k, t, values[of_q], values[of_v], values[of_x], values[of_tau],
-            inputs, since, stamp, values[of_quat],
-        )  # fmt: skip
+        parts = values[of_q], values[of_v], values[of_x], values[of_tau]
+        return Sample(k, t, *parts, inputs, since, stamp, values[of_quat])
 
     return take
+
+
+def diverged(k: int, t: float) -> SimulationError:
+    """Of the sample after k steps, at a time."""
+    return SimulationError(f"the FMU gave a value that is not finite at t = {t:g} s", k, "diverged")
+
+
+def step_failure(k: int, t: float, error: SimulationError) -> SimulationError:
+    """Of the step after k steps, at a time."""
+    return SimulationError(f"step {k + 1} at t = {t:g} s: {error}", k, error.outcome)
 
 
 def _resumed(
     run: Experiment, sample: Sample, error: SimulationError, resume: Resume
 ) -> dict[str, Value]:
     """Start values to go on with after a step that failed; where there are none, its failure."""
-    text = f"step {sample.k + 1} at t = {sample.t:g} s: {error}"
-    failure = SimulationError(text, sample.k, error.outcome)
+    failure = step_failure(sample.k, sample.t, error)
     settings = resume(sample, failure) if error.outcome == "discarded" else None
     if settings is None:
         raise failure from error
