@@ -6,8 +6,7 @@
 #include <stdlib.h>
 #include <time.h>
 
-#include "fmi2Functions.h"
-#include "model.h"
+#include "fmu.c"
 
 /* Processor time of a step, s, the mean of a run from the start; NaN where a call fails. */
 FMI2_Export double step_cost(double h, int steps)

@@ -355,7 +355,9 @@ def native_cost(arm: Arm, folder: Path) -> Callable[[], float]:
     sources = {Path(path).name: content for path, content in flavour.files.items()}
     sources["native_step.c"] = (HERE / "native_step.c").read_bytes()
     path = folder / name
-    path.write_bytes(compile_library(sources, host_platform(), name))
+    path.write_bytes(
+        compile_library(sources, host_platform(), name, units=("directional.c", "native_step.c"))
+    )
     step_cost = ctypes.CDLL(str(path)).step_cost
     step_cost.argtypes, step_cost.restype = (ctypes.c_double, ctypes.c_int), ctypes.c_double
     return lambda: step_cost(STEP, STEPS)

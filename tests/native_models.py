@@ -225,19 +225,19 @@ def engine(name: str, control: str = "task") -> Engine:
 
 
 def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
-    """Engine, FMI layer and C files of the tests, compiled by the machine's own compiler."""
+    """C files of the tests, which include the FMU's, compiled by the machine's own compiler."""
     files = of.sources(*more)
     digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
     folder = SCRATCH / digest
     output = folder / "program"
     if not output.exists():
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         for file, content in files.items():
             (folder / file).write_bytes(content)
         subprocess.run(
             ["gcc", "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
              "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
-             "-o", output, *sorted(f for f in files if f.endswith(".c")), "-lm"],
+             "-o", output, "directional.c", *(path.name for path in more), "-lm"],
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
     return output

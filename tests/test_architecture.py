@@ -52,9 +52,11 @@ LIBRARIES = {
         "ros",
         "pages",
     },  # its rotations: of joints that are locked, for all, to URDF's rpy, to viser's wxyz
+    "simpleeval": {"export"},
     "tqdm": {"cli"},
     "viser": {"pages"},
     "websockets": {"pages"},
+    "xacro": {"export"},
 }
 
 MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES = 350, 60, 10

@@ -25,8 +25,6 @@ static Real largest_of(const Real change[], int count)
 
 #if defined _MSC_VER || defined __STDC_NO_COMPLEX__ || defined NO_COMPLEX
 #define COMPLEX 0
-#include "plant.h"
-#include "stops.h"
 #else
 #define COMPLEX 1
 #include <complex.h>
@@ -73,8 +71,8 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
     return creal(a) < creal(b) ? b : a;
 }
 
-/* From here on the engine has complex numbers, and none of its functions is seen elsewhere. The headers
-   of the standard that it includes are there already. */
+/* From here on the engine has complex numbers. The headers of the standard that it includes are there
+   already. */
 #define double double _Complex
 #define sin complex_sin
 #define cos complex_cos
@@ -85,25 +83,11 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 #undef RE
 #define RE(x) creal(x)
 #define IS_COMPLEX
-#undef INTERNAL
-#define INTERNAL static inline
+#endif
 
-#include "dynamics.c"
-#include "kinematics.c"
-#include "plant.c"
-#include "stops.c"
-#if N_ROWS > N_AXES
-#include "orientation.c"
-#endif
-#if !COMMANDS_ACCELERATION
-#include "effort_control.c"
-#elif defined HAS_RCOND
-#include "pseudo_inverse.c"
-#include "task_control.c"
-#else
-#include "joint_control.c"
-#endif
-#endif
+#undef INTERNAL
+#define INTERNAL static inline /* there is more than derivatives need */
+#include "engine.c"
 
 /* Compute what is wanted. */
 static void evaluate(Plant *plant, const int held[N_JOINTS], int wanted)

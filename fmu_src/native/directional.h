@@ -10,7 +10,8 @@ enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4 };
 
 /* How all variables change at value, by value reference, where inputs and states do as in change.
    Those that hold are the joints at rest at a limit, which stay there. */
-INTERNAL void differentiate(const double value[], const int held[], int wanted,
-                            const double change[], double derivative[]);
+#define differentiate PREFIXED(differentiate)
+HIDDEN void differentiate(const double value[], const int held[], int wanted,
+                          const double change[], double derivative[]);
 
 #endif

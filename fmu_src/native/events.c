@@ -19,8 +19,6 @@ static const double PULL = 1e-9;
    turn drive each other off would else have events without end. */
 static const double SLOW = 1e-4;
 
-enum { N_STATES = 2 * N_JOINTS };
-
 static void get_state(const Plant *plant, double y[N_STATES])
 {
     memcpy(y, &plant->value[Q], N_JOINTS * sizeof *y);

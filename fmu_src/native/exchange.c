@@ -1,149 +1,132 @@
-/* FMI 2.0 Model Exchange: the importer's solver integrates the states q, v, and finds the events. */
+/* Model Exchange: the importer's solver integrates the states q, v, and finds the events. */
 #include <math.h>
 #include <string.h>
 
 #include "events.h"
 #include "instance.h"
 
-enum { N_STATES = 2 * N_JOINTS }; /* q and v follow each other in the table, their derivatives too */
-
 /* The instance where the call is allowed and hands over so many values; its q and v are there. */
-static Instance *enter_with(fmi2Component component, Call call, const void *values, size_t count,
+static Instance *enter_with(void *component, Call call, const void *values, size_t count,
                             size_t wanted)
 {
     Instance *instance = enter(component, call);
     if (!instance)
         return NULL;
     if (count != wanted || (wanted > 0 && !values)) {
-        report(instance, fmi2Error, "%s: %s, %u are wanted", call_name(call),
+        report(instance, ERROR, "%s: %s, %u are wanted", call_name(call),
                values ? "wrong number of values" : "null pointer", (unsigned)wanted);
         return NULL;
     }
     if (instance->state.phase == INITIALIZATION && !instance->state.initialised
-        && initialise(instance, 0) != fmi2OK)
+        && initialise(instance, 0) != OK)
         return NULL;
-    if (instance->state.phase != INSTANTIATED && check_inputs(instance) != fmi2OK)
+    if (instance->state.phase != INSTANTIATED && check_inputs(instance) != OK)
         return NULL;
     return instance;
 }
 
-fmi2Status fmi2EnterEventMode(fmi2Component component)
+Status update_discrete_states(void *component, Boolean *states_changed)
 {
-    Instance *instance = enter(component, ENTER_EVENT_MODE);
+    Instance *instance = enter_with(component, NEW_DISCRETE_STATES, states_changed, 1, 1);
     if (!instance)
-        return fmi2Error;
-    instance->state.phase = EVENT;
-    return fmi2OK;
+        return ERROR;
+    State draft = instance->state;
+    update_stops(&draft);
+    const int changed = handle_event(&draft.plant, &draft.stops);
+    for (int i = 0; i < N_STATES; i++) /* an impact of speeds that are too large for numbers */
+        if (!isfinite(draft.plant.value[Q + i]))
+            return report(instance, ERROR, "%s: %s would not be finite",
+                          call_name(NEW_DISCRETE_STATES), VARIABLE_NAME[Q + i]);
+    draft.has_x = draft.has_tau = draft.has_rates = 0;
+    instance->state = draft;
+    *states_changed = changed;
+    return OK;
 }
 
-fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
-{
-    Instance *instance = enter_with(component, NEW_DISCRETE_STATES, info, 1, 1);
-    if (!instance)
-        return fmi2Error;
-    State *state = &instance->state;
-    memset(info, 0, sizeof *info);
-    update_stops(state);
-    info->valuesOfContinuousStatesChanged = handle_event(&state->plant, &state->stops);
-    state->has_x = state->has_tau = state->has_rates = 0;
-    return fmi2OK;
-}
-
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component component)
-{
-    Instance *instance = enter(component, ENTER_CONTINUOUS_TIME_MODE);
-    if (!instance)
-        return fmi2Error;
-    instance->state.phase = CONTINUOUS_TIME;
-    return fmi2OK;
-}
-
-fmi2Status fmi2CompletedIntegratorStep(fmi2Component component, fmi2Boolean no_set_state_prior,
-                                       fmi2Boolean *enter_event_mode, fmi2Boolean *terminate)
+Status complete_integrator_step(void *component, Boolean *enter_event_mode, Boolean *terminate)
 {
     Instance *instance = enter(component, COMPLETED_INTEGRATOR_STEP);
-    (void)no_set_state_prior;
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!enter_event_mode || !terminate)
-        return report(instance, fmi2Error, "fmi2CompletedIntegratorStep: null pointer");
-    *enter_event_mode = *terminate = fmi2False;
-    return fmi2OK;
+        return report(instance, ERROR, "%s: null pointer", call_name(COMPLETED_INTEGRATOR_STEP));
+    *enter_event_mode = *terminate = 0;
+    return OK;
 }
 
-fmi2Status fmi2SetTime(fmi2Component component, fmi2Real time)
+Status set_time(void *component, double time)
 {
     Instance *instance = enter(component, SET_TIME);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!isfinite(time))
-        return report(instance, fmi2Error, "fmi2SetTime: the time is not finite");
+        return report(instance, ERROR, "%s: the time is not finite", call_name(SET_TIME));
     instance->state.time = time;
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real x[], size_t count)
+Status set_continuous_states(void *component, const double x[], size_t count)
 {
     Instance *instance = enter_with(component, SET_CONTINUOUS_STATES, x, count, N_STATES);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     State *state = &instance->state;
     for (int i = 0; i < N_STATES; i++)
         if (!isfinite(x[i]))
-            return report(instance, fmi2Error, "fmi2SetContinuousStates: %s is not finite",
-                          VARIABLE_NAME[Q + i]);
+            return report(instance, ERROR, "%s: %s is not finite",
+                          call_name(SET_CONTINUOUS_STATES), VARIABLE_NAME[Q + i]);
     update_stops(state); /* what rests does so until an event */
     memcpy(&state->plant.value[Q], x, N_STATES * sizeof *x);
     state->has_x = state->has_tau = state->has_rates = 0;
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2GetDerivatives(fmi2Component component, fmi2Real derivatives[], size_t count)
+Status get_derivatives(void *component, double derivatives[], size_t count)
 {
     Instance *instance = enter_with(component, GET_DERIVATIVES, derivatives, count, N_STATES);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     const double *rate = &instance->state.plant.value[DER_Q];
     update_rates(&instance->state);
     for (int i = 0; i < N_STATES; i++)
         if (!isfinite(rate[i]))
-            return report(instance, fmi2Discard, "fmi2GetDerivatives: %s is not finite",
-                          VARIABLE_NAME[DER_Q + i]);
+            return report(instance, DISCARD, "%s: %s is not finite",
+                          call_name(GET_DERIVATIVES), VARIABLE_NAME[DER_Q + i]);
     memcpy(derivatives, rate, N_STATES * sizeof *rate);
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2GetEventIndicators(fmi2Component component, fmi2Real indicators[], size_t count)
+Status get_event_indicators(void *component, double indicators[], size_t count)
 {
     Instance *instance =
         enter_with(component, GET_EVENT_INDICATORS, indicators, count, N_INDICATORS);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     update_stops(&instance->state);
     event_indicators(&instance->state.plant, &instance->state.stops, indicators);
     for (int i = 0; i < N_INDICATORS; i++)
         if (!isfinite(indicators[i]))
-            return report(instance, fmi2Discard, "fmi2GetEventIndicators: the %d. is not finite",
-                          i + 1);
-    return fmi2OK;
+            return report(instance, DISCARD, "%s: the %d. is not finite",
+                          call_name(GET_EVENT_INDICATORS), i + 1);
+    return OK;
 }
 
-fmi2Status fmi2GetContinuousStates(fmi2Component component, fmi2Real x[], size_t count)
+Status get_continuous_states(void *component, double x[], size_t count)
 {
     Instance *instance = enter_with(component, GET_CONTINUOUS_STATES, x, count, N_STATES);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     memcpy(x, &instance->state.plant.value[Q], N_STATES * sizeof *x);
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component component, fmi2Real nominals[],
+Status get_nominals(void *component, double nominals[],
                                              size_t count)
 {
     Instance *instance = enter_with(component, GET_NOMINALS, nominals, count, N_STATES);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     for (int i = 0; i < N_STATES; i++)
         nominals[i] = 1.0;
-    return fmi2OK;
+    return OK;
 }

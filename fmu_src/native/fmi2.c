@@ -1,17 +1,62 @@
-/* FMI 2.0: the life of an instance, and the steps of co-simulation. */
-#include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
+/* The functions of FMI 2.0, and the table of their calls. */
 #include "instance.h"
-#include "integrator.h"
 
-static const double TIME_TOLERANCE = 1e-9;
-
-static int is_far(double a, double b)
+/* FMI 2.0.4, sections 3.2.3 and 4.2.4: each call, the phases in which it is allowed, and where it is of
+   one kind alone. A refused call changes nothing, so there is no error phase. */
+const Rule *rule_of(Call call)
 {
-    return !(fabs(a - b) <= TIME_TOLERANCE * fmax(1.0, fabs(a)));
+    static const Rule RULES[N_CALLS] = {
+        [INSTANTIATE] = {"fmi2Instantiate", 0},
+        [SET_DEBUG_LOGGING] = {"fmi2SetDebugLogging", ANY},
+        [SETUP_EXPERIMENT] = {"fmi2SetupExperiment", N},
+        [ENTER_INITIALIZATION] = {"fmi2EnterInitializationMode", N},
+        [EXIT_INITIALIZATION] = {"fmi2ExitInitializationMode", I},
+        [TERMINATE] = {"fmi2Terminate", S | F | M | C},
+        [RESET] = {"fmi2Reset", ANY},
+        [DO_STEP] = {"fmi2DoStep", S, CO_SIMULATION},
+        [CANCEL_STEP] = {"fmi2CancelStep", 0, CO_SIMULATION}, /* no step is ever pending */
+        [GET_STATUS] = {"fmi2GetStatus", S | F | T, CO_SIMULATION},
+        [GET_REAL] = {"fmi2GetReal", I | S | F | M | C | T},
+        [GET_BOOLEAN] = {"fmi2GetBoolean", I | S | F | M | C | T},
+        [GET_OTHER] = {"fmi2Get of an Integer or String", I | S | F | M | C | T},
+        [SET_REAL] = {"fmi2SetReal", N | I | S | M | C},
+        [SET_BOOLEAN] = {"fmi2SetBoolean", N | I | S | M | C},
+        [SET_OTHER] = {"fmi2Set of an Integer or String", N | I | S | M | C},
+        [SET_INPUT] = {"fmi2Set of an input", N | I | S | M | C},
+        [SET_PARAMETER] = {"fmi2Set of a parameter", N | I},
+        [SET_Q_V] = {"fmi2Set of a state", M | C},
+        [GET_STATE] = {"fmi2GetFMUstate", ANY},
+        [SET_STATE] = {"fmi2SetFMUstate", ANY},
+        [FREE_STATE] = {"fmi2FreeFMUstate", ANY},
+        [SIZE_OF_STATE] = {"fmi2SerializedFMUstateSize", ANY},
+        [SERIALIZE] = {"fmi2SerializeFMUstate", ANY},
+        [DESERIALIZE] = {"fmi2DeSerializeFMUstate", ANY},
+        [ENTER_EVENT_MODE] = {"fmi2EnterEventMode", C, MODEL_EXCHANGE},
+        [NEW_DISCRETE_STATES] = {"fmi2NewDiscreteStates", M, MODEL_EXCHANGE},
+        [ENTER_CONTINUOUS_TIME_MODE] = {"fmi2EnterContinuousTimeMode", M, MODEL_EXCHANGE},
+        [COMPLETED_INTEGRATOR_STEP] = {"fmi2CompletedIntegratorStep", C, MODEL_EXCHANGE},
+        [SET_TIME] = {"fmi2SetTime", M | C, MODEL_EXCHANGE},
+        [SET_CONTINUOUS_STATES] = {"fmi2SetContinuousStates", C, MODEL_EXCHANGE},
+        [GET_DERIVATIVES] = {"fmi2GetDerivatives", I | M | C | T, MODEL_EXCHANGE},
+        [GET_EVENT_INDICATORS] = {"fmi2GetEventIndicators", I | M | C | T, MODEL_EXCHANGE},
+        [GET_CONTINUOUS_STATES] = {"fmi2GetContinuousStates", I | M | C | T, MODEL_EXCHANGE},
+        [GET_DIRECTIONAL_DERIVATIVE] = {"fmi2GetDirectionalDerivative", I | S | F | M | C | T},
+        [GET_NOMINALS] = {"fmi2GetNominalsOfContinuousStates", N | I | M | C | T, MODEL_EXCHANGE},
+    };
+    return &RULES[call];
+}
+
+void hand_over(const Instance *instance, Status status, const char *category, const char *text)
+{
+    char escaped[1024], *end = escaped; /* a message of FMI 2.0 is a printf format */
+    for (const char *c = text; *c; c++) {
+        if (*c == '%')
+            *end++ = '%';
+        *end++ = *c;
+    }
+    *end = '\0';
+    ((fmi2CallbackLogger)instance->log)(instance->environment, instance->name, (fmi2Status)status,
+                                        category, escaped);
 }
 
 const char *fmi2GetTypesPlatform(void)
@@ -24,18 +69,6 @@ const char *fmi2GetVersion(void)
     return fmi2Version;
 }
 
-/* Why an instance cannot be made; NULL where it can. */
-static const char *why_not(fmi2String name, fmi2Type type, fmi2String guid)
-{
-    if (!name || !*name)
-        return "fmi2Instantiate: the instance has no name";
-    if (type != fmi2CoSimulation && type != fmi2ModelExchange)
-        return "fmi2Instantiate: the type is neither co-simulation nor Model Exchange";
-    if (!guid || strcmp(guid, MODEL_GUID) != 0)
-        return "fmi2Instantiate: the GUID is not that of this FMU, " MODEL_GUID;
-    return NULL;
-}
-
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible,
                               fmi2Boolean logging_on)
@@ -43,25 +76,14 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     (void)resources, (void)visible;
     if (!functions)
         return NULL;
-    Instance draft = {.kind = type,
-                      .log = functions->logger,
+    Instance draft = {.kind = type == fmi2ModelExchange ? MODEL_EXCHANGE : CO_SIMULATION,
+                      .log = (void (*)(void))functions->logger,
                       .environment = functions->componentEnvironment,
-                      .name = name ? name : "",
-                      .verbose = logging_on};
-    const char *reason = why_not(name, type, guid);
-    if (reason) {
-        report(&draft, fmi2Error, "%s", reason);
-        return NULL;
-    }
-    Instance *instance = calloc(1, sizeof *instance + strlen(name) + 1);
-    if (!instance) {
-        report(&draft, fmi2Error, "fmi2Instantiate: no memory");
-        return NULL;
-    }
-    *instance = draft;
-    instance->name = strcpy((char *)(instance + 1), name);
-    reset_state(&instance->state);
-    return instance;
+                      .name = name ? name : "", .verbose = logging_on};
+    if (type == fmi2ModelExchange || type == fmi2CoSimulation)
+        return instantiate(draft, guid);
+    report(&draft, ERROR, "fmi2Instantiate: the type is neither co-simulation nor Model Exchange");
+    return NULL;
 }
 
 void fmi2FreeInstance(fmi2Component component)
@@ -72,20 +94,7 @@ void fmi2FreeInstance(fmi2Component component)
 fmi2Status fmi2SetDebugLogging(fmi2Component component, fmi2Boolean logging_on, size_t count,
                                const fmi2String categories[])
 {
-    Instance *instance = enter(component, SET_DEBUG_LOGGING);
-    int all = count == 0;
-    if (!instance || (count > 0 && !categories))
-        return fmi2Error;
-    for (size_t i = 0; i < count; i++) {
-        const char *category = categories[i] ? categories[i] : "";
-        if (strcmp(category, "logAll") == 0)
-            all = 1;
-        else if (strncmp(category, "logStatus", 9) != 0)
-            return report(instance, fmi2Error, "fmi2SetDebugLogging: there is no category '%s'",
-                          category);
-    }
-    instance->verbose = logging_on && all;
-    return fmi2OK;
+    return (fmi2Status)set_debug_logging(component, logging_on, count, categories);
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component component, fmi2Boolean tolerance_defined,
@@ -95,102 +104,114 @@ fmi2Status fmi2SetupExperiment(fmi2Component component, fmi2Boolean tolerance_de
     Instance *instance = enter(component, SETUP_EXPERIMENT);
     if (!instance)
         return fmi2Error;
-    if (!isfinite(start_time))
-        return report(instance, fmi2Error, "fmi2SetupExperiment: the start time is not finite");
-    if (stop_time_defined && !(stop_time >= start_time))
-        return report(instance, fmi2Error, "fmi2SetupExperiment: stop time %g < start time %g",
-                      stop_time, start_time);
-    if (tolerance_defined)
-        report(instance, fmi2OK, "the tolerance %g of the experiment is ignored: rtol and atol are"
-               " parameters", tolerance);
-    instance->state.time = start_time;
-    instance->state.stop_time = stop_time_defined ? stop_time : HUGE_VAL;
-    return fmi2OK;
+    return (fmi2Status)set_up(instance, SETUP_EXPERIMENT, tolerance_defined ? &tolerance : NULL,
+                              start_time, stop_time_defined ? &stop_time : NULL);
 }
 
 fmi2Status fmi2EnterInitializationMode(fmi2Component component)
 {
-    Instance *instance = enter(component, ENTER_INITIALIZATION);
-    if (!instance)
-        return fmi2Error;
-    instance->state.phase = INITIALIZATION;
-    return fmi2OK;
+    return (fmi2Status)move_on(component, ENTER_INITIALIZATION, INITIALIZATION);
 }
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component component)
 {
-    Instance *instance = enter(component, EXIT_INITIALIZATION);
-    if (!instance || initialise(instance, 1) != fmi2OK)
-        return fmi2Error;
-    instance->state.phase = instance->kind == fmi2ModelExchange ? EVENT : STEP;
-    return fmi2OK;
+    return (fmi2Status)exit_initialization(component);
 }
 
 fmi2Status fmi2Terminate(fmi2Component component)
 {
-    Instance *instance = enter(component, TERMINATE);
-    if (!instance)
-        return fmi2Error;
-    instance->state.phase = TERMINATED;
-    return fmi2OK;
+    return (fmi2Status)move_on(component, TERMINATE, TERMINATED);
 }
 
 fmi2Status fmi2Reset(fmi2Component component)
 {
-    Instance *instance = enter(component, RESET);
-    if (!instance)
-        return fmi2Error;
-    reset_state(&instance->state);
-    return fmi2OK;
+    return (fmi2Status)reset(component);
 }
 
-/* Say why a step cannot be done, and what would help. */
-static fmi2Status discard(Instance *instance, double point, double h, const Obstacle *obstacle)
+fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                       fmi2Real value[])
 {
-    const double *value = instance->state.plant.value;
-    if (obstacle->reason == NOT_FINITE)
-        return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: the equations of motion gave"
-                      " a value that is not finite", point);
-    if (obstacle->reason == MANY_STEPS)
-        return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: max_step = %g s divides a step"
-                      " of %g s into more than %d integration steps; enlarge max_step or shorten"
-                      " the step", point, value[MAX_STEP], h, BUDGET / STAGES);
-    char need[80] = "integration steps below the resolution of time";
-    if (obstacle->reason == MANY_EVALUATIONS)
-        snprintf(need, sizeof need, "more than %d evaluations for the step of %g s", BUDGET, h);
-    return report(instance, fmi2Discard, "fmi2DoStep at %.12g s: rtol = %g and atol = %g need %s:"
-                  " joint '%s' changes at a rate of %.3g 1/s; shorten the step, lessen damping or"
-                  " gains, or enlarge rtol and atol", point, value[RTOL], value[ATOL], need,
-                  JOINT_NAME[obstacle->joint], obstacle->rate);
+    return (fmi2Status)get_reals(component, vr, count, value, count);
+}
+
+fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                       const fmi2Real value[])
+{
+    return (fmi2Status)set_reals(component, vr, count, value, count);
+}
+
+fmi2Status fmi2GetBoolean(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                          fmi2Boolean value[])
+{
+    return (fmi2Status)get_booleans(component, vr, count, value, count);
+}
+
+fmi2Status fmi2SetBoolean(fmi2Component component, const fmi2ValueReference vr[], size_t count,
+                          const fmi2Boolean value[])
+{
+    return (fmi2Status)set_booleans(component, vr, count, value, count);
+}
+
+#define OTHER_TYPE(Name)                                                                           \
+    fmi2Status fmi2Get##Name(fmi2Component component, const fmi2ValueReference vr[], size_t count, \
+                             fmi2##Name value[])                                                   \
+    {                                                                                              \
+        return (fmi2Status)other_variables(component, GET_OTHER, vr, count, value);                \
+    }                                                                                              \
+    fmi2Status fmi2Set##Name(fmi2Component component, const fmi2ValueReference vr[], size_t count, \
+                             const fmi2##Name value[])                                             \
+    {                                                                                              \
+        return (fmi2Status)other_variables(component, SET_OTHER, vr, count, value);                \
+    }
+OTHER_TYPE(Integer)
+OTHER_TYPE(String)
+
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component component,
+                                        const fmi2ValueReference unknown[], size_t n_unknown,
+                                        const fmi2ValueReference known[], size_t n_known,
+                                        const fmi2Real seed[], fmi2Real result[])
+{
+    return (fmi2Status)directional_derivative(component, unknown, n_unknown, known, n_known, seed,
+                                              n_known, result, n_unknown);
+}
+
+fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)
+{
+    return (fmi2Status)save_state(component, saved);
+}
+
+fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate saved)
+{
+    return (fmi2Status)restore_state(component, saved);
+}
+
+fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *saved)
+{
+    return (fmi2Status)free_state(component, saved);
+}
+
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component component, fmi2FMUstate saved, size_t *size)
+{
+    return (fmi2Status)size_of_state(component, saved, size);
+}
+
+fmi2Status fmi2SerializeFMUstate(fmi2Component component, fmi2FMUstate saved, fmi2Byte bytes[],
+                                 size_t size)
+{
+    return (fmi2Status)serialize_state(component, saved, bytes, size);
+}
+
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes[], size_t size,
+                                   fmi2FMUstate *saved)
+{
+    return (fmi2Status)deserialize_state(component, bytes, size, saved);
 }
 
 fmi2Status fmi2DoStep(fmi2Component component, fmi2Real point, fmi2Real h,
                       fmi2Boolean no_set_state_prior)
 {
-    Instance *instance = enter(component, DO_STEP);
     (void)no_set_state_prior;
-    if (!instance)
-        return fmi2Error;
-    State *state = &instance->state;
-    if (is_far(point, state->time))
-        return report(instance, fmi2Error, "fmi2DoStep: the communication point %.12g s is not the"
-                      " time of the FMU, %.12g s", point, state->time);
-    if (!(h > 0.0 && isfinite(h)))
-        return report(instance, fmi2Error, "fmi2DoStep: the step %.12g s must be finite and > 0",
-                      h);
-    if (point + h > state->stop_time && is_far(point + h, state->stop_time))
-        return report(instance, fmi2Error, "fmi2DoStep: the step of %.12g s from %.12g s ends after"
-                      " the stop time, %.12g s", h, point, state->stop_time);
-    if (check_inputs(instance) != fmi2OK)
-        return fmi2Error;
-    Obstacle obstacle;
-    if (!advance_plant(&state->plant, h, &obstacle)) {
-        state->phase = STEP_FAILED;
-        return discard(instance, point, h, &obstacle);
-    }
-    state->time = point + h;
-    state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
-    return fmi2OK;
+    return (fmi2Status)do_step(component, point, h);
 }
 
 fmi2Status fmi2CancelStep(fmi2Component component)
@@ -199,54 +220,131 @@ fmi2Status fmi2CancelStep(fmi2Component component)
     return fmi2Error;
 }
 
-fmi2Status fmi2GetStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Status *value)
+/* Whether there is such a status to tell, and a place for it; refusals are logged. */
+static fmi2Status ask(fmi2Component component, int exists, const void *value)
 {
     Instance *instance = enter(component, GET_STATUS);
     if (!instance || !value)
         return fmi2Error;
-    if (kind != fmi2DoStepStatus)
-        return report(instance, fmi2Discard, "fmi2GetStatus: no such status");
-    *value = instance->state.phase == STEP_FAILED ? fmi2Discard : fmi2OK;
-    return fmi2OK;
+    return exists ? fmi2OK
+                  : (fmi2Status)report(instance, DISCARD, "fmi2GetStatus: no such status");
+}
+
+fmi2Status fmi2GetStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Status *value)
+{
+    const fmi2Status answer = ask(component, kind == fmi2DoStepStatus, value);
+    if (answer == fmi2OK)
+        *value = ((Instance *)component)->state.phase == STEP_FAILED ? fmi2Discard : fmi2OK;
+    return answer;
 }
 
 fmi2Status fmi2GetRealStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Real *value)
 {
-    Instance *instance = enter(component, GET_STATUS);
-    if (!instance || !value)
-        return fmi2Error;
-    if (kind != fmi2LastSuccessfulTime)
-        return report(instance, fmi2Discard, "fmi2GetRealStatus: no such status");
-    *value = instance->state.time;
-    return fmi2OK;
+    const fmi2Status answer = ask(component, kind == fmi2LastSuccessfulTime, value);
+    if (answer == fmi2OK)
+        *value = ((Instance *)component)->state.time;
+    return answer;
 }
 
 fmi2Status fmi2GetBooleanStatus(fmi2Component component, const fmi2StatusKind kind,
                                 fmi2Boolean *value)
 {
-    Instance *instance = enter(component, GET_STATUS);
-    if (!instance || !value)
-        return fmi2Error;
-    if (kind != fmi2Terminated)
-        return report(instance, fmi2Discard, "fmi2GetBooleanStatus: no such status");
-    *value = fmi2False;
-    return fmi2OK;
+    const fmi2Status answer = ask(component, kind == fmi2Terminated, value);
+    if (answer == fmi2OK)
+        *value = fmi2False;
+    return answer;
 }
 
 fmi2Status fmi2GetIntegerStatus(fmi2Component component, const fmi2StatusKind kind,
                                 fmi2Integer *value)
 {
-    Instance *instance = enter(component, GET_STATUS);
-    (void)kind, (void)value;
-    return instance ? report(instance, fmi2Discard, "fmi2GetIntegerStatus: no such status")
-                    : fmi2Error;
+    (void)kind;
+    return ask(component, 0, value);
 }
 
 fmi2Status fmi2GetStringStatus(fmi2Component component, const fmi2StatusKind kind,
                                fmi2String *value)
 {
-    Instance *instance = enter(component, GET_STATUS);
-    (void)kind, (void)value;
-    return instance ? report(instance, fmi2Discard, "fmi2GetStringStatus: no step is pending")
-                    : fmi2Error;
+    (void)kind;
+    return ask(component, 0, value);
+}
+
+fmi2Status fmi2EnterEventMode(fmi2Component component)
+{
+    return (fmi2Status)move_on(component, ENTER_EVENT_MODE, EVENT);
+}
+
+fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
+{
+    fmi2Boolean changed;
+    const Status status = update_discrete_states(component, info ? &changed : NULL);
+    if (status == OK)
+        *info = (fmi2EventInfo){.valuesOfContinuousStatesChanged = changed};
+    return (fmi2Status)status;
+}
+
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component component)
+{
+    return (fmi2Status)move_on(component, ENTER_CONTINUOUS_TIME_MODE, CONTINUOUS_TIME);
+}
+
+fmi2Status fmi2CompletedIntegratorStep(fmi2Component component, fmi2Boolean no_set_state_prior,
+                                       fmi2Boolean *event_mode, fmi2Boolean *terminates)
+{
+    (void)no_set_state_prior;
+    return (fmi2Status)complete_integrator_step(component, event_mode, terminates);
+}
+
+fmi2Status fmi2SetTime(fmi2Component component, fmi2Real time)
+{
+    return (fmi2Status)set_time(component, time);
+}
+
+fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real x[], size_t count)
+{
+    return (fmi2Status)set_continuous_states(component, x, count);
+}
+
+fmi2Status fmi2GetDerivatives(fmi2Component component, fmi2Real derivatives[], size_t count)
+{
+    return (fmi2Status)get_derivatives(component, derivatives, count);
+}
+
+fmi2Status fmi2GetEventIndicators(fmi2Component component, fmi2Real indicators[], size_t count)
+{
+    return (fmi2Status)get_event_indicators(component, indicators, count);
+}
+
+fmi2Status fmi2GetContinuousStates(fmi2Component component, fmi2Real x[], size_t count)
+{
+    return (fmi2Status)get_continuous_states(component, x, count);
+}
+
+fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component component, fmi2Real nominals[],
+                                             size_t count)
+{
+    return (fmi2Status)get_nominals(component, nominals, count);
+}
+
+/* What the modelDescription says that there is not. Some importers bind every name of the standard. */
+static fmi2Status unsupported(fmi2Component component, const char *function)
+{
+    if (component)
+        report(component, ERROR, "%s is not supported by this FMU", function);
+    return fmi2Error;
+}
+
+fmi2Status fmi2SetRealInputDerivatives(fmi2Component component, const fmi2ValueReference vr[],
+                                       size_t count, const fmi2Integer order[],
+                                       const fmi2Real value[])
+{
+    (void)vr, (void)count, (void)order, (void)value;
+    return unsupported(component, "fmi2SetRealInputDerivatives");
+}
+
+fmi2Status fmi2GetRealOutputDerivatives(fmi2Component component, const fmi2ValueReference vr[],
+                                        size_t count, const fmi2Integer order[], fmi2Real value[])
+{
+    (void)vr, (void)count, (void)order, (void)value;
+    return unsupported(component, "fmi2GetRealOutputDerivatives");
 }

@@ -1,124 +1,68 @@
-/* The state machine of FMI 2.0, messages, and initialisation. */
+/* The life of an instance: the rules of its calls, messages, and initialisation. */
 #include "instance.h"
 #include "events.h"
 
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 
 static const char *const PHASE_NAME[N_PHASES] = {
     "instantiated", "initialization mode", "step mode", "step failed", "event mode",
     "continuous-time mode", "terminated"};
 
-enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
-       E = 1 << EVENT, C = 1 << CONTINUOUS_TIME, T = 1 << TERMINATED,
-       ANY = N | I | S | F | E | C | T };
-
-/* Of which kind of instance a call is. */
-typedef enum { BOTH, SIMULATION, EXCHANGE } Kind;
-static const char *const KIND_NAME[] = {"", "co-simulation", "Model Exchange"};
-
-/* FMI 2.0.4, sections 3.2.3 and 4.2.4: each call, the phases in which it is allowed, and where it is of
-   one kind alone. A refused call changes nothing, so there is no error phase. */
-static const struct {
-    const char *name;
-    int phases;
-    Kind kind;
-} CALLS[N_CALLS] = {
-    [SET_DEBUG_LOGGING] = {"fmi2SetDebugLogging", ANY},
-    [SETUP_EXPERIMENT] = {"fmi2SetupExperiment", N},
-    [ENTER_INITIALIZATION] = {"fmi2EnterInitializationMode", N},
-    [EXIT_INITIALIZATION] = {"fmi2ExitInitializationMode", I},
-    [TERMINATE] = {"fmi2Terminate", S | F | E | C},
-    [RESET] = {"fmi2Reset", ANY},
-    [DO_STEP] = {"fmi2DoStep", S, SIMULATION},
-    [CANCEL_STEP] = {"fmi2CancelStep", 0, SIMULATION}, /* no step is ever pending */
-    [GET_STATUS] = {"fmi2GetStatus", S | F | T, SIMULATION},
-    [GET_REAL] = {"fmi2GetReal", I | S | F | E | C | T},
-    [GET_INTEGER] = {"fmi2GetInteger", I | S | F | E | C | T},
-    [GET_BOOLEAN] = {"fmi2GetBoolean", I | S | F | E | C | T},
-    [GET_STRING] = {"fmi2GetString", I | S | F | E | C | T},
-    [SET_REAL] = {"fmi2SetReal", N | I | S | E | C},
-    [SET_INTEGER] = {"fmi2SetInteger", N | I | S | E | C},
-    [SET_BOOLEAN] = {"fmi2SetBoolean", N | I | S | E | C},
-    [SET_STRING] = {"fmi2SetString", N | I | S | E | C},
-    [SET_INPUT] = {"fmi2Set of an input", N | I | S | E | C},
-    [SET_PARAMETER] = {"fmi2Set of a parameter", N | I},
-    [SET_Q_V] = {"fmi2Set of a state", E | C},
-    [GET_STATE] = {"fmi2GetFMUstate", ANY},
-    [SET_STATE] = {"fmi2SetFMUstate", ANY},
-    [FREE_STATE] = {"fmi2FreeFMUstate", ANY},
-    [SIZE_OF_STATE] = {"fmi2SerializedFMUstateSize", ANY},
-    [SERIALIZE] = {"fmi2SerializeFMUstate", ANY},
-    [DESERIALIZE] = {"fmi2DeSerializeFMUstate", ANY},
-    [ENTER_EVENT_MODE] = {"fmi2EnterEventMode", C, EXCHANGE},
-    [NEW_DISCRETE_STATES] = {"fmi2NewDiscreteStates", E, EXCHANGE},
-    [ENTER_CONTINUOUS_TIME_MODE] = {"fmi2EnterContinuousTimeMode", E, EXCHANGE},
-    [COMPLETED_INTEGRATOR_STEP] = {"fmi2CompletedIntegratorStep", C, EXCHANGE},
-    [SET_TIME] = {"fmi2SetTime", E | C, EXCHANGE},
-    [SET_CONTINUOUS_STATES] = {"fmi2SetContinuousStates", C, EXCHANGE},
-    [GET_DERIVATIVES] = {"fmi2GetDerivatives", I | E | C | T, EXCHANGE},
-    [GET_EVENT_INDICATORS] = {"fmi2GetEventIndicators", I | E | C | T, EXCHANGE},
-    [GET_CONTINUOUS_STATES] = {"fmi2GetContinuousStates", I | E | C | T, EXCHANGE},
-    [GET_DIRECTIONAL_DERIVATIVE] = {"fmi2GetDirectionalDerivative", I | S | F | E | C | T},
-    [GET_NOMINALS] = {"fmi2GetNominalsOfContinuousStates", N | I | E | C | T, EXCHANGE},
-};
+static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation"};
 
 const char *call_name(Call call)
 {
-    return CALLS[call].name;
+    return rule_of(call)->name;
 }
 
 int allowed(Instance *instance, Call call, const char *culprit)
 {
+    const Rule *rule = rule_of(call);
     const int phase = instance->state.phase;
-    const Kind kind = instance->kind == fmi2ModelExchange ? EXCHANGE : SIMULATION;
-    if (CALLS[call].kind != BOTH && CALLS[call].kind != kind) {
-        report(instance, fmi2Error, "%s is a call of %s, and the instance is one of %s",
-               CALLS[call].name, KIND_NAME[CALLS[call].kind], KIND_NAME[kind]);
+    if (rule->kind != BOTH_KINDS && rule->kind != instance->kind) {
+        report(instance, ERROR, "%s is a call of %s, and the instance is one of %s", rule->name,
+               KIND_NAME[rule->kind], KIND_NAME[instance->kind]);
         return 0;
     }
-    if (CALLS[call].phases >> phase & 1)
+    if (rule->phases >> phase & 1)
         return 1;
-    report(instance, fmi2Error, "%s%s%s%s is not allowed in the state '%s'", CALLS[call].name,
+    report(instance, ERROR, "%s%s%s%s is not allowed in the state '%s'", rule->name,
            culprit ? " (" : "", culprit ? culprit : "", culprit ? ")" : "", PHASE_NAME[phase]);
     return 0;
 }
 
-int can_be_in(fmi2Type kind, int phase)
+int can_be_in(Kind kind, int phase)
 {
-    const int other = kind == fmi2ModelExchange ? S | F : E | C;
+    const int other = kind == MODEL_EXCHANGE ? S | F : M | C;
     return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
 }
 
-Instance *enter(fmi2Component component, Call call)
+Instance *enter(void *component, Call call)
 {
     return component && allowed(component, call, NULL) ? component : NULL;
 }
 
-fmi2Status report(Instance *instance, fmi2Status status, const char *format, ...)
+Status report(Instance *instance, Status status, const char *format, ...)
 {
     static const char *const CATEGORY[] = {
-        "logAll", "logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"};
-    char text[512], escaped[2 * sizeof text], *end = escaped;
+        "logAll", "logStatusWarning", "logStatusDiscard", "logStatusError"};
+    char text[512];
     va_list arguments;
-    if (!instance->log || (status == fmi2OK && !instance->verbose))
+    if (!instance->log || (status == OK && !instance->verbose))
         return status;
     va_start(arguments, format);
     vsnprintf(text, sizeof text, format, arguments);
     va_end(arguments);
-    for (const char *c = text; *c; c++) { /* FMI messages are printf formats */
-        if (*c == '%')
-            *end++ = '%';
-        *end++ = *c;
-    }
-    *end = '\0';
-    instance->log(instance->environment, instance->name, status, CATEGORY[status], escaped);
+    hand_over(instance, status, CATEGORY[status], text);
     return status;
 }
 
-void reset_state(State *state)
+/* Set the state to that of a new instance. */
+static void reset_state(State *state)
 {
     memset(state, 0, sizeof *state);
     memcpy(state->guid, MODEL_GUID, sizeof MODEL_GUID);
@@ -127,38 +71,123 @@ void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
-fmi2Status check_inputs(Instance *instance)
+Status check_range(Instance *instance, int variable, double value)
+{
+    for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
+        const int index = variable - RANGE[k].first;
+        if (index >= 0 && index < RANGE[k].count
+            && !(value >= RANGE[k].low && value <= RANGE[k].high))
+            return report(instance, ERROR, "%s = %g must be %s", VARIABLE_NAME[variable],
+                          value, RANGE[k].words);
+    }
+    return OK;
+}
+
+Instance *instantiate(Instance draft, const char *token)
+{
+    const char *function = call_name(INSTANTIATE), *name = draft.name;
+    if (!name || !*name) {
+        draft.name = "";
+        report(&draft, ERROR, "%s: the instance has no name", function);
+        return NULL;
+    }
+    if (!token || strcmp(token, MODEL_GUID) != 0) {
+        report(&draft, ERROR, "%s: the " TOKEN " is not that of this FMU, " MODEL_GUID, function);
+        return NULL;
+    }
+    Instance *instance = calloc(1, sizeof *instance + strlen(name) + 1);
+    if (!instance) {
+        report(&draft, ERROR, "%s: no memory", function);
+        return NULL;
+    }
+    *instance = draft;
+    instance->name = strcpy((char *)(instance + 1), name);
+    reset_state(&instance->state);
+    return instance;
+}
+
+Status set_debug_logging(void *component, int on, size_t count, const char *const categories[])
+{
+    Instance *instance = enter(component, SET_DEBUG_LOGGING);
+    int all = count == 0;
+    if (!instance || (count > 0 && !categories))
+        return ERROR;
+    for (size_t i = 0; i < count; i++) {
+        const char *category = categories[i] ? categories[i] : "";
+        if (strcmp(category, "logAll") == 0)
+            all = 1;
+        else if (strncmp(category, "logStatus", 9) != 0)
+            return report(instance, ERROR, "%s: there is no category '%s'",
+                          call_name(SET_DEBUG_LOGGING), category);
+    }
+    instance->verbose = on && all;
+    return OK;
+}
+
+Status set_up(Instance *instance, Call call, const double *tolerance, double start,
+              const double *stop)
+{
+    if (!isfinite(start))
+        return report(instance, ERROR, "%s: the start time is not finite", call_name(call));
+    if (stop && !(*stop >= start))
+        return report(instance, ERROR, "%s: stop time %g < start time %g", call_name(call), *stop,
+                      start);
+    if (tolerance)
+        report(instance, OK, "the tolerance %g of the experiment is ignored: rtol and atol are"
+               " parameters", *tolerance);
+    instance->state.time = start;
+    instance->state.stop_time = stop ? *stop : HUGE_VAL;
+    return OK;
+}
+
+Status exit_initialization(void *component)
+{
+    Instance *instance = enter(component, EXIT_INITIALIZATION);
+    if (!instance || initialise(instance, 1) != OK)
+        return ERROR;
+    instance->state.phase = instance->kind == MODEL_EXCHANGE ? EVENT : STEP;
+    return OK;
+}
+
+Status move_on(void *component, Call call, Phase phase)
+{
+    Instance *instance = enter(component, call);
+    if (!instance)
+        return ERROR;
+    instance->state.phase = phase;
+    return OK;
+}
+
+Status reset(void *component)
+{
+    Instance *instance = enter(component, RESET);
+    if (!instance)
+        return ERROR;
+    reset_state(&instance->state);
+    return OK;
+}
+
+Status check_inputs(Instance *instance)
 {
 #if N_ROWS > N_AXES
     const double *quat = &instance->state.plant.value[QUAT_DES];
     if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
-        return report(instance, fmi2Error, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
+        return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
                       " turns nothing");
 #else
     (void)instance;
 #endif
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status check_parameters(Instance *instance)
+Status check_limits(Instance *instance)
 {
     const double *value = instance->state.plant.value;
-    const int positive[] = {RTOL, ATOL, MAX_STEP};
-    for (int i = 0; i < 3; i++)
-        if (!(value[positive[i]] > 0.0))
-            return report(instance, fmi2Error, "%s = %g must be > 0", VARIABLE_NAME[positive[i]],
-                          value[positive[i]]);
-    if (!(value[PAYLOAD] >= 0.0))
-        return report(instance, fmi2Error, "payload = %g must be >= 0", value[PAYLOAD]);
-#ifdef HAS_RCOND
-    if (!(value[RCOND] >= 0.0 && value[RCOND] < 1.0))
-        return report(instance, fmi2Error, "rcond = %g must be in [0, 1)", value[RCOND]);
-#endif
     for (int i = 0; i < N_JOINTS; i++)
         if (value[Q_MIN + i] > value[Q_MAX + i])
-            return report(instance, fmi2Error, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
+            return report(instance, ERROR, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
                           i + 1, value[Q_MIN + i], i + 1, value[Q_MAX + i], JOINT_NAME[i]);
-    return fmi2OK;
+    return OK;
 }
 
 /* Take the velocity that points into a limit at the start, as at any other time. */
@@ -172,18 +201,18 @@ static void stop_at_start(Plant *plant)
     memcpy(&plant->value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
 }
 
-fmi2Status initialise(Instance *instance, int warn)
+Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
-    if (check_parameters(instance) != fmi2OK || check_inputs(instance) != fmi2OK)
-        return fmi2Error;
+    if (check_limits(instance) != OK || check_inputs(instance) != OK)
+        return ERROR;
     for (int i = 0; i < N_JOINTS; i++) {
         const double start = value[Q_START + i];
         const double low = value[Q_MIN + i], high = value[Q_MAX + i];
         const double q = start < low ? low : start > high ? high : start;
         if (warn && q != start)
-            report(instance, fmi2Warning,
+            report(instance, WARNING,
                    "q_start[%d] = %g of joint '%s' is outside its limits [%g, %g] and was clamped"
                    " to %g", i + 1, start, JOINT_NAME[i], low, high, q);
         value[Q + i] = q;
@@ -192,7 +221,7 @@ fmi2Status initialise(Instance *instance, int warn)
     stop_at_start(&state->plant);
     state->initialised = 1;
     state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
-    return fmi2OK;
+    return OK;
 }
 
 void update_stops(State *state)

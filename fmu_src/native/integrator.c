@@ -12,8 +12,6 @@
 
 #include "stops.h"
 
-enum { N_STATES = 2 * N_JOINTS }; /* y = (q, v) */
-
 /* Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution. */
 static const double A[STAGES][STAGES] = {
     {1.0 / 5, 0, 0, 0, 0, 0},

@@ -11,6 +11,8 @@ typedef struct {
     double value[N_VARIABLES];
 } Plant;
 
+enum { N_STATES = 2 * N_JOINTS }; /* q and v follow each other in the table, their derivatives too */
+
 /* q̈ of the equations of motion at a state, joint limits left out; the rank that J⁺ was given, the
    number of its singular values that were not dropped. */
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],

@@ -1,4 +1,4 @@
-/* FMI 2.0: saving, restoring and serialising the state, which is one plain struct. */
+/* Saving, restoring and serialising the state, which is one plain struct. */
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -6,9 +6,9 @@
 
 #include "instance.h"
 
-static fmi2Status refuse(Instance *instance, Call call, const char *reason)
+static Status refuse(Instance *instance, Call call, const char *reason)
 {
-    return report(instance, fmi2Error, "%s: %s", call_name(call), reason);
+    return report(instance, ERROR, "%s: %s", call_name(call), reason);
 }
 
 static const char NULL_POINTER[] = "null pointer";
@@ -60,7 +60,7 @@ static int are_stops(Stops *stops)
 
 /* Take over a state from bytes that may be anybody's, with whatever checksum: each field is checked,
    and what follows from others is computed anew. A refusal is logged. */
-static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
+static Status take_over(Instance *instance, const void *bytes)
 {
     State *state = &instance->state;
     const double *value = state->plant.value;
@@ -69,7 +69,7 @@ static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
                 && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN])
                 && are_stops(&state->stops);
     const int runs = state->phase >= STEP; /* before, what is wrong is told where it begins */
-    const int steps = runs && instance->kind == fmi2CoSimulation; /* solvers try what they like */
+    const int steps = runs && instance->kind == CO_SIMULATION; /* solvers try what they like */
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));
     for (int i = 0; i < N_JOINTS && steps; i++)
@@ -79,14 +79,17 @@ static fmi2Status take_over(Instance *instance, const fmi2Byte bytes[])
     state->has_stops = runs && !steps && state->has_stops != 0;
     if (!sound)
         return refuse(instance, DESERIALIZE, UNSOUND);
-    return runs ? check_parameters(instance) : fmi2OK;
+    for (int i = 0; i < N_VARIABLES; i++)
+        if (check_range(instance, i, value[i]) != OK)
+            return ERROR;
+    return runs ? check_limits(instance) : OK;
 }
 
-fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)
+Status save_state(void *component, void **saved)
 {
     Instance *instance = enter(component, GET_STATE);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!saved)
         return refuse(instance, GET_STATE, NULL_POINTER);
     if (!*saved)
@@ -94,14 +97,14 @@ fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *saved)
     if (!*saved)
         return refuse(instance, GET_STATE, "no memory");
     memcpy(*saved, &instance->state, sizeof(State));
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate saved)
+Status restore_state(void *component, const void *saved)
 {
     Instance *instance = enter(component, SET_STATE);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!saved)
         return refuse(instance, SET_STATE, NULL_POINTER);
     if (!is_own(saved))
@@ -109,69 +112,67 @@ fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate saved)
     if (!can_be_in(instance->kind, ((const State *)saved)->phase))
         return refuse(instance, SET_STATE, OTHER_KIND);
     memcpy(&instance->state, saved, sizeof(State));
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *saved)
+Status free_state(void *component, void **saved)
 {
     Instance *instance = enter(component, FREE_STATE);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (saved && *saved) {
         free(*saved);
         *saved = NULL;
     }
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component component, fmi2FMUstate saved, size_t *size)
+Status size_of_state(void *component, const void *saved, size_t *size)
 {
     Instance *instance = enter(component, SIZE_OF_STATE);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!saved || !size)
         return refuse(instance, SIZE_OF_STATE, NULL_POINTER);
     *size = SERIALIZED_SIZE;
-    return fmi2OK;
+    return OK;
 }
 
-fmi2Status fmi2SerializeFMUstate(fmi2Component component, fmi2FMUstate saved, fmi2Byte bytes[],
-                                 size_t size)
+Status serialize_state(void *component, const void *saved, void *bytes, size_t size)
 {
     Instance *instance = enter(component, SERIALIZE);
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!saved || !bytes)
         return refuse(instance, SERIALIZE, NULL_POINTER);
     if (size < SERIALIZED_SIZE)
         return refuse(instance, SERIALIZE, "the buffer is too small");
     const uint64_t sum = checksum(saved);
     memcpy(bytes, saved, sizeof(State));
-    memcpy(bytes + sizeof(State), &sum, sizeof sum);
-    return fmi2OK;
+    memcpy((char *)bytes + sizeof(State), &sum, sizeof sum);
+    return OK;
 }
 
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes[], size_t size,
-                                   fmi2FMUstate *saved)
+Status deserialize_state(void *component, const void *bytes, size_t size, void **saved)
 {
     Instance *instance = enter(component, DESERIALIZE);
     uint64_t sum;
     if (!instance)
-        return fmi2Error;
+        return ERROR;
     if (!bytes || !saved)
         return refuse(instance, DESERIALIZE, NULL_POINTER);
     if (size != SERIALIZED_SIZE)
         return refuse(instance, DESERIALIZE, FOREIGN);
-    memcpy(&sum, bytes + sizeof(State), sizeof sum);
+    memcpy(&sum, (const char *)bytes + sizeof(State), sizeof sum);
     if (sum != checksum(bytes) || memcmp(bytes, MODEL_GUID, sizeof MODEL_GUID) != 0)
         return refuse(instance, DESERIALIZE, FOREIGN);
     Instance draft = *instance;
-    if (take_over(&draft, bytes) != fmi2OK)
-        return fmi2Error;
+    if (take_over(&draft, bytes) != OK)
+        return ERROR;
     if (!*saved)
         *saved = calloc(1, sizeof(State));
     if (!*saved)
         return refuse(instance, DESERIALIZE, "no memory");
     memcpy(*saved, &draft.state, sizeof(State));
-    return fmi2OK;
+    return OK;
 }

@@ -10,8 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "fmi2Functions.h"
-#include "instance.h"
+#include "fmu.c"
 
 #define CHECK(condition)                                                                     \
     do {                                                                                     \
@@ -51,7 +50,7 @@ static void log_message(fmi2ComponentEnvironment environment, fmi2String name, f
 
 static const fmi2CallbackFunctions CALLBACKS = {log_message, calloc, free, NULL, NULL};
 
-static Instance *instantiate(void)
+static Instance *create(void)
 {
     const fmi2Type kind = pick(2) ? fmi2CoSimulation : fmi2ModelExchange;
     return fmi2Instantiate("fuzz", kind, MODEL_GUID, "", &CALLBACKS, 0, (int)pick(2));
@@ -165,7 +164,7 @@ static fmi2Status step(Instance *c)
     return status;
 }
 
-static fmi2Status ask(Instance *c)
+static fmi2Status question(Instance *c)
 {
     const fmi2StatusKind kind = (fmi2StatusKind)pick(4);
     const fmi2String names[2] = {pick(2) ? "logAll" : "logStatusError", pick(3) ? "logAll" : "?"};
@@ -188,7 +187,7 @@ static fmi2Status ask(Instance *c)
 static fmi2Status exchange(Instance *c)
 {
     enum { N_STATES = 2 * N_JOINTS, ROOM = N_STATES + N_INDICATORS };
-    const int phase = c->state.phase, of_kind = c->kind == fmi2ModelExchange;
+    const int phase = c->state.phase, of_kind = c->kind == MODEL_EXCHANGE;
     const int event = of_kind && phase == EVENT, runs = of_kind && phase == CONTINUOUS_TIME;
     const int reads = event || runs || (of_kind && (phase == INITIALIZATION || phase == TERMINATED));
     double x[ROOM];
@@ -279,7 +278,7 @@ static fmi2Status move(Instance *c)
         status = fmi2ExitInitializationMode(c);
         CHECK(status == fmi2Error || phase == INITIALIZATION);
         CHECK(c->state.phase == (status != fmi2OK ? phase
-                                 : c->kind == fmi2ModelExchange ? EVENT : STEP));
+                                 : c->kind == MODEL_EXCHANGE ? EVENT : STEP));
         return status;
     case 4:
         if (pick(4))
@@ -297,13 +296,13 @@ static fmi2Status move(Instance *c)
 static void sequence(void)
 {
     fmi2FMUstate saved = NULL;
-    Instance *c = instantiate();
+    Instance *c = create();
     CHECK(c);
     for (unsigned i = 0, length = 1 + pick(LONGEST); i < length; i++) {
         const State before = c->state;
         fmi2Status status;
-        switch (c->kind == fmi2ModelExchange && pick(2) ? 2 : pick(10)) {
-        case 0: status = ask(c); break;
+        switch (c->kind == MODEL_EXCHANGE && pick(2) ? 2 : pick(10)) {
+        case 0: status = question(c); break;
         case 1: status = saved_states(c, &saved); break;
         case 2: status = exchange(c); break;
         case 3:

@@ -1,15 +1,7 @@
 /* Hands the engine's inner functions to the tests. */
 #include <string.h>
 
-#include "directional.h"
-#include "dynamics.h"
-#include "fmi2Functions.h"
-#include "integrator.h"
-#include "stops.h"
-
-#ifdef HAS_RCOND
-#include "pseudo_inverse.h"
-#endif
+#include "fmu.c"
 
 FMI2_Export void probe_task(const double q[], const double v[], double x[], double R[], double J[],
                             double drift[])

@@ -16,8 +16,9 @@ def add(verbs: Any) -> None:
     build = verbs.add_parser("build", help="build an FMU from a URDF")
     build.add_argument("-o", dest="output", metavar="FILE.fmu", help="default: <name>.fmu")
     build.add_argument(
-        "robot", nargs="?", type=Path, metavar="URDF", help="default: the shipped planar 2-DoF arm"
-    )
+        "robot", nargs="?", type=Path, metavar="URDF",
+        help="or a xacro file; default: the shipped planar 2-DoF arm",
+    )  # fmt: skip
     build.add_argument("--urdf", type=Path, metavar="U", help="the same")
     build.add_argument(
         "--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes"

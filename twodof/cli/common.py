@@ -42,7 +42,7 @@ class CommandLineError(InputError):
 
 def in_options(text: str) -> str:
     """A message of the library, which has its arguments in backticks, for the command line."""
-    return ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text)
+    return plain(ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text))
 
 
 def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
@@ -146,7 +146,7 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else that of the URDF or of the default arm, built if need be."""
-    if options.fmu and Path(options.fmu).suffix != ".urdf":
+    if options.fmu and Path(options.fmu).suffix not in (".urdf", ".xacro"):
         if options.native:
             raise CommandLineError(
                 "--native builds the default arm's FMU; leave it out beside an FMU"
@@ -161,7 +161,8 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
         print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
     if robot is None:
         return build_fmu(None, FmuOptions(native=native))
-    name = re.sub(r"\W", "_", robot.stem, flags=re.ASCII)
+    stem = robot.name.removesuffix(".xacro").removesuffix(".urdf")
+    name = re.sub(r"\W", "_", stem, flags=re.ASCII)
     name = name if name.isidentifier() else f"robot_{name}"
     return build_fmu(None, FmuOptions(urdf=robot, name=name, native=native))
 
@@ -263,7 +264,7 @@ def print_best(table: DataFrame) -> None:
     widths = [max(map(len, cells)) for cells in zip(best.columns, units, *rows)]
     print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
     for cells in [best.columns, units, *rows] if rows else []:
-        print("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
+        print(plain("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths))))
 
 
 def quote(path: Path) -> str:
@@ -288,7 +289,12 @@ def print_table(*rows: tuple[str, str]) -> None:
     """Labels and texts, one pair a line."""
     width = max(len(label) for label, _ in rows)
     for label, text in rows:
-        print(f"{label.ljust(width)}  {text}")
+        print(plain(f"{label.ljust(width)}  {text}"))
+
+
+def plain(text: str) -> str:
+    """A text with its control characters as escapes: files from elsewhere write on no terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def print_next(*commands: str) -> None:

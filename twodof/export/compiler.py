@@ -21,6 +21,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "darwin64": ("x86_64-macos.11.0", "aarch64-macos.11.0"),
 }
 """zig's targets by FMI platform; several are joined into one universal library."""
+UNITS = ("directional.c", "fmu.c")
+"""The C files that are compiled; they include the others."""
 EXTENSIONS = {"linux64": ".so", "win64": ".dll", "darwin64": ".dylib"}
 FLAGS = (
     "-std=c99", "-O2", "-ffp-contract=off", "-fcx-limited-range", "-fno-math-errno",
@@ -35,6 +37,7 @@ def compile_library(
     platform: str,
     name: str,
     *,
+    units: Sequence[str] = UNITS,
     flags: Sequence[str] = (),
 ) -> bytes:
     """The shared library of an FMU.
@@ -44,6 +47,7 @@ def compile_library(
             the FMI standard among them.
         platform: FMI platform, a key of ``TARGETS``.
         name: model identifier, the library's name without extension.
+        units: the files that are compiled; they include others.
         flags: further flags for the compiler.
 
     Raises:
@@ -55,11 +59,10 @@ def compile_library(
     with temporary_folder() as folder:
         for file, content in sources.items():
             (folder / file).write_bytes(content)
-        files = sorted(file for file in sources if file.endswith(".c"))
         output = name + EXTENSIONS[platform]
         built = []
         for compiler in _compilers(platform):
-            _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *files], folder)
+            _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *units], folder)
             built.append((folder / output).read_bytes())
     return built[0] if len(built) == 1 else universal(built)
 

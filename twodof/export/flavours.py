@@ -18,7 +18,7 @@ import pythonfmu
 from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
-from .compiler import EXTENSIONS, compile_library
+from .compiler import EXTENSIONS, UNITS, compile_library
 from .native import model_header
 
 LOG = logging.getLogger(__name__)
@@ -134,7 +134,7 @@ def native_flavour(
         attributes={"needsExecutionTool": "false", "providesDirectionalDerivative": "true"},
         exchanges=True,
         files={f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
-        source_files=sorted(path for path in sources if path.endswith(".c")),
+        source_files=UNITS,
         platforms=platforms,
         finish=finish,
         dependencies=b"None: the binaries need the C library and its mathematics only.\n",

@@ -61,15 +61,20 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     return ET.tostring(tree, encoding="unicode") + "\n", files
 
 
-def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
-    """The file of a mesh, its links followed, inside one of the places that it may come from.
+def places_of(folder: Path, mesh_dir: Path | None) -> list[Path]:
+    """The folders from which a URDF may have files: ``mesh_dir``, its own and its package.
 
     The URDF's package is the nearest folder upwards with a package.xml. A folder that carries the
     package's name is not enough: ``package://home/alice/.netrc`` names one too.
     """
     own = folder.resolve()
     package = next((f for f in (own, *own.parents) if (f / "package.xml").is_file()), own)
-    places = [own, package] if mesh_dir is None else [mesh_dir.resolve(), own, package]
+    return [own, package] if mesh_dir is None else [mesh_dir.resolve(), own, package]
+
+
+def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
+    """The file of a mesh, its links followed, inside one of the places that it may come from."""
+    own, places = folder.resolve(), places_of(folder, mesh_dir)
     scheme, separator, rest = uri.partition("://")
     if not separator or scheme == "file":
         name = unquote(rest) if separator else uri

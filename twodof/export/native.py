@@ -7,6 +7,7 @@ so that the engine has one kind of axis. Pinocchio has read the URDF.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Variable, count_event_indicators
+from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,9 @@ FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "li
 """Where the table's parts begin: inputs, outputs, parameters, truth values among these."""
 
 
-def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: str) -> str:
+def model_header(
+    robot: Robot, table: Sequence[Variable], control: str, guid: str, fmi: int = 2
+) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
 
     Names from the URDF, which may be anybody's, are string literals and nothing else.
@@ -34,6 +37,7 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
         table: its variables; a variable's place is its value reference.
         control: what drives it, a key of ``CONTROLS``.
         guid: as the modelDescription has it.
+        fmi: version of FMI; 3 has vectors where 2 has their elements.
 
     Raises:
         BuildError: more joints than the engine's working memory has room for.
@@ -55,7 +59,7 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
         "/* Constants of a robot, generated from its URDF. SI units. Each joint turns about, or\n"
         "   slides along, the z axis of its own frame. */\n"
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
-        f"#define MODEL_GUID {_quoted(guid)}\n"
+        f"#define FMI {fmi}\n#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n} /* that move on their own */\n"
         f"#define N_BODIES {len(parents)}\n"
         f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n"
@@ -64,8 +68,11 @@ def model_header(robot: Robot, table: Sequence[Variable], control: str, guid: st
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
         _value_references(groups),
+        "/* How many values each value reference stands for. */\n"
+        + _table("int EXTENT", _extents(table, fmi)),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
+        _ranges(groups),
         _table("char *const JOINT_NAME", robot.joints),
         "/* The tree: parents are -1 for the root; joints from the root to the task frame. */\n"
         + _table("int PARENT", (parent - 1 for parent in parents)),
@@ -130,6 +137,28 @@ def _value_references(groups: Sequence[str]) -> str:
     lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
     body = "\n".join(lines)
     return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
+
+
+def _ranges(groups: Sequence[str]) -> str:
+    rows = "".join(
+        f"\n    {{{group.upper()}, {groups.count(group)}, {_literal(within.low)},"
+        f" {_literal(within.high)}, {_quoted(within.words)}}},"
+        for group, within in RANGES.items()
+        if group in groups
+    )
+    return (
+        "/* Values that variables may have; others may be any number. */\nstatic const struct {\n"
+        "    int first, count;\n    double low, high;\n    const char *words;\n"
+        f"}} RANGE[] = {{{rows}\n}};\n"
+    )
+
+
+def _extents(table: Sequence[Variable], fmi: int) -> list[int]:
+    """Of each variable 1, or of each vector's first element its length and of the others 0."""
+    if fmi == 2:
+        return [1] * len(table)
+    sizes = Counter(variable.group for variable in table)
+    return [0 if variable.index else sizes[variable.group] for variable in table]
 
 
 def _table(declaration: str, values: Iterable[object]) -> str:

@@ -39,7 +39,7 @@ class FmuOptions:
     """What an FMU is made of.
 
     Attributes:
-        urdf: the URDF; None for the shipped planar arm.
+        urdf: the URDF or xacro file; None for the shipped planar arm.
         mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
         frame: link whose origin is controlled; None: "EndEffector", or the only link without
             a link behind it.
@@ -105,7 +105,8 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     if options.control not in CONTROLS:
         raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
     path = options.urdf or data_file("urdf", "2dof.urdf")
-    text = read_text(path)
+    mesh_dir = _mesh_dir(options)
+    text = read_text(path, mesh_dir)
     try:
         text = lock_joints(text, options.lock) if options.lock else text
         frame = options.frame or end_effector(read_urdf(text))
@@ -115,7 +116,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     if not options.meshes:
         text = without_meshes(text)
     robot, table, starts = _model(options, text)
-    urdf, meshes = collect_meshes(text, path.parent, _mesh_dir(options))
+    urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
     flavour = _flavour(options, robot, table, urdf, starts)
     resources = {"robot.urdf": urdf.encode(), **meshes}
     files = {f"resources/{name}": content for name, content in resources.items()}

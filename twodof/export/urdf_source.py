@@ -12,17 +12,21 @@ import numpy as np
 from ..errors import BuildError
 from ..files import read_file
 from ..plant.urdf import RobotError, Urdf, read_urdf
+from .meshes import places_of
+from .xacro_file import expand
 
 DEFAULT_FRAME = "EndEffector"
 MAX_URDF = 8 * 1024**2
 
 
-def read_text(path: Path) -> str:
-    """The text of a URDF.
+def read_text(path: Path, mesh_dir: Path | None) -> str:
+    """The text of a URDF, or of what a xacro file makes.
 
     Raises:
-        BuildError: it cannot be read, or is not UTF-8.
+        BuildError: it cannot be read or expanded, or is not UTF-8.
     """
+    if path.suffix == ".xacro":
+        return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
     try:
         return read_file(path, MAX_URDF).decode("utf-8")
     except OSError as error:

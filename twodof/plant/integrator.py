@@ -11,8 +11,10 @@ A joint that reaches a limit is set onto it and stays there until it is released
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import chain, product
 from math import inf, isfinite, sqrt, ulp
+from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +56,6 @@ step across that passes the error test. One of this size, whose stages had diffe
 taken."""
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-ALL = slice(None)
 STAGES = 6
 """Evaluations that an integration step costs."""
 PATIENCE = 0.25
@@ -85,13 +86,14 @@ class _Equations:
     def __init__(self, acceleration: Response, n: int) -> None:
         self._acceleration = acceleration
         state = np.empty(2 * n)
-        self._write, self._q, self._v = state.__setitem__, state[:n], state[n:]
+        self._write = Struct(f"{2 * n}d").pack_into  # quicker than numpy at this size
+        self._buffer, self._q, self._v = state.data, state[:n], state[n:]
         self.n, self.evaluations = n, 0
 
     def acceleration(self, y: State) -> tuple[list[float], int]:
         """q̈ at y, and its rank."""
         self.evaluations += 1
-        self._write(ALL, y)
+        self._write(self._buffer, 0, *y)
         a, rank = self._acceleration(self._q, self._v)
         return list(a), rank
 
@@ -205,6 +207,12 @@ def _until_event(
             raise _too_fast(equations, y, too_fine=False)
 
 
+@lru_cache(maxsize=8)  # most steps are of one size
+def _weights(step: float) -> list[list[float]]:
+    """The rows of A, and E, times the step."""
+    return [[step * weight for weight in row] for row in (*A, E)]
+
+
 def _dormand_prince(
     equations: _Equations, y: State, step: float, stops: Stops, k1: State, rank: int
 ) -> tuple[State, list[State], list[int]]:
@@ -218,7 +226,7 @@ def _dormand_prince(
         ranks.append(rank)
         return y[n:] + a
 
-    s2, s3, s4, s5, s6, s7 = ([step * weight for weight in row] for row in A)
+    s2, s3, s4, s5, s6, s7, _ = _weights(step)
     (a,) = s2
     k2 = rates([u + a * p for u, p in zip(y, k1)])
     a, b = s3
@@ -246,7 +254,7 @@ def _error_norm(
     K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float
 ) -> float:
     """Root mean square of the error over its tolerance; the step passes below 1."""
-    a, _, b, c, d, e, f = (step * weight for weight in E)
+    a, _, b, c, d, e, f = _weights(step)[-1]
     k1, _, k3, k4, k5, k6, k7 = K
     total = 0.0
     for old, new, p, q, r, s, t, u in zip(y, y_new, k1, k3, k4, k5, k6, k7):

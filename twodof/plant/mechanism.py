@@ -49,12 +49,14 @@ class Mechanism:
         self._model, self._data = model, model.createData()
         self._G, self._c = robot.coupling, robot.offset
         self._still = np.zeros(model.nv)
-        self._placement: Any = self._data.oMf[self._frame]  # it follows what Pinocchio computes
+        # both follow what Pinocchio computes
+        self._placement: Any = self._data.oMf[self._frame]
+        self._position: Array = self._placement.translation
 
-    def observe(self, q: Array, v: Array) -> tuple[Any, list[list[float]], Any]:
-        """The task frame's placement, Jacobian (6 × n: linear, angular), and drift J̇ v.
+    def observe(self, q: Array, v: Array) -> tuple[list[float], list[list[float]], list[float]]:
+        """The task frame's position, Jacobian (6 × n: linear, angular), and drift J̇ v, 6 values.
 
-        In the root's axes; the placement and the drift are Pinocchio's objects.
+        In the root's axes.
         """
         if self._G is not None:
             q, v = self._G @ q + self._c, self._G @ v
@@ -65,7 +67,14 @@ class Mechanism:
             J = J @ self._G
         # with q̈ = 0 the frame's acceleration is the drift
         drift = frame_acceleration(model, data, frame, WORLD_ALIGNED)
-        return self._placement, J.reshape(6, -1).tolist(), drift
+        rows = J.tolist() if J.ndim == 2 else J.reshape(6, 1).tolist()  # one joint: a vector
+        return self._position.tolist(), rows, drift.vector.tolist()
+
+    @property
+    def rotation(self) -> Array:
+        """The task frame's rotation matrix where it was last observed."""
+        rotation: Array = self._placement.rotation
+        return rotation
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         """τ = M(q) a + h(q, v), N·m or N, n values."""

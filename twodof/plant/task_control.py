@@ -32,12 +32,11 @@ def command(plant: Any) -> Response:
     Kn, rcond = plant.Kn, plant.rcond
 
     def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
-        placement, jacobian, acceleration = observe(q, v)
-        x, drift = placement.translation.tolist(), acceleration.vector.tolist()
+        x, jacobian, drift = observe(q, v)
         velocity = v.tolist()
         errors = [x_des - x[axis] for axis, x_des in place]
         if quat_des is not None:
-            errors += rotation_error(quat_des, placement.rotation)
+            errors += rotation_error(quat_des, plant.known.rotation)
         rows, command = [], []
         for (axis, xd_des, xdd_des, Kp, Kd), error in zip(law, errors):
             row = jacobian[axis]

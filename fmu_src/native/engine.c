@@ -1,0 +1,17 @@
+/* The equations of motion under the control law. Compiled twice: with real numbers, and with complex ones
+   for derivatives. */
+#include "dynamics.c"
+#include "kinematics.c"
+#include "plant.c"
+#include "stops.c"
+#if N_ROWS > N_AXES
+#include "orientation.c"
+#endif
+#if !COMMANDS_ACCELERATION
+#include "effort_control.c"
+#elif defined HAS_RCOND
+#include "pseudo_inverse.c"
+#include "task_control.c"
+#else
+#include "joint_control.c"
+#endif

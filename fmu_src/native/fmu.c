@@ -1,0 +1,14 @@
+/* All of the FMU but the derivatives: its files together, for their functions are static. */
+#include "engine.c"
+#include "integrator.c"
+#include "events.c"
+#include "instance.c"
+#include "simulation.c"
+#include "exchange.c"
+#include "variables.c"
+#include "saved_state.c"
+#if FMI == 3
+#include "fmi3.c"
+#else
+#include "fmi2.c"
+#endif

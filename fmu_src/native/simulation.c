@@ -1,0 +1,62 @@
+/* The steps of co-simulation. */
+#include <math.h>
+#include <stdio.h>
+
+#include "instance.h"
+#include "integrator.h"
+
+static const double TIME_TOLERANCE = 1e-9;
+
+static int is_far(double a, double b)
+{
+    return !(fabs(a - b) <= TIME_TOLERANCE * fmax(1.0, fabs(a)));
+}
+
+/* Say why a step cannot be done, and what would help. */
+static Status discard(Instance *instance, double point, double h, const Obstacle *obstacle)
+{
+    const char *call = call_name(DO_STEP);
+    const double *value = instance->state.plant.value;
+    if (obstacle->reason == NOT_FINITE)
+        return report(instance, DISCARD, "%s at %.12g s: the equations of motion gave"
+                      " a value that is not finite", call, point);
+    if (obstacle->reason == MANY_STEPS)
+        return report(instance, DISCARD, "%s at %.12g s: max_step = %g s divides a step"
+                      " of %g s into more than %d integration steps; enlarge max_step or shorten"
+                      " the step", call, point, value[MAX_STEP], h, BUDGET / STAGES);
+    char need[80] = "integration steps below the resolution of time";
+    if (obstacle->reason == MANY_EVALUATIONS)
+        snprintf(need, sizeof need, "more than %d evaluations for the step of %g s", BUDGET, h);
+    return report(instance, DISCARD, "%s at %.12g s: rtol = %g and atol = %g need %s:"
+                  " joint '%s' changes at a rate of %.3g 1/s; shorten the step, lessen damping or"
+                  " gains, or enlarge rtol and atol", call, point, value[RTOL], value[ATOL], need,
+                  JOINT_NAME[obstacle->joint], obstacle->rate);
+}
+
+Status do_step(void *component, double point, double h)
+{
+    Instance *instance = enter(component, DO_STEP);
+    if (!instance)
+        return ERROR;
+    const char *call = call_name(DO_STEP);
+    State *state = &instance->state;
+    if (is_far(point, state->time))
+        return report(instance, ERROR, "%s: the communication point %.12g s is not the"
+                      " time of the FMU, %.12g s", call, point, state->time);
+    if (!(h > 0.0 && isfinite(h)))
+        return report(instance, ERROR, "%s: the step %.12g s must be finite and > 0", call,
+                      h);
+    if (point + h > state->stop_time && is_far(point + h, state->stop_time))
+        return report(instance, ERROR, "%s: the step of %.12g s from %.12g s ends after"
+                      " the stop time, %.12g s", call, h, point, state->stop_time);
+    if (check_inputs(instance) != OK)
+        return ERROR;
+    Obstacle obstacle;
+    if (!advance_plant(&state->plant, h, &obstacle)) {
+        state->phase = STEP_FAILED;
+        return discard(instance, point, h, &obstacle);
+    }
+    state->time = point + h;
+    state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
+    return OK;
+}

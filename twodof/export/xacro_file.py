@@ -1,0 +1,175 @@
+"""A xacro file expanded to a URDF, by the xacro package in a process that is confined.
+
+A xacro file is a program: its expressions are Python's, it includes files and asks the environment.
+Here simpleeval computes its expressions, with numbers, texts and data alone; files are read in the
+folders alone from which a URDF's meshes may come; the environment is empty; memory and time end.
+"""
+
+from __future__ import annotations
+
+import ast
+import errno
+import io
+import logging
+import os
+import resource
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from pathlib import Path
+from subprocess import DEVNULL
+from typing import Any
+
+from ..children import Child
+from ..errors import BuildError, ChildError
+from ..files import check_file
+
+LOG = logging.getLogger(__name__)
+MAX_MEMORY = 1024**3  # bytes
+MAX_SECONDS = 20
+ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
+"""Audit events that touch nothing outside the process."""
+
+
+def expand(path: Path, folders: Sequence[Path], most: int) -> str:
+    """The URDF that a xacro file makes with its arguments at their defaults.
+
+    Args:
+        path: the file.
+        folders: where it and what it includes may be; packages are looked for there.
+        most: bytes of each file, and of the URDF.
+
+    Raises:
+        BuildError: naming what the file asks for in vain.
+    """
+    missing = [name for name in ("xacro", "simpleeval") if find_spec(name) is None]
+    if missing:
+        raise BuildError(
+            f"cannot expand '{path}': there is no {' and no '.join(missing)}; install the extra"
+            " 'xacro' (pip install 'twodof[xacro]')"
+        )
+    environment = {"LC_ALL": "C.UTF-8"}
+    with Child(_expand, path, folders, most, environment=environment, output=DEVNULL) as child:
+        try:
+            if not child.poll(MAX_SECONDS):
+                raise EOFError(f"it takes more than {MAX_SECONDS} s")
+            text, remarks = child.recv()
+        except (EOFError, ChildError) as error:
+            raise BuildError(f"cannot expand '{path}': {error}") from error
+    if remarks:
+        LOG.warning("%s: xacro says: %s", path, " ".join(remarks.split()))
+    return str(text)
+
+
+def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) -> None:
+    """In the child: sends the URDF, and what xacro remarks."""
+    import xacro
+    from xacro import substitution_args
+
+    import_module("yaml")  # as it is when it is used, when nothing can be imported any more
+    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
+    os.environ.clear()
+    xacro.safe_eval = _evaluate
+    substitution_args._eval = _refuse_eval
+    substitution_args._eval_find = lambda name: str(_package(name, folders))
+    for name in ("isinstance", "repr", "type", "vars"):
+        del xacro._global_symbols["python"][name]
+    xacro.process_doc(xacro.parse("<a b='${math.pi}'/>"))  # which imports the rest
+    sys.addaudithook(_guard(folders, most))
+    remarks = io.StringIO()
+    try:
+        with redirect_stdout(remarks), redirect_stderr(remarks):
+            xacro.init_stacks(str(path))
+            document = xacro.parse(None, str(path))
+            xacro.process_doc(document)
+            text = document.documentElement.toxml() + "\n"
+    except Exception as error:
+        raise BuildError(f"cannot expand '{path}': {_reason(error)}") from None
+    if len(text) > most:
+        raise BuildError(f"'{path}' expands to {len(text)} bytes, at most {most}")
+    pipe.send((text, remarks.getvalue()))
+
+
+def _reason(error: Exception) -> str:
+    """In one line, with the remedy where there is one."""
+    from xacro.substitution_args import ArgException
+
+    cause = error
+    while getattr(cause, "exc", None) is not None:
+        cause = cause.exc  # type: ignore[attr-defined]
+    if isinstance(cause, ArgException):
+        return (
+            f"its argument '{cause}' has no default; expand it by the command xacro, which takes"
+            " arguments, and build what it makes"
+        )
+    if isinstance(cause, OSError) and cause.filename is not None:
+        return f"'{cause.filename}' cannot be read: {cause.strerror}"
+    text = f"{cause}" or type(cause).__name__
+    return " ".join(f"{text} {getattr(error, 'suffix', None) or ''}".split())
+
+
+class _Every(set[str]):
+    """All names."""
+
+    def __contains__(self, name: object) -> bool:
+        return True
+
+
+def _evaluate(expression: str, symbols: dict[str, Any], _: object = None) -> object:
+    """The value of an expression, in place of xacro's own function, which calls ``eval``."""
+    import xacro
+    from simpleeval import BASIC_ALLOWED_ATTRS, EvalWithCompoundTypes
+
+    attributes = {
+        **BASIC_ALLOWED_ATTRS, xacro.NameSpace: _Every(), xacro.YamlDictWrapper: _Every(),
+        xacro.YamlListWrapper: BASIC_ALLOWED_ATTRS[list],
+    }  # fmt: skip
+    functions = {name: f for name, f in xacro._global_symbols.items() if callable(f)}
+    evaluator = EvalWithCompoundTypes(functions=functions, names=symbols, allowed_attrs=attributes)
+    tree = ast.parse(expression.strip(), mode="eval").body
+    value: object = evaluator.eval(expression, previously_parsed=tree)
+    return value
+
+
+def _refuse_eval(*_: object) -> str:
+    raise ValueError("$(eval …) is not supported; write ${…}")
+
+
+def _package(name: str, folders: Sequence[Path]) -> Path:
+    """The folder of a package, by its own name or what its package.xml says."""
+    for folder in folders:
+        for candidate in (folder / name, folder):
+            declared = candidate / "package.xml"
+            if candidate.is_dir() and (
+                candidate.name == name
+                or (declared.is_file() and f"<name>{name}</name>" in declared.read_text("utf-8"))
+            ):
+                return candidate
+    where = " or ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
+    raise ValueError(
+        f"package '{name}' not found in {where}; give the folder of the packages with `mesh_dir`"
+    )
+
+
+def _guard(folders: Sequence[Path], most: int) -> Any:
+    """An audit hook that lets files in the folders be read, and nothing else of the system."""
+
+    def guard(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in ("glob.glob", "open", "os.listdir", "os.scandir"):
+            path = Path(os.path.realpath(arguments[0]))
+            if not any(path.is_relative_to(folder) for folder in folders):
+                where = " or ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
+                raise PermissionError(
+                    errno.EACCES, f"it is not in {where}, and nothing else is read", str(path)
+                )
+            if event == "open":
+                if arguments[1] not in ("r", "rb"):
+                    raise PermissionError(errno.EACCES, "nothing is written", str(path))
+                check_file(path, most)
+        elif event not in ALLOWED:
+            raise RuntimeError(f"a xacro file may not do that ({event})")
+
+    return guard
