@@ -101,7 +101,7 @@ def test_a_summary_with_a_flipped_bit_is_not_believed(bag: Path) -> None:
 
 @pytest.mark.parametrize("field", [0, 22], ids=["messages", "chunks"])
 def test_numbers_that_contradict_each_other_are_not_believed(bag: Path, field: int) -> None:
-    """With a checksum that is right: of messages and those by channel, of chunks and their index."""
+    """With a checksum that is right: messages and those by channel, chunks and their index."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
     (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)

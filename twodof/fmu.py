@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import count, takewhile
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree as ET
 
 import fmpy
@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 
+WARNING = fmi2.fmi2Warning
 Values = Array[c_double]
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
 MAX_RESOURCE = 256 * 1024**2
@@ -171,6 +172,7 @@ class Instance:
                 instanceName=identifier,
             )
             self._slave.instantiate(callbacks=self._callbacks, loggingOn=True)
+            self._do_step, self._component = self._slave.dll.fmi2DoStep, self._slave.component
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
         finally:
@@ -202,18 +204,20 @@ class Instance:
     def step(self, t: float, h: float) -> None:
         """One communication step from t to t + h."""
         self._said = ""
-        self._check(self._slave.dll.fmi2DoStep(self._slave.component, t, h, fmi2.fmi2True))
+        if (status := self._do_step(self._component, t, h, 1)) > WARNING:
+            self._check(status)
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
         """A function that reads these Real variables, each time into the same place."""
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].valueReference for name in names))
         values = (c_double * n)()
-        get, component = self._slave.dll.fmi2GetReal, self._slave.component
+        get, component = self._slave.dll.fmi2GetReal, self._component
 
         def read() -> Values:
             self._said = ""
-            self._check(get(component, references, n, values))
+            if (status := get(component, references, n, values)) > WARNING:
+                self._check(status)
             return values
 
         return read
@@ -242,12 +246,11 @@ class Instance:
         except FMICallException as error:
             self._check(error.status)
 
-    def _check(self, status: int) -> None:
+    def _check(self, status: int) -> NoReturn:
         """Raise what a call's status means, in the FMU's own words where it said something."""
-        if status > fmi2.fmi2Warning:
-            self._fatal = status == fmi2.fmi2Fatal
-            outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
-            raise SimulationError(self._said or f"a call failed, status {status}", outcome=outcome)
+        self._fatal = status == fmi2.fmi2Fatal
+        outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
+        raise SimulationError(self._said or f"a call failed, status {status}", outcome=outcome)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
@@ -259,7 +262,7 @@ class Instance:
         self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
     ) -> None:
         message = text.decode("utf-8", "replace").strip()
-        if status > fmi2.fmi2Warning:
+        if status > WARNING:
             self._said = message
         logger.log(LEVELS.get(status, logging.CRITICAL), message)
 
