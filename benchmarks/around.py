@@ -2,9 +2,9 @@
 
     python benchmarks/around.py [MESSAGES]
 
-Processor time. What is compared takes turns, so that noise of the machine hits all alike; ratios are
-medians over the turns. Processes are measured whole, with their children. MESSAGES, ten million if
-they are not given, is the size of the big bag, which takes some 1.3 GB of disk for a while.
+Processor time. What is compared takes turns, so that noise of the machine hits all alike; ratios
+are medians over the turns. Processes are measured whole, with their children. MESSAGES is the size
+of the big bag, ten million if it is not given, which takes some 1.3 GB of disk for a while.
 """
 
 from __future__ import annotations

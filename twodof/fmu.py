@@ -205,7 +205,7 @@ class Instance:
         """One communication step from t to t + h."""
         self._said = ""
         if (status := self._do_step(self._component, t, h, 1)) > WARNING:
-            self._check(status)
+            self._refuse(status)
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
         """A function that reads these Real variables, each time into the same place."""
@@ -217,7 +217,7 @@ class Instance:
         def read() -> Values:
             self._said = ""
             if (status := get(component, references, n, values)) > WARNING:
-                self._check(status)
+                self._refuse(status)
             return values
 
         return read
@@ -244,9 +244,9 @@ class Instance:
         try:
             function(*arguments, **named)
         except FMICallException as error:
-            self._check(error.status)
+            self._refuse(error.status)
 
-    def _check(self, status: int) -> NoReturn:
+    def _refuse(self, status: int) -> NoReturn:
         """Raise what a call's status means, in the FMU's own words where it said something."""
         self._fatal = status == fmi2.fmi2Fatal
         outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
