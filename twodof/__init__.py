@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from .version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from .bag.commands import read_commands as read_commands
     from .bag.reader import read_bag as read_bag
     from .bag.recording import Recording as Recording
     from .bag.recovery import recover as recover
@@ -31,9 +32,11 @@ if TYPE_CHECKING:
     from .master import Summary as Summary
     from .master import samples as samples
     from .master import simulate as simulate
+    from .pages.arm import page as page
     from .pages.live import live as live
     from .pages.replay import view as view
     from .plots.runs import plot as plot
+    from .ros.foxglove import Foxglove as Foxglove
     from .ros.publisher import Publisher as Publisher
     from .ros.publisher import publish as publish
     from .sweeps.coordinator import sweep as sweep
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOMES = {
+    "bag.commands": ("read_commands",),
     "bag.reader": ("read_bag",),
     "bag.recording": ("Recording",),
     "bag.recovery": ("recover",),
@@ -51,9 +55,11 @@ _HOMES = {
     "fmu": ("Fmu", "load_fmu"),
     "linear": ("LinearModel", "linearise"),
     "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
+    "pages.arm": ("page",),
     "pages.live": ("live",),
     "pages.replay": ("view",),
     "plots.runs": ("plot",),
+    "ros.foxglove": ("Foxglove",),
     "ros.publisher": ("Publisher", "publish"),
     "sweeps.coordinator": ("sweep",),
     "sweeps.results": ("read_sweep",),

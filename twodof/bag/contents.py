@@ -12,7 +12,12 @@ from .sqlite import sqlite3_messages
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The files that hold a bag's messages, in the order in which they were written."""
+    """The files that hold a bag's messages, in the order in which they were written.
+
+    An MCAP file alone, as pages and other tools write them, is a bag too.
+    """
+    if folder.suffix == ".mcap" and folder.is_file():
+        return [folder]
     files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
     return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 

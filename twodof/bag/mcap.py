@@ -24,6 +24,7 @@ from .records import (
     Batch,
     Channel,
     DamageError,
+    refusing_damage,
 )
 
 if sys.version_info >= (3, 14):
@@ -32,7 +33,7 @@ else:
     from backports import zstd
 
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, FOOTER = 3, 4, 5, 6, 2  # opcodes
+SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, FOOTER = 3, 4, 5, 6, 12, 2  # opcodes
 READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
 HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # with the record's head: channel, sequence, two times
@@ -43,25 +44,36 @@ MANY = 1000  # records outside of chunks
 def mcap_messages(path: Path, allowance: Allowance) -> Iterator[Batch]:
     """All messages of a file; errors as of ``read_messages``."""
     tables = Tables()
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise DamageError(f"'{path.name}' is no MCAP file")
-        loose: list[bytes] = []  # records outside of chunks
-        try:
-            for opcode, content in _mcap_records(path, file, allowance):
-                allowance.left += MAX_RATIO * len(content)
-                if opcode != CHUNK:
-                    loose.append(content)
-                if opcode == CHUNK or len(loose) > MANY:
-                    before, loose = b"".join(loose), []
-                    yield from messages_in(path, before, tables, allowance)
-                if opcode == CHUNK:
-                    chunk = unpack_chunk(path, content, allowance)
-                    yield from messages_in(path, chunk, tables, allowance)
-        except DamageError:  # what came before is sound
-            yield from messages_in(path, b"".join(loose), tables, allowance)
-            raise
+    loose: list[bytes] = []  # records outside of chunks
+    try:
+        for opcode, content in _records(path, allowance):
+            allowance.left += MAX_RATIO * len(content)
+            if opcode != CHUNK:
+                loose.append(content)
+            if opcode == CHUNK or len(loose) > MANY:
+                before, loose = b"".join(loose), []
+                yield from messages_in(path, before, tables, allowance)
+            if opcode == CHUNK:
+                chunk = unpack_chunk(path, content, allowance)
+                yield from messages_in(path, chunk, tables, allowance)
+    except DamageError:  # what came before is sound
         yield from messages_in(path, b"".join(loose), tables, allowance)
+        raise
+    yield from messages_in(path, b"".join(loose), tables, allowance)
+
+
+def read_metadata(path: Path, name: str, key: str) -> str:
+    """An entry of a file's own metadata; "" where it has none of that name.
+
+    Raises:
+        DamageError, OSError: as ``read_messages``.
+    """
+    with refusing_damage(path):
+        for _, content in _records(path, Allowance(), (METADATA,)):
+            found, _, position = fields("sI", content, HEAD.size)
+            if found == name:
+                return _entries(content[position:]).get(key, "")
+    return ""
 
 
 def messages_in(path: Path, chunk: bytes, tables: Tables, allowance: Allowance) -> Iterator[Batch]:
@@ -155,11 +167,22 @@ class Tables:
         return Batch(self.channels[channel], stamps, rows[:, MESSAGE_HEAD.size : end])
 
 
-def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[tuple[int, bytes]]:
-    """Opcode of each record up to the footer that matters, and the record with its head.
+def _records(
+    path: Path, allowance: Allowance, wanted: Sequence[int] = READ
+) -> Iterator[tuple[int, bytes]]:
+    """Opcode of each record up to the footer that is wanted, and the record with its head.
 
     Of a chunk, the content alone.
     """
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise DamageError(f"'{path.name}' is no MCAP file")
+        yield from _records_of(path, file, allowance, wanted)
+
+
+def _records_of(
+    path: Path, file: BinaryIO, allowance: Allowance, wanted: Sequence[int]
+) -> Iterator[tuple[int, bytes]]:
     size, position = path.stat().st_size, len(MAGIC)
     while True:
         start = position
@@ -171,16 +194,16 @@ def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[
         position += HEAD.size + length
         if opcode == 0 or position > size:
             raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
-        if opcode in READ and length > MAX_CHUNK:
+        if opcode in wanted and length > MAX_CHUNK:
             raise DamageError(f"'{path.name}' has a record of {length} bytes")
         if opcode == FOOTER:
             file.seek(length, 1)
             if file.read(len(MAGIC)) != MAGIC:
                 raise DamageError(f"'{path.name}' ends in the middle, at byte {size}")
             return
-        if opcode == CHUNK:
+        if opcode == CHUNK and opcode in wanted:
             yield opcode, file.read(length)
-        elif opcode in READ:
+        elif opcode in wanted:
             yield opcode, head + file.read(length)
         elif length:
             file.seek(length, 1)
@@ -211,16 +234,20 @@ def _channel(
     content: bytes, position: int, schemas: dict[int, tuple[str, str]]
 ) -> tuple[int, Channel]:
     number, schema, topic, encoding, length, position = fields("HHssI", content, position)
-    metadata = content[position : position + length]
-    entries, position = {}, 0
-    while position < len(metadata):
-        key, value, position = fields("ss", metadata, position)
-        entries[key] = value
+    entries = _entries(content[position : position + length])
     name, definition = schemas[schema]
     qos = entries.get("offered_qos_profiles", "")
     return number, Channel(
         topic, name, encoding, definition, qos, entries.get("topic_type_hash", "")
     )
+
+
+def _entries(metadata: bytes) -> dict[str, str]:
+    entries, position = {}, 0
+    while position < len(metadata):
+        key, value, position = fields("ss", metadata, position)
+        entries[key] = value
+    return entries
 
 
 def fields(form: str, content: bytes, position: int) -> list[Any]:

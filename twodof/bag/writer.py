@@ -22,12 +22,11 @@ from ..files import lock, read_file, sync
 from ..master import Sample, Sink
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, STORE, Messages
-from .provenance import ProvenanceFile, read_provenance
+from .provenance import KEY, ProvenanceFile, read_provenance
 from .storage import (
     BATCH_SIZE,
     MAX_METADATA,
     OVERHEAD,
-    PROVENANCE_KEY,
     REMOVED,
     STORAGES,
     BagWriter,
@@ -227,7 +226,7 @@ class Bag(Sink):
         if self._fsync and changes:
             sync(self._provenance.path)
         if samples:
-            stamps, messages = self._messages.of(b"".join(samples))
+            stamps, messages = self._messages.of_all(b"".join(samples))
             if not self._taken:
                 self._give(stamps[:1], self._messages.latched(stamps[0]))
             self._give(stamps, messages)
@@ -253,7 +252,7 @@ class Bag(Sink):
             storage.salvage()
             self._store()
         with suppress(OSError):  # it was removed: the messages are worth closing without it
-            self._writer.set_custom_data(PROVENANCE_KEY, self._provenance.text())
+            self._writer.set_custom_data(KEY, self._provenance.text())
         self._writer.close()
         if self._fsync:
             sync(storage.path, self.path / "metadata.yaml", self.path)

@@ -57,6 +57,10 @@ def add(verbs: Any) -> None:
         "--native", action="store_true", help="compiled C, which needs no Python where it runs"
     )
     build.add_argument(
+        "--no-live-documentation", action="store_true",
+        help="leave the arm that runs in a browser out of a native FMU's documentation",
+    )  # fmt: skip
+    build.add_argument(
         "--platform", dest="platforms", action="append", default=[], metavar="P",
         help="of a native FMU: linux64, win64, darwin64 or all; repeatable (this machine's)",
     )  # fmt: skip
@@ -85,6 +89,7 @@ def call(options: argparse.Namespace) -> int:
         name=options.name,
         link_environment=options.link_environment,
         native=options.native,
+        live_documentation=not options.no_live_documentation,
         platforms=_platforms(options.platforms),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # other platforms take minutes

@@ -34,10 +34,8 @@ class Numbers(NamedTuple):
     size: int
 
 
-class Header(NamedTuple):
-    """A stamp and a frame_id."""
-
-    frame: str
+class Stamp(NamedTuple):
+    """A message's time; with a frame_id behind it, its header."""
 
 
 class MixtureError(Exception):
@@ -48,10 +46,10 @@ class Layout:
     """Serialised messages that differ in stamps and numbers alone, as all of a topic's in a run do.
 
     Args:
-        parts: a header, a text, the length of a sequence, or numbers, as they follow each other.
+        parts: a stamp, a text, the length of a sequence, or numbers, as they follow each other.
     """
 
-    def __init__(self, *parts: Header | str | int | Numbers) -> None:
+    def __init__(self, *parts: Stamp | str | int | Numbers) -> None:
         content = LITTLE_ENDIAN
         self._stamps: list[int] = []
         self._numbers: list[slice] = []
@@ -62,9 +60,9 @@ class Layout:
                 content += bytes(8 * part.size)
                 continue
             content += bytes(_gap(4, len(content)))
-            if isinstance(part, Header):
+            if isinstance(part, Stamp):
                 self._stamps.append(len(content))
-                content += bytes(8) + _text(part.frame, "<")
+                content += bytes(8)
             else:
                 content += _text(part, "<") if isinstance(part, str) else struct.pack("<I", part)
         self._plain = np.frombuffer(content, np.uint8)
@@ -111,7 +109,7 @@ class JointStateLayout(Layout):
         self._sizes = tuple(sizes)
         self._names = {order: _names(names, order) for order in "<>"}
         parts = [part for size in self._sizes for part in (size, Numbers(size))]
-        super().__init__(Header(frame), len(names), *names, *parts)
+        super().__init__(Stamp(), frame, len(names), *names, *parts)
 
     def read(self, rows: Rows) -> list[Array]:
         """Positions, velocities, efforts of N messages, N × size each.

@@ -23,7 +23,7 @@ from ..experiments import Experiment, Value
 from ..fmu import read_resource
 from ..master import Sample
 from ..plant.urdf import Joint, RobotError
-from .cdr import Header, JointStateLayout, Layout, Numbers, Rows
+from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -33,6 +33,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 TRANSFORMS = "/tf"
 TARGET = "/target"
 END_EFFECTOR = "/end_effector"
+CLOCK = "/clock"
 POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 FOREVER = QosTime(9223372036, 854775807)
@@ -41,6 +42,9 @@ XYZ = "float64 x\nfloat64 y\nfloat64 z"
 DEFINITIONS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "rosgraph_msgs/msg/Clock": "builtin_interfaces/Time clock",
+    "std_msgs/msg/Bool": "bool data",
+    "std_msgs/msg/UInt32": "uint32 data",
     "std_msgs/msg/String": "string data",
     JOINT_STATE: "std_msgs/Header header\nstring[] name\n"
     "float64[] position\nfloat64[] velocity\nfloat64[] effort",
@@ -101,6 +105,7 @@ class Messages:
         run: the experiment whose samples come.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
+        clock: also the samples' stamps as the time.
 
     Attributes:
         topics: all topics by name.
@@ -109,20 +114,19 @@ class Messages:
         BagError: the FMU has not what is asked for.
     """
 
-    def __init__(self, run: Experiment, *, scene: bool, effort: bool) -> None:
+    def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False) -> None:
         if effort and not run.fmu.vector("tau"):
             raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
         self._scene = _load_scene(run) if scene else None
         self._axes = ["xyz".index(axis) for axis in run.fmu.axes]
         n, m, poses = len(run.fmu.joints), 0, False
         efforts = n if effort else 0
-        layouts: dict[str, Layout] = {
-            JOINT_STATES: JointStateLayout(run.fmu.joints, "", (n, n, efforts))
-        }
+        layouts: dict[str, Layout] = {CLOCK: Layout(Stamp())} if clock else {}
+        layouts[JOINT_STATES] = JointStateLayout(run.fmu.joints, "", (n, n, efforts))
         self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM)}
         if self._scene is not None:
             m, poses = len(run.fmu.vector("x_des")), bool(run.fmu.vector("quat_des"))
-            place = Layout(Header(run.fmu.root), Numbers(7 if poses else 3))
+            place = Layout(Stamp(), run.fmu.root, Numbers(7 if poses else 3))
             layouts |= {TRANSFORMS: _tf_layout(self._scene.moving), TARGET: place}
             layouts |= {END_EFFECTOR: place}
             self.topics |= SCENE_TOPICS
@@ -130,6 +134,8 @@ class Messages:
                 self.topics |= dict.fromkeys((TARGET, END_EFFECTOR), Topic(POSE, STREAM))
             if not m:
                 del self.topics[TARGET], layouts[TARGET]
+        if clock:
+            self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
         self._layouts, turns = layouts, 4 * poses
         sizes = {"q": n, "v": n, "tau": efforts, "quat": turns, "x_des": m, "quat_des": turns}
         self._numbers = np.dtype([("stamp", "<i8"), *((k, "<f8", (c,)) for k, c in sizes.items())])
@@ -156,10 +162,14 @@ class Messages:
             given = (*given, *sample.quat, *self._target)
         return self._pack(sample.stamp, *sample.q, *sample.v, *given)
 
-    def of(self, numbers: bytes) -> tuple[NDArray[np.int64], dict[str, Rows]]:
+    def of(self, sample: Sample) -> dict[str, Rows]:
+        """Messages of one sample, by topic."""
+        return self.of_all(self.numbers(sample))[1]
+
+    def of_all(self, numbers: bytes) -> tuple[NDArray[np.int64], dict[str, Rows]]:
         """Stamps of N samples, ns, and their messages by topic."""
         table = np.frombuffer(numbers, self._numbers)
-        parts = {JOINT_STATES: [table["q"], table["v"], table["tau"]]}
+        parts = {CLOCK: [], JOINT_STATES: [table["q"], table["v"], table["tau"]]}
         if self._scene is not None:
             end_effector = self._scene.end_effector(table["q"])
             target = end_effector.copy()  # an axis that is not controlled is left as it is
@@ -201,7 +211,7 @@ def _load_scene(run: Experiment) -> Scene:
 
 def _tf_layout(joints: Iterable[Joint]) -> Layout:
     """Of a TFMessage: a transform for each joint, from the parent link to the child link."""
-    parts: list[Header | str | Numbers] = []
+    parts: list[Stamp | str | Numbers] = []
     for joint in joints:
-        parts += (Header(joint.parent), joint.child, Numbers(7))
-    return Layout(len(parts) // 3, *parts)
+        parts += (Stamp(), joint.parent, joint.child, Numbers(7))
+    return Layout(len(parts) // 4, *parts)

@@ -6,10 +6,10 @@ from itertools import accumulate, chain
 
 import numpy as np
 
-from ..errors import SimulationError
+from ..errors import SimulationError, diverged, step_failure
 from ..experiments import Experiment
 from ..fmu import Instance
-from ..master import OUTPUTS, diverged, step_failure
+from ..master import OUTPUTS
 from .metrics import Array
 
 
