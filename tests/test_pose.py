@@ -296,7 +296,7 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 import numpy as np
-from twodof.ros.cdr import Header, Layout, Numbers
+from twodof.ros.cdr import Layout, Numbers, Stamp
 from twodof.ros.messages import POSE, STREAM
 from twodof.ros.network import network, open_domain
 from twodof.ros.dds import dds_qos, dds_type
@@ -311,7 +311,7 @@ print("ready", flush=True)
 while not writer.get_matched_subscriptions():
     time.sleep(0.01)
 for frame, xyz, quat in said:
-    said = Layout(Header(frame), Numbers(7)).pack(np.array([0]), np.array([[*xyz, *quat]]))
+    said = Layout(Stamp(), frame, Numbers(7)).pack(np.array([0]), np.array([[*xyz, *quat]]))
     writer.write(writer.data_type(said.tobytes()))
     time.sleep(0.3)
 time.sleep(60)
