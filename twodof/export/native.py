@@ -45,6 +45,9 @@ def model_header(
     n, m = len(robot.joints), len(robot.axes)
     if n > MAX_JOINTS:
         raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
+    indicators = count_event_indicators(robot, control)
+    if fmi == 3:
+        table = _with_indicators(table, indicators)
     groups = [variable.group for variable in table]
     model = robot.model
     subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
@@ -64,7 +67,7 @@ def model_header(
         f"#define N_BODIES {len(parents)}\n"
         f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n"
         f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
-        f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
+        f"#define N_INDICATORS {indicators} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
         _value_references(groups),
@@ -136,6 +139,14 @@ def _value_references(groups: Sequence[str]) -> str:
     lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
     body = "\n".join(lines)
     return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
+
+
+def _with_indicators(table: Sequence[Variable], count: int) -> list[Variable]:
+    """The variables of FMI 3.0: event indicators and the time are among them."""
+    first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
+    places = [*(("event_indicators", i) for i in range(count)), ("time", None)]
+    added = [Variable(group, i, "local", "", None, "") for group, i in places]
+    return [*table[:first], *added, *table[first:]]
 
 
 def _extents(table: Sequence[Variable], fmi: int) -> list[int]:

@@ -19,11 +19,12 @@ from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
-from .compiler import host_platform
+from .compiler import PLATFORMS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import model_description
+from .model_description3 import model_description3
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)
@@ -56,7 +57,9 @@ class FmuOptions:
         link_environment: remember the folders of this Python's packages in the FMU; not for the
             native flavour, which needs none.
         native: the plant as compiled C instead of Python code.
-        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64"; empty: this machine's.
+        fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
+        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or of FMI 3.0
+            "x86_64-linux", "aarch64-linux"; empty: this machine's.
     """
 
     urdf: Path | None = None
@@ -71,6 +74,7 @@ class FmuOptions:
     name: str = "TwoDof"
     link_environment: bool = False
     native: bool = False
+    fmi: int | None = None
     platforms: tuple[str, ...] = ()
 
 
@@ -123,7 +127,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     files.update(flavour.files)
 
     def describe(guid: str) -> bytes:
-        return model_description(
+        description = model_description(
             robot,
             table,
             options.control,
@@ -134,6 +138,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
             exchanges=flavour.exchanges,
             source_files=flavour.source_files,
         )
+        return model_description3(description) if flavour.fmi == 3 else description
 
     digest = hashlib.sha256(describe(""))
     for name in sorted(files):
@@ -164,17 +169,27 @@ def _flavour(
     starts: Mapping[str, Any],
 ) -> Flavour:
     if not options.native:
-        if options.platforms:
-            raise BuildError("platforms can be chosen for the native flavour only, `native=True`")
+        if options.platforms or options.fmi:
+            raise BuildError(
+                "the platforms and the version of FMI can be chosen for the native flavour only,"
+                " `native=True`"
+            )
         return python_flavour(
             robot, options.control, urdf, starts, options.name, options.link_environment
         )
     if options.link_environment:
         raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
-    platforms = options.platforms or (host_platform(),)
+    fmi = options.fmi or (2 if options.platforms or host_platform() else 3)
+    if fmi not in PLATFORMS:
+        raise BuildError(f"there is no FMI {fmi} here, `fmi` is 2 or 3")
+    platforms = options.platforms or (host_platform(fmi),)
     if platforms == ("",):
         raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
-    return native_flavour(robot, options.control, table, options.name, platforms)
+    for platform in platforms:
+        if platform not in PLATFORMS[fmi]:
+            names = ", ".join(PLATFORMS[fmi])
+            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}")
+    return native_flavour(robot, options.control, table, options.name, platforms, fmi)
 
 
 def _mesh_dir(options: FmuOptions) -> Path | None:
