@@ -31,7 +31,7 @@ from twodof.plant.urdf import read_urdf
 
 REFUSED = (
     "of type 'floating'", "of type 'planar'", "of type 'spherical'", "has no moving joint",
-    "but has no mass", "no inertia about its axis", "which does not exist", "not physical",
+    "no mass or no inertia about its axis", "which does not exist", "not physical",
     "has no links",
 )  # fmt: skip
 FLIGHT = 0.1  # s

@@ -1,10 +1,10 @@
-"""Makes docs/arm.png, plot.png and map.png, and fmu_src/model.png, the icon of FMUs.
+"""Makes docs/arm.png, plot.png, map.png and load.png, and fmu_src/model.png, the icon of FMUs.
 
     python docs/make_pictures.py
 
 The first picture shows the default run, from the samples of the FMU itself, with the arm drawn from
-its meshes as seen from above. The second is what ``twodof plot`` makes of three runs, the third is
-what it makes of the sweep in docs/gains.md. The icon is for FMI tools and suits the FMU of any
+its meshes as seen from above. The second is what ``twodof plot`` makes of three runs, the others
+are what it makes of the sweeps in docs/gains.md. The icon is for FMI tools and suits the FMU of any
 robot. Needs the extras 'view', 'sweep' and 'native'.
 """
 
@@ -42,13 +42,19 @@ STEP_IN_DEPTH = 0.0012  # m: an edge is drawn where the depth jumps by more
 
 
 def main() -> None:
-    """Make all pictures."""
+    """Make all of them."""
     plt.rcParams.update({"font.family": "DejaVu Sans", "text.color": INK})
     with tempfile.TemporaryDirectory() as folder:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
         samples = list(twodof.samples(fmu))
         draw_plot(fmu, ROOT / "docs" / "plot.png")
-        draw_map(Path(folder), ROOT / "docs" / "map.png")
+        native = twodof.build_fmu(
+            Path(folder) / "TwoDof-native.fmu", twodof.FmuOptions(native=True)
+        )
+        gains = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
+        draw_map(native, gains, {}, ROOT / "docs" / "map.png")
+        loads = {"Kp": np.linspace(250, 5000, 20), "payload": np.linspace(0.024, 0.264, 11)}
+        draw_map(native, loads, {"Kd": 80.0, "limit_effort": True}, ROOT / "docs" / "load.png")
     draw_arm(samples, ROOT / "docs" / "arm.png")
     draw_icon(ROOT / "fmu_src" / "model.png")
 
@@ -210,12 +216,11 @@ def draw_plot(fmu: Path, path: Path) -> None:
     figure.savefig(path, dpi=135, pil_kwargs={"optimize": True}, metadata={"Software": None})
 
 
-def draw_map(folder: Path, path: Path) -> None:
-    """The default arm's gain map."""
-    fmu = twodof.build_fmu(folder / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
-    grid = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
-    twodof.sweep(fmu, grid=grid, output=folder / "gains")
-    figure = drawn(drawing(*twodof.read_sweep(folder / "gains"), "gains"))
+def draw_map(fmu: Path, grid: dict, settings: dict, path: Path) -> None:
+    """A map of the default arm."""
+    table = fmu.with_name(path.stem)
+    twodof.sweep(fmu, grid=grid, settings=settings, output=table)
+    figure = drawn(drawing(*twodof.read_sweep(table), path.stem))
     figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
 
 

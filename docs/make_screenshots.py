@@ -1,14 +1,16 @@
-"""Makes docs/view.png and docs/live.png, screenshots of the pages.
+"""Makes docs/view.png, live.png and panda.png, screenshots of the pages.
 
     python docs/make_screenshots.py
 
 The first is the replay of a real run of the default arm, whose target changes; the second a live
-arm, whose target has just been dragged. Needs chromium and the packages 'viser' and 'playwright'.
+arm, whose target has just been dragged; the third the Panda on its way to a pose. Needs chromium
+and the packages 'viser', 'playwright' and 'example-robot-data'.
 """
 
 from __future__ import annotations
 
 import sys
+import sysconfig
 import tempfile
 from pathlib import Path
 
@@ -16,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import browser  # noqa: E402
+from PIL import Image  # noqa: E402
 from playwright.sync_api import Browser, Page  # noqa: E402
 
 import twodof  # noqa: E402
@@ -35,6 +38,7 @@ def main() -> None:
         twodof.simulate(run, twodof.Bag(folder / "my_bag"))
         view(chromium, folder)
         live(chromium, folder, fmu)
+        panda(chromium, folder)
 
 
 def view(chromium: Browser, folder: Path) -> None:
@@ -61,6 +65,27 @@ def live(chromium: Browser, folder: Path, fmu: Path) -> None:
         browser.until(page, lambda found: browser.numbers(found["error"])[0] < 60.0)
         browser.press(page, "Pause")
         shoot(page, "live.png")
+
+
+def panda(chromium: Browser, folder: Path) -> None:
+    """The scene alone, of the run in docs/tutorial.md after a second."""
+    share = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share"
+    urdf = share / "example-robot-data/robots/panda_description/urdf/panda.urdf"
+    bent = (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8, 0.03)
+    options = twodof.FmuOptions(
+        urdf=urdf, mesh_dir=share, frame="panda_hand_tcp", control="pose", native=True, q_start=bent
+    )
+    fmu = twodof.build_fmu(folder / "Panda.fmu", options)
+    goal = {"x_des": (0.45, 0.2, 0.4), "quat_des": (0.9, 0.1, 0.3, 0.2)}
+    twodof.simulate(fmu, twodof.Bag(folder / "panda"), stop_time=1, settings=goal)
+    with (
+        browser.served("view", "panda", cwd=folder) as command,
+        browser.opened(chromium, command.url) as page,
+    ):
+        browser.until(page, lambda found: found["time"] == "1.000 s")
+        page.wait_for_timeout(3000)
+        picture = Image.fromarray(browser.still(page).astype("uint8"))
+        picture.save(ROOT / "docs" / "panda.png", optimize=True)
 
 
 def shoot(page: Page, name: str) -> None:

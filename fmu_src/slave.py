@@ -219,6 +219,9 @@ class TwoDofSlave(fmi.Fmi2Slave):
         if kind == "Real" and not self._finite(value):
             self._refuse(f"{variable.name} = {value} is not finite")
             return None
+        if variable.causality == "input" and variable.refusal(value):
+            self._refuse(variable.refusal(value))  # of parameters when the run begins
+            return None
         return variable
 
     def _variable(self, vr, kind, call):

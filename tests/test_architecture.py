@@ -54,6 +54,7 @@ LIBRARIES = {
     },  # its rotations: of joints that are locked, for all, to URDF's rpy, to viser's wxyz
     "simpleeval": {"export"},
     "tqdm": {"cli"},
+    "trimesh": {"pages"},
     "viser": {"pages"},
     "websockets": {"pages"},
     "xacro": {"export"},

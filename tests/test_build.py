@@ -407,3 +407,58 @@ def test_outputs_depend_on_exactly_what_is_declared(fmu_path):
     idle = {"f_ext[3]"}  # of no effect on this arm, across the plane in which it moves
     for name, others in expected.items():
         assert found[name] | (idle & others) == others & {*inputs}, name
+
+
+# --- sizes, ranges and types ---
+
+QUANTITY = {"rad": "Angle", "rad/s": "AngularVelocity", "N.m": "Torque", "m": "Length"}
+
+
+@pytest.mark.parametrize("flavour", ["python", "native"])
+def test_types_have_quantities_and_angles_are_shown_in_degrees(flavour, fmu_path, native_path):
+    description = read_model_description(str(native_path if flavour == "native" else fmu_path))
+    for variable in description.modelVariables:
+        if variable.unit in QUANTITY:
+            declared = variable.declaredType
+            assert (declared.quantity, declared.unit) == (QUANTITY[variable.unit], variable.unit)
+            assert declared.displayUnit == ("deg" if variable.unit == "rad" else None)
+    (deg,) = [u for unit in description.unitDefinitions for u in unit.displayUnits]
+    assert (deg.name, float(deg.factor)) == ("deg", pytest.approx(np.rad2deg(1.0)))
+    assert description.author and description.copyright
+
+
+def test_sizes_are_those_of_the_robot(fmu_path):
+    variables = {v.name: v for v in read_model_description(str(fmu_path)).modelVariables}
+
+    def size(name):
+        variable = variables[name]
+        return tuple(x and float(x) for x in (variable.min, variable.max, variable.nominal))
+
+    assert size("q[1]") == (-np.pi, np.pi, None)
+    assert size("v[1]") == size("x[1]") == size("q_start[1]") == (None, None, None)
+    assert size("tau[1]") == size("tau_ext[2]") == (None, None, 10.0)
+    assert size("Kp[2]") == size("Kn") == size("payload") == (0.0, None, None)
+    assert size("rtol") == (sys.float_info.min, None, 1e-3)
+    assert size("rcond") == (0.0, np.nextafter(1.0, 0.0), None)
+
+
+@pytest.mark.parametrize("flavour", ["python", "native"])
+def test_what_the_description_excludes_is_refused_and_nothing_else(flavour, fmu_path, native_path):
+    driver = Driver(native_path if flavour == "native" else fmu_path)
+    ranged = {
+        v.name: side
+        for v in driver.description.modelVariables
+        for side in ((float(v.min or -np.inf), -np.inf), (float(v.max or np.inf), np.inf))
+        if np.isfinite(side[0]) and v.causality != "output"
+    }
+    assert len(ranged) == 10
+    for name, (end, beyond) in ranged.items():
+        for value in (end, float(np.nextafter(end, beyond))):
+            driver.log.clear()
+            driver.initialise(**{name: value})
+            driver.call("reset")
+            refusals = [message for status, message in driver.log if status == 3]
+            assert [message.startswith(f"{name} = ") for message in refusals] == (
+                [] if value == end else [True]
+            )
+    driver.free()

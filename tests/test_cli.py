@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 import os
 import re
@@ -219,7 +221,7 @@ BAD: dict[str, Case] = {
         text("arm.urdf", urdf()), [*BUILD, "--frame", "hand"], "no frame 'hand'.*: base, a$",
     ),
     "joint type": (text("arm.urdf", urdf(kind="planar")), BUILD, "'j' is of type 'planar'"),
-    "no mass": (text("arm.urdf", urdf(link='<link name="a"/>')), BUILD, "'a' moves .*no mass"),
+    "no mass": (text("arm.urdf", urdf(link='<link name="a"/>')), BUILD, "'j': .*no mass .*--lock"),
     "negative mass": (
         text("arm.urdf", urdf(link=GOOD_LINK.replace('value="1"', 'value="-1"'))),
         BUILD, "'a': negative mass -1",
@@ -453,6 +455,28 @@ def test_info_of_a_bag_with_a_run_json_of_another_tool(
     (folder / "bag/run.json").write_text(provenance)
     assert main(["info", "bag"]) == 0
     assert "6 joint states" in capfd.readouterr().out
+
+
+HOSTILE = "\x1b]0;title\x07 \x9b2J \x1b[31m"
+"""Commands to a terminal, which some carry out whoever printed them."""
+
+
+def test_text_of_a_bag_is_no_command_to_the_terminal(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "bag"
+    twodof.simulate(native_path, twodof.Bag(bag), stop_time=0.02)
+    provenance = json.loads((bag / "run.json").read_text())
+    provenance["command_line"] = provenance["fmu"]["name"] = HOSTILE
+    (bag / "run.json").write_text(json.dumps(provenance))
+    assert main(["info", str(bag)]) == 0
+    assert main(["info", str(tmp_path / HOSTILE)]) == 1
+    logging.getLogger("twodof").warning("mesh '%s' is left out", HOSTILE)
+    out, err = capsys.readouterr()
+    assert out.count(r"\x1b[31m") == 2 and err.count(r"\x1b[31m") >= 1
+    assert all(c.isprintable() or c == "\n" for c in out + err)
+    assert main(["info", str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["command_line"] == HOSTILE
 
 
 @pytest.mark.parametrize("kept", [0, 10, 300])

@@ -241,6 +241,15 @@ def test_a_late_event_of_a_joint_that_is_on_its_way_back_keeps_its_velocity(fall
     assert falling.y == [1.0, 0.0, -1.0, 0.0]
 
 
+def test_an_impact_beyond_all_numbers_is_refused_and_changes_nothing(fmus):
+    model = Model(fmus["effort"], q_start=[0.5, 0.1], q_max=[1.0, 2.0])
+    model.go()
+    model.y = [1.1, 0.1, 1e308, 1e308]
+    model.enterEventMode()
+    model.refused("fmi2NewDiscreteStates: v[2] would not be finite", "newDiscreteStates")
+    assert model.y == [1.1, 0.1, 1e308, 1e308]
+
+
 @pytest.mark.parametrize("rigid", [False, True])
 def test_a_held_joint_is_let_go_where_it_is_pulled_off_and_no_sooner(fmus, rigid):
     model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0],

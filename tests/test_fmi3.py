@@ -251,9 +251,9 @@ def test_what_the_description_does_not_have_is_refused(pair):
         assert a.dll[f"fmi3{name}"](ctypes.c_void_p(a.component), *null) == ERROR
         assert a.messages == [(ERROR, f"fmi3{name} is not supported by this FMU")]
     b = exchange(fmu)
-    b.refused("fmi3DoStep is a call of co-simulation", "doStep" if hasattr(b, "doStep") else
-              "fmi3DoStep", b.component, 0.0, 0.01, False, *map(ctypes.byref, (
-                  ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double())))  # fmt: skip
+    results = [ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double()]
+    step = (b.component, 0.0, 0.01, False, *map(ctypes.byref, results))
+    b.refused("fmi3DoStep is a call of co-simulation", "fmi3DoStep", *step)
 
 
 @pytest.mark.parametrize(

@@ -286,3 +286,30 @@ def test_example_robot_needs_no_mesh_dir(robots: Path, name: str, count: int) ->
     assert len(files) == count
     meshes = {mesh.get("filename", "") for mesh in ET.fromstring(text).iter("mesh")}
     assert meshes == {f"package://{name}" for name in files}
+
+
+LIBRARY = {
+    "in the same folder": ("colours.mtl", b"newmtl red\n"),
+    "with a space": ("two words.mtl", b"newmtl blue\n"),
+    "that is not there": ("none.mtl", None),
+}
+
+
+@pytest.mark.parametrize(("name", "content"), LIBRARY.values(), ids=LIBRARY)
+def test_an_obj_brings_the_library_of_its_colours(
+    disk: Path, name: str, content: bytes | None
+) -> None:
+    folder = disk / "ws/arm_description/meshes"
+    (folder / "box.obj").write_text(f"# a box\r\nmtllib {name}\r\nv 0 0 0\r\n")
+    if content:
+        (folder / name).write_bytes(content)
+    _, files = collect_meshes(urdf("../meshes/box.obj"), disk / "ws/arm_description/urdf", None)
+    libraries = {key: value.strip() for key, value in files.items() if key.endswith(".mtl")}
+    assert libraries == ({"meshes/box.obj.mtl": content.strip()} if content else {})
+
+
+def test_a_library_from_elsewhere_is_refused(disk: Path) -> None:
+    path = disk / "ws/arm_description/meshes/box.obj"
+    path.write_text("mtllib ../../../secret.stl\n")
+    with pytest.raises(BuildError, match=r"secret\.stl.* may come from nowhere else"):
+        collect_meshes(urdf("../meshes/box.obj"), disk / "ws/arm_description/urdf", None)

@@ -259,21 +259,30 @@ def test_refusals_name_the_culprit():
     assert arm.status("doStep", 0.9e-9, 0.01) == OK
 
 
-def test_parameters_are_checked_when_initialization_ends():
-    for name, value, message in (
+@pytest.mark.parametrize(
+    "name, value, message",
+    [
         ("rtol", 0.0, "rtol = 0 must be > 0"),
         ("atol", -1.0, "atol = -1 must be > 0"),
         ("max_step", 0.0, "max_step = 0 must be > 0"),
         ("rcond", 1.0, r"rcond = 1 must be in \[0, 1\)"),
-        ("q_min[2]", 4.0, r"q_min\[2\] = 4 > q_max\[2\] = 3.14159 \(joint 'joint2'\)"),
-    ):
-        arm = arm_in("initialization")
-        good = arm.get(name)
-        arm.set(name, value)
-        arm.refused(message, "exitInitializationMode")
-        arm.refused(message, "getReal", [arm.of.reference("q[1]")])
-        arm.set(name, good)
-        arm.exitInitializationMode()
+        ("payload", -0.1, "payload = -0.1 must be >= 0"),
+        ("Kp[2]", -1.0, r"Kp\[2\] = -1 must be >= 0"),
+    ],
+)
+def test_values_out_of_their_range_are_refused_where_they_are_set(name, value, message):
+    arm = arm_in("initialization")
+    arm.refused(message, "setReal", [0, arm.of.reference(name)], [0.3, value])
+
+
+def test_limits_are_checked_when_initialization_ends():
+    arm = arm_in("initialization")
+    message = r"q_min\[2\] = 4 > q_max\[2\] = 3.14159 \(joint 'joint2'\)"
+    arm.set("q_min[2]", 4.0)
+    arm.refused(message, "exitInitializationMode")
+    arm.refused(message, "getReal", [arm.of.reference("q[1]")])
+    arm.set("q_min[2]", -4.0)
+    arm.exitInitializationMode()
 
 
 def test_start_and_stop_times():
@@ -421,6 +430,7 @@ FORGERIES = {
     "rtol": ((0.0,), "rtol = 0 must be > 0"),
     "rcond": ((1.0,), r"rcond = 1 must be in \[0, 1\)"),
     "q_min[1]": ((1.0,), UNSOUND),
+    "Kp[1]": ((-1.0,), r"Kp\[1\] = -1 must be >= 0"),
     "limit_effort": ((0.5, 2.0, np.nan), UNSOUND),
 }
 
@@ -453,13 +463,13 @@ def test_what_a_state_computes_on_demand_is_not_taken_from_its_bytes(field):
 
 def test_a_state_from_before_the_run_keeps_what_is_yet_to_be_refused():
     arm = Arm(start=False)
-    arm.set("rtol", -1.0)
+    arm.set("q_min[1]", 4.0)
     saved = arm.deSerializeFMUstate(arm.snapshot())
     arm.reset()
     arm.setFMUState(saved)
     arm.setupExperiment(startTime=0.0)
     arm.enterInitializationMode()
-    arm.refused("rtol = -1 must be > 0", "exitInitializationMode")
+    arm.refused(r"q_min\[1\] = 4 > q_max", "exitInitializationMode")
 
 
 def test_reset_repeats_the_first_run_bit_for_bit():

@@ -443,6 +443,15 @@ def test_bad_parameters_are_refused_at_the_end_of_initialisation(fmu_path, setti
 
 
 @in_child_process
+def test_a_gain_below_zero_is_refused_and_the_old_one_kept(fmu_path):
+    driver = Driver(fmu_path).initialise()
+    driver.set(Kp=(80.0, -1.0))
+    assert driver.log == [(ERROR, "Kp[2] = -1 must be >= 0")]
+    assert driver.get("Kp") == [50.0, 50.0]
+    assert [driver.step(0.0), driver.step(0.0)] == [DISCARD, OK]
+
+
+@in_child_process
 def test_calls_before_their_time_are_refused(fmu_path):
     driver = Driver(fmu_path)
     assert driver.step(0.0) == DISCARD

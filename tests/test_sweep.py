@@ -23,6 +23,8 @@ import duckdb
 import numpy as np
 import oracles
 import pandas
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from harness import asked, changed_plant, children_of, lay_traps, lives, needs, wait_until
 
@@ -485,6 +487,76 @@ def test_damaged_and_foreign_tables_get_one_line(native_path: Path, tmp_path: Pa
         read_sweep(tmp_path / "cut")
     with pytest.raises(TwoDofError, match="is no sweep"):
         read_sweep(tmp_path)
+
+
+def endless(table: pa.Table) -> pa.Table:
+    """Two million rows in some kilobytes."""
+    return table.take(pa.array(np.zeros(2_000_000, dtype=np.int64)))
+
+
+def of_one_text(table: pa.Table) -> pa.Table:
+    """A text of a megabyte, stored once, in each of a thousand rows."""
+    provenance = json.loads(table.schema.metadata[b"twodof"])
+    provenance["design"]["draws"] = 1000
+    rows = table.take(pa.array(np.zeros(1000, dtype=np.int64)))
+    rows = changed(rows, "run", pa.array(range(1000)))
+    rows = changed(rows, "message", pa.array(["x" * 1024**2] * 1000))
+    return rows.replace_schema_metadata({b"twodof": json.dumps(provenance)})
+
+
+def changed(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
+    place = table.schema.get_field_index(name)
+    field = table.schema.field(name)
+    return table.set_column(place, field.with_type(values.type), values)
+
+
+def described(table: pa.Table, key: str, value: object) -> pa.Table:
+    provenance = {**json.loads(table.schema.metadata[b"twodof"]), key: value}
+    return table.replace_schema_metadata({b"twodof": json.dumps(provenance)})
+
+
+HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
+    "without outcomes": lambda table: table.drop(["outcome"]),
+    "without runs": lambda table: table.drop(["run"]),
+    "runs beyond the design": lambda table: changed(table, "run", pa.array([0, 10**9])),
+    "runs before the first": lambda table: changed(table, "run", pa.array([0, -1])),
+    "a run twice": lambda table: changed(table, "run", pa.array([1, 1])),
+    "text for numbers": lambda table: changed(table, "settling_time", pa.array(["a", "b"])),
+    "not finite": lambda table: changed(table, "Kp", pa.array([1.0, np.inf])),
+    "no design": lambda table: described(table, "design", []),
+    "no FMU": lambda table: described(table, "fmu", {}),
+    "a long number": lambda table: described(
+        table, "options", {"stop_time": 10**400, "step": 1, "settings": {}}
+    ),
+    "endless": endless,
+    "one text for all": of_one_text,
+}
+
+
+READING = pa.proxy_memory_pool(pa.default_memory_pool())  # which outlives what lies in it
+
+
+@pytest.fixture(scope="module")
+def sound(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sound") / "s"
+    sweep(native_path, grid={"Kp": [1.0, 2.0]}, stop_time=0.02, output=path, workers=1)
+    return path / "runs.parquet"
+
+
+@pytest.mark.parametrize("make", HOSTILE_TABLES.values(), ids=HOSTILE_TABLES)
+def test_hostile_table_gets_one_line_in_little_memory(
+    sound: Path, tmp_path: Path, make: Callable[[pa.Table], pa.Table]
+) -> None:
+    assert len(read_sweep(sound.parent)[0]) == 2
+    pq.write_table(make(pq.read_table(sound)), tmp_path / "runs.parquet")
+    usual = pa.default_memory_pool()
+    pa.set_memory_pool(READING)
+    try:
+        with pytest.raises(TwoDofError, match=r"runs\.parquet' was not written|it is damaged"):
+            read_sweep(tmp_path)
+    finally:
+        pa.set_memory_pool(usual)
+    assert READING.max_memory() < 64 * 1024**2
 
 
 @pytest.mark.long

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.spatial.transform import Rotation
 
 import twodof
 from twodof.cli.main import main
@@ -161,3 +162,37 @@ def test_a_urdf_is_run_by_one_command(
     xarm = panda_file.parents[2] / "xarm_description/urdf/xarm7.urdf"
     assert main(["run", str(xarm), "--native", "-o", "bag2", "--stop-time", "0.1"]) == 0
     assert (tmp_path / "xarm7-native.fmu").exists()
+
+
+BALL = """<robot name="top"><link name="base"/><link name="a"/><link name="b"/><link name="top">
+<inertial><mass value="2"/><inertia ixx="0.2" ixy="0" ixz="0" iyy="0.3" iyz="0" izz="0.4"/>
+</inertial></link>{}</robot>""".format(
+    "".join(
+        f'<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="{axis}"/></joint>'
+        for name, parent, child, axis in (
+            ("z", "base", "a", "0 0 1"), ("y", "a", "b", "0 1 0"), ("x", "b", "top", "1 0 0"),
+        )
+    )
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("native", [False, True], ids=["python", "native"])
+def test_links_without_mass_make_a_ball_joint(
+    native: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A body that turns about its centre without torque keeps its angular momentum."""
+    (tmp_path / "top.urdf").write_text(BALL)
+    options = FmuOptions(urdf=tmp_path / "top.urdf", control="effort", native=native)
+    fmu = build_fmu(tmp_path / "top.fmu", options)
+    assert "without mass, which are taken as they are: 'a', 'b'" in caplog.text
+    settings = {"v_start": (1.0, 0.3, 2.0), "rtol": 1e-11, "atol": 1e-13}
+    momenta = []
+    for sample in twodof.samples(fmu, stop_time=2.0, settings=settings):
+        turns = Rotation.from_euler("ZYX", sample.q)
+        z, y = Rotation.from_euler("Z", sample.q[0]), Rotation.from_euler("ZY", sample.q[:2])
+        axes = np.column_stack([[0, 0, 1], z.apply([0, 1, 0]), y.apply([1, 0, 0])])
+        inertia = turns.as_matrix() @ np.diag([0.2, 0.3, 0.4]) @ turns.as_matrix().T
+        momenta.append(inertia @ axes @ sample.v)
+    assert np.ptp(np.array(sample.q)) > 1.0
+    np.testing.assert_allclose(momenta, [momenta[0]] * len(momenta), atol=1e-9)

@@ -30,10 +30,16 @@ Status update_discrete_states(void *component, Boolean *states_changed)
     Instance *instance = enter_with(component, NEW_DISCRETE_STATES, states_changed, 1, 1);
     if (!instance)
         return ERROR;
-    State *state = &instance->state;
-    update_stops(state);
-    *states_changed = handle_event(&state->plant, &state->stops);
-    state->has_x = state->has_tau = state->has_rates = 0;
+    State draft = instance->state;
+    update_stops(&draft);
+    const int changed = handle_event(&draft.plant, &draft.stops);
+    for (int i = 0; i < N_STATES; i++) /* an impact of speeds that are too large for numbers */
+        if (!isfinite(draft.plant.value[Q + i]))
+            return report(instance, ERROR, "%s: %s would not be finite",
+                          call_name(NEW_DISCRETE_STATES), VARIABLE_NAME[Q + i]);
+    draft.has_x = draft.has_tau = draft.has_rates = 0;
+    instance->state = draft;
+    *states_changed = changed;
     return OK;
 }
 

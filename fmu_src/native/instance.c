@@ -71,6 +71,18 @@ static void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
+Status check_range(Instance *instance, int variable, double value)
+{
+    for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
+        const int index = variable - RANGE[k].first;
+        if (index >= 0 && index < RANGE[k].count
+            && !(value >= RANGE[k].low && value <= RANGE[k].high))
+            return report(instance, ERROR, "%s = %g must be %s", VARIABLE_NAME[variable],
+                          value, RANGE[k].words);
+    }
+    return OK;
+}
+
 Instance *instantiate(Instance draft, const char *token)
 {
     const char *function = call_name(INSTANTIATE), *name = draft.name;
@@ -168,20 +180,9 @@ Status check_inputs(Instance *instance)
     return OK;
 }
 
-Status check_parameters(Instance *instance)
+Status check_limits(Instance *instance)
 {
     const double *value = instance->state.plant.value;
-    const int positive[] = {RTOL, ATOL, MAX_STEP};
-    for (int i = 0; i < 3; i++)
-        if (!(value[positive[i]] > 0.0))
-            return report(instance, ERROR, "%s = %g must be > 0", VARIABLE_NAME[positive[i]],
-                          value[positive[i]]);
-    if (!(value[PAYLOAD] >= 0.0))
-        return report(instance, ERROR, "payload = %g must be >= 0", value[PAYLOAD]);
-#ifdef HAS_RCOND
-    if (!(value[RCOND] >= 0.0 && value[RCOND] < 1.0))
-        return report(instance, ERROR, "rcond = %g must be in [0, 1)", value[RCOND]);
-#endif
     for (int i = 0; i < N_JOINTS; i++)
         if (value[Q_MIN + i] > value[Q_MAX + i])
             return report(instance, ERROR, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
@@ -204,7 +205,7 @@ Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
-    if (check_parameters(instance) != OK || check_inputs(instance) != OK)
+    if (check_limits(instance) != OK || check_inputs(instance) != OK)
         return ERROR;
     for (int i = 0; i < N_JOINTS; i++) {
         const double start = value[Q_START + i];

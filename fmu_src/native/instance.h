@@ -129,11 +129,14 @@ INTERNAL Status move_on(void *component, Call call, Phase phase);
 
 INTERNAL Status reset(void *component);
 
+/* Whether a variable may have a value; a refusal is logged. */
+INTERNAL Status check_range(Instance *instance, int variable, double value);
+
 /* Whether the control law can follow the inputs; a refusal is logged. */
 INTERNAL Status check_inputs(Instance *instance);
 
-/* Whether the parameters make sense; a refusal is logged. */
-INTERNAL Status check_parameters(Instance *instance);
+/* Whether the joints' limits make ranges; a refusal is logged. */
+INTERNAL Status check_limits(Instance *instance);
 
 /* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
    clamped is logged too. */

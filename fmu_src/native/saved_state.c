@@ -79,7 +79,10 @@ static Status take_over(Instance *instance, const void *bytes)
     state->has_stops = runs && !steps && state->has_stops != 0;
     if (!sound)
         return refuse(instance, DESERIALIZE, UNSOUND);
-    return runs ? check_parameters(instance) : OK;
+    for (int i = 0; i < N_VARIABLES; i++)
+        if (check_range(instance, i, value[i]) != OK)
+            return ERROR;
+    return runs ? check_limits(instance) : OK;
 }
 
 Status save_state(void *component, void **saved)

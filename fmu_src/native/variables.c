@@ -155,10 +155,13 @@ Status set_reals(void *component, const Reference vr[], size_t count, const doub
     for (size_t i = 0; i < count; i++) {
         if (!settable(instance, SET_REAL, vr[i]))
             return ERROR;
-        for (int e = 0; e < EXTENT[vr[i]]; e++, next++)
+        for (int e = 0; e < EXTENT[vr[i]]; e++, next++) {
             if (!isfinite(*next))
                 return report(instance, ERROR, "%s = %s is not finite", VARIABLE_NAME[vr[i] + e],
                               isnan(*next) ? "nan" : *next > 0.0 ? "inf" : "-inf");
+            if (check_range(instance, (int)vr[i] + e, *next) != OK)
+                return ERROR;
+        }
     }
     for (size_t i = 0; i < count; i++)
         for (int e = 0; e < EXTENT[vr[i]]; e++)

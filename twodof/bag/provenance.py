@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -115,12 +116,9 @@ def read_provenance(path: Path) -> dict[str, Any]:
     """
     file = path / FILE
     try:
-        text = read_file(file, MAX_SIZE)
-        if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
-            raise ValueError("it is damaged")  # an empty one takes 24 times as much memory
-        content = json.loads(text.decode("utf-8"))
+        content = parsed(read_file(file, MAX_SIZE))
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
-            if not _fits(content, SHAPE):
+            if not fits(content, SHAPE):
                 raise ValueError("it is damaged")
             return content
     except (FileNotFoundError, NotADirectoryError):
@@ -130,15 +128,29 @@ def read_provenance(path: Path) -> dict[str, Any]:
     return {}
 
 
-def _fits(content: Any, shape: Any) -> bool:
+def parsed(text: bytes) -> Any:
+    """JSON from elsewhere.
+
+    Raises:
+        ValueError, RecursionError: it is none, or would take much more memory than its text.
+    """
+    if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
+        raise ValueError("it is damaged")  # an empty one takes 24 times as much memory
+    return json.loads(text.decode("utf-8"))
+
+
+def fits(content: Any, shape: Any) -> bool:
+    """Whether a value has the shape, written as ``SHAPE`` is; numbers are finite."""
     if isinstance(shape, list):
-        return isinstance(content, list) and all(_fits(element, shape[0]) for element in content)
+        return isinstance(content, list) and all(fits(element, shape[0]) for element in content)
     if isinstance(shape, tuple):
         same = isinstance(content, list) and len(content) == len(shape)
-        return same and all(map(_fits, content, shape))
+        return same and all(map(fits, content, shape))
     if isinstance(shape, dict):
         keys = content if str in shape else shape
         return isinstance(content, dict) and all(
-            _fits(content.get(key), shape.get(key, shape.get(str))) for key in keys
+            fits(content.get(key), shape.get(key, shape.get(str))) for key in keys
         )
+    if shape == NUMBER:
+        return isinstance(content, shape) and abs(content) <= sys.float_info.max
     return isinstance(content, shape)

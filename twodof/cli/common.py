@@ -42,7 +42,7 @@ class CommandLineError(InputError):
 
 def in_options(text: str) -> str:
     """A message of the library, which has its arguments in backticks, for the command line."""
-    return ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text)
+    return plain(ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text))
 
 
 def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
@@ -264,7 +264,7 @@ def print_best(table: DataFrame) -> None:
     widths = [max(map(len, cells)) for cells in zip(best.columns, units, *rows)]
     print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
     for cells in [best.columns, units, *rows] if rows else []:
-        print("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
+        print(plain("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths))))
 
 
 def quote(path: Path) -> str:
@@ -289,7 +289,12 @@ def print_table(*rows: tuple[str, str]) -> None:
     """Labels and texts, one pair a line."""
     width = max(len(label) for label, _ in rows)
     for label, text in rows:
-        print(f"{label.ljust(width)}  {text}")
+        print(plain(f"{label.ljust(width)}  {text}"))
+
+
+def plain(text: str) -> str:
+    """A text with its control characters as escapes: files from elsewhere write on no terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def print_next(*commands: str) -> None:

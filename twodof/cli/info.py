@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from .common import best_runs, controlled, print_best, print_json, print_table
+from .common import best_runs, controlled, plain, print_best, print_json, print_table
 from .options import add_json_option
 
 if TYPE_CHECKING:
@@ -147,7 +147,8 @@ def _print_fmu(fmu: Fmu) -> None:
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     print()
     for row in rows:
-        print("  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[3]]).rstrip())
+        cells = [*(cell.ljust(w) for cell, w in zip(row, widths)), row[3]]
+        print(plain("  ".join(cells).rstrip()))
 
 
 def _start(text: str) -> str:
@@ -177,7 +178,7 @@ def _print_bag(run: Recording, count: int) -> None:
     print()
     width = max(len(topic.name) for topic in run.topics)
     for topic in run.topics:
-        print(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}")
+        print(plain(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}"))
 
 
 def _state(run: Recording, k: int) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 from ..errors import TwoDofError
 from ..version import __version__
 from . import build, info, linearise, live, plot, publish, recover, run, sweep, view
-from .common import INTERRUPTED, CommandLineError, in_options
+from .common import INTERRUPTED, CommandLineError, in_options, plain
 
 VERBS = (build, run, publish, info, linearise, plot, view, live, sweep, recover)
 LONGEST_LINE = 2000
@@ -125,7 +125,7 @@ def _fail(message: str, status: int = 1) -> int:
     line = " ".join(message.split())
     if len(line) > LONGEST_LINE:  # a name of a file from elsewhere can have any length
         line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
-    print("twodof: error:", line, file=sys.stderr)
+    print("twodof: error:", plain(line), file=sys.stderr)
     return status
 
 

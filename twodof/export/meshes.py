@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import xml.etree.ElementTree as ET
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
@@ -44,8 +45,11 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
         if uri not in names:
             try:
                 path = _find(uri, folder, mesh_dir)
-                names[uri] = _inside(path, files)
-                files[names[uri]] = read_file(path, MAX_MESHES - sum(map(len, files.values())))
+                name = _inside(path, files)
+                files[name] = read_file(path, MAX_MESHES - sum(map(len, files.values())))
+                if colours := _colours(path, files[name], mesh_dir):
+                    files[f"{name}.mtl"] = colours
+                names[uri] = name
             except FileNotFoundError:
                 missing.append(uri)
                 continue
@@ -97,6 +101,18 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
             " of the meshes, or of their packages, with `mesh_dir`"
         )
     raise FileNotFoundError
+
+
+def _colours(path: Path, content: bytes, mesh_dir: Path | None) -> bytes:
+    """The material libraries of an OBJ file that are there."""
+    found = b""
+    if path.suffix.lower() != ".obj":
+        return found
+    for line in re.findall(rb"^mtllib[ \t]+([^\r\n]+)", content, re.MULTILINE):
+        with suppress(FileNotFoundError):
+            library = _find(os.fsdecode(line.strip()), path.parent, mesh_dir)
+            found += read_file(library, MAX_MESHES) + b"\n"
+    return found
 
 
 def _inside(path: Path, files: dict[str, bytes]) -> str:

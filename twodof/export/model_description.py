@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Control, Variable, count_event_indicators
+from ..plant.urdf import UNBOUNDED
+from ..plant.variables import (
+    CONTROLS,
+    NO_RANGE,
+    RANGES,
+    Control,
+    Range,
+    Variable,
+    count_event_indicators,
+)
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
@@ -24,6 +34,22 @@ UNITS: dict[str, dict[str, int]] = {
 }
 """Exponents of the SI base units; all factors are 1."""
 
+QUANTITIES = {
+    "m": "Length",
+    "m/s": "Velocity",
+    "m/s2": "Acceleration",
+    "rad": "Angle",
+    "rad/s": "AngularVelocity",
+    "rad/s2": "AngularAcceleration",
+    "N": "Force",
+    "N.m": "Torque",
+    "s": "Time",
+    "kg": "Mass",
+}
+"""What is measured in a unit, by the names of Modelica's standard library; gains are none."""
+DISPLAY = {"rad": ("deg", 180.0 / math.pi)}
+"""Units for people, and how many of them are one."""
+
 LOG_CATEGORIES = {
     "logStatusWarning": "Warnings",
     "logStatusDiscard": "Refused steps",
@@ -33,8 +59,12 @@ LOG_CATEGORIES = {
 }
 DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
 VENDOR = "twodof"
+AUTHOR = "the twodof developers"
 
 STATES = ("q", "v")
+SMALL = ("rtol", "atol", "max_step")
+"""Whose start is their size."""
+EFFORTS = ("tau", "tau_cmd", "tau_ext")
 START = ("q_start", "q_min", "q_max")
 """What q depends on at the start."""
 IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
@@ -72,6 +102,8 @@ def model_description(
         description=f"Robot '{robot.name}' with {len(robot.joints)} joints under"
         f" {CONTROLS[control].title.format(frame=robot.frame)}",
         version=version,
+        author=AUTHOR,
+        copyright=f"Copyright (c) {AUTHOR}; of the robot's description, its author's",
         license="BSD-3-Clause",
         generationTool=f"{VENDOR} {version}",
         variableNamingConvention="structured",
@@ -89,7 +121,9 @@ def model_description(
         _source_files(ET.SubElement(root, "ModelExchange", exchange), source_files)
     capabilities["canHandleVariableCommunicationStepSize"] = "true"
     _source_files(ET.SubElement(root, "CoSimulation", capabilities), source_files)
-    _units(root, table)
+    used = {variable.unit for variable in table}
+    _units(root, used)
+    _types(root, used)
     categories = ET.SubElement(root, "LogCategories")
     for category, description in LOG_CATEGORIES.items():
         ET.SubElement(categories, "Category", name=category, description=description)
@@ -101,7 +135,7 @@ def model_description(
         stepSize=repr(DEFAULT_STEP),
     )
     _vendor_annotation(root, robot, control)
-    _variables(root, table, exchanges)
+    _variables(root, robot, table, exchanges)
     _structure(root, robot, table, CONTROLS[control])
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
@@ -115,14 +149,26 @@ def _source_files(interface: ET.Element, names: Sequence[str]) -> None:
             ET.SubElement(files, "File", name=name)
 
 
-def _units(root: ET.Element, table: Sequence[Variable]) -> None:
-    used = {variable.unit for variable in table}
+def _units(root: ET.Element, used: Collection[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     for name, exponents in UNITS.items():
         if name in used:
             unit = ET.SubElement(definitions, "Unit", name=name)
             base = {key: str(exponent) for key, exponent in exponents.items()}
             ET.SubElement(unit, "BaseUnit", {**base, "factor": "1"})
+            if name in DISPLAY:
+                display, factor = DISPLAY[name]
+                ET.SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
+
+
+def _types(root: ET.Element, used: Collection[str]) -> None:
+    definitions = ET.SubElement(root, "TypeDefinitions")
+    for unit, quantity in QUANTITIES.items():
+        if unit in used:
+            simple = ET.SubElement(definitions, "SimpleType", name=quantity)
+            real = ET.SubElement(simple, "Real", quantity=quantity, unit=unit)
+            if unit in DISPLAY:
+                real.set("displayUnit", DISPLAY[unit][0])
 
 
 def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
@@ -136,7 +182,26 @@ def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
         ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
 
 
-def _variables(root: ET.Element, table: Sequence[Variable], exchanges: bool) -> None:
+def _range(robot: Robot, variable: Variable) -> Range:
+    """Of values: the URDF's limits of a joint's position, else what the FMU refuses to leave."""
+    if variable.group == "q" and variable.index is not None:
+        limits = robot.q_min[variable.index], robot.q_max[variable.index]
+        low, high = (side if abs(side) < UNBOUNDED else math.inf * side for side in limits)
+        return Range(low, high, "")
+    return RANGES.get(variable.group, NO_RANGE)
+
+
+def _nominal(robot: Robot, variable: Variable) -> float:
+    """The size of values, 1 where there is no better one to be known."""
+    if variable.group in SMALL:
+        return float(variable.start or 1.0)
+    if variable.group in EFFORTS and variable.index is not None:
+        effort = robot.effort[variable.index]
+        return effort if 0.0 < effort < math.inf else 1.0
+    return 1.0
+
+
+def _variables(root: ET.Element, robot: Robot, table: Sequence[Variable], exchanges: bool) -> None:
     variables = ET.SubElement(root, "ModelVariables")
     at = {(variable.group, variable.index): i for i, variable in enumerate(table, start=1)}
     for reference, variable in enumerate(table):
@@ -156,15 +221,28 @@ def _variables(root: ET.Element, table: Sequence[Variable], exchanges: bool) -> 
         typed = ET.SubElement(scalar, variable.type)
         if variable.unit:
             typed.set("unit", variable.unit)
+        if variable.unit in QUANTITIES:
+            typed.set("declaredType", QUANTITIES[variable.unit])
+        within = _range(robot, variable)
+        _size(typed, within, _nominal(robot, variable))
         start = variable.start
         if state:  # FMI allows these two of an FMU for co-simulation alone neither
-            start = table[at[f"{variable.group}_start", variable.index] - 1].start
+            start = table[at[f"{variable.group}_start", variable.index] - 1].start or 0.0
+            start = min(max(start, within.low), within.high)
             typed.set("reinit", "true")
         if start is not None:
             boolean = variable.type == "Boolean"
             typed.set("start", str(start).lower() if boolean else repr(start))
         if variable.derivative_of:
             typed.set("derivative", str(at[variable.derivative_of, variable.index]))
+
+
+def _size(typed: ET.Element, within: Range, nominal: float) -> None:
+    for name, value, default in (
+        ("min", within.low, -math.inf), ("max", within.high, math.inf), ("nominal", nominal, 1.0),
+    ):  # fmt: skip
+        if value != default:
+            typed.set(name, repr(value))
 
 
 def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], control: Control) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Variable, count_event_indicators
+from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
 Array = NDArray[np.float64]
 
@@ -75,6 +75,7 @@ def model_header(
         + _table("int EXTENT", _extents(table, fmi)),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
+        _ranges(groups),
         _table("char *const JOINT_NAME", robot.joints),
         "/* The tree: parents are -1 for the root; joints from the root to the task frame. */\n"
         + _table("int PARENT", (parent - 1 for parent in parents)),
@@ -147,6 +148,20 @@ def _with_indicators(table: Sequence[Variable], count: int) -> list[Variable]:
     places = [*(("event_indicators", i) for i in range(count)), ("time", None)]
     added = [Variable(group, i, "local", "", None, "") for group, i in places]
     return [*table[:first], *added, *table[first:]]
+
+
+def _ranges(groups: Sequence[str]) -> str:
+    rows = "".join(
+        f"\n    {{{group.upper()}, {groups.count(group)}, {_literal(within.low)},"
+        f" {_literal(within.high)}, {_quoted(within.words)}}},"
+        for group, within in RANGES.items()
+        if group in groups
+    )
+    return (
+        "/* Values that variables may have; others may be any number. */\nstatic const struct {\n"
+        "    int first, count;\n    double low, high;\n    const char *words;\n"
+        f"}} RANGE[] = {{{rows}\n}};\n"
+    )
 
 
 def _extents(table: Sequence[Variable], fmi: int) -> list[int]:

@@ -144,9 +144,9 @@ def load_fmu(path: str | Path) -> Fmu:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
         form = f"FMI {description.fmiVersion} {kind}"
         raise FmuError(f"'{path}' is {form}; FMI 2.0 or 3.0 co-simulation is needed")
-    kind = root.find("CoSimulation[@providesDirectionalDerivatives]")  # FMPy knows 2.0's word
-    if kind is not None:
-        derivatives = kind.get("providesDirectionalDerivatives") in ("true", "1")
+    simulation = root.find("CoSimulation[@providesDirectionalDerivatives]")
+    if simulation is not None:  # FMPy knows 2.0's word for it
+        derivatives = simulation.get("providesDirectionalDerivatives") in ("true", "1")
         description.coSimulation.providesDirectionalDerivative = derivatives
     fmu = Fmu(
         path=path,

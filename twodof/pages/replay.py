@@ -20,8 +20,9 @@ from ..files import data_file, refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
 from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks
+from .meshes import ReadMesh
 from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
-from .robot import PageRobot, ReadMesh
+from .robot import PageRobot
 from .widgets import Plot, Readout, Switch
 
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)}

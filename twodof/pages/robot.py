@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import PageError
 from ..kinematics import Array, Kinematics
 from ..plant.urdf import Joint, RobotError, Urdf, read_urdf
 from ..plots.scales import COLOURS
-from ..ros.scene import floats, load_mesh, origin
+from ..ros.scene import floats, origin
+from .meshes import Colour, ReadMesh, mesh_parts
 from .page import Page
-
-ReadMesh = Callable[[str], bytes | None]
-"""The bytes of a mesh by its name ``meshes/…``, None where it is missing."""
 
 NO_MATERIAL = (0.62, 0.66, 0.70)
 
@@ -117,11 +114,15 @@ class PageRobot:
             self._scene.add_cylinder(name, number("radius"), number("length"), **look)
         elif element.tag == "mesh":
             file = element.get("filename", "").removeprefix("package://")
-            mesh = _mesh(file, self._read(file), floats(element, "scale", "1 1 1"))
-            if mesh is None:
+            parts = mesh_parts(file, self._read, floats(element, "scale", "1 1 1"))
+            if not parts:
                 self.missing.append(file)
                 return False
-            self._scene.add_mesh_simple(name, *mesh, flat_shading=True, **look)
+            for i, part in enumerate(parts):
+                own = {**look, "color": part.colour or look["color"]}
+                self._scene.add_mesh_simple(
+                    f"{name}/part{i}", part.vertices, part.triangles, flat_shading=True, **own
+                )
         else:
             return False
         return True
@@ -148,7 +149,7 @@ def _wxyz(rotation: Rotation) -> Array:
     return np.roll(rotation.as_quat(), 1, axis=-1)
 
 
-def _colour(tree: ET.Element, visual: ET.Element) -> tuple[float, float, float]:
+def _colour(tree: ET.Element, visual: ET.Element) -> Colour:
     material = visual.find("material")
     if material is not None:
         named = [m for m in tree.findall("material") if m.get("name") == material.get("name")]
@@ -157,18 +158,3 @@ def _colour(tree: ET.Element, visual: ET.Element) -> tuple[float, float, float]:
                 r, g, b = floats(colour, "rgba", "1 1 1 1")[:3].tolist()
                 return r, g, b
     return NO_MATERIAL
-
-
-def _mesh(
-    name: str, content: bytes | None, scale: Array
-) -> tuple[Array, NDArray[np.uint32]] | None:
-    """Vertices V × 3 in m and triangles T × 3; None where the mesh is not at hand."""
-    if content is None:
-        return None
-    try:
-        mesh = load_mesh(name, content, scale)
-    except ValueError:
-        return None
-    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
-    triangles = [(corner[0], corner[1], corner[2]) for corner in corners]
-    return np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32)

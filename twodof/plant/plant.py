@@ -22,7 +22,7 @@ from .mechanism import Mechanism
 from .orientation import quaternion
 from .robot import Robot
 from .stops import Stops
-from .variables import CONTROLS, Variable
+from .variables import CONTROLS, RANGES, Variable
 
 LAWS = {
     "task": task_control,
@@ -90,7 +90,7 @@ class Plant:
     rigid_stops: bool
 
     def __init__(self, robot: Robot, table: Sequence[Variable], control: str = "task") -> None:
-        self.robot, self.control = robot, control
+        self.robot, self.control, self._table = robot, control, table
         self._law, self._commands = LAWS[control].command, CONTROLS[control].commands
         for variable in table:
             if variable.causality in ("output", "local"):
@@ -270,13 +270,12 @@ class Plant:
             self._check_target()
         except DiscardError as error:
             raise ParameterError(str(error)) from error
-        for name in ("rtol", "atol", "max_step"):
-            if not getattr(self, name) > 0.0:
-                raise ParameterError(f"{name} = {getattr(self, name):g} must be > 0")
-        if not self.payload >= 0.0:
-            raise ParameterError(f"payload = {self.payload:g} must be >= 0")
-        if "rcond" in CONTROLS[self.control].parameters and not 0.0 <= self.rcond < 1.0:
-            raise ParameterError(f"rcond = {self.rcond:g} must be in [0, 1)")
+        for variable in self._table:
+            if variable.group in RANGES:
+                value = getattr(self, variable.group)
+                value = value if variable.index is None else value[variable.index]
+                if refusal := variable.refusal(value):
+                    raise ParameterError(refusal)
         for i, (low, high) in enumerate(zip(self.q_min, self.q_max)):
             if low > high:
                 raise ParameterError(

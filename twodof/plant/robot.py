@@ -89,17 +89,17 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
     check_axes(axes)
     urdf = read_urdf(text)
     odd: list[str] = []
-    for joint in urdf.joints.values():
-        if joint.moves:
-            _check_body(urdf, joint, odd)
+    bodies = {joint.child: _mass(urdf, joint, odd) for joint in urdf.joints.values() if joint.moves}
     warnings = list(urdf.warnings)
+    if empty := ", ".join(f"'{link}'" for link, mass in bodies.items() if not mass):
+        warnings.append(f"moving links without mass, which are taken as they are: {empty}")
     if odd:
         links = ", ".join(f"'{link}'" for link in dict.fromkeys(odd))
         warnings.append(
             "no body can have these inertias, one principal moment larger than the sum of the"
             f" other two, which are taken as they are: {links}"
         )
-    if not any(joint.moves for joint in urdf.joints.values()):
+    if not bodies:
         raise RobotError("the URDF has no moving joint")
     if frame not in urdf.links:
         raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
@@ -172,23 +172,15 @@ def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
     return low, high
 
 
-def _check_body(urdf: Urdf, joint: Joint, odd: list[str]) -> None:
-    """A moving body, that is a link with all that is fixed to it, needs physical inertia."""
+def _mass(urdf: Urdf, joint: Joint, odd: list[str]) -> float:
+    """Of a moving body, that is a link with all that is fixed to it, whose inertia is physical."""
     fixed = [other for other in urdf.joints.values() if not other.moves]
     body = [joint.child]
     for name in body:
         body.extend(other.child for other in fixed if other.parent == name)
     links = {str(link.get("name")): link for link in urdf.tree.findall("link")}
-    mass = 0.0
-    for name in body:
-        inertial = links[name].find("inertial")
-        if inertial is not None:
-            mass += _check_inertia(name, inertial, odd)
-    if mass == 0.0:
-        raise RobotError(
-            f"link '{joint.child}' moves (joint '{joint.name}') but has no mass;"
-            " give it an <inertial> with the mass and inertia of the part"
-        )
+    inertials = ((name, links[name].find("inertial")) for name in body)
+    return sum(_check_inertia(name, found, odd) for name, found in inertials if found is not None)
 
 
 def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
@@ -264,6 +256,7 @@ def _check_mass_matrix(robot: Robot) -> None:
         block = M[i:, i:]
         if not np.linalg.eigvalsh(block)[0] > 1e-12 * np.trace(block):
             raise RobotError(
-                f"joint '{robot.joints[i]}': the links behind it have no inertia about its axis,"
-                " so its acceleration is not defined"
+                f"joint '{robot.joints[i]}': the links behind it have no mass or no inertia about"
+                " its axis, so its acceleration is not defined; give them an <inertial> with those"
+                " of the part, or lock the joint with `lock`"
             )

@@ -6,6 +6,8 @@ value reference.
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,6 +16,26 @@ if TYPE_CHECKING:
     from .robot import Robot
 
 Value = float | bool
+
+
+@dataclass(frozen=True)
+class Range:
+    """Values that a variable may have, both ends among them, and how to say it."""
+
+    low: float
+    high: float
+    words: str
+
+
+NO_RANGE = Range(-math.inf, math.inf, "")
+NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
+POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
+RANGES = {
+    **dict.fromkeys(("Kp", "Kd", "Kp_rot", "Kd_rot", "Kn", "payload"), NOT_NEGATIVE),
+    **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),
+    "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
+}
+"""By group; what is not here may be any number. The FMU refuses what is outside."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +75,12 @@ class Variable:
     def type(self) -> str:
         """FMI type of the variable."""
         return "Boolean" if isinstance(self.start, bool) else "Real"
+
+    def refusal(self, value: Value) -> str:
+        """Why it cannot have a value, "" where it can."""
+        within = RANGES.get(self.group, NO_RANGE)
+        fits = within.low <= value <= within.high
+        return "" if fits else f"{self.name} = {value:g} must be {within.words}"
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """The table of a sweep: a folder of Parquet files that any reader of Parquet opens as one.
 
 While the sweep runs, its rows come in parts; when all are there, they become one file, in the order
-of the runs. All of pyarrow is here.
+of the runs. A table may come from elsewhere: what is read is what is written here, in bounded
+memory, or refused. All of pyarrow is here.
 """
 
 from __future__ import annotations
@@ -10,21 +11,25 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bag.provenance import NUMBER, VALUES, fits, parsed
 from ..errors import SweepError
-from ..files import is_being_written, lock, refusing, write_file
+from ..files import check_file, is_being_written, lock, refusing, write_file
+from .design import MAX_RUNS
 from .metrics import METRICS
 from .runner import Row
 
 try:
     import pandas
     import pyarrow as pa
+    import pyarrow.compute as pc
     import pyarrow.parquet as pq
 except ImportError as missing:
     raise SweepError(
@@ -37,6 +42,18 @@ KEY = b"twodof"
 PERIOD = 1.0  # s between two parts
 COMPARED = ("fmu", "design", "options", "bags")
 """What must be equal for a sweep to be resumed; so must the version of this package."""
+
+SHAPE = {
+    "fmu": {"file": str, "name": str, "guid": str},
+    "design": {"grids": {str: [NUMBER]}, "ranges": {str: [NUMBER]}, "draws": int},
+    "options": {"stop_time": NUMBER, "step": NUMBER, "settings": VALUES},
+    "versions": {"twodof": str},
+    "command_line": str,
+}
+"""Of the provenance that is read back."""
+MAX_SIZE = 512 * 1024**2
+"""Bytes of a table in memory: a million runs with a message each."""
+TEXTS = ["outcome", "message"]
 
 RANKED = ("settling_time", "peak_effort", "final_error")
 """The best run has settled first; of those that settle at the same sample, that of least effort."""
@@ -111,8 +128,7 @@ class Results:
             raise SweepError(f"there is no sweep '{self.path}' to resume")
         if is_being_written(self.path):
             raise SweepError(f"'{self.path}' is being written by another process")
-        for file in _files(self.path):
-            table = _read(file)
+        for file, table in _read(_files(self.path)):
             _check_same(self.path, _provenance(file, table.schema), provenance)
             self._schema = table.schema
             self.done[table.column("run").to_numpy()] = True
@@ -149,8 +165,8 @@ class Results:
         """One file in place of the parts, which go when it is whole."""
         parts = [file for file in _files(self.path) if file.name != WHOLE]
         if parts:
-            tables = [table for file in parts if len(table := _read(file))]
-            _write(self.path / WHOLE, pa.concat_tables(tables).sort_by("run").combine_chunks())
+            tables = pa.concat_tables(table for _, table in _read(parts))
+            _write(self.path / WHOLE, tables.sort_by("run").combine_chunks())
         for file in filter(_is_part, self.path.iterdir()):
             file.unlink()
 
@@ -165,7 +181,7 @@ def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
     files = _files(path)
     if not files:
         raise SweepError(f"'{path}' is no sweep: it has no {WHOLE} and no parts")
-    table = pa.concat_tables(map(_read, files)).sort_by("run")
+    table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")
     return table.to_pandas(), _provenance(files[0], table.schema)
 
 
@@ -203,18 +219,73 @@ def _is_part(file: Path) -> bool:
     return PART.fullmatch(file.name) is not None
 
 
-def _read(file: Path) -> pa.Table:
-    try:
-        return pq.read_table(file)
-    except (OSError, pa.ArrowException) as error:
-        raise SweepError(f"cannot read '{file}': {' '.join(str(error).split()):.300}") from error
+def _read(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
+    """Each file with its table."""
+    room = MAX_SIZE
+    for file in files:
+        try:
+            check_file(file, MAX_SIZE)
+            schema = pq.read_schema(file)
+            runs = _check_schema(file, schema)
+            with pq.ParquetFile(file, read_dictionary=TEXTS) as stored:
+                _check_size(file, stored.metadata, runs, room)
+                table = stored.read()
+            room -= table.nbytes + sum(_expanded(table.column(name)) for name in TEXTS)
+            if room < 0:
+                raise _damaged(file)
+            _check_values(file, table, runs)
+            yield file, table.cast(schema)
+        except (OSError, pa.ArrowException) as error:
+            reason = " ".join(str(error).split())
+            raise SweepError(f"cannot read '{file}': {reason:.300}") from error
+
+
+def _check_schema(file: Path, schema: pa.Schema) -> int:
+    """Refuse a table whose columns are not those of a sweep; how many runs its design has."""
+    design = _provenance(file, schema)["design"]
+    names = [*design["grids"], *design["ranges"]]
+    runs: int = prod(map(len, design["grids"].values())) * design["draws"]
+    if runs > MAX_RUNS or not schema.equals(_schema(names, names, {})):
+        raise _damaged(file)
+    return runs
+
+
+def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> None:
+    """Refuse a table that says of itself that it is larger than it can be, before it is read."""
+    groups = [content.row_group(i) for i in range(content.num_row_groups)]
+    size = sum(g.column(j).total_uncompressed_size for g in groups for j in range(g.num_columns))
+    if size > room or sum(group.num_rows for group in groups) > runs:
+        raise _damaged(file)
+
+
+def _expanded(texts: pa.ChunkedArray) -> int:
+    """Bytes of texts of which each is stored once, were they stored for each row."""
+    lengths = (pc.binary_length(chunk.dictionary).take(chunk.indices) for chunk in texts.chunks)
+    return sum(pc.sum(of, min_count=0).as_py() for of in lengths)
+
+
+def _check_values(file: Path, table: pa.Table, count: int) -> None:
+    """Refuse runs that the design has not, and numbers that are none."""
+    runs = table.column("run")
+    numbers = [column for column in table.columns if pa.types.is_float64(column.type)]
+    if len(table) and not (
+        len(runs.unique()) == len(runs)
+        and 0 <= pc.min(runs).as_py() <= pc.max(runs).as_py() < count
+        and all(pc.all(pc.is_finite(column), min_count=0).as_py() for column in numbers)
+    ):
+        raise _damaged(file)
+
+
+def _damaged(file: Path) -> SweepError:
+    return SweepError(f"cannot read '{file}': it is damaged")
 
 
 def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
     try:
-        provenance = json.loads((schema.metadata or {})[KEY])
-        assert isinstance(provenance, dict) and {*COMPARED, "versions"} <= {*provenance}
-    except (KeyError, ValueError, AssertionError):
+        provenance: dict[str, Any] = parsed((schema.metadata or {})[KEY])
+        if not fits(provenance, SHAPE):
+            raise ValueError
+    except (KeyError, ValueError, RecursionError):
         raise SweepError(f"'{file}' was not written by twodof") from None
     return provenance
 

@@ -1,0 +1,148 @@
+"""Meshes in colours: against the files' own XML, and as pixels of pages and exports."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import Counter
+from pathlib import Path
+
+import browser
+import numpy as np
+import pytest
+
+import twodof
+from twodof.cli.main import main
+from twodof.pages.meshes import mesh_parts
+from twodof.ros.scene import load_mesh
+
+ONE = np.ones(3)
+DAE = "{http://www.collada.org/2005/11/COLLADASchema}"
+
+
+@pytest.mark.parametrize("name", ["link0", "link5", "hand", "finger"])
+def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) -> None:
+    """Triangles of each colour are as many as the file's own lists say; the shape is coal's."""
+    content = (robots / f"panda_description/meshes/visual/{name}.dae").read_bytes()
+    tree = ET.fromstring(content)
+    diffuse = {
+        str(effect.get("id")): tuple(
+            round(float(value), 3)
+            for value in effect.find(f".//{DAE}diffuse/{DAE}color").text.split()[:3]
+        )
+        for effect in tree.iter(f"{DAE}effect")
+    }
+    effects = {
+        str(material.get("id")): material.find(f"{DAE}instance_effect").get("url")[1:]
+        for material in tree.iter(f"{DAE}material")
+    }
+    symbols = {
+        str(bound.get("symbol")): bound.get("target")[1:]
+        for bound in tree.iter(f"{DAE}instance_material")
+    }
+    expected: Counter[tuple[float, ...]] = Counter()
+    for kind in ("triangles", "polylist"):
+        for listed in tree.iter(f"{DAE}{kind}"):
+            colour = diffuse[effects[symbols[listed.get("material")]]]
+            expected[colour] += int(listed.get("count"))
+    parts = mesh_parts(f"{name}.dae", {f"{name}.dae": content}.get, 2.0 * ONE)
+    found: Counter[tuple[float, ...]] = Counter()
+    for part in parts:
+        nearest = min(diffuse.values(), key=lambda c: np.abs(np.subtract(c, part.colour)).max())
+        np.testing.assert_allclose(part.colour, nearest, atol=0.5 / 255 + 1e-3)
+        found[nearest] += len(part.triangles)
+    assert found == expected and len(found) > 1 - (name == "hand")
+    points = np.concatenate([part.vertices for part in parts])
+    shape = np.array(load_mesh(f"{name}.dae", content, 2.0 * ONE).vertices())
+    np.testing.assert_allclose(points.min(axis=0), shape.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(points.max(axis=0), shape.max(axis=0), atol=1e-6)
+
+
+CUBE = """mtllib colours.mtl
+o cube
+v -1 -1 -1
+v 1 -1 -1
+v 1 1 -1
+v -1 1 -1
+v -1 -1 1
+v 1 -1 1
+v 1 1 1
+v -1 1 1
+usemtl green
+f 1 4 3 2
+f 1 2 6 5
+f 3 4 8 7
+usemtl red
+f 5 6 7 8
+f 2 3 7 6
+f 4 1 5 8
+"""
+COLOURS = "newmtl red\nKd 0.9 0.05 0.05\nmap_Kd /etc/passwd\nnewmtl green\nKd 0.05 0.8 0.05\n"
+
+
+def test_an_obj_has_the_colours_of_its_library() -> None:
+    files = {"meshes/cube.obj": CUBE.encode(), "meshes/cube.obj.mtl": COLOURS.encode()}
+    parts = mesh_parts("meshes/cube.obj", files.get, np.array([1.0, 2.0, 3.0]))
+    assert {tuple(np.round(part.colour, 2)): len(part.triangles) for part in parts} == {
+        (0.9, 0.05, 0.05): 6, (0.05, 0.8, 0.05): 6,
+    }  # fmt: skip
+    assert np.abs(parts[0].vertices).max(axis=0).tolist() == [1.0, 2.0, 3.0]
+    del files["meshes/cube.obj.mtl"]
+    plain = mesh_parts("meshes/cube.obj", files.get, ONE)
+    assert {part.colour for part in plain} == {None}
+    assert sum(len(part.triangles) for part in plain) == 12
+
+
+def test_what_has_no_colours_or_cannot_be_read() -> None:
+    triangle = (
+        b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    )
+    files = {"a.stl": triangle + b"endloop\nendfacet\nendsolid a\n", "b.dae": b"<a", "c.obj": b"v"}
+    (part,) = mesh_parts("a.stl", files.get, ONE)
+    assert part.colour is None and part.triangles.tolist() == [[0, 1, 2]]
+    assert [mesh_parts(name, files.get, ONE) for name in ("b.dae", "c.obj", "d.dae")] == [[]] * 3
+
+
+URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/></material>
+<link name="base"/><link name="tip"><inertial><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial><visual>
+<origin xyz="0.5 0 0"/><geometry><mesh filename="cube.obj" scale="0.2 0.2 0.2"/></geometry>
+<material name="blue"/></visual></link><joint name="j" type="continuous"><parent link="base"/>
+<child link="tip"/><axis xyz="0 0 1"/></joint><link name="hand"/><joint name="k" type="fixed">
+<parent link="tip"/><child link="hand"/><origin xyz="1 0 0"/></joint></robot>"""
+
+
+def test_pages_and_exports_show_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both colours of the cube, and not the URDF's, which is for meshes without."""
+    for name, text in {"cube.urdf": URDF, "cube.obj": CUBE, "colours.mtl": COLOURS}.items():
+        (tmp_path / name).write_text(text)
+    options = twodof.FmuOptions(urdf=tmp_path / "cube.urdf", native=True, axes="y", name="Cube")
+    fmu = twodof.build_fmu(tmp_path / "Cube.fmu", options)
+    twodof.simulate(fmu, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "bag", "--export", "bag.html", "--no-browser"]) == 0
+    with browser.chromium() as shown:
+        with (
+            browser.served("view", "bag", cwd=tmp_path) as served,
+            browser.opened(shown, served.url) as page,
+        ):
+            assert min(coloured(browser.picture(page))) > 1000
+        with shown.new_context(viewport={"width": 450, "height": 280}, offline=True) as context:
+            context.set_default_timeout(1e3 * browser.PATIENCE)
+            page = context.new_page()
+            page.clock.install(time=0)
+            page.clock.pause_at(1)  # a replay that never rests cannot be looked at
+            page.goto((tmp_path / "bag.html").as_uri())
+            page.wait_for_selector("canvas")
+            for _ in range(20):  # while the scene is being loaded
+                page.clock.run_for(100)
+                seen = coloured(browser.still(page))
+                if min(seen) > 100:
+                    break
+            assert min(seen) > 100
+
+
+def coloured(shown: np.ndarray) -> tuple[int, int]:
+    """Numbers of pixels that are red and green."""
+    r, g, b = np.moveaxis(shown.astype(int), -1, 0)
+    red, green = (r > 100) & (g < r / 2) & (b < r / 2), (g > 80) & (r < g / 2) & (b < g / 2)
+    return int(red.sum()), int(green.sum())

@@ -1,0 +1,78 @@
+"""Meshes as a page draws them: triangles, in parts of one colour each."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..kinematics import Array
+from ..ros.scene import load_mesh
+
+LOG = logging.getLogger(__name__)
+ReadMesh = Callable[[str], bytes | None]
+"""The bytes of a mesh by its name ``meshes/…``, None where it is missing."""
+Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
+COLOURED = (".dae", ".obj")
+"""Formats that have colours."""
+
+
+class Part(NamedTuple):
+    """Vertices V × 3 in m and triangles T × 3, with their colour where the file says one."""
+
+    vertices: Array
+    triangles: NDArray[np.uint32]
+    colour: Colour | None
+
+
+def mesh_parts(name: str, read: ReadMesh, scale: Array) -> list[Part]:
+    """The parts of a mesh, none where it is not at hand or cannot be read.
+
+    Textures are not shown. An OBJ's colours are those of the file beside it that a build gives
+    its name and ``.mtl``.
+    """
+    content = read(name)
+    if content is None:
+        return []
+    suffix = Path(name).suffix.lower()
+    if suffix in COLOURED:
+        try:
+            return _coloured(suffix, content, read(f"{name}.mtl"), scale)
+        except Exception as error:  # of a foreign reader, each in its own way
+            LOG.info("mesh '%s' is drawn without its colours: %s", name, error)
+    try:
+        mesh = load_mesh(name, content, scale)
+    except ValueError:
+        return []
+    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
+    triangles = [(corner[0], corner[1], corner[2]) for corner in corners]
+    return [Part(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32), None)]
+
+
+def _coloured(suffix: str, content: bytes, library: bytes | None, scale: Array) -> list[Part]:
+    """By trimesh, which places the parts in the file's scene."""
+    import trimesh
+
+    files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # whatever it is called
+    scene = trimesh.load_scene(
+        io.BytesIO(content), file_type=suffix[1:], resolver=files, process=False
+    )
+    parts = []
+    for mesh in scene.dump():
+        material = getattr(mesh.visual, "material", None)
+        colour = None
+        if material is not None and not (suffix == ".obj" and library is None):
+            r, g, b = (float(value) / 255.0 for value in material.main_color[:3])
+            colour = r, g, b
+        vertices = np.array(mesh.vertices) * scale
+        parts.append(Part(vertices, np.array(mesh.faces, dtype=np.uint32), colour))
+    if not parts:
+        raise ValueError("the file has no triangles")
+    return parts
