@@ -191,9 +191,9 @@ def jacobians(instance, unknown, known):
     return np.array(directional).T, np.array(adjoint)
 
 
-@pytest.mark.parametrize("robot, control", COMBINATIONS)
-def test_adjoint_derivatives_are_the_transpose(pair, robot, control):
-    two, three = pair(robot, control)
+@pytest.mark.parametrize("control", ["task", "joint", "effort"])
+def test_adjoint_derivatives_are_the_transpose(pair, control):
+    two, three = pair("twodof", control)
     by_names = twodof.linearise(two, {"q": 0.3, "v": 0.2})
     ours = twodof.linearise(three, {"q": 0.3, "v": 0.2})
     for matrix in "ABCD":
