@@ -58,9 +58,9 @@ def receive() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
+    from twodof.ros.dds import dds_qos, dds_type
     from twodof.ros.messages import JOINT_STATE, STREAM
     from twodof.ros.network import Network, open_domain
-    from twodof.ros.publisher import dds_qos, dds_type
 
     _domain, _interfaces = open_domain(Network(DOMAIN, loopback=True))
     participant = DomainParticipant(DOMAIN)

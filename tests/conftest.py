@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 from harness import cannot_run
+from nodes import listen as listen
+from nodes import number as number
+from nodes import program as program
 
 import twodof
 

@@ -39,6 +39,7 @@ LIBRARIES = {
     "cyclonedds": {"ros"},
     "distributed": {"sweeps"},
     "fmpy": {"fmu"},
+    "foxglove": {"ros"},
     "lz4": {"bag"},
     "matplotlib": {"plots"},
     "pandas": {"sweeps", "bag", "plots", "cli"},  # tables: made, of a recording, drawn, printed

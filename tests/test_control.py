@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from harness import Driver, in_child_process
 from native_models import ROBOTS, Engine, Reduced, engine, model
 from scipy.integrate import solve_ivp
 
@@ -484,3 +485,32 @@ def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, ca
     assert bag.tau.shape == bag.q.shape and bag.target.shape[1] == (2 if follows else 0)
     loop = Loop(twodof.experiment(fmu, stop_time=np.inf))
     assert (loop.news().sample.error is None) == (not follows)
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+@in_child_process
+def test_states_go_on_bit_for_bit(fmus, control):
+    """Saved while joints rest on rigid stops, restored, serialised, and the whole after a reset."""
+    inputs = {
+        "task": {"x_des": (0.1, 0.25)},
+        "pose": {"quat_des": (0.0, 0.0, 0.3, 0.9), "Kd_rot": (5.0, 4.0, 3.0)},
+        "joint": {"q_des": (1.0, 1.0), "Kp": (300.0, 200.0)},
+        "effort": {"tau_cmd": (3.0, 1.0)},
+    }[control]
+    start = {"q_max": (0.6, 0.5), "rigid_stops": True, "payload": 0.05, "limit_effort": True}
+    for native in (False, True):
+        driver = Driver(fmus[control, native]).initialise(**start, **inputs)
+        first = driver.run(20)
+        state = driver.call("getFMUstate")
+        blob = driver.call("serializeFMUstate", state)
+        then = driver.run(20, 20)
+        assert any(row[0] == 0.6 or row[1] == 0.5 for row in first + then)
+        driver.set(f_ext=(1.0, 2.0, 3.0))
+        driver.run(3, 40)
+        for saved in (state, driver.call("deSerializeFMUstate", blob)):
+            driver.call("setFMUstate", saved)
+            assert driver.run(20, 20) == then
+        driver.call("reset")
+        driver.initialise(**start, **inputs)
+        assert driver.run(40) == first + then and driver.log == []
+        driver.free()

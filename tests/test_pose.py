@@ -297,7 +297,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 from twodof.ros.messages import POSE, STORE, STREAM, Message, _place
 from twodof.ros.network import network, open_domain
-from twodof.ros.publisher import dds_qos, dds_type
+from twodof.ros.dds import dds_qos, dds_type
 
 domain, _ = open_domain(network())
 participant = DomainParticipant(network().domain)

@@ -8,198 +8,36 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import re
-import shutil
 import signal
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from threading import Thread
-from typing import Any
 
 import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
 from harness import cannot_run, needs, wait_until
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
+from nodes import (
+    COMMANDS,
+    LATCHED,
+    STREAMS,
+    TWODOF,
+    Node,
+    ended,
+    environment,
+    published,
+    recorded,
+    stamp_of,
+)
 
 import twodof
 from twodof.cli.main import main
 from twodof.plots.track import read_tracks
 from twodof.ros.network import LAST_DOMAIN, Network, network
-
-HERE = Path(__file__).resolve().parent
-TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
-STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
-LATCHED = ("/robot_description", "/tf_static")
-COMMANDS = ("/target_command", "/clicked_point")
-DOMAINS = itertools.count(os.getpid())
-PATIENCE = 20.0  # s
-
-
-@pytest.fixture(scope="session")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Fast DDS node, compiled."""
-    generator, compiler = needs("fastddsgen"), needs("g++", "c++")
-    if not Path("/usr/include/fastdds/dds").is_dir():
-        cannot_run("the headers of Fast DDS are not installed (Debian: libfastrtps-dev)")
-    folder = tmp_path_factory.mktemp("fastdds")
-    for source in (HERE / "fastdds").iterdir():
-        shutil.copy(source, folder)
-    subprocess.run([generator, "-cs", "ros.idl"], cwd=folder, check=True, capture_output=True)
-    sources = [path.name for path in folder.glob("*.c[px][px]")]
-    command = [
-        compiler,
-        "-std=c++14",
-        "-w",
-        "-I.",
-        *sources,
-        "-lfastrtps",
-        "-lfastcdr",
-        "-o",
-        "node",
-    ]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return folder / "node"
-
-
-@pytest.fixture
-def number() -> int:
-    """A DDS domain that no other test uses."""
-    return 1 + next(DOMAINS) % 100
-
-
-class Node:
-    """A Fast DDS node that listens to topics, or talks on those of COMMANDS."""
-
-    def __init__(self, program: Path, number: int, *topics: str, inside: tuple[str, ...] = ()):
-        command = [*inside, str(program), str(number), *topics]
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            errors="surrogateescape",
-        )  # fmt: skip
-        self.told: list[list[Any]] = []
-        self._thread = Thread(target=self._read)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            if line.endswith("\n"):
-                self.told.append(json.loads(line))
-
-    def messages(self, topic: str) -> list[Any]:
-        """Fields of what came on a topic."""
-        return [it[3] for it in self.told if it[:2] == ["message", topic]]
-
-    def until(self, condition: Callable[[], Any], patience: float = PATIENCE) -> None:
-        end = time.monotonic() + patience
-        while not condition():
-            assert time.monotonic() < end, self.told[-3:]
-            time.sleep(0.02)
-
-    def hears(self, topic: str = "/joint_states", more: int = 5) -> None:
-        """Wait for some more messages."""
-        before = len(self.messages(topic))
-        self.until(lambda: len(self.messages(topic)) >= before + more)
-
-    def point(self, topic: str, frame: str, *xyz: float) -> None:
-        """Send a point to somebody who listens."""
-        self.until(lambda: ["matched", topic, 1] in self.told)
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{topic} {frame or '-'} {' '.join(map(repr, xyz))}\n")
-        self.process.stdin.flush()
-
-    def leave(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        try:
-            self.process.wait(PATIENCE)
-        finally:
-            self.process.kill()
-            self._thread.join()
-            self.process.wait()
-
-
-@pytest.fixture
-def listen(program: Path, number: int) -> Iterator[Callable[..., Node]]:
-    nodes: list[Node] = []
-
-    def begin(*topics: str, **options: Any) -> Node:
-        nodes.append(Node(program, number, *topics, **options))
-        return nodes[-1]
-
-    yield begin
-    for node in nodes:
-        if node.process.poll() is None:
-            node.process.send_signal(signal.SIGCONT)
-            node.leave()
-
-
-def environment(number: int, **variables: str) -> dict[str, str]:
-    kept = {n: v for n, v in os.environ.items() if not n.startswith(("ROS_", "CYCLONEDDS"))}
-    return {**kept, "ROS_DOMAIN_ID": str(number), "ROS_LOCALHOST_ONLY": "1", **variables}
-
-
-@contextmanager
-def published(
-    number: int, fmu: Path, *options: str, inside: tuple[str, ...] = (), **variables: str
-) -> Iterator[subprocess.Popen[str]]:
-    """``twodof publish`` in a process of its own, when it has told that it is on the network."""
-    process = subprocess.Popen(
-        [*inside, *TWODOF, "publish", str(fmu), *options],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=environment(number, **variables),
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        process.told = []  # type: ignore[attr-defined]
-        while not process.told or "ros2 topic echo" not in process.told[-1]:  # type: ignore[attr-defined]
-            process.told.append(process.stdout.readline())  # type: ignore[attr-defined]
-            assert process.told[-1], process.communicate()  # type: ignore[attr-defined]
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def ended(process: subprocess.Popen[str], status: int = 0) -> tuple[str, str]:
-    """What it said at its end."""
-    out, err = process.communicate(timeout=90.0)
-    assert process.returncode == status, err
-    return out, err
-
-
-def recorded(bag: Path) -> dict[str, list[Any]]:
-    """Fields of all messages by topic."""
-    found: dict[str, list[Any]] = {}
-    with (bag / f"{bag.name}.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, message, decoded in reader.iter_decoded_messages():
-            fields = listed(decoded)
-            found.setdefault(channel.topic, []).append(fields)
-            if channel.topic in STREAMS:
-                header = fields[0][0][0] if channel.topic == "/tf" else fields[0]
-                assert stamp_of(header) == message.log_time
-    return found
-
-
-def listed(message: Any) -> Any:
-    if hasattr(message, "__slots__"):
-        return [listed(getattr(message, name)) for name in message.__slots__]
-    return [listed(it) for it in message] if isinstance(message, list | tuple) else message
-
-
-def stamp_of(header: Any) -> int:
-    (seconds, nanoseconds), _frame = header
-    return int(seconds) * SECOND + int(nanoseconds)
 
 
 def test_another_makers_dds_hears_every_field_of_the_bag(
@@ -544,7 +382,7 @@ from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from twodof.ros.messages import STREAM
-from twodof.ros.publisher import dds_qos, dds_type
+from twodof.ros.dds import dds_qos, dds_type
 
 number, configuration = int(sys.argv[1]), sys.argv[2]
 domain = Domain(number, f"<CycloneDDS><Domain>{configuration}</Domain></CycloneDDS>")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from .version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from .bag.commands import read_commands as read_commands
     from .bag.reader import read_bag as read_bag
     from .bag.recording import Recording as Recording
     from .bag.recovery import recover as recover
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from .pages.live import live as live
     from .pages.replay import view as view
     from .plots.runs import plot as plot
+    from .ros.foxglove import Foxglove as Foxglove
     from .ros.publisher import Publisher as Publisher
     from .ros.publisher import publish as publish
     from .sweeps.coordinator import sweep as sweep
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
 # imported on first use: FMPy, rosbags and Pinocchio take a second together
 _HOMES = {
+    "bag.commands": ("read_commands",),
     "bag.reader": ("read_bag",),
     "bag.recording": ("Recording",),
     "bag.recovery": ("recover",),
@@ -54,6 +57,7 @@ _HOMES = {
     "pages.live": ("live",),
     "pages.replay": ("view",),
     "plots.runs": ("plot",),
+    "ros.foxglove": ("Foxglove",),
     "ros.publisher": ("Publisher", "publish"),
     "sweeps.coordinator": ("sweep",),
     "sweeps.results": ("read_sweep",),

@@ -91,6 +91,7 @@ def experiment(
     step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
     input_file: str | Path | None = None,
+    changes: Changes | None = None,
     stamp_start: float | None = None,
 ) -> Experiment:
     """Check what a run is asked to do.
@@ -102,6 +103,7 @@ def experiment(
         settings: start values of inputs and parameters by name; a vector's name takes one value
             for all elements or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
+        changes: in its place, times and inputs that change there, as of ``read_commands``.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
 
     Raises:
@@ -112,12 +114,15 @@ def experiment(
     if stop_time is None:
         stop_time = start_time + _default(fmu, "stopTime", 5.0) - _default(fmu, "startTime", 0.0)
     given = resolve(fmu, settings or {})
-    changes = [] if input_file is None else read_changes(fmu, input_file)
-    for name in changes[0][1] if changes else ():
-        if name in given:
-            raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
-    while changes and changes[0][0] <= start_time + TIME_TOLERANCE * step:
-        given |= changes.pop(0)[1]
+    if input_file is not None:
+        if changes is not None:
+            raise InputError("`input_file` and `changes` are both inputs over time; give one")
+        changes = read_changes(fmu, input_file)
+        for name in changes[0][1]:
+            if name in given:
+                raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
+        while changes and changes[0][0] <= start_time + TIME_TOLERANCE * step:
+            given |= changes.pop(0)[1]
     if stamp_start is not None and not isfinite(stamp_start):
         raise InputError(f"stamp_start = {stamp_start} is not finite")
     run = Experiment(
@@ -127,7 +132,7 @@ def experiment(
         steps=_steps(start_time, stop_time, step),
         start_values={**_declared_starts(fmu), **given},
         given=given,
-        changes=changes,
+        changes=changes or [],
         stamp_start=stamp_start,
     )
     run.first_stamp()  # which refuses what has none

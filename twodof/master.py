@@ -14,11 +14,11 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from itertools import accumulate, chain, count
-from math import asin, dist, hypot, isfinite
+from math import asin, dist, hypot, inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .errors import SimulationError
+from .errors import InputError, SimulationError
 from .experiments import (
     NANOSECONDS,
     TIME_TOLERANCE,
@@ -130,13 +130,18 @@ Resume = Callable[[Sample, SimulationError], Mapping[str, Setting] | None]
 class RealTime:
     """Paces a run to the wall clock.
 
+    Args:
+        speed: s of the run in a second.
+
     Attributes:
         missed: samples that were ready only after their time.
         worst: the largest delay, s.
     """
 
-    def __init__(self) -> None:
-        self.missed = 0
+    def __init__(self, speed: float = 1.0) -> None:
+        if not 0.0 < speed < inf:
+            raise InputError(f"`speed` {speed:g} is no factor")
+        self._speed, self.missed = speed, 0
         self.worst = 0.0
         self._start: float | None = None
 
@@ -145,8 +150,9 @@ class RealTime:
         self._start = None
 
     def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the wall clock is ``elapsed`` s after the first call, or ``stop`` is true."""
+        """Wait until ``elapsed`` s of the run are due since the first call, or ``stop`` is true."""
         now = time.perf_counter()
+        elapsed /= self._speed
         if self._start is None:
             self._start = now - elapsed
         due = self._start + elapsed
@@ -273,12 +279,16 @@ def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
 
     With them a run can go on after a step that was discarded: across a singularity, speeds can
     escape to infinity in finite time after a target that is out of reach. None where the FMU has
-    not the variables.
+    no such variables.
     """
-    values = {"q_start": sample.q, "v_start": (0.0,) * len(sample.v), "x_des": sample.x}
-    if sample.quat:
-        values["quat_des"] = sample.quat
-    return values if all(fmu.vector(group) for group in values) else None
+    still = (0.0,) * len(sample.v)
+    start = {"q_start": sample.q, "v_start": still}
+    targets = {
+        "x_des": sample.x, "quat_des": sample.quat,
+        "q_des": sample.q, "v_des": still, "a_des": still, "tau_cmd": still,
+    }  # fmt: skip
+    meant = {group: value for group, value in targets.items() if value and fmu.vector(group)}
+    return {**start, **meant} if meant and all(map(fmu.vector, start)) else None
 
 
 @dataclass(frozen=True)

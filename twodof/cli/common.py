@@ -108,11 +108,18 @@ def experiment_of(
 ) -> Experiment:
     """The experiment that the options ask for."""
     from ..experiments import experiment
+    from ..fmu import load_fmu
 
+    fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
+    if table is not None:
+        folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
+        if Path(folder).is_dir() and folder:
+            from ..bag.commands import read_commands
+
+            table, changes = None, read_commands(fmu, folder, topic)
     return experiment(
-        chosen_fmu(options), stop_time=stop_time, step=step,
-        settings=parse_settings(options.settings), input_file=options.input,
-        stamp_start=options.stamp_start,
+        fmu, stop_time=stop_time, step=step, settings=parse_settings(options.settings),
+        input_file=table, changes=changes, stamp_start=options.stamp_start,
     )  # fmt: skip
 
 

@@ -15,7 +15,9 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     add_set_option(parser)
     parser.add_argument(
-        "--input", metavar="CSV", help="inputs over time: a column 'time' and one for each input"
+        "--input",
+        metavar="CSV|BAG[:TOPIC]",
+        help="inputs over time: a column 'time' and one for each input; or a bag's commands",
     )
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
     parser.add_argument(

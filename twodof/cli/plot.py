@@ -46,11 +46,13 @@ def call(options: argparse.Namespace) -> int:
 def _plot_bags(options: argparse.Namespace) -> int:
     from ..plots.runs import drawing
     from ..plots.track import read_tracks
-    from ..plots.words import labels, outcome
+    from ..plots.words import difference, labels, outcome
 
     tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
     results = [pair for pair in zip(labels(tracks), map(outcome, tracks)) if pair[1]]
-    _show_or_save(drawing(tracks), options.output, *results)
+    for track in tracks[1:]:
+        results.append((track.name, difference(tracks[0], track)))
+    _show_or_save(drawing(tracks), options.output, *filter(lambda pair: pair[1], results))
     return 0
 
 

@@ -22,6 +22,7 @@ from .common import (
 from .options import add_run_options
 
 if TYPE_CHECKING:
+    from ..ros.foxglove import Foxglove
     from ..ros.publisher import Publisher
 
 
@@ -30,7 +31,8 @@ def add(verbs: Any) -> None:
     publish = verbs.add_parser(
         "publish", help="step an FMU in real time on a ROS 2 network",
         description="Step an FMU in real time and publish each step as sensor_msgs/JointState over"
-        " DDS, until Ctrl-C. Points on /target_command and /clicked_point move the target. Honours"
+        " DDS, until Ctrl-C. Commands from others drive the robot: joint states on /joint_commands,"
+        " or points on /target_command and /clicked_point, as its control takes. Honours"
         " ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and"
         " CYCLONEDDS_URI.",
     )  # fmt: skip
@@ -42,15 +44,51 @@ def add(verbs: Any) -> None:
     publish.add_argument(
         "--subnet", action="store_true", help="for other hosts too, not for this one alone"
     )
+    publish.add_argument(
+        "--foxglove", action="store_true", help="serve Foxglove too, on this machine alone"
+    )
+    publish.add_argument(
+        "--foxglove-port", dest="port", type=int, default=8765, metavar="PORT", help="(%(default)s)"
+    )
+    _add_loop_options(publish)
     add_run_options(publish)
     publish.set_defaults(call=call)
+
+
+def _add_loop_options(publish: argparse.ArgumentParser) -> None:
+    """Of a robot in the loop of a controller."""
+    publish.add_argument("--namespace", default="", metavar="NS", help="of the topics")
+    publish.add_argument(
+        "--state-topic", default="joint_states", metavar="TOPIC", help="(%(default)s)"
+    )
+    publish.add_argument(
+        "--command-topic", metavar="TOPIC",
+        help="where commands are heard (joint_commands or target_command, as the control takes)",
+    )  # fmt: skip
+    publish.add_argument(
+        "--lockstep", action="store_true", help="do a step when its command has come, by stamp"
+    )
+    publish.add_argument(
+        "--timeout", type=float, metavar="S",
+        help="s without a command until the robot is held (0.5), or in lockstep until the end (10)",
+    )  # fmt: skip
+    publish.add_argument(
+        "--on-timeout", choices=("hold", "ramp"),
+        help="hold the last command (targets), or ramp to zero (efforts)",
+    )  # fmt: skip
+    publish.add_argument(
+        "--clock", action="store_true", help="publish /clock, and hear /pause and /step"
+    )
+    publish.add_argument(
+        "--speed", type=float, metavar="FACTOR", help="of real time (1; in lockstep unlimited)"
+    )
 
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     from ..master import RealTime
     from ..ros.network import network
-    from ..ros.publisher import publish
+    from ..ros.publisher import Publisher, publish
 
     if not 0.0 < options.rate < math.inf:
         raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")
@@ -60,11 +98,19 @@ def call(options: argparse.Namespace) -> int:
     endless = options.stop_time is None
     run = experiment_of(options, math.inf if endless else options.stop_time, 1.0 / options.rate)
     bag = bag_of(options, options.output) if options.output else None
-    pace = RealTime()
+    wire = Publisher(
+        place, scene=options.scene, effort=options.effort, clock=options.clock,
+        namespace=options.namespace, state_topic=options.state_topic,
+        command_topic=options.command_topic, lockstep=options.lockstep, timeout=options.timeout,
+        on_timeout=options.on_timeout, opened=_print_network,
+    )  # fmt: skip
+    speed = 1.0 if options.speed is None and not options.lockstep else options.speed
+    pace = None if speed is None else RealTime(speed)
+    viewer = _foxglove(options) if options.foxglove else None
     with asked_to_stop() as asked:
         summary = publish(
-            run, *filter(None, [bag]), place=place, scene=options.scene, effort=options.effort,
-            opened=_print_network, pace=pace, stop=asked,
+            run, *filter(None, [viewer, bag]), wire=wire, pace=pace, stop=asked,
+            steer=viewer.command if viewer else dict,
         )  # fmt: skip
     print_summary(options, run, bag, summary, pace)
     if bag is not None and not options.json:
@@ -72,13 +118,22 @@ def call(options: argparse.Namespace) -> int:
     return INTERRUPTED if summary.stopped else 0
 
 
+def _foxglove(options: argparse.Namespace) -> Foxglove:
+    from ..ros.foxglove import Foxglove
+
+    def tell(server: Foxglove) -> None:
+        print(f"open  Foxglove, Open connection, Foxglove WebSocket: {server.url}", flush=True)
+
+    return Foxglove(options.port, scene=options.scene, effort=options.effort, opened=tell)
+
+
 def _print_network(wire: Publisher) -> None:
     place = wire.place
     print_table(
         ("topics", ", ".join(wire.topics)),
         ("network", f"DDS domain {place.domain} on {wire.interface}, {in_options(place.reach)}"),
-        ("targets", f"from {', '.join(wire.commands)}" if wire.commands else "fixed"),
+        ("commands", f"from {', '.join(wire.commands)}" if wire.commands else "none"),
         ("end", "Ctrl-C"),
     )
-    print_next("ros2 topic echo /joint_states")
+    print_next(f"ros2 topic echo {wire.topics[0]}")
     sys.stdout.flush()

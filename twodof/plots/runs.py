@@ -59,8 +59,10 @@ def plot(
 
 def drawing(tracks: Sequence[Track]) -> Drawing:
     """What to draw of tracks; the table has a column for each."""
-    name = tracks[0].name + (f"-and-{len(tracks) - 1}-more" if len(tracks) > 1 else "")
-    return Drawing(_title(tracks), name, partial(_draw, tracks), [*map(summary, tracks)])
+    first, *others = tracks
+    table = [summary(first), *(summary(other, first) for other in others)]
+    name = first.name + (f"-and-{len(tracks) - 1}-more" if len(tracks) > 1 else "")
+    return Drawing(_title(tracks), name, partial(_draw, tracks), table)
 
 
 class _Page:

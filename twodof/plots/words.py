@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..files import shown
 from .track import Track, number
 
@@ -64,8 +66,29 @@ def outcome(track: Track) -> str:
     return text
 
 
-def summary(track: Track) -> dict[str, str]:
-    """The main numbers of a run in words, by what they are."""
+def difference(first: Track, other: Track) -> str:
+    """How far the joints of a run are from those of another, while both last; "" if none is theirs.
+
+    Positions of the other are interpolated linearly to the times of the first.
+    """
+    both = first.t <= other.t[-1]
+    places = {joint.name: joint.q for joint in other.joints}
+    worst = ""
+    most = -1.0
+    for joint in first.joints:
+        if joint.name in places and both.any():
+            off = np.abs(joint.q[both] - np.interp(first.t[both], other.t, places[joint.name]))
+            if off.max() > most:
+                most, at = float(off.max()), float(first.t[both][off.argmax()])
+                spread = float(np.sqrt(np.mean(off**2)))
+                where = f"at most, {joint.name} at {number(at)} s; RMS {spread:.3g}"
+                size = f"{most:.3g} {joint.unit}".strip()
+                worst = f"{size} off '{first.name}' {where}"
+    return worst
+
+
+def summary(track: Track, first: Track | None = None) -> dict[str, str]:
+    """The main numbers of a run in words, by what they are; and how far it is off the first."""
     settings = {
         key: track.settings[key]
         for key in ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
@@ -82,4 +105,6 @@ def summary(track: Track) -> dict[str, str]:
     }
     if track.task:
         rows["result"] = outcome(track)
+    if first is not None:
+        rows["difference"] = difference(first, track)
     return rows

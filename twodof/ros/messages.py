@@ -29,6 +29,7 @@ JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TARGET = "/target"
 END_EFFECTOR = "/end_effector"
+CLOCK = "/clock"
 POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 FOREVER = QosTime(9223372036, 854775807)
@@ -77,6 +78,7 @@ class Messages:
         run: the experiment whose samples come.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
+        clock: also the samples' stamps as the time.
 
     Attributes:
         topics: all topics by name.
@@ -85,11 +87,12 @@ class Messages:
         BagError: the FMU has not what is asked for.
     """
 
-    def __init__(self, run: Experiment, *, scene: bool, effort: bool) -> None:
+    def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False) -> None:
         if effort and not run.fmu.vector("tau"):
             raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
         self._effort = effort
         self._scene = _load_scene(run) if scene else None
+        self._clock = clock
         self._axes = run.fmu.axes
         self._root = run.fmu.root
         n = len(run.fmu.joints)
@@ -101,12 +104,17 @@ class Messages:
                 self.topics |= dict.fromkeys((TARGET, END_EFFECTOR), Topic(POSE, STREAM))
             if not run.fmu.vector("x_des"):
                 del self.topics[TARGET]
+        if clock:
+            self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
 
     def of(self, sample: Sample) -> list[tuple[str, Serialised]]:
         """Topics and messages of one sample."""
         effort = sample.tau if self._effort else ()
         state = self._joint_state.pack(sample.stamp, sample.q, sample.v, effort)
         messages: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
+        if self._clock:
+            now = Message["rosgraph_msgs/msg/Clock"](clock=_time(sample.stamp))
+            messages.insert(0, self._serialise((CLOCK, now)))
         if self._scene is not None:
             messages += map(self._serialise, self._of_scene(self._scene, sample))
         return messages
@@ -151,12 +159,13 @@ def _load_scene(run: Experiment) -> Scene:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
 
 
-def _header(stamp: int, frame: str) -> Any:
+def _time(stamp: int) -> Any:
     seconds, nanoseconds = divmod(stamp, NANOSECONDS)
-    time_type = Message["builtin_interfaces/msg/Time"]
-    return Message["std_msgs/msg/Header"](
-        stamp=time_type(sec=seconds, nanosec=nanoseconds), frame_id=frame
-    )
+    return Message["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+
+
+def _header(stamp: int, frame: str) -> Any:
+    return Message["std_msgs/msg/Header"](stamp=_time(stamp), frame_id=frame)
 
 
 def _place(stamp: int, frame: str, xyz: Sequence[float], quat: Sequence[float] | None) -> Any:

@@ -16,13 +16,10 @@ from xml.sax.saxutils import quoteattr
 
 from ..errors import PublishError
 from ..files import temporary_folder
+from . import dds  # noqa: F401 - says what to install where what follows is missing
 
-try:
-    from cyclonedds import core, domain
-except ImportError as missing:
-    raise PublishError(
-        f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')"
-    ) from missing
+# isort: split
+from cyclonedds import core, domain
 
 LOG = logging.getLogger(__name__)
 RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")

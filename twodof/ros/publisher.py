@@ -1,111 +1,62 @@
-"""A run on a ROS 2 network: the messages of the bag over DDS, and targets that others ask for.
-
-Names, types and qualities of service are those of ROS 2 (REP 2011's type hashes, rmw_cyclonedds of
-Jazzy), so that its tools see the run as they see any node's.
-"""
+"""A run on a ROS 2 network: the messages of the bag over DDS, and commands from others."""
 
 from __future__ import annotations
 
-import functools
 import logging
+import re
+import time
 from collections.abc import Callable, Mapping
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Nodetype, Qos, QosDurability
-
-from ..errors import PublishError, SimulationError
-from ..experiments import Experiment, Setting, experiment
+from ..errors import InputError, PublishError, SimulationError
+from ..experiments import NANOSECONDS, Experiment, Setting, experiment
 from ..fmu import Fmu
 from ..master import RealTime, Sample, Sink, Summary, at_rest, simulate
-from .messages import POINT, POSE, STORE, STREAM, Messages, Serialised
+from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
+from .dds import dds_qos, dds_topic
+from .listener import Listener
+from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, Serialised
 from .network import Network, network, open_domain
 
 # isort: split
-from cyclonedds import core, domain, idl, pub, qos, sub, topic  # where missing, network says so
+from cyclonedds import core, domain, pub  # where missing, dds says so
 
 LOG = logging.getLogger(__name__)
-COMMANDS = ("/target_command", "/clicked_point")
-LONGEST_NAME = 80  # of a frame, that is told
-
-
-class Carrier:
-    """What every DDS type does with its messages: carry them serialised.
-
-    What the bytes mean is rosbags' business.
-    """
-
-    def __init__(self, cdr: Serialised) -> None:
-        self.cdr = cdr
-
-    def serialize(self, **_options: object) -> bytes:
-        """The bytes, as Cyclone DDS asks for them."""
-        return bytes(self.cdr)
-
-    @classmethod
-    def deserialize(cls, cdr: bytes) -> Carrier:
-        """A message that has come."""
-        return cls(cdr)
-
-    @classmethod
-    def deserialize_key(cls, _key: bytes) -> None:
-        """A notice without a message, that a writer has left."""
-
-
-@functools.cache
-def dds_type(name: str) -> Any:
-    """The DDS type of a ROS 2 message type, with the names that rosidl_generator_dds_idl gives."""
-    package, _, kind = name.split("/")
-    fields = {f"{field}_": _field_type(*of) for field, of in STORE.fielddefs[name][1]}
-    struct = idl.make_idl_struct(
-        f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False
-    )
-    for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
-        setattr(struct, method, vars(Carrier)[method])  # a base would be part of the type
-    return struct
-
-
-def _field_type(node: Nodetype, of: Any) -> Any:
-    if node is Nodetype.NAME:
-        return dds_type(of)
-    if node is Nodetype.SEQUENCE:
-        return idl.types.sequence[_field_type(*of[0])]
-    return str if of[0] == "string" else getattr(idl.types, of[0])
-
-
-def dds_qos(offered: Qos, type_name: str) -> Any:
-    """Quality of service of a writer or reader.
-
-    A write never waits for a reader: one that does not keep up misses messages.
-    """
-    latched = offered.durability is QosDurability.TRANSIENT_LOCAL
-    return qos.Qos(
-        qos.Policy.Reliability.Reliable(max_blocking_time=0),
-        qos.Policy.Durability.TransientLocal if latched else qos.Policy.Durability.Volatile,
-        qos.Policy.History.KeepLast(offered.depth),
-        qos.Policy.DataRepresentation(use_cdrv0_representation=True),
-        qos.Policy.Userdata(f"typehash={STORE.hash_rihs01(type_name)};".encode()),
-    )
+JOINT_COMMANDS, TARGET_COMMAND, CLICKED_POINT = "joint_commands", "target_command", "clicked_point"
+NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+LOCKSTEP_TIMEOUT = 10.0  # s
 
 
 class Publisher(Sink):
-    """A sink that publishes each sample, and hears of targets.
+    """A sink that publishes each sample, and hears of targets and commands.
 
     Args:
         place: the network; None: what the environment asks for.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
+        clock: also the samples' stamps as /clock; and hear /pause and /step.
+        namespace: of all topics but /clock, /pause, /step and names given that begin with "/".
+        state_topic: of the joint states.
+        command_topic: where commands are heard; None: "joint_commands", or "target_command" for an
+            FMU whose control has a target of the frame.
+        lockstep: each communication step awaits the command that has the sample's stamp.
+        timeout: s without a command until the robot is held, or in lockstep until the run ends,
+            by the wall clock; None: 0.5, in lockstep 10.
+        on_timeout: "hold" or "ramp", as of ``Watchdog``; None: what is safe.
         opened: told when the network is open.
 
     Attributes:
+        lockstep: as given.
         place: the network.
         interface: names of the network interfaces in use, known when it is open.
         topics: what is published.
-        commands: the topics on which targets are heard of; none where the FMU has no inputs
-            x_des[k], or does not say which axes of which frame they are. Known when it has begun.
+        commands: the topics on which commands are heard; none where the FMU has no inputs for
+            them, or does not say which axes of which frame targets are. Known when it has begun.
 
     Raises:
+        InputError: an argument is wrong.
         PublishError: the network cannot be used as asked for.
     """
 
@@ -115,56 +66,108 @@ class Publisher(Sink):
         *,
         scene: bool = False,
         effort: bool = False,
+        clock: bool = False,
+        namespace: str = "",
+        state_topic: str = JOINT_STATES[1:],
+        command_topic: str | None = None,
+        lockstep: bool = False,
+        timeout: float | None = None,
+        on_timeout: str | None = None,
         opened: Callable[[Publisher], None] = lambda publisher: None,
     ) -> None:
+        names = {"namespace": namespace, "state_topic": state_topic, "command_topic": command_topic}
+        for argument, name in names.items():
+            if name and not NAME.fullmatch(name):
+                raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
+        if on_timeout not in (None, "hold", "ramp"):
+            raise InputError(f"`on_timeout` '{on_timeout}' is not 'hold' or 'ramp'")
+        if timeout is not None and not 0.0 < timeout < inf:
+            raise InputError(f"`timeout` {timeout:g} is no time")
+        names = {"namespace": namespace, "state_topic": state_topic, "command_topic": command_topic}
+        for argument, name in names.items():
+            if name and not NAME.fullmatch(name):
+                raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
+        if on_timeout not in (None, "hold", "ramp"):
+            raise InputError(f"`on_timeout` '{on_timeout}' is not 'hold' or 'ramp'")
+        if timeout is not None and not 0.0 < timeout < inf:
+            raise InputError(f"`timeout` {timeout:g} is no time")
         self._opened = opened
         self.place = network() if place is None else place
-        self.interface = ""
-        self._scene, self._effort = scene, effort
-        self._begun = False
-        self._warned: set[str] = set()
+        self.interface, self.lockstep = "", lockstep
+        self._scene, self._effort, self._clock = scene, effort, clock
+        self._prefix = f"/{namespace.strip('/')}" if namespace else ""
+        self._state_topic, self._command_topic = state_topic, command_topic
+        self._timeout, self._on_timeout = timeout, on_timeout
+        self._begun = self._answered = False
+        self._warn = warner(LOG)
 
     def begin(self, run: Experiment) -> Publisher:
         """Take the experiment whose samples come.
 
         Raises:
             BagError: the FMU has not what is asked for.
+            InputError: it has nothing to command, or no effort to ramp.
         """
-        self._fmu, self._axes, self._root = run.fmu, run.fmu.axes, run.fmu.root
-        self._messages = Messages(run, scene=self._scene, effort=self._effort)
-        self.topics = tuple(self._messages.topics)
-        self.commands = COMMANDS if self._axes and run.fmu.vector("x_des") else ()
-        turns = bool(run.fmu.vector("quat_des"))
-        self._heard = dict(zip(self.commands, (POSE if turns else POINT, POINT)))
+        self._run, self._follows = run, Commands(run.fmu)
+        self._messages = Messages(run, scene=self._scene, effort=self._effort, clock=self._clock)
+        self.topics = tuple(map(self._named, self._messages.topics))
+        of_joints = self._follows.type == JOINT_STATE
+        self._watchdog: Watchdog | None = None
+        if of_joints and not self.lockstep:
+            ramp = None if self._on_timeout is None else self._on_timeout == "ramp"
+            self._watchdog = Watchdog(run.fmu, self._timeout or TIMEOUT, ramp)
+        elif self._on_timeout is not None:
+            raise InputError("`on_timeout` is for commands of joints that are not in `lockstep`")
+        self._heard = {}
+        if self._follows.type:
+            usual = JOINT_COMMANDS if of_joints else TARGET_COMMAND
+            self._heard[self._resolved(self._command_topic or usual)] = self._follows.type
+            if not of_joints and not self.lockstep:
+                self._heard[self._resolved(CLICKED_POINT)] = POINT
+        elif self.lockstep or self._command_topic:
+            raise InputError(f"'{run.fmu.path}' has no inputs that `command_topic` could command")
+        self.commands = tuple(self._heard)
+        for both in {*self.commands} & {*self.topics}:
+            raise InputError(f"`command_topic` is '{both}', which is published")
         return self
+
+    def _named(self, name: str) -> str:
+        """The name on the network of a topic of ours."""
+        if name == CLOCK:  # there is one
+            return name
+        return self._resolved(self._state_topic if name == JOINT_STATES else name[1:])
+
+    def _resolved(self, name: str) -> str:
+        """As ROS 2 resolves names: one that does not begin with "/" is in the namespace."""
+        return name if name.startswith("/") else f"{self._prefix}/{name}"
 
     def __enter__(self) -> Publisher:
         self._domain, self.interface = open_domain(self.place)
         try:
-            self._participant = domain.DomainParticipant(self.place.domain)
+            participant = self._participant = domain.DomainParticipant(self.place.domain)
             self._writers = {
                 name: pub.DataWriter(
-                    self._participant, self._topic(name, said.type), dds_qos(said.qos, said.type)
+                    participant,
+                    dds_topic(participant, self._named(name), said.type),
+                    dds_qos(said.qos, said.type),
                 )
                 for name, said in self._messages.topics.items()
             }
-            self._readers = [
-                sub.DataReader(self._participant, self._topic(name, kind), dds_qos(STREAM, kind))
-                for name, kind in self._heard.items()
-            ]
+            self._listener = Listener(
+                participant, self._follows, self._heard, orders=self._clock,
+                oldest=None if self._watchdog is None else self._watchdog.timeout,
+            )  # fmt: skip
         except core.DDSException as error:
             raise PublishError(f"DDS domain {self.place.domain} fails: {error}") from error
         self._opened(self)
         return self
-
-    def _topic(self, name: str, type_name: str) -> Any:
-        return topic.Topic(self._participant, f"rt{name}", dds_type(type_name))
 
     def write(self, sample: Sample) -> None:
         """Publish one sample: one JointState, and the scene's messages."""
         if not self._begun:
             self._begun = True
             self._publish(self._messages.latched(sample.stamp))
+        self._sample = sample
         self._publish(self._messages.of(sample))
 
     def _publish(self, messages: list[tuple[str, Serialised]]) -> None:
@@ -173,72 +176,85 @@ class Publisher(Sink):
             try:
                 writer.write(writer.data_type(cdr))
             except core.DDSException as error:
-                self._warn_once(name, f"messages on {name} are lost: {error}")
+                self._warn(name, f"messages on {name} are lost: {error}")
 
-    def command(self) -> dict[str, tuple[float, ...]] | None:
-        """The target that was asked for since the last call, as inputs of the FMU, if one was.
+    def command(
+        self, stop: Callable[[], bool] = lambda: False, pace: RealTime | None = None
+    ) -> Mapping[str, Setting] | None:
+        """What others ask of the FMU from the latest sample on, as inputs, if they do.
 
-        Points and poses are in the frame of the robot's root, which an empty frame_id means too.
-        One in another frame, or whose numbers are not finite or no orientation, is ignored.
+        Waits while the run is paused and, in lockstep, for the command that belongs to the sample.
+
+        Args:
+            stop: asked while it waits; True ends that.
+            pace: begins anew after a pause.
+
+        Raises:
+            PublishError: in lockstep no command came in time; it says who is missing.
         """
-        target: dict[str, tuple[float, ...]] = {}
-        for (name, kind), reader in zip(self._heard.items(), self._readers):
-            for message in reader.take(STREAM.depth):
-                if message.sample_info.valid_data:
-                    target |= self._target(name, kind, message.cdr)
-        return target or None
+        self._listener.await_go(stop, pace)
+        if self.lockstep:
+            return self._await_command(stop)
+        asked: Inputs = {}
+        for command in self._listener.commands(self._sample):
+            asked |= command.inputs
+        if self._watchdog is not None:
+            if not asked:
+                return self._watchdog.asked(self._sample.t)
+            self._watchdog.heard(self._sample.t, asked)
+        return asked
+
+    def _await_command(self, stop: Callable[[], bool]) -> Inputs | None:
+        """The command that has the latest sample's stamp; the last sample needs none."""
+        sample, latest, begun = self._sample, None, time.monotonic()
+        while sample.k < self._run.steps and not stop():
+            for command in self._listener.commands(sample):
+                latest = command.stamp
+                if latest == sample.stamp:
+                    self._answered = True
+                    return command.inputs
+            waited = time.monotonic() - begun
+            if waited > (self._timeout or LOCKSTEP_TIMEOUT):
+                raise PublishError(
+                    f"no command for the sample at t = {sample.t:g} s in {waited:.3g} s:"
+                    f" {self._missing(latest)}"
+                )
+            if not self._listener.wait() and not self._answered:
+                self._publish(self._messages.of(sample))  # who comes now has missed it
+        return None
+
+    def _missing(self, latest: int | None) -> str:
+        """Who is missing, by the stamp of the latest command."""
+        (name,) = self.commands
+        if latest is not None:
+            own = self._sample.stamp / NANOSECONDS
+            told = f"the latest on {name} is stamped {latest / NANOSECONDS:.9f} s, not {own:.9f} s"
+            return f"{told}; a command has the stamp of the state that it answers"
+        if not self._listener.is_matched(name):
+            return f"nobody publishes on {name}"
+        if not self._writers[JOINT_STATES].get_matched_subscriptions():
+            return f"nobody hears {self._named(JOINT_STATES)}"
+        return f"who publishes on {name} is silent"
 
     def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
-        """What a run goes on with where a step was discarded: who asks for targets ends no run."""
-        rest = at_rest(self._fmu, sample) if self.commands else None
+        """What a run goes on with where a step was discarded: who commands ends no run."""
+        rest = at_rest(self._run.fmu, sample) if self.commands else None
         if rest is not None:
-            self._warn_once("rest", f"{error}: the robot is stopped, and its target is where it is")
+            self._warn("rest", f"{error}: the robot is stopped, and its target is where it is")
         return rest
-
-    def _target(self, name: str, kind: str, cdr: Serialised) -> dict[str, tuple[float, ...]]:
-        """What a message asks for, as inputs of the FMU; nothing where it is ignored."""
-        what = "a pose" if kind == POSE else "a point"
-        try:
-            message: Any = STORE.deserialize_cdr(cdr, kind)
-        except Exception as error:  # the bytes are anybody's
-            self._warn_once("bytes", f"{what} on {name} cannot be read ({error}): ignored")
-            return {}
-        frame = message.header.frame_id
-        point = message.pose.position if kind == POSE else message.point
-        turn = message.pose.orientation if kind == POSE else None
-        quat = () if turn is None else (turn.x, turn.y, turn.z, turn.w)
-        if frame not in ("", self._root):
-            told = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
-            self._warn_once("frame", f"{what} on {name} is in frame {told}: ignored")
-            return {}
-        if not all(map(isfinite, (point.x, point.y, point.z, *quat))):
-            self._warn_once("finite", f"{what} on {name} is not finite: ignored")
-            return {}
-        if quat and not any(quat):
-            self._warn_once("turn", f"{what} on {name} has the orientation 0, 0, 0, 0: ignored")
-            return {}
-        place = {"x_des": tuple(getattr(point, axis) for axis in self._axes)}
-        return place | ({"quat_des": quat} if quat else {})
-
-    def _warn_once(self, kind: str, text: str) -> None:
-        if kind not in self._warned:
-            self._warned.add(kind)
-            LOG.warning("%s; there may be more like it", text)
 
     def __exit__(self, *exception: object) -> None:
         # entities are deleted with their last reference, writers after waiting for readers
-        del self._readers, self._writers, self._participant, self._domain
+        del self._listener, self._writers, self._participant, self._domain
 
 
 def publish(
     run: Experiment | Fmu | str | Path,
     *sinks: Sink,
-    place: Network | None = None,
-    scene: bool = False,
-    effort: bool = False,
-    opened: Callable[[Publisher], None] = lambda publisher: None,
+    wire: Publisher | None = None,
     pace: RealTime | None = None,
     stop: Callable[[], bool] = lambda: False,
+    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
     **options: Any,
 ) -> Summary:
     """Step an FMU in real time on a ROS 2 network, until it is asked to stop.
@@ -247,17 +263,23 @@ def publish(
         run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
             a stop time it has no end.
         sinks: what consumes the samples too, a bag for instance.
-        place, scene, effort, opened: as of ``Publisher``.
-        pace, stop: as of ``simulate``.
+        wire: the publisher; None: one of the joint states.
+        pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
+        stop, steer: as of ``simulate``; commands from the network have the last word.
 
     Raises:
         FmuError, InputError, PublishError: before the first sample.
+        PublishError: in lockstep no command came in time.
         SimulationError: the FMU refused or failed a call.
     """
     if not isinstance(run, Experiment):
         run = experiment(run, **{"stop_time": inf, **options})
-    wire = Publisher(place, scene=scene, effort=effort, opened=opened)
-    return simulate(
-        run, wire, *sinks, pace=pace or RealTime(), stop=stop, steer=wire.command,
-        resume=wire.resume,
-    )  # fmt: skip
+    wire = wire or Publisher()
+    if pace is None and not wire.lockstep:
+        pace = RealTime()
+
+    def asked() -> Mapping[str, Setting]:
+        commands = wire.command(stop, pace) or {}
+        return {**(steer() or {}), **commands}
+
+    return simulate(run, wire, *sinks, pace=pace, stop=stop, steer=asked, resume=wire.resume)

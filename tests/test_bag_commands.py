@@ -1,0 +1,162 @@
+"""Commands of bags replayed into an FMU; bags of others are written by rosbags."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+import twodof
+from twodof.cli.main import main
+from twodof.ros.messages import JOINT_STATE, POINT, STORE, Message
+
+BEGIN = 1_700_000_000_000_000_000
+STEP = 10_000_000  # ns
+
+
+def header(stamp: int, frame: str = "") -> Any:
+    time = Message["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    return Message["std_msgs/msg/Header"](time, frame)
+
+
+def joint_state(stamp: int, names: Sequence[str], *numbers: Sequence[float]) -> Any:
+    parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
+    return Message[JOINT_STATE](header(stamp), [*names], *parts)
+
+
+def point(stamp: int, x: float, y: float) -> Any:
+    return Message[POINT](header(stamp, "world"), Message["geometry_msgs/msg/Point"](x, y, 0.0))
+
+
+def write(path: Path, messages: Sequence[tuple[str, int, Any]], **options: Any) -> Path:
+    """A bag of (topic, log time, message)."""
+    with Writer(path, version=8, **options) as writer:
+        connections: dict[str, Any] = {}
+        for topic, stamp, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], stamp, STORE.serialize_cdr(message, kind))
+    return path
+
+
+@pytest.fixture(scope="module")
+def effort(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bare default arm."""
+    path = tmp_path_factory.mktemp("effort") / "Bare.fmu"
+    return twodof.build_fmu(path, twodof.FmuOptions(control="effort", native=True))
+
+
+def test_a_recorded_run_is_replayed_to_the_bit(native_path: Path, tmp_path: Path) -> None:
+    targets = {0: (0.1, 0.2), 70: (0.22, 0.05), 71: (0.2, 0.0), 150: (0.0, 0.25)}
+    run = twodof.experiment(native_path, stop_time=2, step=0.01, settings={"Kp": 80})
+    source = twodof.samples(run)
+    with twodof.Bag(tmp_path / "first").begin(run) as bag:
+        sample = next(source)
+        while True:
+            bag.write(sample)
+            if sample.k == 200:
+                break
+            given = targets.get(sample.k)
+            sample = source.send({"x_des": given} if given else None)
+    options = ["--set", "Kp=80", "--stop-time", "2", "-o", str(tmp_path / "again")]
+    assert main(["run", str(native_path), "--input", str(tmp_path / "first"), *options]) == 0
+    first, again = (twodof.read_bag(tmp_path / name) for name in ("first", "again"))
+    np.testing.assert_array_equal(first.q, again.q)
+    np.testing.assert_array_equal(first.v, again.v)
+    changes = [
+        json.loads((b.path / "run.json").read_text())["input_changes"] for b in (first, again)
+    ]
+    assert changes[0] == changes[1] and len(changes[0]) == 4
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: StoragePlugin) -> None:
+    """Held from the first communication point at or after each, as a run on the network has it."""
+    given = {0: (1.0, 0.5), 3: (-2.0, 0.25), 40: (0.5, -0.5)}
+    states = [
+        ("/joint_states", BEGIN + k * STEP, joint_state(0, ("joint1", "joint2"), (0.0, 0.0)))
+        for k in range(100)
+    ]
+    commands = [
+        ("/cmd", BEGIN + k * STEP - 7, joint_state(5, ("joint2", "joint1"), (), (), tau[::-1]))
+        for k, tau in given.items()
+    ]
+    bag = write(
+        tmp_path / "real", sorted(states + commands, key=lambda m: m[1]), storage_plugin=storage
+    )
+    model = tmp_path / "model"
+    options = ["--stop-time", "0.99", "-o", str(model)]
+    assert main(["run", str(effort), "--input", f"{bag}:/cmd", *options]) == 0
+    source = twodof.samples(effort, stop_time=0.99)
+    sample = next(source)
+    for q in twodof.read_bag(model).q[1:]:
+        tau = given.get(sample.k)
+        sample = source.send({"tau_cmd": tau} if tau else None)
+        assert tuple(q) == sample.q
+    assert twodof.read_commands(effort, bag) == twodof.read_commands(effort, bag, "/cmd")
+
+
+def test_points(native_path: Path, tmp_path: Path) -> None:
+    goals = [(BEGIN, point(0, 0.1, 0.2)), (BEGIN + STEP, point(0, 0.2, 0.1))]
+    bag = write(tmp_path / "bag", [("/goal", *goal) for goal in goals])
+    assert twodof.read_commands(native_path, bag) == [
+        (0.0, {"x_des[1]": 0.1, "x_des[2]": 0.2}),
+        (0.01, {"x_des[1]": 0.2, "x_des[2]": 0.1}),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("messages", "topic", "reason"),
+    [
+        ([("/a", BEGIN, point(0, 0.1, 0.2))], None, "no commands for this FMU, which follows"),
+        ([("/joint_states", BEGIN, joint_state(0, ("joint1",), (0.1,)))], None, "no commands for"),
+        ([("/a", BEGIN, joint_state(0, ("joint1",), (), (), (1.0,)))], "/b", "no commands on /b"),
+        (
+            [(name, BEGIN, joint_state(0, ("joint1",), (), (), (1.0,))) for name in ("/a", "/b")],
+            None, "several topics that can be commands: /a, /b; choose one",
+        ),
+        (
+            [("/a", BEGIN, joint_state(0, ("joint1",), (), (), (float("nan"),)))],
+            None, "the command at 0 s is not finite",
+        ),
+        ([("/a", BEGIN, joint_state(0, ("elbow",), (), (), (1.0,)))], None, "of no joint of this"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_replayed(
+    effort: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
+    messages: list[tuple[str, int, Any]], topic: str | None, reason: str,
+) -> None:  # fmt: skip
+    bag = write(tmp_path / "bag", messages)
+    given = f"{bag}:{topic}" if topic else str(bag)
+    assert main(["run", str(effort), "--input", given, "-o", str(tmp_path / "none")]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("twodof: error: ") and reason in line
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_plot_of_two_bags_tells_how_far_they_are_apart(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Sampled at other times, and one of them for longer."""
+
+    def bag(name: str, count: int, step: int, off: float) -> str:
+        def q(k: int) -> tuple[float, float]:
+            t = k * step / 1e9
+            return (0.5 * t, 0.1 + off * t)
+
+        return str(write(tmp_path / name, [
+            ("/joint_states", BEGIN + k * step, joint_state(0, "ab", q(k))) for k in range(count)
+        ]))  # fmt: skip
+
+    bags = [bag("real", 101, STEP, 0.0), bag("model", 80, 3 * STEP, 0.25)]
+    assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0
+    text = "0.25 off 'real' at most, b at 1 s; RMS 0.145"
+    assert f"model  {text}\n" in capfd.readouterr().out
+    assert text in html.unescape((tmp_path / "both.html").read_text())

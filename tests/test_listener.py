@@ -1,0 +1,373 @@
+"""Robots in the loop of a controller in C++ on Fast DDS, under its clock, and paused.
+
+Truth is the loop closed in Python by the same equation, and the bag read by the MCAP project.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bags import SECOND
+from mcap.reader import make_reader
+from nodes import Node, ended, published, recorded, stamp_of
+
+import twodof
+from twodof.cli.main import main
+
+GAINS = {2: (2.0, 0.2), 7: (60.0, 8.0)}
+GOALS = {2: (0.9, -0.6), 7: (0.3, -0.4, 0.2, -1.8, 0.1, 1.6, 0.5)}
+Listen = Callable[..., Node]
+
+
+def pd(sample: twodof.Sample, n: int) -> list[float]:
+    """As the controller in C++ computes it."""
+    return answer(n, sample.q, sample.v)
+
+
+def answer(n: int, q: Sequence[float], v: Sequence[float]) -> list[float]:
+    kp, kd = GAINS[n]
+    return [kp * (goal - q) - kd * v for goal, q, v in zip(GOALS[n], q, v)]
+
+
+def control(n: int) -> list[str]:
+    return ["--control", "/joint_states", "/joint_commands", *map(str, (*GAINS[n], *GOALS[n]))]
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory, panda: str) -> Callable[[int], Path]:
+    """The bare plant of the default arm (2 joints) and of the Panda (7)."""
+    folder = tmp_path_factory.mktemp("bare")
+
+    def build(n: int) -> Path:
+        options: dict[str, Any] = {"control": "effort", "native": True}
+        if n == 7:
+            (folder / "panda.urdf").write_text(panda)
+            options |= {"urdf": folder / "panda.urdf", "frame": "panda_link8", "meshes": False}
+        return twodof.build_fmu(folder / f"Bare{n}.fmu", twodof.FmuOptions(**options))
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def jointed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default arm under joint control."""
+    path = tmp_path_factory.mktemp("joint") / "Joint.fmu"
+    return twodof.build_fmu(path, twodof.FmuOptions(control="joint", native=True))
+
+
+def messages(bag: Path) -> list[tuple[str, int, bytes]]:
+    """Topics, stamps and bytes; where chunks of the file end is the clock's business."""
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        return [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages()]
+
+
+def closed(fmu: Path, n: int, steps: int, delay: Callable[[int], int]) -> Iterator[twodof.Sample]:
+    """The loop closed in Python; the command of step k is that of the sample so many before."""
+    past: list[list[float]] = []
+    run = twodof.samples(fmu, step=0.01, stop_time=steps * 0.01)
+    sample = next(run)
+    while True:
+        yield sample
+        past.append(pd(sample, n))
+        if sample.k == steps:
+            return
+        at = sample.k - delay(sample.k)
+        sample = run.send({"tau_cmd": past[at]} if at >= 0 else None)
+
+
+def test_lockstep_is_the_loop_closed_in_python_to_the_bit(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    fmu, steps = bare(7), length(6000, 1000)
+    node = listen(*control(7))
+    bag = tmp_path / "bag"
+    options = ["--lockstep", "--stamp-start", "1000", "--stop-time", str(steps / 100)]
+    with published(number, fmu, *options, "--rate", "100", "-o", str(bag)) as process:
+        out, err = ended(process)
+    assert err == ""
+    print(re.search("time .*", out))
+    states = recorded(bag)["/joint_states"]
+    assert [stamp_of(state[0]) for state in states] == [
+        1000 * SECOND + k * SECOND // 100 for k in range(steps + 1)
+    ]
+    truth = [[[*s.q], [*s.v]] for s in closed(fmu, 7, steps, lambda k: 0)]
+    assert [state[2:4] for state in states] == truth
+    node.leave()
+    assert node.told[-1] == ["controlled", steps + 1] or node.told[-1][1] > steps  # first repeated
+
+
+def test_lockstep_gives_the_same_bytes_each_time(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    fmu, contents = bare(2), []
+    options = ["--lockstep", "--stamp-start", "1000", "--stop-time", "5", "--scene"]
+    bag = tmp_path / "bag"
+    for _ in range(length(10, 2)):
+        node = listen(*control(2))
+        with published(number, fmu, *options, "--overwrite", "-o", str(bag)) as process:
+            assert ended(process)[1] == ""
+        node.leave()
+        contents.append(((bag / "run.json").read_bytes(), messages(bag)))
+    assert all(content == contents[0] for content in contents)
+    assert len(json.loads(contents[0][0])["input_changes"]) > 400
+
+
+def test_a_controller_in_real_time_misses_nothing(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
+    length: Callable[[int, int], int],
+) -> None:  # fmt: skip
+    """Each step has the answer to a sample of just before; with those delays, the same bits."""
+    fmu, steps = bare(7), 100 * length(60, 4)
+    node = listen("/joint_states", *control(7))
+    bag = tmp_path / "bag"
+    options = ["--stop-time", str(steps / 100), "-o", str(bag)]
+    with published(number, fmu, *options) as process:
+        _, err = ended(process)
+    assert err == ""
+    states = recorded(bag)["/joint_states"]
+    node.until(lambda: node.messages("/joint_states")[-1] == states[-1])
+    heard = node.messages("/joint_states")
+    assert heard == states[-len(heard) :] and len(heard) > 0.8 * steps
+    node.leave()
+    assert node.told[-1] == ["controlled", len(heard)]
+    answers = {tuple(answer(7, *state[2:4])): k for k, state in enumerate(states)}
+    held, delays, applied = {}, {}, []
+    for t, values in json.loads((bag / "run.json").read_text())["input_changes"]:
+        held |= values
+        k = round(t * 100)
+        delays[k] = k - answers[tuple(held[f"tau_cmd[{i + 1}]"] for i in range(7))]
+        applied.append(k - delays[k])
+    assert applied == sorted(set(applied))  # in their order, none twice
+    assert min(delays.values()) >= 0 and sorted(delays.values())[len(delays) // 2] <= 1
+    print(f"{len(applied)} of {len(heard)} answers applied, delays {sorted({*delays.values()})}")
+    first, latest = min(delays), {}
+    for k in range(steps):
+        latest[k] = k - delays[k] if k in delays else latest.get(k - 1, -1)
+    truth = closed(fmu, 7, steps, lambda k: k - latest[k] if k >= first else k + 1)
+    assert [state[2:4] for state in states] == [[[*s.q], [*s.v]] for s in truth]
+
+
+def test_lockstep_says_who_is_missing(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
+) -> None:
+    fmu = bare(2)
+
+    def ends(bag: str, *told: str) -> None:
+        options = ["--lockstep", "--timeout", "3", "-o", str(tmp_path / bag)]
+        with published(number, fmu, *options) as process:
+            for line in 15 * told:  # one that comes before its sender is discovered is lost
+                node.say(line)
+                time.sleep(0.1)
+            _, err = ended(process, 1)
+        (line,) = err.splitlines()
+        errors.append(line.partition(": no command for the sample at t = ")[2])
+        assert len(recorded(tmp_path / bag)["/joint_states"]) == 1
+
+    errors: list[str] = []
+    ends("nobody")
+    node = listen("/joint_commands=command")
+    ends("deaf")
+    node.leave()
+    node = listen("/joint_commands=command", "/joint_states")
+    ends("silent")
+    node.leave()
+    node = listen("/joint_commands=command", "/joint_states")
+    ends("stamp", "/joint_commands 1 5000000007 joint1 - - 0.1")
+    expected = (
+        "0 s in 3[.]\\d+ s: nobody publishes on /joint_commands",
+        "0 s in 3[.]\\d* ?s: nobody hears /joint_states",
+        "0 s in 3[.]\\d* ?s: who publishes on /joint_commands is silent",
+        "0 s in 3[.]\\d* ?s: the latest on /joint_commands is stamped 5.000000007 s,"
+        " not \\d+[.]\\d+ s; a command has the stamp of the state that it answers",
+    )
+    for error, text in zip(errors, expected, strict=True):
+        assert re.fullmatch(text.replace("[.]\\d+", "[.]?\\d*", 1), error), error
+
+
+def test_a_controller_that_stalls_dies_and_returns(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
+) -> None:
+    bag = tmp_path / "bag"
+    with published(number, bare(2), "--effort", "-o", str(bag)) as process:
+        watch = listen("/joint_states")
+        node = listen(*control(2))
+
+        def efforts() -> list[float]:
+            return [abs(m[4][0]) + abs(m[4][1]) for m in watch.messages("/joint_states")]
+
+        watch.until(lambda: efforts() and efforts()[-1] > 0.0)
+        node.process.send_signal(signal.SIGSTOP)
+        watch.until(lambda: efforts()[-1] == 0.0)
+        node.process.send_signal(signal.SIGCONT)
+        watch.until(lambda: efforts()[-1] > 0.0)
+        node.process.kill()
+        node.leave()
+        watch.until(lambda: efforts()[-1] == 0.0)
+        listen(*control(2))
+        watch.until(lambda: efforts()[-1] > 0.0)
+        process.send_signal(signal.SIGINT)
+        _, err = ended(process, 130)
+    (line,) = err.splitlines()
+    assert "no command for 0.5 s: efforts go to 0" in line
+    tau = np.array([state[4] for state in recorded(bag)["/joint_states"]])
+    silent = np.flatnonzero((tau[1:] == 0).all(axis=1) & (tau[:-1] != 0).any(axis=1))
+    assert len(silent) == 2
+    for k in silent:  # ramps: of one sign, in equal steps
+        np.testing.assert_allclose(np.diff(tau[k - 40 : k + 2], n=2, axis=0), 0.0, atol=1e-9)
+
+
+def test_commands_that_mean_nothing_have_one_warning_a_kind(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
+) -> None:
+    bag = tmp_path / "bag"
+    node = listen("/joint_states", "/joint_commands=command")
+    yesterday = time.time_ns() - 86_400 * SECOND
+    with published(number, bare(2), "-o", str(bag)) as process:
+        node.hears()
+        for _ in range(3):
+            for line in (
+                "1 0 joint1,joint2 - - nan,1.0",
+                "1 0 elbow - - 1.0",
+                "1 0 joint1,joint2 - - 1.0",
+                f"1 {yesterday} joint1 - - 1.0",
+                "1 0 joint1,elbow - - 0.25,1.0",
+                "1 0 \udcff - - 1.0",  # no UTF-8
+            ):
+                node.say(f"/joint_commands {line}")
+            node.hears()
+        process.send_signal(signal.SIGINT)
+        _, err = ended(process, 130)
+    changes = json.loads((bag / "run.json").read_text())["input_changes"]
+    assert [values for _, values in changes] == [{"tau_cmd[1]": 0.25}]
+    found = sorted(
+        line.removeprefix("WARNING: a command on /joint_commands ") for line in err.splitlines()
+    )
+    expected = [
+        "cannot be read", "has 1 efforts for 2 joints", "is not finite", "is of joints that this",
+        "is of no joint of this robot: 'elbow'", "is stamped 8.64e+04 s before the sample",
+    ]  # fmt: skip
+    assert len(found) == len(expected)
+    for line, text in zip(found, expected):
+        assert line.startswith(text)
+
+
+def test_a_flood_of_commands_holds_nothing_up(
+    jointed: Path, tmp_path: Path, number: int, listen: Listen
+) -> None:
+    """Some 10,000 a second; the newest wins."""
+    bag = tmp_path / "bag"
+    node = listen("/joint_states", "/joint_commands=command")
+    with published(number, jointed, "--stop-time", "4", "-o", str(bag)) as process:
+        node.hears()
+        node.say("/joint_commands 15000 0 joint2,joint1 0.1,0.2 - -")
+        node.say("/joint_commands 1 0 joint2,joint1 0.3,0.4 - -")
+        out, _ = ended(process)
+    assert "missed" in out and len(recorded(bag)["/joint_states"]) == 401
+    changes = json.loads((bag / "run.json").read_text())["input_changes"]
+    targets = [(v["q_des[1]"], v["q_des[2]"]) for _, v in changes]
+    assert targets == [(0.2, 0.1), (0.4, 0.3)]
+
+
+def test_absurd_efforts_end_no_run(
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
+) -> None:
+    bag = tmp_path / "bag"
+    node = listen("/joint_states", "/joint_commands=command")
+    with published(number, bare(2), "-o", str(bag)) as process:
+        node.hears()
+        node.say("/joint_commands 1 0 joint1,joint2 - - 1e300,-1e300")
+        node.hears(more=150)
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
+    assert np.isfinite([state[2:4] for state in recorded(bag)["/joint_states"]]).all()
+
+
+def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
+    """A namespace is of names that do not begin with a slash."""
+    options = ["--namespace", "left", "--state-topic", "/robot_joint_states", "--scene", "--clock"]
+    node = listen("/robot_joint_states=state", "/clock=clock", "/left/arm/command=command")
+    with published(number, jointed, *options, "--command-topic", "arm/command") as process:
+        node.hears("/robot_joint_states")
+        node.hears("/clock")
+        node.until(lambda: ["matched", "/left/arm/command", 1] in node.told)
+        topics = process.told[0].split(maxsplit=1)[1].strip().split(", ")
+    assert {*topics} == {
+        "/robot_joint_states", "/clock", "/left/tf", "/left/tf_static", "/left/robot_description",
+        "/left/end_effector",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("speed", [0.1, 1.0, 10.0])
+def test_the_clock_is_that_of_the_simulation(
+    native_path: Path, number: int, listen: Listen, speed: float
+) -> None:
+    node = listen("/clock=clock", "/joint_states")
+    simulated = 4 * speed
+    options = ["--clock", "--speed", str(speed), "--stamp-start", "100"]
+    with published(number, native_path, *options, "--stop-time", str(simulated)) as process:
+        assert ended(process)[1] == ""
+    told = [it for it in node.told if it[:2] == ["message", "/clock"]]
+    stamps = [seconds * SECOND + rest for _, _, _, (seconds, rest) in told]
+    last = 100 * SECOND + round(simulated * 100) * SECOND // 100
+    assert stamps == [last - k * SECOND // 100 for k in range(len(stamps))][::-1]
+    assert stamps == [stamp_of(m[0]) for m in node.messages("/joint_states")][-len(stamps) :]
+    wall = (told[-1][2] - told[0][2]) / SECOND
+    assert (stamps[-1] - stamps[0]) / SECOND / wall == pytest.approx(speed, rel=0.1)
+
+
+def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
+    node = listen("/clock=clock", "/pause=bool", "/step=uint")
+
+    def clock() -> list[int]:
+        return [seconds * SECOND + rest for seconds, rest in node.messages("/clock")]
+
+    with published(number, native_path, "--clock", "--stamp-start", "0") as process:
+        node.hears("/clock")
+        node.say("/pause true")
+        time.sleep(1.0)
+        paused = clock()[-1]
+        time.sleep(0.5)
+        assert clock()[-1] == paused
+        node.say("/step 3")
+        node.until(lambda: clock()[-1] > paused)
+        time.sleep(0.5)
+        assert clock()[-1] == paused + 3 * SECOND // 100
+        node.say("/pause false")
+        node.hears("/clock", more=30)
+        began = time.time_ns()
+        node.hears("/clock", more=50)
+        assert time.time_ns() - began > 0.4 * SECOND  # what was missed is not made up for
+        process.send_signal(signal.SIGINT)
+        assert ended(process, 130)[1] == ""
+    assert np.ptp(np.diff(clock())) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--namespace", "a b"], "--namespace 'a b' is no name of ROS 2"),
+        (["--state-topic", "1st"], "--state-topic '1st' is no name of ROS 2"),
+        (["--command-topic", "joint_states"], "--command-topic is '/joint_states', which is publ"),
+        (["--speed", "0"], "--speed 0 is no factor"),
+        (["--speed", "inf"], "--speed inf is no factor"),
+        (["--timeout", "-1"], "--timeout -1 is no time"),
+        (["--on-timeout", "ramp"], "--on-timeout 'ramp' is for control 'effort'"),
+        (["--on-timeout", "hold", "--lockstep"], "--on-timeout is for commands of joints that are"),
+    ],
+)
+def test_options_that_cannot_be(
+    jointed: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
+) -> None:
+    assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"twodof: error: {culprit}"), line

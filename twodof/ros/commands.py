@@ -1,0 +1,199 @@
+"""What messages of others ask of an FMU, as values of its inputs; and what is done without any.
+
+A control law (``plant.variables.CONTROLS``) follows messages of one type: points or poses of the
+frame, or JointStates, whose joints are matched by name.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from math import isfinite
+from typing import Any, NamedTuple
+
+from ..errors import InputError
+from ..experiments import NANOSECONDS
+from ..fmu import Fmu
+from .messages import JOINT_STATE, POINT, POSE, STORE
+
+LOG = logging.getLogger(__name__)
+LONGEST_NAME = 80  # of a frame or joint, that is told
+MAX_COMMAND = 64 * 1024  # bytes; some thousand joints, read within milliseconds
+TIMEOUT = 0.5  # s without a command until the robot is held
+RAMP = 0.5  # s in which efforts come down to 0
+Inputs = dict[str, float]
+
+
+def warner(log: logging.Logger) -> Callable[[str, str], None]:
+    """A function that warns of each kind of fault once."""
+    told: set[str] = set()
+
+    def warn(kind: str, text: str) -> None:
+        if kind not in told:
+            told.add(kind)
+            log.warning("%s; there may be more like it", text)
+
+    return warn
+
+
+class CommandError(Exception):
+    """A message that is no command.
+
+    Attributes:
+        kind: of the fault, one word.
+    """
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+class Command(NamedTuple):
+    """What a message asks for.
+
+    Attributes:
+        stamp: ns since the epoch; 0 where it has none.
+        inputs: values of the FMU's inputs.
+        strangers: names of joints that the robot has not.
+    """
+
+    stamp: int
+    inputs: Inputs
+    strangers: tuple[str, ...] = ()
+
+
+def deserialise(kind: str, cdr: bytes) -> Any:
+    """A message of a type.
+
+    Raises:
+        CommandError: the bytes, which are anybody's, are none.
+    """
+    try:
+        if len(cdr) > MAX_COMMAND:
+            raise ValueError(f"it has {len(cdr)} bytes")
+        return STORE.deserialize_cdr(cdr, kind)
+    except Exception as error:  # rosbags raises anything
+        raise CommandError("bytes", f"cannot be read ({error})") from error
+
+
+class Commands:
+    """The messages that an FMU can follow.
+
+    Args:
+        fmu: that is commanded.
+
+    Attributes:
+        type: of the message that commands all that there is; "" where the FMU follows none.
+        types: all that it follows.
+    """
+
+    def __init__(self, fmu: Fmu) -> None:
+        self._axes, self._root = fmu.axes, fmu.root
+        self._groups = {
+            group: fmu.vector(group) for group in ("x_des", "quat_des", "q_des", "v_des", "tau_cmd")
+        }
+        self._joints = {name: i for i, name in enumerate(fmu.joints)}
+        self.types: tuple[str, ...] = ()
+        if self._groups["x_des"] and fmu.axes:
+            self.types = (POSE, POINT) if self._groups["quat_des"] else (POINT,)
+        elif self._groups["q_des"] or self._groups["tau_cmd"]:
+            self.types = (JOINT_STATE,)
+        self.type = next(iter(self.types), "")
+
+    def read(self, kind: str, cdr: bytes) -> Command:
+        """What a message of one of ``types`` asks for.
+
+        Points and poses are in the frame of the robot's root, which an empty frame_id means too.
+
+        Raises:
+            CommandError: it cannot be read, is in another frame, not finite, no orientation, of
+                no joint of this robot, or without the numbers that its control takes.
+        """
+        message = deserialise(kind, cdr)
+        given = self._of_joints(message) if kind == JOINT_STATE else self._of_frame(kind, message)
+        if not all(map(isfinite, given.values())):
+            raise CommandError("finite", "is not finite")
+        names = message.name if kind == JOINT_STATE else ()
+        strangers = tuple(name for name in names if name not in self._joints)
+        stamp = message.header.stamp
+        return Command(stamp.sec * NANOSECONDS + stamp.nanosec, given, strangers)
+
+    def _of_frame(self, kind: str, message: Any) -> Inputs:
+        frame = message.header.frame_id
+        if frame not in ("", self._root):
+            told = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
+            raise CommandError("frame", f"is in frame {told}")
+        point = message.pose.position if kind == POSE else message.point
+        given = {
+            name: getattr(point, axis) for name, axis in zip(self._groups["x_des"], self._axes)
+        }
+        if kind == POSE:
+            turn = message.pose.orientation
+            quat = (turn.x, turn.y, turn.z, turn.w)
+            if not any(quat):
+                raise CommandError("turn", "has the orientation 0, 0, 0, 0")
+            given |= zip(self._groups["quat_des"], quat)
+        return given
+
+    def _of_joints(self, message: Any) -> Inputs:
+        """Efforts, or positions and velocities, which are 0 where there are none."""
+        names = message.name
+        known = [(self._joints[name], k) for k, name in enumerate(names) if name in self._joints]
+        if not known:
+            told = ", ".join(names)[:LONGEST_NAME]
+            raise CommandError("names", f"is of no joint of this robot: {told!r}")
+
+        def numbers(part: Sequence[float], what: str) -> Sequence[float]:
+            if len(part) != len(names):
+                told = f"has {len(part)} {what} for {len(names)} joints"
+                raise CommandError("sizes", told)
+            return part
+
+        if effort := self._groups["tau_cmd"]:
+            tau = numbers(message.effort, "efforts")
+            return {effort[i]: float(tau[k]) for i, k in known}
+        q = numbers(message.position, "positions")
+        given = {self._groups["q_des"][i]: float(q[k]) for i, k in known}
+        v = numbers(message.velocity, "velocities") if len(message.velocity) else [0.0] * len(q)
+        return given | {self._groups["v_des"][i]: float(v[k]) for i, k in known}
+
+
+class Watchdog:
+    """What is done when commands stop, so that the robot is safe.
+
+    Targets are held, without the velocity that went with them; efforts are ramped to 0.
+
+    Args:
+        fmu: that is commanded.
+        timeout: s without a command.
+        ramp: bring efforts down to 0; None: where there are any.
+
+    Raises:
+        InputError: efforts are to be ramped where there are none.
+    """
+
+    def __init__(self, fmu: Fmu, timeout: float, ramp: bool | None = None) -> None:
+        self.timeout, self._since = timeout, 0.0
+        self._efforts, self._speeds = fmu.vector("tau_cmd"), fmu.vector("v_des")
+        self._ramp = bool(self._efforts) if ramp is None else ramp
+        if self._ramp and not self._efforts:
+            raise InputError("`on_timeout` 'ramp' is for control 'effort'; others hold the target")
+        self._last: Inputs = {}
+        self._warn = warner(LOG)
+
+    def heard(self, t: float, inputs: Inputs) -> None:
+        """Take a command that came at a time, s."""
+        self._since = t
+        self._last |= inputs
+
+    def asked(self, t: float) -> Inputs:
+        """What inputs are to be at a time, s, where no command has come."""
+        late = t - self._since - self.timeout
+        if not self._last or late < 0.0:
+            return {}
+        what = "efforts go to 0" if self._ramp else "the last one is held"
+        self._warn("silence", f"no command for {self.timeout:g} s: {what}")
+        if self._ramp:
+            left = max(0.0, 1.0 - late / RAMP)
+            return {name: left * self._last[name] for name in self._efforts if name in self._last}
+        return {name: 0.0 for name in self._speeds if name in self._last}

@@ -1,0 +1,86 @@
+"""What DDS carries: messages that are serialised already, under ROS 2's names for their types.
+
+Names, types and qualities of service are those of ROS 2 (REP 2011's type hashes, rmw_cyclonedds of
+Jazzy), so that its tools see the run as they see any node's.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from rosbags.interfaces import Nodetype, Qos, QosDurability
+
+from ..errors import PublishError
+from .messages import STORE, Serialised
+
+try:
+    from cyclonedds import idl, qos, topic
+except ImportError as missing:
+    raise PublishError(
+        f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')"
+    ) from missing
+
+
+class Carrier:
+    """What every DDS type does with its messages: carry them serialised.
+
+    What the bytes mean is rosbags' business.
+    """
+
+    def __init__(self, cdr: Serialised) -> None:
+        self.cdr = cdr
+
+    def serialize(self, **_options: object) -> bytes:
+        """The bytes, as Cyclone DDS asks for them."""
+        return bytes(self.cdr)
+
+    @classmethod
+    def deserialize(cls, cdr: bytes) -> Carrier:
+        """A message that has come."""
+        return cls(cdr)
+
+    @classmethod
+    def deserialize_key(cls, _key: bytes) -> None:
+        """A notice without a message, that a writer has left."""
+
+
+@functools.cache
+def dds_type(name: str) -> Any:
+    """The DDS type of a ROS 2 message type, with the names that rosidl_generator_dds_idl gives."""
+    package, _, kind = name.split("/")
+    fields = {f"{field}_": _field_type(*of) for field, of in STORE.fielddefs[name][1]}
+    struct = idl.make_idl_struct(
+        f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False
+    )
+    for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
+        setattr(struct, method, vars(Carrier)[method])  # a base would be part of the type
+    return struct
+
+
+def _field_type(node: Nodetype, of: Any) -> Any:
+    if node is Nodetype.NAME:
+        return dds_type(of)
+    if node is Nodetype.SEQUENCE:
+        return idl.types.sequence[_field_type(*of[0])]
+    return {"string": str, "bool": bool}.get(of[0]) or getattr(idl.types, of[0])
+
+
+def dds_qos(offered: Qos, type_name: str) -> Any:
+    """Quality of service of a writer or reader.
+
+    A write never waits for a reader: one that does not keep up misses messages.
+    """
+    latched = offered.durability is QosDurability.TRANSIENT_LOCAL
+    return qos.Qos(
+        qos.Policy.Reliability.Reliable(max_blocking_time=0),
+        qos.Policy.Durability.TransientLocal if latched else qos.Policy.Durability.Volatile,
+        qos.Policy.History.KeepLast(offered.depth),
+        qos.Policy.DataRepresentation(use_cdrv0_representation=True),
+        qos.Policy.Userdata(f"typehash={STORE.hash_rihs01(type_name)};".encode()),
+    )
+
+
+def dds_topic(participant: Any, name: str, type_name: str) -> Any:
+    """A topic of ROS 2 in DDS."""
+    return topic.Topic(participant, f"rt{name}", dds_type(type_name))
