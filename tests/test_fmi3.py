@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import re
 import subprocess
-import sys
 import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
@@ -367,19 +366,6 @@ def test_three_fmus_in_one_program(pair, tmp_path):
         for _, control, fmi in FMUS
     ]
     assert np.abs(rows - np.hstack(alone)[10::10]).max() <= 1e-12
-
-
-def test_aarch64_equals_x86_64(pair, tmp_path):
-    """The sources, compiled for a Raspberry Pi or a Jetson, and run in an emulator."""
-    emulator = needs("qemu-aarch64", "qemu-aarch64-static")
-    native, arguments, _ = embedded(pair, tmp_path, ["cc"])
-    expected = subprocess.check_output([native, *arguments], text=True).split()
-    zig = [sys.executable, "-m", needs("ziglang"), "cc", "-target", "aarch64-linux-musl"]
-    small, _, _ = embedded(pair, tmp_path / "arm", [*zig, "-static"])
-    assert small.read_bytes()[18:20] == b"\xb7\x00"  # EM_AARCH64
-    printed = subprocess.check_output([emulator, small, *arguments], text=True).split()
-    difference = np.array(printed, dtype=float) - np.array(expected, dtype=float)
-    assert len(printed) == 300 and np.abs(difference).max() <= 1e-12
 
 
 def test_fmpy_rebuilds_the_library_from_the_sources(pair, tmp_path):
