@@ -1,10 +1,10 @@
-"""Makes docs/view.png, live.png and panda.png, screenshots of the pages.
+"""Makes docs/view.png, live.png, panda.png and page.png, screenshots of the pages.
 
     python docs/make_screenshots.py
 
 The first is the replay of a real run of the default arm, whose target changes; the second a live
-arm, whose target has just been dragged; the third the Panda on its way to a pose. Needs chromium
-and the packages 'viser', 'playwright' and 'example-robot-data'.
+arm, whose target has just been dragged; the third the Panda on its way to a pose, and the fourth in
+a page of its own. Needs chromium and the packages 'viser', 'playwright' and 'example-robot-data'.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import browser  # noqa: E402
+from native_models import robots_folder  # noqa: E402
 from PIL import Image  # noqa: E402
 from playwright.sync_api import Browser, Page  # noqa: E402
 
@@ -28,7 +29,7 @@ INPUTS = "time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n4,0.22,-0.08\n"
 
 
 def main() -> None:
-    """Make both."""
+    """Make all."""
     browser.VIEWPORT.update(SIZE)
     with tempfile.TemporaryDirectory() as name, browser.chromium() as chromium:
         folder = Path(name)
@@ -39,6 +40,25 @@ def main() -> None:
         view(chromium, folder)
         live(chromium, folder, fmu)
         panda(chromium, folder)
+        page(chromium, folder)
+
+
+def page(chromium: Browser, folder: Path) -> None:
+    """docs/page.png: a Panda in a page of its own."""
+    options = twodof.FmuOptions(
+        urdf=robots_folder() / "panda_description/urdf/panda.urdf",
+        mesh_dir=robots_folder().parent, frame="panda_hand_tcp", control="pose", native=True,
+        name="Panda",
+    )  # fmt: skip
+    file = twodof.page(twodof.build_fmu(folder / "Panda.fmu", options), folder / "panda.html")
+    with browser.opened(chromium, file.as_uri(), ready="#arm-scene[data-ready]") as shown:
+        shown.locator("#arm-play").click()
+        shown.evaluate(
+            "() => { arm.startAgain(); arm.set('x_des', [0.5, 0.1, 0.4]);"
+            " arm.set('quat_des', [1, 0, 0.3, 0.2]); arm.step(40); }"
+        )
+        shown.wait_for_timeout(3000)
+        shown.screenshot(path=ROOT / "docs" / "page.png")
 
 
 def view(chromium: Browser, folder: Path) -> None:

@@ -19,6 +19,7 @@ import pinocchio as pin
 
 from twodof.export.compiler import compile_library, host_platform
 from twodof.export.flavours import engine_sources
+from twodof.export.mechanism import mechanism_source
 from twodof.export.native import model_header
 from twodof.plant.plant import Plant
 from twodof.plant.robot import Robot, load_robot
@@ -74,6 +75,7 @@ class Model:
         headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{fmi}*.h")
         files = engine_sources(self.control, fmi)
         files |= {path.name: path.read_bytes() for path in (*headers, *more)}
+        files["mechanism.c"] = mechanism_source(self.robot, self.table).encode()
         files["model.h"] = model_header(self.robot, self.table, self.control, GUID, fmi).encode()
         return files
 
@@ -177,16 +179,17 @@ class Engine:
         )
         return getattr(self.lib, f"probe_{name}")(*values)
 
-    def frame(self, q, v):
-        """Position, orientation, Jacobian and drift, all three axes, linear then angular."""
-        x, R, J, drift = np.empty(3), np.empty((3, 3)), np.empty((6, self.n)), np.empty(6)
-        self.call("task", q, v, x, R, J, drift)
-        return x, R, J, drift
-
     def task(self, q, v):
-        axes = ["xyz".index(axis) for axis in self.model.robot.axes]
-        x, _, J, drift = self.frame(q, v)
-        return x[axes], J[axes], drift[axes]
+        """Position, Jacobian and drift in the rows of the task."""
+        rows = self.m + 3 * (self.model.control == "pose")
+        x, J, drift = np.empty(self.m), np.empty((rows, self.n)), np.empty(rows)
+        self.call("task", q, v, x, J, drift)
+        return x, J, drift
+
+    def effort_of_force(self, q, force):
+        tau = np.empty(self.n)
+        self.call("effort_of_force", q, force, tau)
+        return tau
 
     def inverse_dynamics(self, q, v, a, gravity):
         tau = np.empty(self.n)
@@ -234,8 +237,9 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
         folder.mkdir(exist_ok=True)
         for file, content in files.items():
             (folder / file).write_bytes(content)
+        level = "-O2" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
         subprocess.run(
-            ["gcc", "-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
+            ["gcc", "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
              "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
              "-o", output, "directional.c", *(path.name for path in more), "-lm"],
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},

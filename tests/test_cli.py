@@ -319,7 +319,7 @@ BAD: dict[str, Case] = {
     "--set with a line break": (nothing, [*RUN, "--set", "K\np=1"], "no variable 'K.*p'"),
     # inputs over time
     "CSV missing": (nothing, CSV, "cannot read 'in.csv': No such file"),
-    "CSV a folder": (nothing, [*CSV[:-1], "."], "cannot read '.': Is a directory"),
+    "CSV a folder": (nothing, [*CSV[:-1], "."], "cannot read the bag '.': it has no"),
     "CSV empty": (text("in.csv", b""), CSV, "'in.csv' is empty"),
     "CSV no text": (text("in.csv", b"\xff\xfe"), CSV, "'in.csv' is not a CSV file"),
     "CSV without time": (text("in.csv", "t,Kn\n0,1"), CSV, "'in.csv' has no column 'time'"),

@@ -141,6 +141,7 @@ CASES = {
     "sliding joints": ("tiago", "task", {"Kn": 1.0, "limit_effort": True}),
     "pose": ("ur5", "pose", {"payload": 1.0}),
     "pose, dropped": ("ur5", "pose", {"rcond": 0.3}),
+    "pose, rows that depend on others": ("twodof", "pose", {"payload": 0.5}),
     "pose, mimic": ("panda", "pose", {"Kn": 1.0}),
     "panda": ("panda", "effort", {"payload": 1.0}),
     "panda joint": ("panda", "joint", {"limit_effort": True, "payload": 1.0}),

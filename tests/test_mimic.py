@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import twodof
 from twodof import FmuOptions
-from twodof.kinematics import Kinematics
+from twodof.geometry.kinematics import Kinematics
 from twodof.plant.mechanism import Mechanism
 from twodof.plant.robot import load_robot
 from twodof.plant.urdf import read_urdf

@@ -460,7 +460,7 @@ def sparse(path: Path) -> None:
 SPECIAL: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pipe": (os.mkfifo, "Not a regular file"),
     "a device": (lambda path: path.symlink_to("/dev/zero"), "Not a regular file"),
-    "a folder": (Path.mkdir, "Is a directory|no bag"),
+    "a folder": (Path.mkdir, "Is a directory|no bag|it has no .mcap"),
     "a link to itself": (lambda path: path.symlink_to(path.name), "symbolic links"),
     "3 GB of zeros": (sparse, "File too large"),
 }

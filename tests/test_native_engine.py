@@ -29,21 +29,25 @@ def test_robots_cover_trees_prismatic_joints_and_every_axis():
     assert kinds >= {"RX", "RY", "RZ", "PZ", "RevoluteUnaligned"}
 
 
+@pytest.mark.parametrize("control", ["task", "pose"])
 @pytest.mark.parametrize("name", EVERY_ROBOT)
-def test_kinematics_equal_pinocchio(name):
-    native, robot, (G, c) = engine(name), model(name).robot, coupling(name)
+def test_kinematics_equal_pinocchio(name, control):
+    native, robot, (G, c) = engine(name, control), model(name).robot, coupling(name)
     data, frame = robot.model.createData(), robot.frame_id
-    for q, v, _ in random_states(np.random.default_rng(1), native.n):
+    axes = ["xyz".index(axis) for axis in robot.axes]
+    rows = [*axes, 3, 4, 5] if control == "pose" else axes
+    for q, v, force in random_states(np.random.default_rng(1), native.n):
         Q = G @ q + c
         pin.forwardKinematics(robot.model, data, Q, G @ v, np.zeros(robot.model.nv))
-        J = pin.computeFrameJacobian(robot.model, data, Q, frame, pin.LOCAL_WORLD_ALIGNED)
+        J = pin.computeFrameJacobian(robot.model, data, Q, frame, pin.LOCAL_WORLD_ALIGNED) @ G
         drift = pin.getFrameClassicalAcceleration(
             robot.model, data, frame, pin.LOCAL_WORLD_ALIGNED
         ).vector
-        place = data.oMf[frame]
-        expected = (place.translation, place.rotation, J @ G, drift)
-        for ours, theirs in zip(native.frame(q, v), expected, strict=True):
+        expected = (data.oMf[frame].translation[axes], J[rows], drift[rows])
+        for ours, theirs in zip(native.task(q, v), expected, strict=True):
             assert deviation(ours, theirs) <= 1e-11
+        force = np.resize(force, 3)
+        assert deviation(native.effort_of_force(q, force), J[:3].T @ force) <= 1e-11
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)

@@ -343,11 +343,15 @@ def test_a_pose_on_the_network_is_the_target(
         assert talker.stdin is not None
         talker.stdin.write(text)
         talker.stdin.close()
+        wire.write(next(twodof.samples(run)))
         wait_until(lambda: asked.append(wire.command()) or asked[-1])
         talker.kill()
     assert [command for command in asked if command] == [
-        {"x_des": (0.5, 0.2, 0.7), "quat_des": (0.0, 2.0, 0.0, 0.0)}
-    ]
+        {
+            "x_des[1]": 0.5, "x_des[2]": 0.2, "x_des[3]": 0.7,
+            "quat_des[1]": 0.0, "quat_des[2]": 2.0, "quat_des[3]": 0.0, "quat_des[4]": 0.0,
+        }
+    ]  # fmt: skip
     told = [record.getMessage() for record in caplog.records]
     assert "a pose on /target_command is in frame 'elsewhere'" in told[0]
     assert "has the orientation 0, 0, 0, 0: ignored" in told[1] and "not finite" in told[2]

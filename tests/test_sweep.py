@@ -31,12 +31,14 @@ from harness import asked, changed_plant, children_of, lay_traps, lives, needs, 
 import twodof
 from twodof import TwoDofError, sweep
 from twodof.cli.main import main
+from twodof.fmu import Instance, instantiate
 from twodof.plots.figure import drawn, save
 from twodof.plots.sweeps import drawing
 from twodof.sweeps import runner as runner_module
 from twodof.sweeps.metrics import METRICS
 from twodof.sweeps.results import read_sweep
 from twodof.sweeps.runner import Job, Runner
+from twodof.sweeps.trace import trace
 
 Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
 STEP, STOP = 0.01, 5.0
@@ -1016,3 +1018,26 @@ def test_plot_of_a_sweep_prints_the_best_runs(
     assert "is a sweep; it is drawn alone" in capsys.readouterr().err
     found = drawing(*read_sweep(undisturbed), "a")
     assert f"{best['Kp']:g}" in save(found, tmp_path / "a.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("max_step", [1e-3, 1e-9], ids=["finished", "discarded"])
+def test_a_trace_has_the_numbers_of_the_samples(native_path: Path, max_step: float) -> None:
+    """To the bit; where a run fails, so do both, at the same step and for the same reason."""
+    run = twodof.experiment(native_path, stop_time=2.0, settings={"max_step": max_step})
+    ends = []
+
+    def whole(read: Callable[[Instance], object]) -> object:
+        try:
+            with instantiate(run.fmu) as instance:
+                return read(instance)
+        except twodof.TwoDofError as error:
+            ends.append((str(error), error.k, error.outcome))
+            return None
+
+    samples = whole(lambda instance: [*twodof.samples(run, instance=instance)])
+    outputs = whole(lambda instance: trace(run, instance))
+    if max_step < 1e-3:
+        assert len(ends) == 2 and ends[0] == ends[1] and ends[0][2] == "discarded"
+        return
+    for name, values in outputs.items():
+        np.testing.assert_array_equal(values, [getattr(sample, name) for sample in samples])

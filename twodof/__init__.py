@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .master import Summary as Summary
     from .master import samples as samples
     from .master import simulate as simulate
+    from .pages.arm import page as page
     from .pages.live import live as live
     from .pages.replay import view as view
     from .plots.runs import plot as plot
@@ -54,6 +55,7 @@ _HOMES = {
     "fmu": ("Fmu", "load_fmu"),
     "linear": ("LinearModel", "linearise"),
     "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
+    "pages.arm": ("page",),
     "pages.live": ("live",),
     "pages.replay": ("view",),
     "plots.runs": ("plot",),

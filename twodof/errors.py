@@ -60,3 +60,13 @@ class PageError(TwoDofError):
 
 class PublishError(TwoDofError):
     """A run cannot be published: Cyclone DDS, the network or a variable of ROS 2 is at fault."""
+
+
+def diverged(k: int, t: float) -> SimulationError:
+    """Of the sample after k steps, at a time."""
+    return SimulationError(f"the FMU gave a value that is not finite at t = {t:g} s", k, "diverged")
+
+
+def step_failure(k: int, t: float, error: SimulationError) -> SimulationError:
+    """Of the step after k steps, at a time."""
+    return SimulationError(f"step {k + 1} at t = {t:g} s: {error}", k, error.outcome)

@@ -3,10 +3,12 @@ folders marked as being written, and folders for a while."""
 
 from __future__ import annotations
 
+import codecs
 import errno
 import fcntl
 import io
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -242,3 +244,13 @@ def data_file(*parts: str) -> Path:
     package = Path(__file__).parent
     installed = package.joinpath(*parts)
     return installed if installed.exists() else package.parent.joinpath(*parts)
+
+
+def is_plain_xml(xml: bytes) -> bool:
+    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
+    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
+    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
+    encoding = declared[1].lower() if declared else b"utf-8"
+    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
+    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
+    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)

@@ -18,7 +18,7 @@ from math import asin, dist, hypot, inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .errors import InputError, SimulationError
+from .errors import InputError, SimulationError, diverged, step_failure
 from .experiments import (
     NANOSECONDS,
     TIME_TOLERANCE,
@@ -209,12 +209,13 @@ def samples(
             answer = yield sample
             if k == run.steps or stop():
                 return
-            asked = {**_changes_until(sample.t, due, run), **resolve(run.fmu, answer or {})}
-            latest = {name: value for name, value in asked.items() if value != inputs.get(name)}
             try:
-                if latest:
-                    instance.set(latest)
-                    inputs, since = {**inputs, **latest}, sample.t
+                if answer or due:
+                    asked = {**_changes_until(sample.t, due, run), **resolve(run.fmu, answer or {})}
+                    latest = {n: value for n, value in asked.items() if value != inputs.get(n)}
+                    if latest:
+                        instance.set(latest)
+                        inputs, since = {**inputs, **latest}, sample.t
                 instance.step(sample.t, run.step)
             except SimulationError as error:
                 again = _resumed(run, sample, error, resume)
@@ -246,18 +247,17 @@ def _sampler(
     """A function that reads the outputs after k steps, with the inputs and since when they hold."""
     groups = [run.fmu.vector(group) for group in OUTPUTS]
     ends = list(accumulate(map(len, groups)))
-    slices = [slice(a, b) for a, b in zip([0, *ends], ends)]
     read = instance.reader([*chain(*groups)])
-    first_stamp = run.first_stamp()
+    of_q, of_v, of_x, of_tau, of_quat = (slice(a, b) for a, b in zip([0, *ends], ends))
+    start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
-        t, values = run.time(k), read()
+        t, values = start + k * step, tuple(read())
         if not all(map(isfinite, values)):
-            text = f"the FMU gave a value that is not finite at t = {t:g} s"
-            raise SimulationError(text, k, "diverged")
-        q, v, x, tau, quat = (values[part] for part in slices)
-        stamp = first_stamp + round(k * run.step * NANOSECONDS)
-        return Sample(k, t, q, v, x, tau, inputs, since, stamp, quat)
+            raise diverged(k, t)
+        stamp = first_stamp + round(k * step * NANOSECONDS)
+        parts = values[of_q], values[of_v], values[of_x], values[of_tau]
+        return Sample(k, t, *parts, inputs, since, stamp, values[of_quat])
 
     return take
 
@@ -266,8 +266,7 @@ def _resumed(
     run: Experiment, sample: Sample, error: SimulationError, resume: Resume
 ) -> dict[str, Value]:
     """Start values to go on with after a step that failed; where there are none, its failure."""
-    text = f"step {sample.k + 1} at t = {sample.t:g} s: {error}"
-    failure = SimulationError(text, sample.k, error.outcome)
+    failure = step_failure(sample.k, sample.t, error)
     settings = resume(sample, failure) if error.outcome == "discarded" else None
     if settings is None:
         raise failure from error

@@ -41,16 +41,6 @@ static inline double _Complex analytic(double _Complex x, Real value, Real deriv
     return value + UNIT * (derivative * cimag(x));
 }
 
-static inline double _Complex complex_sin(double _Complex x)
-{
-    return analytic(x, sin(creal(x)), cos(creal(x)));
-}
-
-static inline double _Complex complex_cos(double _Complex x)
-{
-    return analytic(x, cos(creal(x)), -sin(creal(x)));
-}
-
 static inline double _Complex complex_sqrt(double _Complex x)
 {
     const Real root = sqrt(creal(x));
@@ -76,8 +66,6 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 /* From here on the engine has complex numbers. The headers of the standard that it includes are there
    already. */
 #define double double _Complex
-#define sin complex_sin
-#define cos complex_cos
 #define sqrt complex_sqrt
 #define atan2 complex_atan2
 #define fabs complex_fabs

@@ -3,8 +3,8 @@
 
 #include <string.h>
 
-int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const double q[N_JOINTS],
-            const double v[N_JOINTS], double given[N_JOINTS])
+int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+            const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
 {
     (void)joint, (void)q, (void)v;
     memcpy(given, &value[TAU_CMD], N_JOINTS * sizeof *given);

@@ -1,7 +1,6 @@
 /* The equations of motion under the control law. Compiled twice: with real numbers, and with complex ones
    for derivatives. */
-#include "dynamics.c"
-#include "kinematics.c"
+#include "mechanism.c"
 #include "plant.c"
 #include "stops.c"
 #if N_ROWS > N_AXES

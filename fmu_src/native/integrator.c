@@ -56,7 +56,8 @@ typedef struct {
     long evaluations;           /* of the equations of motion so far */
     double Q[N_STATES][4];      /* coefficients of the dense output */
     Stops stops;
-    int stopped[N_JOINTS];      /* joints that reached a limit at the end of the step */
+    int stopped[N_JOINTS];      /* joints that reached a limit at the end of the step, */
+    int let_go[N_JOINTS];       /* and joints that are no longer pressed into theirs there */
 } Step;
 
 /* q̈ at a state, and its rank. */
@@ -222,6 +223,7 @@ static double first_event(Step *step)
     events(step, reached, found);
     for (int i = 0; i < N_JOINTS; i++) {
         step->stopped[i] = found[i] && !step->stops.held[i];
+        step->let_go[i] = found[i] && step->stops.held[i];
         if (step->stopped[i])
             reached[i] = fmin(fmax(reached[i], low[i]), high[i]);
     }
@@ -277,6 +279,7 @@ static double until_event(Step *step, double t, double end, Obstacle *obstacle)
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
     const double jump_step = JUMP_STEP * next;
     memset(step->stopped, 0, sizeof step->stopped);
+    memset(step->let_go, 0, sizeof step->let_go);
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         const int small = next <= jump_step; /* also where stretched to the end */
@@ -319,7 +322,7 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
     double left[N_JOINTS];       /* when each joint last left its limit */
     double until[N_JOINTS] = {0}; /* until when each joint is kept at its limit */
-    int kept[N_JOINTS];
+    int kept[N_JOINTS], let_go[N_JOINTS] = {0};
     Step step;
     double t = 0.0;
     if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
@@ -334,16 +337,26 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
         left[i] = -HUGE_VAL;
     while (t < h) {
         double end = h;
+        int held_again = 0;
         for (int i = 0; i < N_JOINTS; i++) {
             kept[i] = until[i] > t;
             if (kept[i])
                 end = fmin(end, until[i]);
         }
         set_out(&step, kept);
-        for (int i = 0; i < N_JOINTS; i++)
+        for (int i = 0; i < N_JOINTS; i++) {
             if (!step.stops.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
                 left[i] = t;
+            if (step.stops.watched[i] && let_go[i]) { /* it is pressed again, by rounding */
+                until[i] = t + patience;
+                held_again = 1;
+            }
+            let_go[i] = 0;
+        }
+        if (held_again)
+            continue;
         t = until_event(&step, t, end, obstacle);
+        memcpy(let_go, step.let_go, sizeof let_go);
         for (int i = 0; i < N_JOINTS; i++)
             if (step.stopped[i] && t - left[i] < patience)
                 until[i] = t + patience;

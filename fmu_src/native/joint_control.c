@@ -2,8 +2,8 @@
    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2. */
 #include "control.h"
 
-int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const double q[N_JOINTS],
-            const double v[N_JOINTS], double given[N_JOINTS])
+int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+            const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
 {
     (void)joint;
     for (int i = 0; i < N_JOINTS; i++)

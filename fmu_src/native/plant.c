@@ -11,7 +11,7 @@
 #include <string.h>
 
 #include "control.h"
-#include "dynamics.h"
+#include "mechanism.h"
 #if N_ROWS > N_AXES
 #include "orientation.h"
 #endif
@@ -34,32 +34,50 @@ static void body(const double value[N_VARIABLES], int as_known, Carrier *carrier
     load_carrier(payload, &value[PAYLOAD_COM], carrier);
 }
 
-/* τ of what the law gave, limited where it is to be. */
-static void control_effort(const double value[N_VARIABLES], Placement joint[N_BODIES],
-                           const double v[N_JOINTS], const double given[N_JOINTS],
-                           double tau[N_JOINTS])
+/* Whether the law knows the robot as it is, so that what it wants is what comes. */
+static int knows_all(const double value[N_VARIABLES])
+{
+#if COMMANDS_ACCELERATION
+    return value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0;
+#else
+    (void)value;
+    return 0;
+#endif
+}
+
+/* τ of what the law gave, without limits. */
+static void wanted_effort(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                          const double v[N_JOINTS], const double given[N_JOINTS],
+                          double tau[N_JOINTS])
 {
 #if COMMANDS_ACCELERATION
     Carrier known;
     body(value, 1, &known);
     inverse_dynamics(joint, &known, v, given, &value[GRAVITY], tau);
 #else
-    (void)joint, (void)v;
+    (void)value, (void)joint, (void)v;
     memcpy(tau, given, N_JOINTS * sizeof *tau);
 #endif
+}
+
+static void limit_effort(const double value[N_VARIABLES], double tau[N_JOINTS])
+{
     for (int i = 0; i < N_JOINTS && value[LIMIT_EFFORT] != 0.0; i++)
         tau[i] = saturated(tau[i], EFFORT[i]);
 }
 
 /* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 where a was commanded and is what comes. */
-static void add_excess(const double value[N_VARIABLES], Placement joint[N_BODIES],
+static void add_excess(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                        const Carrier *carrier, const double v[N_JOINTS],
                        const double given[N_JOINTS], const double a[N_JOINTS],
                        double sum[N_JOINTS])
 {
     double tau[N_JOINTS], needed[N_JOINTS];
-    control_effort(value, joint, v, given, tau);
-    inverse_dynamics(joint, carrier, v, a, &value[GRAVITY], needed);
+    wanted_effort(value, joint, v, given, tau);
+    memcpy(needed, tau, sizeof needed);
+    if (!knows_all(value))
+        inverse_dynamics(joint, carrier, v, a, &value[GRAVITY], needed);
+    limit_effort(value, tau);
     for (int i = 0; i < N_JOINTS; i++)
         sum[i] += tau[i] - needed[i];
 }
@@ -68,36 +86,27 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
                  double a[N_JOINTS])
 {
     const double *value = plant->value, *force = &value[F_EXT];
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     Carrier carrier;
-    double given[N_JOINTS], excess[N_JOINTS];
+    double given[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
     int acts = 0;
     place_joints(q, joint);
-    body(value, 0, &carrier);
     const int rank = command(value, joint, q, v, given);
     for (int i = 0; i < N_JOINTS; i++) {
         a[i] = COMMANDS_ACCELERATION ? given[i] : 0.0;
         excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
     }
     if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
-        TaskFrame task;
-        task_frame(joint, v, &task);
+        effort_of_force(joint, force, further);
         for (int i = 0; i < N_JOINTS; i++)
-            for (int k = 0; k < 3; k++)
-                excess[i] += task.J[k][i] * force[k];
+            excess[i] += further[i];
     }
-#if COMMANDS_ACCELERATION
-    const int exact = value[LIMIT_EFFORT] == 0.0
-                      && (value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0);
-#else
-    const int exact = 0;
-#endif
-    if (!exact)
+    body(value, 0, &carrier);
+    if (value[LIMIT_EFFORT] != 0.0 || !knows_all(value))
         add_excess(value, joint, &carrier, v, given, a, excess);
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
-        double further[N_JOINTS];
         acceleration_of_effort(joint, &carrier, excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
@@ -108,7 +117,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
 void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
                   const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS])
 {
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     Carrier carrier;
     place_joints(q, joint);
     body(plant->value, 0, &carrier);
@@ -121,22 +130,22 @@ void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
 
 void compute_position(Plant *plant)
 {
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     TaskFrame task;
     place_joints(&plant->value[Q], joint);
     task_frame(joint, &plant->value[V], &task);
     for (int k = 0; k < N_AXES; k++) {
-        plant->value[X + k] = task.x[AXIS[k]];
+        plant->value[X + k] = task.x[k];
         plant->value[XD + k] = 0.0;
         for (int i = 0; i < N_JOINTS; i++)
-            plant->value[XD + k] += task.J[AXIS[k]][i] * plant->value[V + i];
+            plant->value[XD + k] += task.J[k][i] * plant->value[V + i];
     }
 #if N_ROWS > N_AXES
     quaternion(task.R, &plant->value[QUAT]);
     for (int k = 0; k < 3; k++) {
         plant->value[OMEGA + k] = 0.0;
         for (int i = 0; i < N_JOINTS; i++)
-            plant->value[OMEGA + k] += task.J[3 + k][i] * plant->value[V + i];
+            plant->value[OMEGA + k] += task.J[N_AXES + k][i] * plant->value[V + i];
     }
 #endif
 }
@@ -144,8 +153,9 @@ void compute_position(Plant *plant)
 void compute_effort(Plant *plant)
 {
     double *value = plant->value, given[N_JOINTS];
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     place_joints(&value[Q], joint);
     command(value, joint, &value[Q], &value[V], given);
-    control_effort(value, joint, &value[V], given, &value[TAU]);
+    wanted_effort(value, joint, &value[V], given, &value[TAU]);
+    limit_effort(value, &value[TAU]);
 }

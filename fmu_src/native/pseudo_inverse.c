@@ -6,7 +6,8 @@
 
 /* Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12. */
 static const double WELL_CONDITIONED = 1e-3;
-/* Rows count as orthogonal where the cosine of their angle is below this, 2⁻⁵⁰. */
+/* Rows count as orthogonal where the cosine of their angle is below this, 2⁻⁵⁰, or the ratio of their
+   lengths: the shorter is what rounding has left of a row that depends on others. */
 static const double ORTHOGONAL = 1.0 / 1125899906842624.0;
 enum { MAX_SWEEPS = 12 };
 
@@ -61,7 +62,9 @@ static void orthogonalise(double J[N_ROWS][N_JOINTS], double b[N_ROWS])
         for (int i = 0; i < N_ROWS; i++)
             for (int j = i + 1; j < N_ROWS; j++) {
                 const double ii = dot(J[i], J[i]), ij = dot(J[i], J[j]), jj = dot(J[j], J[j]);
-                if (!(RE(fabs(ij)) > RE(ORTHOGONAL * sqrt(ii * jj))))
+                if (!(RE(fabs(ij)) > RE(ORTHOGONAL * sqrt(ii * jj)))
+                    || !(RE(ii) > RE(ORTHOGONAL * ORTHOGONAL * jj))
+                    || !(RE(jj) > RE(ORTHOGONAL * ORTHOGONAL * ii)))
                     continue;
                 rotated = 1;
                 const double zeta = (jj - ii) / (2.0 * ij);

@@ -7,56 +7,52 @@
    Source: Luh, Walker & Paul, IEEE TAC 25(3), 1980; Khatib, IEEE J-RA 3(1), 1987. */
 #include "control.h"
 
-#include <string.h>
-
 #include "pseudo_inverse.h"
 #if N_ROWS > N_AXES
 #include "orientation.h"
 #endif
 
-/* A row of the law: of which row of the frame, value references of its inputs, and its error. */
+/* A row of the law: value references of its inputs, and its error. */
 typedef struct {
-    int of, xd_des, xdd_des, Kp, Kd;
+    int xd_des, xdd_des, Kp, Kd;
     double error;
 } Row;
 
 static void law(const double value[N_VARIABLES], TaskFrame *task, Row row[N_ROWS])
 {
     for (int k = 0; k < N_AXES; k++) {
-        const Row linear = {AXIS[k], XD_DES + k, XDD_DES + k, KP + k, KD + k,
-                            value[X_DES + k] - task->x[AXIS[k]]};
+        const Row linear = {XD_DES + k, XDD_DES + k, KP + k, KD + k,
+                            value[X_DES + k] - task->x[k]};
         row[k] = linear;
     }
 #if N_ROWS > N_AXES
     double error[3];
     rotation_error(&value[QUAT_DES], task->R, error);
     for (int k = 0; k < 3; k++) {
-        const Row angular = {3 + k, OMEGA_DES + k, ALPHA_DES + k, KP_ROT + k, KD_ROT + k, error[k]};
+        const Row angular = {OMEGA_DES + k, ALPHA_DES + k, KP_ROT + k, KD_ROT + k, error[k]};
         row[N_AXES + k] = angular;
     }
 #endif
 }
 
-int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const double q[N_JOINTS],
-            const double v[N_JOINTS], double given[N_JOINTS])
+int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+            const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
 {
     TaskFrame task;
     Row row[N_ROWS];
-    double J[N_ROWS][N_JOINTS], wanted[N_ROWS];
+    double wanted[N_ROWS];
     const double Kn = value[KN];
     (void)q;
     task_frame(joint, v, &task);
     law(value, &task, row);
     for (int k = 0; k < N_ROWS; k++) {
         double xd = 0.0;
-        for (int i = 0; i < N_JOINTS; i++) {
-            J[k][i] = task.J[row[k].of][i];
-            xd += J[k][i] * v[i];
-        }
+        for (int i = 0; i < N_JOINTS; i++)
+            xd += task.J[k][i] * v[i];
         wanted[k] = value[row[k].xdd_des] + value[row[k].Kd] * (value[row[k].xd_des] - xd)
-                    + value[row[k].Kp] * row[k].error - task.drift[row[k].of] + Kn * xd;
+                    + value[row[k].Kp] * row[k].error - task.drift[k] + Kn * xd;
     }
-    const int rank = apply_pseudo_inverse(J, wanted, value[RCOND], given);
+    const int rank = apply_pseudo_inverse(task.J, wanted, value[RCOND], given);
     for (int i = 0; i < N_JOINTS; i++)
         given[i] -= Kn * v[i];
     return rank;
@@ -65,12 +61,9 @@ int command(const double value[N_VARIABLES], Placement joint[N_BODIES], const do
 void conditioning(const double q[N_JOINTS], double ratio[N_ROWS])
 {
     const double still[N_JOINTS] = {0};
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     TaskFrame task;
-    double J[N_ROWS][N_JOINTS];
     place_joints(q, joint);
     task_frame(joint, still, &task);
-    for (int k = 0; k < N_ROWS; k++)
-        memcpy(J[k], task.J[k < N_AXES ? AXIS[k] : 3 + k - N_AXES], sizeof J[k]);
-    singular_ratios(J, ratio);
+    singular_ratios(task.J, ratio);
 }

@@ -3,23 +3,29 @@
 
 #include "fmu.c"
 
-FMI2_Export void probe_task(const double q[], const double v[], double x[], double R[], double J[],
+FMI2_Export void probe_task(const double q[], const double v[], double x[], double J[],
                             double drift[])
 {
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     TaskFrame task;
     place_joints(q, joint);
     task_frame(joint, v, &task);
     memcpy(x, task.x, sizeof task.x);
-    memcpy(R, task.R, sizeof task.R);
     memcpy(J, task.J, sizeof task.J);
     memcpy(drift, task.drift, sizeof task.drift);
+}
+
+FMI2_Export void probe_effort_of_force(const double q[], const double force[], double tau[])
+{
+    JointPosition joint[N_BODIES];
+    place_joints(q, joint);
+    effort_of_force(joint, force, tau);
 }
 
 FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], const double a[],
                                         const double gravity[], double tau[])
 {
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, v, &carrier);
@@ -28,7 +34,7 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
 
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])
 {
-    Placement joint[N_BODIES];
+    JointPosition joint[N_BODIES];
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, q, &carrier);

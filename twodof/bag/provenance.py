@@ -11,9 +11,12 @@ from ..errors import BagError
 from ..experiments import Changes, Experiment
 from ..files import read_file
 from ..version import versions
+from .records import DamageError, read_metadata
 
 FILE = "run.json"
 FORMAT = 1
+KEY = "twodof"
+"""Of the provenance in a bag's own metadata."""
 MAX_YAML = 256 * 1024  # bytes of changes: a writer of YAML takes 2 s for a MiB
 TAIL = b"]}\n"
 KNOWN_UNTIL = "inputs_known_until"
@@ -109,21 +112,27 @@ def _as_json(content: Any) -> bytes:
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """The provenance in a bag's folder; {} where there is none, or a file of another tool.
+    """The provenance of a bag; {} where there is none, or that of another tool.
+
+    It is in the bag's folder, or in the metadata of a bag that is a single file.
 
     Raises:
         BagError: it cannot be read, or is not what was written.
     """
-    file = path / FILE
+    single = path.suffix == ".mcap" and path.is_file()
+    file = path if single else path / FILE
     try:
-        content = parsed(read_file(file, MAX_SIZE))
+        text = read_metadata(path, KEY, FILE).encode() if single else read_file(file, MAX_SIZE)
+        if single and not text:
+            return {}
+        content = parsed(text)
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
             if not fits(content, SHAPE):
                 raise ValueError("it is damaged")
             return content
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError, DamageError) as error:
         raise BagError(f"cannot read '{file}': {error}") from error
     return {}
 

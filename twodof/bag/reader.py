@@ -99,7 +99,7 @@ def whole_bag(path: Path) -> list[Path]:
         packed = [*path.glob("*.zstd")]
         what = "it is compressed as a whole" if packed else "it has no .mcap or .db3 file"
         raise BagError(f"cannot read the bag '{path}': {what}")
-    if not (path / "metadata.yaml").is_file():
+    if files != [path] and not (path / "metadata.yaml").is_file():
         if is_being_written(path):
             raise BagError(f"the bag '{path}' is still being written")
         raise BagError(

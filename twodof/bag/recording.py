@@ -170,7 +170,7 @@ class Recording:
         text = self.provenance.get("urdf")
         if text is None or not self.axes:
             return np.empty((len(self.stamps), 0))
-        from ..kinematics import Kinematics  # SciPy takes half a second to import
+        from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
 
         try:
             robot: Urdf = read_urdf(text)

@@ -12,7 +12,7 @@ import shutil
 import sqlite3
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from operator import length_hint
@@ -35,7 +35,7 @@ MAX_RATIO = 1000  # of unpacked to packed; an arm at rest reaches 24, one of 50 
 RECORD = 2000  # bytes that a record counts for; a message takes 3 of the file at least, packed
 TEXT = 100  # bytes that one of a topic's texts counts for, which are kept
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, FOOTER = 3, 4, 5, 6, 2  # opcodes of the MCAP specification
+SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, FOOTER = 3, 4, 5, 6, 12, 2  # of the MCAP specification
 READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
 HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # with the record's head: channel, sequence, two times
@@ -86,7 +86,12 @@ class Allowance:
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The files that hold a bag's messages, in the order in which they were written."""
+    """The files that hold a bag's messages, in the order in which they were written.
+
+    An MCAP file alone, as pages and other tools write them, is a bag too.
+    """
+    if folder.suffix == ".mcap" and folder.is_file():
+        return [folder]
     files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
     return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
@@ -143,8 +148,29 @@ def _mcap_messages(path: Path, allowance: Allowance) -> Iterator[tuple[Channel, 
                 position = end
 
 
-def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[tuple[int, bytes]]:
-    """Opcode of each record up to the footer that matters, and the record with its head.
+def read_metadata(path: Path, name: str, key: str) -> str:
+    """An entry of an MCAP file's own metadata; "" where it has none of that name.
+
+    Raises:
+        DamageError, OSError: as ``read_messages``.
+    """
+    try:
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise DamageError(f"'{path.name}' is no MCAP file")
+            for _, content in _mcap_records(path, file, Allowance(), (METADATA,)):
+                found, _, position = _fields("sI", content, HEAD.size)
+                if found == name:
+                    return _entries(content[position:]).get(key, "")
+    except (struct.error, UnicodeDecodeError) as error:
+        raise DamageError(f"'{path.name}' is damaged") from error
+    return ""
+
+
+def _mcap_records(
+    path: Path, file: BinaryIO, allowance: Allowance, wanted: Sequence[int] = READ
+) -> Iterator[tuple[int, bytes]]:
+    """Opcode of each record up to the footer that is wanted, and the record with its head.
 
     Of a chunk, the content alone.
     """
@@ -159,16 +185,16 @@ def _mcap_records(path: Path, file: BinaryIO, allowance: Allowance) -> Iterator[
         position += HEAD.size + length
         if opcode == 0 or position > size:
             raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
-        if opcode in READ and length > MAX_CHUNK:
+        if opcode in wanted and length > MAX_CHUNK:
             raise DamageError(f"'{path.name}' has a record of {length} bytes")
         if opcode == FOOTER:
             file.seek(length, 1)
             if file.read(len(MAGIC)) != MAGIC:
                 raise DamageError(f"'{path.name}' ends in the middle, at byte {size}")
             return
-        if opcode == CHUNK:
+        if opcode == CHUNK and opcode in wanted:
             yield opcode, file.read(length)
-        elif opcode in READ:
+        elif opcode in wanted:
             yield opcode, head + file.read(length)
         elif length:
             file.seek(length, 1)
@@ -199,16 +225,20 @@ def _channel(
     content: bytes, position: int, schemas: dict[int, tuple[str, str]]
 ) -> tuple[int, Channel]:
     number, schema, topic, encoding, length, position = _fields("HHssI", content, position)
-    metadata = content[position : position + length]
-    entries, position = {}, 0
-    while position < len(metadata):
-        key, value, position = _fields("ss", metadata, position)
-        entries[key] = value
+    entries = _entries(content[position : position + length])
     name, definition = schemas[schema]
     qos = entries.get("offered_qos_profiles", "")
     return number, Channel(
         topic, name, encoding, definition, qos, entries.get("topic_type_hash", "")
     )
+
+
+def _entries(metadata: bytes) -> dict[str, str]:
+    entries, position = {}, 0
+    while position < len(metadata):
+        key, value, position = _fields("ss", metadata, position)
+        entries[key] = value
+    return entries
 
 
 def _fields(form: str, content: bytes, position: int) -> list[Any]:

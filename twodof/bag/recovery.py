@@ -22,7 +22,7 @@ from ..errors import BagError
 from ..files import lock, read_file, sync
 from . import provenance
 from .records import Allowance, Channel, DamageError, read_messages, storage_files
-from .storage import KINDS, MAX_METADATA, PROVENANCE_KEY, BagWriter, check_path
+from .storage import KINDS, MAX_METADATA, BagWriter, check_path
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
 MAX_DEFINITION = 64 * 1024  # bytes
@@ -133,7 +133,7 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
     writer = BagWriter(new, KINDS[files[0].suffix])
     with suppress(BagError):  # damaged: the messages are worth saving without it
         if provenance.read_provenance(folder):
-            writer.set_custom_data(PROVENANCE_KEY, run_file.read_text("utf-8").strip())
+            writer.set_custom_data(provenance.KEY, run_file.read_text("utf-8").strip())
     with writer:
         topics = _Topics(writer)
         for file in files:

@@ -23,8 +23,6 @@ from ..errors import BagError
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 MAX_METADATA = 64 * 1024**2  # bytes
-PROVENANCE_KEY = "twodof"
-"""Of the provenance in metadata.yaml's custom data."""
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
 REMOVED = "it was removed while it was being written"

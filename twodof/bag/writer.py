@@ -22,11 +22,10 @@ from ..experiments import Experiment, Value
 from ..files import lock, read_file, sync
 from ..master import Sample, Sink
 from ..ros.messages import JOINT_STATES, STORE, Messages, Serialised
-from .provenance import ProvenanceFile, read_provenance
+from .provenance import KEY, ProvenanceFile, read_provenance
 from .storage import (
     BATCH_SIZE,
     MAX_METADATA,
-    PROVENANCE_KEY,
     REMOVED,
     STORAGES,
     BagWriter,
@@ -249,7 +248,7 @@ class Bag(Sink):
             storage.salvage()
             self._store()
         with suppress(OSError):  # it was removed: the messages are worth closing without it
-            self._writer.set_custom_data(PROVENANCE_KEY, self._provenance.text())
+            self._writer.set_custom_data(KEY, self._provenance.text())
         self._writer.close()
         if self._fsync:
             sync(storage.path, self.path / "metadata.yaml", self.path)

@@ -57,6 +57,10 @@ def add(verbs: Any) -> None:
         "--native", action="store_true", help="compiled C, which needs no Python where it runs"
     )
     build.add_argument(
+        "--no-live-documentation", action="store_true",
+        help="leave the arm that runs in a browser out of a native FMU's documentation",
+    )  # fmt: skip
+    build.add_argument(
         "--platform", dest="platforms", action="append", default=[], metavar="P",
         help="of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
         " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
@@ -91,6 +95,7 @@ def call(options: argparse.Namespace) -> int:
         link_environment=options.link_environment,
         native=options.native,
         fmi=options.fmi,
+        live_documentation=not options.no_live_documentation,
         platforms=_platforms(options.platforms, options.fmi or 2),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # other platforms take minutes

@@ -49,10 +49,12 @@ def _plot_bags(options: argparse.Namespace) -> int:
     from ..plots.words import difference, labels, outcome
 
     tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
-    results = [pair for pair in zip(labels(tracks), map(outcome, tracks)) if pair[1]]
-    for track in tracks[1:]:
-        results.append((track.name, difference(tracks[0], track)))
-    _show_or_save(drawing(tracks), options.output, *filter(lambda pair: pair[1], results))
+    results = []
+    for label, track in zip(labels(tracks), tracks):
+        apart = difference(tracks[0], track) if track is not tracks[0] else ""
+        if text := "; ".join(filter(None, (outcome(track), apart))):
+            results.append((label, text))
+    _show_or_save(drawing(tracks), options.output, *results)
     return 0
 
 

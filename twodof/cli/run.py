@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +50,7 @@ def call(options: argparse.Namespace) -> int:
     bag = bag_of(options, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
     pace = RealTime() if options.realtime else None
     with asked_to_stop() as asked:
-        summary = simulate(run, bag, progress(), pace=pace, stop=asked)
+        summary = simulate(run, bag, *progress(), pace=pace, stop=asked)
     print_summary(options, run, bag, summary, pace)
     if not options.json:
         print_next(
@@ -60,8 +61,10 @@ def call(options: argparse.Namespace) -> int:
     return INTERRUPTED if summary.stopped else 0
 
 
-def progress() -> Sink:
-    """A sink that shows a bar on a terminal and nothing in a pipe."""
+def progress() -> list[Sink]:
+    """A sink that shows a bar on a terminal; none in a pipe."""
+    if not sys.stderr.isatty():
+        return []
     from tqdm import tqdm
 
     from ..master import Sink
@@ -74,7 +77,7 @@ def progress() -> Sink:
         def __enter__(self) -> Progress:
             run = self._run
             self._bar = tqdm(
-                total=run.steps * run.step, unit="s", disable=None, leave=False, desc="simulating",
+                total=run.steps * run.step, unit="s", leave=False, desc="simulating",
                 bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s,"
                 " {remaining} left",
             )  # fmt: skip
@@ -86,4 +89,4 @@ def progress() -> Sink:
         def __exit__(self, *exception: object) -> None:
             self._bar.close()
 
-    return Progress()
+    return [Progress()]

@@ -29,6 +29,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name),
              3: tuple(name for name in TARGETS if "-" in name)}  # fmt: skip
 """By version of FMI."""
+ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
 UNITS = ("directional.c", "fmu.c")
 """The C files that are compiled; they include the others."""
 EXTENSIONS = {
@@ -37,10 +38,10 @@ EXTENSIONS = {
 }
 FLAGS = (
     "-std=c99", "-O2", "-ffp-contract=off", "-fcx-limited-range", "-fno-math-errno",
-    "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic", "-shared",
+    "-fno-tree-slp-vectorize", "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic",
 )  # fmt: skip
 """Multiplications are never fused with additions, so that platforms agree; complex ones are so
-without a thought for infinities."""
+without a thought for infinities. Pairing scalars into vectors takes long and gains nothing."""
 
 
 def compile_library(
@@ -78,6 +79,34 @@ def compile_library(
     return built[0] if len(built) == 1 else universal(built)
 
 
+def compile_web_module(
+    sources: Mapping[str, bytes], units: Sequence[str], functions: Sequence[str]
+) -> bytes:
+    """A WebAssembly module of these of the C files, that imports nothing and exports functions.
+
+    Its ``_initialize`` is to be called first.
+
+    Raises:
+        BuildError: there is no compiler for it, or the compiler failed.
+    """
+    if not compiles_for_the_web():
+        raise BuildError(
+            "cannot compile for the browser: install the package 'ziglang' (the extra 'native')"
+        )
+    exports = [f"-Wl,--export={function}" for function in functions]
+    with temporary_folder() as folder:
+        for file, content in sources.items():
+            (folder / file).write_bytes(content)
+        link = ["-mexec-model=reactor", "-s", "-o", "module.wasm", *exports]
+        _run([*ZIG, "wasm32-wasi", *FLAGS, *link, *units], folder)
+        return (folder / "module.wasm").read_bytes()
+
+
+def compiles_for_the_web() -> bool:
+    """Whether there is a compiler for WebAssembly."""
+    return importlib.util.find_spec("ziglang") is not None
+
+
 def host_platform(fmi: int = 2) -> str:
     """FMI platform of this machine, in a version's words; "" where there is no name for it."""
     machine = host.machine().lower()
@@ -110,9 +139,8 @@ def universal(libraries: Sequence[bytes]) -> bytes:
 
 def _compilers(platform: str) -> list[list[str]]:
     """Commands that compile for a platform, one for each architecture."""
-    if importlib.util.find_spec("ziglang") is not None:
-        zig = [sys.executable, "-m", "ziglang", "cc", "-target"]
-        return [[*zig, target] for target in TARGETS[platform]]
+    if compiles_for_the_web():  # zig, which compiles for everything
+        return [[*ZIG, target] for target in TARGETS[platform]]
     own = next((cc for cc in ("cc", "gcc", "clang") if shutil.which(cc)), None)
     here = [name for name in (host_platform(2), host_platform(3)) if name]
     if platform in here and own:
@@ -130,7 +158,7 @@ def _compilers(platform: str) -> list[list[str]]:
 
 def _link_flags(output: str) -> list[str]:
     """Flags that leave nothing of this machine and this moment in the library."""
-    flags = ["-s", "-o", output]
+    flags = ["-shared", "-s", "-o", output]
     if output.endswith(".so"):
         return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
     if output.endswith(".dylib"):

@@ -11,6 +11,7 @@ from string import Template
 from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
+from .arm_page import LivePart
 from .flavours import Files, Flavour
 
 LAWS = {
@@ -41,6 +42,7 @@ def documentation(
     guid: str,
     version: str,
     urdf: str,
+    live: LivePart,
 ) -> Files:
     """Files of the folder by their path in the FMU.
 
@@ -49,6 +51,7 @@ def documentation(
         flavour: says what the FMU depends on, cannot do, and whose code it contains.
         name, guid, version: of the model description.
         urdf: text of resources/robot.urdf.
+        live: the arm itself, or nothing.
     """
     rows = "\n".join(
         "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in _row(variable)) + "</tr>"
@@ -56,6 +59,8 @@ def documentation(
     )
     template = data_file("fmu_src", "documentation.html").read_text("utf-8")
     page = Template(template).substitute(
+        head=live.head,
+        live=live.body,
         name=name,
         robot=html.escape(robot.name),
         frame=html.escape(robot.frame),

@@ -19,6 +19,7 @@ from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, UNITS, compile_library
+from .mechanism import mechanism_source
 from .model_description3 import build_description
 from .native import model_header
 
@@ -131,6 +132,7 @@ def native_flavour(
     assert fmpy is not None and fmpy.origin is not None
     headers = Path(fmpy.origin).parent / "c-code"
     sources = engine_sources(control, fmi)
+    sources["mechanism.c"] = mechanism_source(robot, table).encode()
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS[fmi]})
     described = {"buildDescription.xml": build_description(name, UNITS)} if fmi == 3 else {}
 

@@ -1,8 +1,7 @@
 """The native flavour: the header of a robot's constants, and compiling the C engine with it.
 
-The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``model.h``, in which
-each joint turns about, or slides along, the z axis of its own frame: frames are rotated here, once,
-so that the engine has one kind of axis. Pinocchio has read the URDF.
+The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``model.h``; the robot's
+dynamics are ``mechanism.c``. Pinocchio has read the URDF.
 """
 
 from __future__ import annotations
@@ -11,13 +10,10 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import BuildError
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
-
-Array = NDArray[np.float64]
 
 MAX_JOINTS = 128
 """The engine's working memory is on the stack: 0.2 MB at this number."""
@@ -45,29 +41,16 @@ def model_header(
     n, m = len(robot.joints), len(robot.axes)
     if n > MAX_JOINTS:
         raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
-    indicators = count_event_indicators(robot, control)
-    if fmi == 3:
-        table = _with_indicators(table, indicators)
+    table = engine_variables(robot, table, control, fmi)
     groups = [variable.group for variable in table]
-    model = robot.model
-    subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
-    to_z = [_rotation_to_z(axis[:3] + axis[3:]) for axis in subspaces]
-    turned = [np.eye(3), *to_z]  # by Pinocchio's joint index, 0 the root
-    parents = [int(parent) for parent in list(model.parents)[1:]]
-    placements = list(model.jointPlacements)[1:]
-    inertias = list(model.inertias)[1:]
-    frame = model.frames[robot.frame_id]
-    path = [int(i) - 1 for i in model.supports[frame.parentJoint]][1:]
     sections = [
-        "/* Constants of a robot, generated from its URDF. SI units. Each joint turns about, or\n"
-        "   slides along, the z axis of its own frame. */\n"
+        "/* Constants of a robot, generated from its URDF. SI units. */\n"
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
         f"#define FMI {fmi}\n#define MODEL_GUID {_quoted(guid)}\n"
         f"#define N_JOINTS {n} /* that move on their own */\n"
-        f"#define N_BODIES {len(parents)}\n"
-        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n"
-        f"#define N_PATH {len(path)} /* joints that move the task frame */\n",
-        f"#define N_INDICATORS {indicators} /* of events */\n"
+        f"#define N_BODIES {robot.model.njoints - 1} /* of which some may follow others */\n"
+        f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n",
+        f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
         _value_references(groups),
@@ -77,29 +60,6 @@ def model_header(
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
         _ranges(groups),
         _table("char *const JOINT_NAME", robot.joints),
-        "/* The tree: parents are -1 for the root; joints from the root to the task frame. */\n"
-        + _table("int PARENT", (parent - 1 for parent in parents)),
-        _table("int PRISMATIC", (int(axis[:3].any()) for axis in subspaces)),
-        _following(robot),
-        _table("int PATH", path or [0]),
-        _table("int AXIS", ("xyz".index(axis) for axis in robot.axes)),
-        "/* Joint frames in their parents' at q = 0; the task frame in its joint's. */\n"
-        + _table(
-            "double JOINT_R",
-            (turned[p].T @ M.rotation @ R for p, M, R in zip(parents, placements, to_z)),
-        ),
-        _table(
-            "double JOINT_P", (turned[p].T @ M.translation for p, M in zip(parents, placements))
-        ),
-        f"static const double FRAME_P[3] = "
-        f"{_literal(turned[frame.parentJoint].T @ frame.placement.translation)};\n"
-        f"static const double FRAME_R[3][3] = "
-        f"{_literal(turned[frame.parentJoint].T @ frame.placement.rotation)};\n"
-        f"enum {{ CARRIER = {int(frame.parentJoint) - 1} }}; /* the joint that carries it */\n",
-        "/* Bodies: mass, centre of mass, inertia about it, in the joint's frame. */\n"
-        + _table("double MASS", (inertia.mass for inertia in inertias)),
-        _table("double COM", (R.T @ inertia.lever for R, inertia in zip(to_z, inertias))),
-        _table("double INERTIA", (R.T @ inertia.inertia @ R for R, inertia in zip(to_z, inertias))),
         "/* Effort limits, HUGE_VAL where there is none, and viscous damping of the joints. */\n"
         + _table("double EFFORT", robot.effort),
         _table("double DAMPING", robot.damping),
@@ -108,30 +68,17 @@ def model_header(
     return "\n".join(sections)
 
 
-def _subspace(joint: object) -> Array:
-    """Velocity of a joint with one coordinate, in its own frame: linear, angular; one is zero."""
-    data = joint.createData()  # type: ignore[attr-defined]
-    joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
-    return np.asarray(data.S).reshape(6)
-
-
-def _following(robot: Robot) -> str:
-    """Which of the joints that move on their own each body's joint follows, and how."""
-    G = np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling
-    tables = _table("double OFFSET", robot.offset.tolist())
-    if robot.coupling is not None:
-        tables += _table("double RATIO", G.sum(axis=1).tolist())
-        tables += _table("int LEADER", (int(np.argmax(np.abs(row))) for row in G))
-    return "/* A joint's position is RATIO q[LEADER] + OFFSET. */\n" + tables
-
-
-def _rotation_to_z(axis: Array) -> Array:
-    """A rotation R with R e_z = axis; a permutation, so exact, where the axis is x, y or z."""
-    k = int(np.argmax(np.abs(axis)))
-    x = np.roll(np.eye(3)[0], k + 1)  # the coordinate axis after the largest component
-    x -= axis * axis.dot(x)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])
+def engine_variables(
+    robot: Robot, table: Sequence[Variable], control: str, fmi: int
+) -> Sequence[Variable]:
+    """The variables by value reference: in FMI 3.0 event indicators and the time are among them."""
+    if fmi == 2:
+        return table
+    first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
+    count = count_event_indicators(robot, control)
+    places = [*(("event_indicators", i) for i in range(count)), ("time", None)]
+    added = [Variable(group, i, "local", "", None, "") for group, i in places]
+    return [*table[:first], *added, *table[first:]]
 
 
 def _value_references(groups: Sequence[str]) -> str:
@@ -140,14 +87,6 @@ def _value_references(groups: Sequence[str]) -> str:
     lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
     body = "\n".join(lines)
     return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
-
-
-def _with_indicators(table: Sequence[Variable], count: int) -> list[Variable]:
-    """The variables of FMI 3.0: event indicators and the time are among them."""
-    first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
-    places = [*(("event_indicators", i) for i in range(count)), ("time", None)]
-    added = [Variable(group, i, "local", "", None, "") for group, i in places]
-    return [*table[:first], *added, *table[first:]]
 
 
 def _ranges(groups: Sequence[str]) -> str:

@@ -7,24 +7,27 @@ import io
 import logging
 import math
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ..errors import ZIP_ERRORS, BuildError
-from ..files import check_archive, data_file, write_file
+from ..files import check_archive, data_file, read_member, write_file
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
-from .compiler import PLATFORMS, host_platform
+from .arm_page import CONTAINER, Arm, LivePart, live_part
+from .compiler import PLATFORMS, compiles_for_the_web, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
-from .model_description import model_description
+from .model_description import DEFAULT_STEP, model_description
 from .model_description3 import model_description3
+from .native import engine_variables
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)
@@ -32,6 +35,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 
+MAX_PAGE = 512 * 1024**2  # bytes of documentation
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -57,6 +61,8 @@ class FmuOptions:
         link_environment: remember the folders of this Python's packages in the FMU; not for the
             native flavour, which needs none.
         native: the plant as compiled C instead of Python code.
+        live_documentation: put the arm, alive, into the documentation of a native FMU, where
+            there is a compiler for it; its meshes are then in the FMU twice.
         fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
         platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or of FMI 3.0
             "x86_64-linux", "aarch64-linux"; empty: this machine's.
@@ -75,6 +81,7 @@ class FmuOptions:
     link_environment: bool = False
     native: bool = False
     fmi: int | None = None
+    live_documentation: bool = True
     platforms: tuple[str, ...] = ()
 
 
@@ -96,14 +103,20 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
     options = options or FmuOptions()
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = Path(output if output is not None else default)
-    flavour, guid, files = _compose(options)
-    if not _holds(path, files["modelDescription.xml"], flavour.platforms):
-        _write_zip(path, {**files, **flavour.finish(guid)})
+    flavour, files, finish = _compose(options)
+    live = _is_live(options)
+    if not _holds(path, files["modelDescription.xml"], flavour.platforms, live):
+        _write_zip(path, {**files, **finish()})
     return path
 
 
-def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
-    """The flavour, the GUID, and all files of the FMU but those that the flavour finishes."""
+def _is_live(options: FmuOptions) -> bool:
+    """Whether the arm is in the documentation, alive."""
+    return options.native and options.live_documentation and compiles_for_the_web()
+
+
+def _compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
+    """The flavour, what the GUID is of, and what gives all other files: it compiles."""
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
     if options.control not in CONTROLS:
@@ -146,19 +159,59 @@ def _compose(options: FmuOptions) -> tuple[Flavour, str, Files]:
     guid = digest.hexdigest()
     files["modelDescription.xml"] = describe(guid)
     files["model.png"] = data_file("fmu_src", "model.png").read_bytes()
-    files.update(
-        documentation(
-            robot,
-            table,
-            options.control,
-            flavour,
-            name=options.name,
-            guid=guid,
-            version=__version__,
-            urdf=urdf,
-        )
+    return flavour, files, partial(_finish, options, robot, table, flavour, guid, files)
+
+
+def _finish(
+    options: FmuOptions,
+    robot: Robot,
+    table: Sequence[Variable],
+    flavour: Flavour,
+    guid: str,
+    files: Files,
+) -> Files:
+    """What the GUID is not of: binaries and documentation."""
+    binaries = flavour.finish(guid)
+    live = LivePart("", "")
+    if _is_live(options):
+        variables = engine_variables(robot, table, options.control, flavour.fmi)
+        live = _live_part(options, robot, variables, guid, {**files, **binaries})
+    return binaries | documentation(
+        robot,
+        table,
+        options.control,
+        flavour,
+        name=options.name,
+        guid=guid,
+        version=__version__,
+        urdf=files["resources/robot.urdf"].decode(),
+        live=live,
     )
-    return flavour, guid, files
+
+
+def _live_part(
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], guid: str, files: Files
+) -> LivePart:
+    """The arm of the FMU that has these files."""
+    variables = [
+        {
+            "name": variable.name, "reference": reference, "causality": variable.causality,
+            "unit": variable.unit, "start": variable.start, "description": variable.description,
+        }
+        for reference, variable in enumerate(table)
+        if variable.causality != "local"
+    ]  # fmt: skip
+    folder = "sources/"
+    return live_part(
+        Arm(
+            name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
+            joints=robot.joints, frame=robot.frame, root=robot.root, axes="".join(robot.axes),
+            control=options.control, variables=variables, step=DEFAULT_STEP,
+            urdf=files["resources/robot.urdf"].decode(),
+            read=lambda name: files.get(f"resources/{name}"),
+            sources={p[len(folder) :]: c for p, c in files.items() if p.startswith(folder)},
+        )
+    )  # fmt: skip
 
 
 def _flavour(
@@ -248,7 +301,7 @@ def _rest(robot: Robot) -> tuple[float, ...]:
     )
 
 
-def _holds(path: Path, description: bytes, platforms: Sequence[str]) -> bool:
+def _holds(path: Path, description: bytes, platforms: Sequence[str], live: bool) -> bool:
     """Whether the file is already this FMU; its guid is a digest of all that matters."""
     try:
         check_archive(path)
@@ -256,7 +309,8 @@ def _holds(path: Path, description: bytes, platforms: Sequence[str]) -> bool:
             found = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
             with archive.open("modelDescription.xml") as file:
                 same = file.read(len(description) + 1) == description
-            return same and found == set(platforms)
+            page = read_member(archive, "documentation/index.html", MAX_PAGE)
+            return same and found == set(platforms) and (CONTAINER in page) == live
     except (*ZIP_ERRORS, KeyError):
         return False
 

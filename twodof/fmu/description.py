@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import re
 import zipfile
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ import fmpy
 from fmpy.model_description import ModelDescription, ModelVariable
 
 from ..errors import ZIP_ERRORS, FmuError
-from ..files import UnsafeArchiveError, check_archive, read_member
+from ..files import UnsafeArchiveError, check_archive, is_plain_xml, read_member
 
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
 MAX_RESOURCE = 256 * 1024**2
@@ -31,6 +30,7 @@ class Variable:
         causality, unit: as the description has them.
         type: "Real" for Float64 too, "Boolean", or another as the description has it.
         start: text of the start value; None where there is none.
+        description: of the scalar, or of the array as a whole.
         reference: value reference.
         element: 0-based place in the array, row by row.
     """
@@ -40,6 +40,7 @@ class Variable:
     type: str
     unit: str | None
     start: str | None
+    description: str
     reference: int
     element: int = 0
 
@@ -198,19 +199,9 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
         raise FmuError(f"'{path}': {error}") from error
     except ZIP_ERRORS as error:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
-    if not _is_plain(xml):
+    if not is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, archive.namelist()
-
-
-def _is_plain(xml: bytes) -> bool:
-    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
-    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
-    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
-    encoding = declared[1].lower() if declared else b"utf-8"
-    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
-    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
-    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
 
 
 def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
@@ -241,13 +232,15 @@ def _scalars(variable: ModelVariable) -> Iterator[Variable]:
     """A scalar variable itself, or the elements of an array."""
     kind = "Real" if variable.type == "Float64" else variable.type
     rest = (variable.causality, kind, variable.unit)
+    text = variable.description or ""
     if not variable.dimensions:
-        yield Variable(variable.name, *rest, variable.start, variable.valueReference)
+        yield Variable(variable.name, *rest, variable.start, text, variable.valueReference)
         return
     starts: list[str | None] = list((variable.start or "").split())
     starts = starts or [None]
     inner = re.fullmatch(r"der\((.*)\)", variable.name)
     for i, place in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
-        text = f"[{','.join(map(str, place))}]"
-        name = f"der({inner[1]}{text})" if inner else variable.name + text
-        yield Variable(name, *rest, starts[i % len(starts)], variable.valueReference, i)
+        index = f"[{','.join(map(str, place))}]"
+        name = f"der({inner[1]}{index})" if inner else variable.name + index
+        start = starts[i % len(starts)]
+        yield Variable(name, *rest, start, text, variable.valueReference, i)

@@ -8,11 +8,11 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from ctypes import byref, c_double, c_uint
+from ctypes import Array, byref, c_bool, c_double, c_uint
 from itertools import accumulate, chain
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import fmpy
 import numpy as np
@@ -29,13 +29,15 @@ from .description import Fmu
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
+WARNING = fmi2.fmi2Warning
+Values = Array[c_double]
 
 
 class Instance:
     """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
 
     FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
-    SimulationError with the FMU's own words.
+    SimulationError with the FMU's own words. What is called at each step goes past FMPy's checks.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
@@ -51,6 +53,7 @@ class Instance:
                 modelIdentifier=identifier,
                 instanceName=identifier,
             )
+            self._component = self._slave.component
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
         finally:
@@ -65,6 +68,8 @@ class Instance:
         )
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
+        self._do_step = slave.dll.fmi2DoStep
+        self._step_arguments: tuple[object, ...] = (1,)
         return slave
 
     def initialise(
@@ -92,18 +97,27 @@ class Instance:
 
     def step(self, t: float, h: float) -> None:
         """One communication step from t to t + h."""
-        self._call(self._slave.doStep, t, h)
+        self._said = ""
+        if (status := self._do_step(self._component, t, h, *self._step_arguments)) > WARNING:
+            self._refuse(status)
 
-    def reader(self, names: Sequence[str]) -> Callable[[], tuple[float, ...]]:
-        """A function that reads these Real variables."""
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """A function that reads these Real variables, each time into the same place."""
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].reference for name in names))
         values = (c_double * n)()
-        get = self._slave.fmi2GetReal
+        return self._reader(values, self._slave.dll.fmi2GetReal, references, n, values)
 
-        def read() -> tuple[float, ...]:
-            self._call(get, self._slave.component, references, n, values)
-            return tuple(values)
+    def _reader(
+        self, values: Values, get: Callable[..., int], *arguments: object
+    ) -> Callable[[], Values]:
+        component = self._component
+
+        def read() -> Values:
+            self._said = ""
+            if (status := get(component, *arguments)) > WARNING:
+                self._refuse(status)
+            return values
 
         return read
 
@@ -129,9 +143,13 @@ class Instance:
         try:
             function(*arguments, **named)
         except FMICallException as error:
-            self._fatal = error.status == fmi2.fmi2Fatal
-            outcome = "discarded" if error.status == fmi2.fmi2Discard else "failed"
-            raise SimulationError(self._said or str(error), outcome=outcome) from error
+            self._refuse(error.status)
+
+    def _refuse(self, status: int) -> NoReturn:
+        """Raise what a call's status means, in the FMU's own words where it said something."""
+        self._fatal = status == fmi2.fmi2Fatal
+        outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
+        raise SimulationError(self._said or f"a call failed, status {status}", outcome=outcome)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
@@ -143,7 +161,7 @@ class Instance:
         self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
     ) -> None:
         message = text.decode("utf-8", "replace").strip()
-        if status > fmi2.fmi2Warning:
+        if status > WARNING:
             self._said = message
         logger.log(LEVELS.get(status, logging.CRITICAL), message)
 
@@ -159,6 +177,9 @@ class Instance3(Instance):
     def _instantiate(self, **what: str) -> Any:
         slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=self._log_message, loggingOn=True)
+        self._ends = c_bool()
+        results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
+        self._do_step, self._step_arguments = slave.dll.fmi3DoStep, (True, *results)
         return slave
 
     def _starts(self) -> dict[int, list[float | bool]]:
@@ -180,6 +201,12 @@ class Instance3(Instance):
         self._accept(self._slave.enterInitializationMode, startTime=start_time, stopTime=stop)
         self._accept(self._slave.exitInitializationMode)
 
+    def step(self, t: float, h: float) -> None:
+        """One communication step from t to t + h."""
+        super().step(t, h)
+        if self._ends:
+            raise SimulationError(self._said or "the FMU ends the simulation")
+
     def reset(self) -> None:
         """Back to where it was when it was instantiated."""
         super().reset()
@@ -198,22 +225,27 @@ class Instance3(Instance):
                 self._accept(setter, references, list(values_of))
         self._arrays.update(arrays)
 
-    def reader(self, names: Sequence[str]) -> Callable[[], tuple[float, ...]]:
-        """A function that reads these Real variables."""
-        chosen = [self._fmu.variables[name] for name in names]
-        distinct = list(dict.fromkeys(variable.reference for variable in chosen))
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """A function that reads these Real variables, each time into the same place."""
+        wanted = [self._fmu.variables[name] for name in names]
+        distinct = list(dict.fromkeys(variable.reference for variable in wanted))
         first = dict(zip(distinct, accumulate((self._sizes[r] for r in distinct), initial=0)))
-        places = [first[variable.reference] + variable.element for variable in chosen]
+        places = [first[variable.reference] + variable.element for variable in wanted]
         size = sum(self._sizes[reference] for reference in distinct)
         references = (c_uint * len(distinct))(*distinct)
-        values = (c_double * size)()
-        get = self._slave.fmi3GetFloat64
+        whole = (c_double * size)()
+        get = self._slave.dll.fmi3GetFloat64
+        read = self._reader(whole, get, references, len(distinct), whole, size)
+        if places == [*range(size)]:
+            return read
+        values = (c_double * len(places))()
 
-        def read() -> tuple[float, ...]:
-            self._call(get, self._slave.component, references, len(distinct), values, size)
-            return tuple([values[place] for place in places])
+        def read_elements() -> Values:
+            read()
+            values[:] = [whole[place] for place in places]
+            return values
 
-        return read
+        return read_elements
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
         """∂unknown/∂known at the instance's state, a row each of the unknown."""

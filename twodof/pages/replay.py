@@ -18,9 +18,9 @@ from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
 from ..files import data_file, refusing, shown, write_file
 from ..fmu import load_fmu, read_resource
+from ..geometry.meshes import ReadMesh
 from ..plots.scales import SMALLEST_ERROR
 from ..plots.track import read_tracks
-from .meshes import ReadMesh
 from .page import HOST, PATH, PLOT_RATE, PORT, RATE, TRAIL, Array, Page
 from .robot import PageRobot
 from .widgets import Plot, Readout, Switch

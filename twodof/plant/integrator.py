@@ -132,6 +132,7 @@ def advance(
     patience = PATIENCE * min(max_step, h)
     left = [-inf] * len(limits)  # when each joint last left its limit
     kept = [0.0] * len(limits)  # until when each joint is kept at its limit
+    let_go: list[int] = []
     while t < h:
         end = min((until for until in kept if until > t), default=h)
         keep = [until > t for until in kept]
@@ -141,7 +142,13 @@ def advance(
         for i, (low, high) in enumerate(limits):
             if i not in stops.held and not low < y[i] < high:
                 left[i] = t
-        t, y, stopped = _until_event(
+        again = [i for i in let_go if i in stops.watched]  # it is pressed again, by rounding
+        for i in again:
+            kept[i] = t + patience
+        let_go = []
+        if again:
+            continue
+        t, y, stopped, let_go = _until_event(
             equations, y, f, rank, t, min(end, h), stops, rtol, atol, max_step
         )
         for i in stopped:
@@ -162,11 +169,11 @@ def _until_event(
     rtol: float,
     atol: float,
     max_step: float,
-) -> tuple[float, State, list[int]]:
+) -> tuple[float, State, list[int], list[int]]:
     """Integrate from t until a joint reaches or leaves a limit, or until the end.
 
-    Returns the time, the state there, and the joints that reached a limit. f is q̈ at y, of this
-    rank.
+    Returns the time, the state there, the joints that reached a limit, and those that leave theirs.
+    f is q̈ at y, of this rank.
     """
     first = min(max_step, end - t)
     jump_step = JUMP_STEP * first
@@ -186,10 +193,10 @@ def _until_event(
         if norm < 1.0 or at_jump:
             event = _first_event(equations, y, y_new, step, stops, K)
             if event is not None:
-                passed, y, stopped = event
-                return (end if last and passed == step else t + passed), y, stopped
+                passed, y, stopped, let_go = event
+                return end if last and passed == step else t + passed, y, stopped, let_go
             if last:
-                return end, y_new, []
+                return end, y_new, [], []
             t, y, rates, rank = t + step, y_new, K[-1], ranks[-1]
             if norm < 1.0:  # else the error says nothing about the next step
                 step = min(max_step, step * max(MIN_FACTOR, min(growth, factor)))
@@ -281,10 +288,11 @@ def _too_fast(equations: _Equations, y: State, *, too_fine: bool) -> StepError:
 
 def _first_event(
     equations: _Equations, y: State, y_new: State, step: float, stops: Stops, K: list[State]
-) -> tuple[float, State, list[int]] | None:
+) -> tuple[float, State, list[int], list[int]] | None:
     """First time in (0, step] at which a limit is reached or left.
 
-    Returns that time, the state from there on, and the joints that reached a limit.
+    Returns that time, the state from there on, the joints that reached a limit, and those that
+    leave theirs.
     """
     n = equations.n
     if not stops.watched:
@@ -307,11 +315,12 @@ def _first_event(
         latest = excursion
     latest = _bisect(lambda passed: bool(_events(equations, state(passed), stops)), latest, step)
     y = state(latest).copy()
-    stopped = [i for i in _events(equations, y, stops) if i not in stops.held]
+    events = _events(equations, y, stops)
+    stopped = [i for i in events if i not in stops.held]
     for i in stopped:
         low, high = stops.limits[i]
         y[i] = min(max(y[i], low), high)
-    return latest, y, stopped
+    return latest, y, stopped, [i for i in events if i in stops.held]
 
 
 def _events(equations: _Equations, y: State, stops: Stops) -> list[int]:

@@ -14,7 +14,8 @@ import numpy as np
 WELL_CONDITIONED = 1e-3
 """Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12."""
 ORTHOGONAL = 2.0**-50
-"""Rows count as orthogonal where the cosine of their angle is below this."""
+"""Rows count as orthogonal where the cosine of their angle is below this, or the ratio of their
+lengths: the shorter is what rounding has left of a row that depends on others."""
 MAX_SWEEPS = 12
 PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 
@@ -83,7 +84,8 @@ def _by_singular_values(
         for i, j in PAIRS[len(rows)]:
             ri, rj = rows[i], rows[j]
             ii, ij, jj = _dot(ri, ri), _dot(ri, rj), _dot(rj, rj)
-            if abs(ij) > ORTHOGONAL * sqrt(ii * jj):
+            shorter, longer = sorted((ii, jj))
+            if abs(ij) > ORTHOGONAL * sqrt(ii * jj) and shorter > ORTHOGONAL**2 * longer:
                 rotated = True
                 zeta = (jj - ii) / (2.0 * ij)
                 t = 1.0 / (abs(zeta) + sqrt(1.0 + zeta * zeta))

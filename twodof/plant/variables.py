@@ -7,7 +7,6 @@ value reference.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -29,7 +28,7 @@ class Range:
 
 NO_RANGE = Range(-math.inf, math.inf, "")
 NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
-POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
+POSITIVE = Range(math.nextafter(0.0, 1.0), math.inf, "> 0")
 RANGES = {
     **dict.fromkeys(("Kp", "Kd", "Kp_rot", "Kd_rot", "Kn", "payload"), NOT_NEGATIVE),
     **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kinematics import Array, Kinematics
+from ..geometry.kinematics import Array, Kinematics
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
 
 DEFAULT_FRAME = "EndEffector"

@@ -83,14 +83,6 @@ class Publisher(Sink):
             raise InputError(f"`on_timeout` '{on_timeout}' is not 'hold' or 'ramp'")
         if timeout is not None and not 0.0 < timeout < inf:
             raise InputError(f"`timeout` {timeout:g} is no time")
-        names = {"namespace": namespace, "state_topic": state_topic, "command_topic": command_topic}
-        for argument, name in names.items():
-            if name and not NAME.fullmatch(name):
-                raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
-        if on_timeout not in (None, "hold", "ramp"):
-            raise InputError(f"`on_timeout` '{on_timeout}' is not 'hold' or 'ramp'")
-        if timeout is not None and not 0.0 < timeout < inf:
-            raise InputError(f"`timeout` {timeout:g} is no time")
         self._opened = opened
         self.place = network() if place is None else place
         self.interface, self.lockstep = "", lockstep

@@ -9,19 +9,17 @@ import logging
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..files import temporary_folder
-from ..kinematics import Array, Kinematics, Placement
+from ..geometry.kinematics import Array, Kinematics, Placement
+from ..geometry.meshes import load_mesh
+from ..geometry.shapes import floats, origin
 from ..plant.urdf import Joint, RobotError, read_urdf
 
 LARGEST = 1e6  # m
-MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
-"""Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
 logger = logging.getLogger(__name__)
 
 
@@ -87,18 +85,6 @@ class Scene:
         """Position of the end effector in the root frame, m."""
         x, y, z = self._kinematics.path(self._frame, [q])[0].tolist()
         return x, y, z
-
-
-def floats(element: ET.Element | None, key: str, default: str) -> Array:
-    """The numbers of an attribute."""
-    text = default if element is None else element.get(key, default)
-    return np.array([float(word) for word in text.split()])
-
-
-def origin(element: ET.Element | None) -> Placement:
-    """URDF's xyz and rpy, about the fixed axes x, y and z."""
-    rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0"))
-    return Placement(floats(element, "xyz", "0 0 0"), rotation)
 
 
 def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> None:
@@ -172,28 +158,6 @@ def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Ar
             reason = " ".join(str(error).split())  # coal's has many lines
     logger.warning("mesh '%s' is left out of the scene: %s", uri, reason)
     return None
-
-
-def load_mesh(name: str, content: bytes, scale: Array) -> Any:
-    """A mesh file as coal's model, its vertices in m.
-
-    Raises:
-        ValueError: it cannot be read, or is of a format that has other files read beside it.
-    """
-    try:
-        import coal
-    except ImportError as missing:
-        raise ValueError(f"{missing}; install the package 'coal'") from missing
-    suffix = Path(name).suffix.lower()
-    if suffix not in MESH_FORMATS:
-        raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
-    if suffix == ".obj":
-        content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
-    with temporary_folder() as folder:
-        file = folder / Path(name).name
-        file.write_bytes(content)
-        # boxes along the axes: others take longer, and complain on stderr of odd triangles
-        return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
 
 
 def _place(part: ET.Element, place: Placement) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from math import nan
@@ -18,8 +17,9 @@ from ..errors import SimulationError
 from ..experiments import Experiment, Value, experiment, resolve
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
-from ..master import Sample, Sink, simulate
-from .metrics import METRICS, measure
+from ..master import OUTPUTS, Sample, Sink, simulate
+from .metrics import METRICS, Array, measure
+from .trace import trace
 
 Point = tuple[int, tuple[float, ...]]
 """Number of a run, and the values of the variables that are varied."""
@@ -82,20 +82,25 @@ class Runner:
         settings = resolve(self._base.fmu, dict(zip(self._job.names, values)))
         given = {**self._base.given, **settings}
         run = replace(self._base, start_values={**self._base.start_values, **given}, given=given)
-        trace = _Trace()
-        sinks: list[Sink] = [trace]
-        if self._job.bags is not None:
-            from ..bag.writer import Bag  # rosbags takes half a second to import
-
-            sinks.append(Bag(Path(self._job.bags) / f"{number:06d}", overwrite=True))
         try:
-            simulate(run, *sinks, instance=self._fresh())
+            outputs = self._outputs(run, number)
         except SimulationError as error:
             self._drop()  # whatever state it is in
             nothing = [nan] * len(METRICS)
             return (number, *values, *nothing, run.time(error.k), error.outcome, str(error))
-        metrics = trace.metrics().values()  # in the order of METRICS
+        metrics = _metrics(run, outputs).values()  # in the order of METRICS
         return (number, *values, *metrics, run.time(run.steps), "finished", None)
+
+    def _outputs(self, run: Experiment, number: int) -> Mapping[str, Array]:
+        """Simulate, with a bag where the job wants one; the outputs at all samples."""
+        if self._job.bags is None:
+            return trace(run, self._fresh())
+        from ..bag.writer import Bag  # rosbags takes half a second to import
+
+        kept = _Kept()
+        bag = Bag(Path(self._job.bags) / f"{number:06d}", overwrite=True)
+        simulate(run, kept, bag, instance=self._fresh())
+        return {name: np.array([getattr(s, name) for s in kept.samples]) for name in OUTPUTS}
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
         """Rows of some points, and the time they took, s; errors as of ``run``."""
@@ -115,30 +120,24 @@ class Runner:
         self._used.close()
 
 
-class _Trace(Sink):
-    """A sink that keeps all samples as numbers."""
+class _Kept(Sink):
+    """A sink that keeps all samples."""
 
     def __init__(self) -> None:
-        self._values = array("d")
-
-    def begin(self, run: Experiment) -> _Trace:
-        """Take the experiment."""
-        self._run = run
-        return self
+        self.samples: list[Sample] = []
 
     def write(self, sample: Sample) -> None:
-        """Keep one sample."""
-        self._values.extend((sample.t, *sample.q, *sample.v, *sample.x, *sample.tau))
+        """Keep one."""
+        self.samples.append(sample)
 
-    def metrics(self) -> dict[str, float]:
-        """What the run is judged by."""
-        run = self._run
-        sizes = [1, *(len(run.fmu.vector(group)) for group in ("q", "v", "x", "tau"))]
-        table = np.frombuffer(self._values).reshape(-1, sum(sizes))
-        t, q, v, x, tau = np.split(table, np.cumsum(sizes)[:-1], axis=1)
-        target = _given(run, "x_des", len(x[0]))
-        limits = [_given(run, name, len(q[0])) for name in ("q_min", "q_max")]
-        return measure(t[:, 0], q, v, x, tau, target, *limits)
+
+def _metrics(run: Experiment, outputs: Mapping[str, Array]) -> dict[str, float]:
+    """What a run is judged by."""
+    q, v, x, tau = (outputs[group] for group in ("q", "v", "x", "tau"))
+    t = run.start_time + np.arange(len(q), dtype=np.float64) * run.step
+    target = _given(run, "x_des", x.shape[1])
+    limits = [_given(run, name, q.shape[1]) for name in ("q_min", "q_max")]
+    return measure(t, q, v, x, tau, target, *limits)
 
 
 def _given(run: Experiment, group: str, size: int) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from .plant.urdf import Joint, Urdf
+from ..plant.urdf import Joint, Urdf
 
 Array = NDArray[np.float64]
 
@@ -55,9 +55,9 @@ class Kinematics:
 
     def moves(self, joint: Joint) -> bool:
         """Whether a joint's position depends on q."""
-        return self._column(joint)[0] is not None
+        return self.column(joint)[0] is not None
 
-    def _column(self, joint: Joint) -> tuple[int | None, float, float]:
+    def column(self, joint: Joint) -> tuple[int | None, float, float]:
         """Which column of q moves a joint, and how; for one at rest the column is None."""
         if joint.name in self._columns:
             return self._columns[joint.name], 1.0, 0.0
@@ -66,7 +66,7 @@ class Kinematics:
     def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
         """Where a joint's child is in its parent; q is N × joints, rad or m."""
         q = np.asarray(q, dtype=np.float64)
-        column, ratio, offset = self._column(joint)
+        column, ratio, offset = self.column(joint)
         moved = np.full((len(q), 1), offset)
         if column is not None:
             moved = moved + ratio * q[:, column, None]
@@ -99,7 +99,7 @@ class Kinematics:
         end = places[-1].translation
         jacobian = np.zeros((len(end), 6, len(self._columns)))
         for joint, place in zip(chain, places[1:]):
-            column, ratio, _ = self._column(joint)
+            column, ratio, _ = self.column(joint)
             if column is not None:
                 axis = ratio * place.rotation.apply(joint.axis)
                 arm = end - place.translation

@@ -12,8 +12,7 @@ import pytest
 
 import twodof
 from twodof.cli.main import main
-from twodof.pages.meshes import mesh_parts
-from twodof.ros.scene import load_mesh
+from twodof.geometry.meshes import load_mesh, mesh_parts
 
 ONE = np.ones(3)
 DAE = "{http://www.collada.org/2005/11/COLLADASchema}"

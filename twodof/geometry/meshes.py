@@ -1,19 +1,19 @@
-"""Meshes as a page draws them: triangles, in parts of one colour each."""
+"""Meshes as they are drawn: triangles, in parts of one colour each."""
 
 from __future__ import annotations
 
 import io
 import logging
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kinematics import Array
-from ..ros.scene import load_mesh
+from ..files import temporary_folder
+from .kinematics import Array
 
 LOG = logging.getLogger(__name__)
 ReadMesh = Callable[[str], bytes | None]
@@ -22,6 +22,8 @@ Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
 COLOURED = (".dae", ".obj")
 """Formats that have colours."""
+MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
+"""Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
 
 
 class Part(NamedTuple):
@@ -76,3 +78,25 @@ def _coloured(suffix: str, content: bytes, library: bytes | None, scale: Array) 
     if not parts:
         raise ValueError("the file has no triangles")
     return parts
+
+
+def load_mesh(name: str, content: bytes, scale: Array | Sequence[float]) -> Any:
+    """A mesh file as coal's model, its vertices in m.
+
+    Raises:
+        ValueError: it cannot be read, or is of a format that has other files read beside it.
+    """
+    try:
+        import coal
+    except ImportError as missing:
+        raise ValueError(f"{missing}; install the package 'coal'") from missing
+    suffix = Path(name).suffix.lower()
+    if suffix not in MESH_FORMATS:
+        raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
+    if suffix == ".obj":
+        content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
+    with temporary_folder() as folder:
+        file = folder / Path(name).name
+        file.write_bytes(content)
+        # boxes along the axes: others take longer, and complain on stderr of odd triangles
+        return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)

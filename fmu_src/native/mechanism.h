@@ -1,0 +1,53 @@
+/* Kinematics and dynamics of the robot: what mechanism.c, generated from its URDF, computes. Joints
+   that mimic others follow them there; all else knows the joints that move on their own. */
+#ifndef MECHANISM_H
+#define MECHANISM_H
+
+#include "internal.h"
+#include "model.h"
+
+/* Where a joint is: cosine and sine of its angle; of one that slides its displacement, as c. */
+typedef struct {
+    double c, s;
+} JointPosition;
+
+/* The task frame in the root's axes, in the rows of the task: its axes, then with an orientation
+   the turning about x, y and z. */
+typedef struct {
+    double x[N_AXES];           /* position, m */
+    double J[N_ROWS][N_JOINTS]; /* Jacobian: the velocity is J v, m/s and rad/s */
+    double drift[N_ROWS];       /* J̇ v, the acceleration where q̈ = 0, m/s2 and rad/s2 */
+#if N_ROWS > N_AXES
+    double R[3][3];             /* orientation */
+#endif
+} TaskFrame;
+
+/* The body that carries the task frame, with its payload: mass, mass times centre, and inertia
+   about the frame of its joint: xx, xy, yy, xz, yz, zz. */
+typedef struct {
+    double mass, moment[3], inertia[6];
+} Carrier;
+
+INTERNAL void place_joints(const double q[N_JOINTS], JointPosition joint[N_BODIES]);
+
+/* The task frame at the velocity v. */
+INTERNAL void task_frame(const JointPosition joint[N_BODIES], const double v[N_JOINTS],
+                         TaskFrame *task);
+
+/* τ = Jᵀ f, what a force at the task frame, N, in the root's axes, is at the joints. */
+INTERNAL void effort_of_force(const JointPosition joint[N_BODIES], const double force[3],
+                              double tau[N_JOINTS]);
+
+/* The carrier with a point mass, kg, at a place in the task frame, m. */
+INTERNAL void load_carrier(double payload, const double place[3], Carrier *carrier);
+
+/* τ = M(q) a + h(q, v), joint efforts in N·m or N. The gravity is in the root's axes, m/s2. */
+INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const Carrier *carrier,
+                               const double v[N_JOINTS], const double a[N_JOINTS],
+                               const double gravity[3], double tau[N_JOINTS]);
+
+/* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */
+INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const Carrier *carrier,
+                                     const double tau[N_JOINTS], double a[N_JOINTS]);
+
+#endif

@@ -1,0 +1,148 @@
+/** Where the scene is seen from. A robot that moves in a plane is seen from the front. */
+
+const FIELD_OF_VIEW = 0.6; // rad, vertical
+const ROOM = 1.45; // of the picture to what is in it
+
+class Camera {
+  touched = false;
+  distance = 1;
+  size = 1;
+  centre = [0, 0, 0];
+  back = [0, 0, 1];
+
+  /**
+   * @param {{front: number[], vertical: number[]}} view towards the viewer, and upwards
+   * @param {boolean} flat seen from the front, and never tumbled
+   * @param {number[][]} points that must be seen, m
+   */
+  constructor(view, flat, points) {
+    this.view = view;
+    this.flat = flat;
+    this.points = points;
+    this.aspect = 1;
+    this.reset();
+  }
+
+  /** Back to where all is seen from. */
+  reset() {
+    this.touched = false;
+    this.back = unit(this.view.front);
+    const axes = [0, 1, 2];
+    const low = axes.map((i) => Math.min(...this.points.map((p) => p[i])));
+    const high = axes.map((i) => Math.max(...this.points.map((p) => p[i])));
+    this.centre = axes.map((i) => (low[i] + high[i]) / 2);
+    this.size = Math.max(Math.hypot(...axes.map((i) => high[i] - low[i])), 1e-3);
+    this.distance = (ROOM * this.size) / 2 / Math.tan(FIELD_OF_VIEW / 2);
+  }
+
+  /** @returns {number[]} */
+  get right() {
+    return unit(cross(this.view.vertical, this.back));
+  }
+
+  /** @returns {number[]} */
+  get up() {
+    return cross(this.back, this.right);
+  }
+
+  /** @returns {number[]} where the viewer is */
+  get eye() {
+    return plus(this.centre, this.stretched, this.back);
+  }
+
+  /** The distance; larger where the picture is narrow. */
+  get stretched() {
+    return this.distance / Math.min(1, this.aspect);
+  }
+
+  /** From the root frame to clip space. */
+  matrix() {
+    const [r, u, b] = [this.right, this.up, this.back];
+    const eye = this.eye, near = this.stretched / 50, far = this.stretched * 50;
+    const seen = Float64Array.of(
+      r[0], u[0], b[0], 0, r[1], u[1], b[1], 0, r[2], u[2], b[2], 0,
+      -dot(r, eye), -dot(u, eye), -dot(b, eye), 1,
+    );
+    const f = 1 / Math.tan(FIELD_OF_VIEW / 2);
+    const projection = Float64Array.of(
+      f / this.aspect, 0, 0, 0, 0, f, 0, 0,
+      0, 0, (far + near) / (near - far), -1, 0, 0, (2 * far * near) / (near - far), 0,
+    );
+    return multiply(projection, seen);
+  }
+
+  /**
+   * A point in the picture: x to the right and y downwards, each from 0 to 1.
+   * @param {Numbers} p
+   */
+  project(p) {
+    const m = this.matrix();
+    const w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
+    const [x, y] = transform(m, p);
+    return [0.5 + x / w / 2, 0.5 - y / w / 2];
+  }
+
+  /**
+   * Direction of the ray through a point of the picture.
+   * @param {number} x
+   * @param {number} y
+   */
+  ray(x, y) {
+    const f = 2 * Math.tan(FIELD_OF_VIEW / 2);
+    const right = plus([0, 0, 0], (x - 0.5) * f * this.aspect, this.right);
+    return unit(plus(plus(right, (0.5 - y) * f, this.up), -1, this.back));
+  }
+
+  /**
+   * Where the ray through a point of the picture meets a plane; null where they are nearly parallel.
+   * @param {number} x
+   * @param {number} y
+   * @param {Numbers} point
+   * @param {Numbers} normal
+   */
+  meet(x, y, point, normal) {
+    const ray = this.ray(x, y), along = dot(ray, normal);
+    if (Math.abs(along) < 0.05) return null;
+    return plus(this.eye, dot(plus([point[0], point[1], point[2]], -1, this.eye), normal) / along, ray);
+  }
+
+  /**
+   * Move around by a part of the picture.
+   * @param {number} dx
+   * @param {number} dy
+   */
+  orbit(dx, dy) {
+    this.touched = true;
+    const { vertical } = this.view;
+    this.back = transform(turn(unit(vertical), -4 * dx), this.back);
+    const tilted = unit(transform(turn(this.right, -3 * dy), this.back));
+    if (Math.abs(dot(tilted, unit(vertical))) < 0.995) this.back = tilted;
+  }
+
+  /**
+   * Move along the picture by a part of it.
+   * @param {number} dx
+   * @param {number} dy
+   */
+  pan(dx, dy) {
+    this.touched = true;
+    const height = 2 * this.stretched * Math.tan(FIELD_OF_VIEW / 2);
+    this.centre = plus(plus(this.centre, -dx * height * this.aspect, this.right), dy * height, this.up);
+  }
+
+  /** @param {number} factor */
+  zoom(factor) {
+    this.touched = true;
+    this.distance = Math.min(Math.max(this.distance * factor, this.size / 20), this.size * 20);
+  }
+
+  /**
+   * Step back, where what moves has left the picture and the user has not chosen it.
+   * @param {number[]} p
+   */
+  follow(p) {
+    const [x, y] = this.project(p);
+    if (!this.touched && !(Math.min(x, y) > 0.03 && Math.max(x, y) < 0.97) && this.distance < 9 * this.size)
+      this.distance *= 1.02;
+  }
+}

@@ -1,0 +1,211 @@
+/** The panel: what the FMU has to set, a readout, and buttons. All text is text. */
+
+const GAINS = ["Kp", "Kd", "Kp_rot", "Kd_rot", "Kn"];
+const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start"];
+const PER_AXIS = ["x_des", "xd_des", "xdd_des"];
+const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
+  ["target or command", true, ["x_des", "q_des", "tau_cmd"]],
+  ["gains", true, GAINS],
+  ["disturbance and payload", false, ["f_ext", "tau_ext", "payload", "payload_com", "payload_known"]],
+  ["feedforward", false, ["quat_des", "xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
+  ["parameters, which begin the run anew", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
+]);
+
+/**
+ * An element with text, and what it holds.
+ * @param {string} tag
+ * @param {string} text
+ * @param {...Node} inner
+ * @returns {HTMLElement}
+ */
+function element(tag, text, ...inner) {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  made.append(...inner);
+  return made;
+}
+
+/**
+ * @param {string} id
+ * @returns {any}
+ */
+function byId(id) {
+  return document.getElementById(`arm-${id}`);
+}
+
+class Controls {
+  /**
+   * @param {Session} session
+   * @param {{centre: number[], radius: number}} reach
+   * @param {(name: string, value: Value | number[]) => void} told
+   */
+  constructor(session, reach, told) {
+    this.session = session;
+    this.reach = reach;
+    this.told = told;
+    /** @type {Map<string, HTMLInputElement[]>} */
+    this.fields = new Map();
+    for (const [title, open, groups] of GROUPS) {
+      const rows = groups.filter((group) => session.groups.has(group)).flatMap((group) => this.rows(group));
+      if (!rows.length) continue;
+      const details = element("details", "", element("summary", title), ...rows);
+      details.toggleAttribute("open", open);
+      byId("controls").append(details);
+    }
+  }
+
+  /**
+   * The sliders of a group: one for all gains, else one for each element.
+   * @param {string} group
+   */
+  rows(group) {
+    const names = /** @type {string[]} */ (this.session.groups.get(group));
+    if (GAINS.includes(group)) return [this.row(group, names[0])];
+    const rows = names.map((name) => this.row(name, name));
+    return PER_JOINT.includes(group) ? [element("div", group), ...rows] : rows;
+  }
+
+  /**
+   * @param {string} name of a variable, or of a group
+   * @param {string} first whose value it shows
+   */
+  row(name, first) {
+    const { session } = this, variable = session.variable(first);
+    const value = /** @type {Value} */ (session.values.get(first));
+    const label = element("span", this.label(name));
+    label.title = `${name}: ${variable.description}${variable.unit ? `, ${variable.unit}` : ""}`;
+    if (typeof value === "boolean") return this.checkbox(label, name);
+    const [low, high] = this.range(name, Number(value));
+    const inputs = ["range", "number"].map((type) => {
+      const input = document.createElement("input");
+      Object.assign(input, { type, step: "any", value: String(value) });
+      if (type === "range") Object.assign(input, { min: String(low), max: String(high), value: String(value) });
+      input.setAttribute("aria-label", `${name}, ${type === "range" ? "slider" : variable.unit || "number"}`);
+      input.addEventListener(variable.causality === "parameter" || type === "number" ? "change" : "input", () => {
+        if (input.value !== "") this.told(name, Number(input.value));
+      });
+      return input;
+    });
+    this.fields.set(first, inputs);
+    const row = element("label", "", label, ...inputs);
+    row.className = "slider";
+    return row;
+  }
+
+  /**
+   * A variable's name, with that of its joint or axis in place of its number.
+   * @param {string} name
+   */
+  label(name) {
+    const [group, number] = name.replace("]", "").split("["), { joints, axes } = this.session.facts;
+    if (number === undefined) return name;
+    const i = Number(number) - 1;
+    if (PER_JOINT.includes(group)) return joints[i].name;
+    return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
+  }
+
+  /**
+   * @param {HTMLElement} label
+   * @param {string} name
+   */
+  checkbox(label, name) {
+    const input = document.createElement("input");
+    input.type = "checkbox";
+    input.checked = Boolean(this.session.values.get(name));
+    input.addEventListener("change", () => this.told(name, input.checked));
+    this.fields.set(name, [input]);
+    const row = element("label", "", label, input);
+    row.className = "slider";
+    return row;
+  }
+
+  /**
+   * What a slider goes from and to.
+   * @param {string} name
+   * @param {number} value
+   * @returns {[number, number]}
+   */
+  range(name, value) {
+    const [group, number] = name.replace("]", "").split("["), i = Number(number) - 1;
+    const { joints, axes } = this.session.facts, joint = joints[i];
+    const strongest = Math.max(...joints.map(({ effort }) => effort ?? 0)) || 20;
+    const force = strongest / (this.reach.radius || 1);
+    if (GAINS.includes(group)) return [0, Math.max(4 * value, 20)];
+    if (group === "x_des") {
+      const middle = this.reach.centre["xyz".indexOf(axes[i])];
+      return [middle - 1.1 * this.reach.radius, middle + 1.1 * this.reach.radius];
+    }
+    if (group === "q_des" || group === "q_start") return [joint.low ?? -Math.PI, joint.high ?? Math.PI];
+    if (group === "tau_cmd" || group === "tau_ext") return [-(joint.effort ?? strongest), joint.effort ?? strongest];
+    if (group === "payload") return [0, force / 9.81];
+    const most = { f_ext: force, payload_com: 0.3, gravity: 20, quat_des: 1 }[group] ?? 5;
+    return [-most, most];
+  }
+
+  /** Show what the session has, but where the user is typing. */
+  show() {
+    for (const [name, inputs] of this.fields) {
+      const value = this.session.values.get(name);
+      for (const input of inputs) {
+        if (input.type === "checkbox") input.checked = Boolean(value);
+        else if (document.activeElement !== input || input.type === "range") {
+          const text = input.type === "range" ? String(value) : String(Number(Number(value).toFixed(6)));
+          if (input.value !== text) input.value = text;
+        }
+      }
+    }
+  }
+}
+
+/**
+ * Units of position, velocity and effort.
+ * @param {JointFacts[]} joints
+ */
+function unitsOf(joints) {
+  const slide = joints.some(({ prismatic }) => prismatic), turns = joints.some(({ prismatic }) => !prismatic);
+  if (slide && turns) return ["rad or m", "rad/s or m/s", "N·m or N"];
+  return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
+}
+
+class Readout {
+  /**
+   * @param {Session} session
+   * @param {Curves} curves
+   */
+  constructor(session, curves) {
+    this.session = session;
+    this.curves = curves;
+    const table = byId("readout"), units = unitsOf(session.facts.joints);
+    table.append(element("tr", "", ...["", ...units].map((unit) => element("th", unit))));
+    this.cells = session.facts.joints.map((joint, i) => {
+      const swatch = document.createElement("input");
+      Object.assign(swatch, { type: "checkbox", checked: true, className: "swatch" });
+      swatch.style.accentColor = COLOURS[i % COLOURS.length];
+      swatch.setAttribute("aria-label", `curves of ${joint.name}`);
+      swatch.addEventListener("change", () => curves.hidden[swatch.checked ? "delete" : "add"](i));
+      const name = element("td", "", element("label", "", swatch, document.createTextNode(joint.name)));
+      name.title = joint.name;
+      const cells = ["q", "v", "tau"].map(() => element("td", ""));
+      table.append(element("tr", "", name, ...cells));
+      return cells;
+    });
+    this.error = element("td", "");
+    /** @type {HTMLTableCellElement} */ (this.error).colSpan = 3;
+    if (!Number.isNaN(session.error())) table.append(element("tr", "", element("td", "error"), this.error));
+  }
+
+  /** @param {number} k number of the sample @param {JointFacts[]} stopped joints at a limit */
+  show(k, stopped) {
+    const { session } = this;
+    session.facts.joints.forEach((joint, i) => {
+      ["q", "v", "tau"].forEach((group, c) => {
+        const value = session.at(group, k)[i];
+        this.cells[i][c].textContent = value.toFixed(4).replace("-", "\u2212");
+      });
+      this.cells[i][0].className = stopped.includes(joint) ? "limit" : "";
+    });
+    this.error.textContent = session.groups.has("x_des")
+      ? `${Number((1e3 * session.error(k)).toPrecision(4))} mm`
+      : `${Number(session.error(k).toPrecision(4))} ${unitsOf(session.facts.joints)[0]}`;
+  }
+}

@@ -1,0 +1,101 @@
+/**
+ * The FMU's engine, compiled to WebAssembly: the functions of page.c, by value reference.
+ *
+ * @typedef {Object} Variable one of the FMU's
+ * @property {string} name
+ * @property {number} reference of an element of a vector its own, in a row
+ * @property {string} causality
+ * @property {string} unit
+ * @property {number | boolean | null} start
+ * @property {string} description
+ *
+ * @typedef {Record<string, (...values: number[]) => number>} Functions
+ */
+
+const ERROR = 2; // of FMI's status: discard is 2, error 3, fatal 4
+
+class Engine {
+  /** @param {WebAssembly.Instance} instance */
+  constructor(instance) {
+    this.calls = /** @type {Functions} */ (/** @type {unknown} */ (instance.exports));
+    this.memory = /** @type {WebAssembly.Memory} */ (instance.exports.memory);
+    this.calls._initialize();
+    this.call("engine_instantiate");
+    this.room = 0;
+    this.references = this.values = 0;
+  }
+
+  /** @param {Uint8Array} module */
+  static async load(module) {
+    return new Engine((await WebAssembly.instantiate(module, {})).instance);
+  }
+
+  /** What the FMU has logged. */
+  said() {
+    const bytes = new Uint8Array(this.memory.buffer, this.calls.engine_message());
+    return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));
+  }
+
+  /**
+   * Call a function; what is worse than a warning is thrown, in the FMU's own words.
+   * @param {string} name
+   * @param {number[]} values
+   */
+  call(name, ...values) {
+    this.calls.engine_forget();
+    if (this.calls[name](...values) >= ERROR) throw new Error(this.said() || name);
+  }
+
+  /** @param {number[]} references */
+  prepare(references) {
+    if (references.length > this.room) {
+      this.room = references.length;
+      this.references = this.calls.engine_allocate(4 * this.room);
+      this.values = this.calls.engine_allocate(8 * this.room);
+    }
+    new Uint32Array(this.memory.buffer, this.references, references.length).set(references);
+  }
+
+  /**
+   * @param {number[]} references
+   * @param {number[]} values
+   */
+  setReal(references, values) {
+    this.prepare(references);
+    new Float64Array(this.memory.buffer, this.values, values.length).set(values);
+    this.call("engine_set_reals", this.references, references.length, this.values);
+  }
+
+  /**
+   * @param {number} reference
+   * @param {boolean} value
+   */
+  setBoolean(reference, value) {
+    this.call("engine_set_boolean", reference, Number(value));
+  }
+
+  /** @param {number[]} references */
+  getReal(references) {
+    this.prepare(references);
+    this.call("engine_get_reals", this.references, references.length, this.values);
+    return new Float64Array(this.memory.buffer, this.values, references.length);
+  }
+
+  /** Back to the beginning, before initialisation. */
+  reset() {
+    this.call("engine_reset");
+  }
+
+  /** Go through initialisation, at time 0 and without an end. */
+  initialise() {
+    this.call("engine_initialise");
+  }
+
+  /**
+   * @param {number} t
+   * @param {number} h s
+   */
+  step(t, h) {
+    this.call("engine_step", t, h);
+  }
+}

@@ -1,0 +1,174 @@
+/** What is dragged in the scene: the target, rings that turn it, and else the view. */
+
+const GRIP = 26, GRIP_OF_RING = 12; // pixels
+const RING = 0.16; // of the size of the scene
+const RING_POINTS = 48;
+const AXIS_COLOURS = [[0.84, 0.22, 0.2], [0.2, 0.62, 0.3], [0.2, 0.42, 0.85]];
+
+class Handle {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {Camera} camera
+   * @param {Session} session
+   * @param {() => number[]} place where the target is, in the root frame
+   * @param {(name: string, values: number[]) => void} told what the target is to be
+   */
+  constructor(canvas, camera, session, place, told) {
+    this.canvas = canvas;
+    this.camera = camera;
+    this.session = session;
+    this.place = place;
+    this.told = told;
+    this.axes = session.groups.has("x_des") ? session.facts.axes : "";
+    this.turns = session.groups.has("quat_des");
+    /** @type {Map<number, number[]>} where pointers are, in parts of the picture */
+    this.pointers = new Map();
+    /** @type {((x: number, y: number) => void) | null} */
+    this.drag = null;
+    canvas.addEventListener("pointerdown", (event) => this.press(event));
+    canvas.addEventListener("pointermove", (event) => this.move(event));
+    for (const end of /** @type {const} */ (["pointerup", "pointercancel"]))
+      canvas.addEventListener(end, (event) => {
+        this.pointers.delete(event.pointerId);
+        this.drag = null;
+      });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      camera.zoom(Math.exp(event.deltaY / 800));
+    }, { passive: false });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  }
+
+  /** @param {PointerEvent} event */
+  at(event) {
+    const box = this.canvas.getBoundingClientRect();
+    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+  }
+
+  /**
+   * Pixels from a point of the picture to one of the scene.
+   * @param {number[]} at
+   * @param {Numbers} p
+   */
+  distance(at, p) {
+    const [x, y] = this.camera.project(p);
+    return Math.hypot((x - at[0]) * this.canvas.clientWidth, (y - at[1]) * this.canvas.clientHeight);
+  }
+
+  /** @param {PointerEvent} event */
+  press(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    const at = this.at(event);
+    this.pointers.set(event.pointerId, at);
+    const grip = event.pointerType === "touch" ? 2 : 1;
+    this.drag = null;
+    if (this.pointers.size > 1 || event.button !== 0) return;
+    const ring = this.turns ? this.nearest(at, grip) : -1;
+    if (this.axes && this.distance(at, this.place()) < GRIP * grip) this.drag = this.carry(at);
+    else if (ring >= 0) this.drag = this.turn(at, ring);
+  }
+
+  /** @param {PointerEvent} event */
+  move(event) {
+    const before = this.pointers.get(event.pointerId), at = this.at(event);
+    if (!before) return;
+    this.pointers.set(event.pointerId, at);
+    const [dx, dy] = [at[0] - before[0], at[1] - before[1]];
+    if (this.drag) return this.drag(at[0], at[1]);
+    const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
+    if (other) {
+      const spread = (/** @type {number[]} */ p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+      this.camera.zoom(spread(before) / Math.max(spread(at), 1e-3));
+      this.camera.pan(dx / 2, dy / 2);
+    } else if (this.camera.flat !== (event.shiftKey || event.buttons === 2)) this.camera.pan(dx, dy);
+    else this.camera.orbit(dx, dy);
+  }
+
+  /**
+   * Carry the target in the plane of the picture, or in that of the task axes.
+   * @param {number[]} at
+   */
+  carry(at) {
+    const begin = this.place(), { camera, axes } = this;
+    let normal = camera.back;
+    if (axes.length < 3) {
+      const free = "xyz".split("").filter((axis) => !axes.includes(axis)).map((axis) => base("xyz".indexOf(axis)));
+      normal = free.length === 1 ? free[0] : unit(plus(camera.back, -dot(camera.back, line(axes)), line(axes)));
+    }
+    const first = camera.meet(at[0], at[1], begin, normal) ?? begin;
+    return (/** @type {number} */ x, /** @type {number} */ y) => {
+      const met = camera.meet(x, y, begin, normal);
+      if (!met) return;
+      const place = plus(plus(begin, 1, met), -1, first);
+      this.told("x_des", axes.split("").map((axis) => place["xyz".indexOf(axis)]));
+    };
+  }
+
+  /**
+   * The points of the ring about an axis of the target.
+   * @param {number} axis
+   */
+  ring(axis) {
+    const place = this.place(), turned = rotation(this.session.held("quat_des"));
+    const [one, two] = [base((axis + 1) % 3), base((axis + 2) % 3)];
+    return Array.from({ length: RING_POINTS + 1 }, (_, i) => {
+      const angle = (2 * Math.PI * i) / RING_POINTS;
+      const p = plus(plus([0, 0, 0], Math.cos(angle), one), Math.sin(angle), two);
+      return plus(place, RING * this.camera.size, transform(turned, p));
+    });
+  }
+
+  /**
+   * The axis of the ring that is next to a point of the picture, else -1.
+   * @param {number[]} at
+   * @param {number} grip
+   */
+  nearest(at, grip) {
+    const distances = [0, 1, 2].map((axis) => Math.min(...this.ring(axis).map((p) => this.distance(at, p))));
+    const least = Math.min(...distances);
+    return least < GRIP_OF_RING * grip ? distances.indexOf(least) : -1;
+  }
+
+  /**
+   * Turn the target about one of its axes.
+   * @param {number[]} at
+   * @param {number} axis
+   */
+  turn(at, axis) {
+    const place = this.place(), start = this.session.held("quat_des"), turned = rotation(start);
+    const normal = transform(turned, base(axis)), one = transform(turned, base((axis + 1) % 3));
+    const two = cross(normal, one);
+    /**
+     * @param {number} x
+     * @param {number} y
+     */
+    const angle = (x, y) => {
+      const met = this.camera.meet(x, y, place, normal);
+      const arm = met && plus(met, -1, place);
+      return arm ? Math.atan2(dot(arm, two), dot(arm, one)) : null;
+    };
+    const first = angle(at[0], at[1]);
+    return (/** @type {number} */ x, /** @type {number} */ y) => {
+      const now = angle(x, y);
+      if (now === null || first === null) return;
+      const half = (now - first) / 2;
+      this.told("quat_des", compose(start, [...plus([0, 0, 0], Math.sin(half), base(axis)), Math.cos(half)]));
+    };
+  }
+}
+
+/**
+ * @param {number} axis
+ * @returns {number[]}
+ */
+function base(axis) {
+  return [0, 1, 2].map((i) => Number(i === axis));
+}
+
+/**
+ * The direction of a single task axis.
+ * @param {string} axes
+ */
+function line(axes) {
+  return base("xyz".indexOf(axes));
+}

@@ -1,0 +1,105 @@
+/**
+ * Vectors of three, and matrices of 4 × 4 by columns, as WebGL has them.
+ *
+ * @typedef {ArrayLike<number>} Numbers
+ */
+
+/**
+ * @param {Numbers} a
+ * @param {Numbers} b
+ */
+function multiply(a, b) {
+  const c = new Float64Array(16);
+  for (let j = 0; j < 4; j++)
+    for (let i = 0; i < 4; i++)
+      for (let k = 0; k < 4; k++) c[4 * j + i] += a[4 * k + i] * b[4 * j + k];
+  return c;
+}
+
+/**
+ * A point, or with w = 0 a direction.
+ * @param {Numbers} m
+ * @param {Numbers} p
+ */
+function transform(m, p, w = 1) {
+  return [0, 1, 2].map((i) => m[i] * p[0] + m[4 + i] * p[1] + m[8 + i] * p[2] + m[12 + i] * w);
+}
+
+/**
+ * A turn about an axis of length 1, rad: Rodrigues' formula.
+ * @param {Numbers} a
+ * @param {number} angle
+ */
+function turn(a, angle) {
+  const c = Math.cos(angle), s = Math.sin(angle), d = 1 - c;
+  const [x, y, z] = [a[0], a[1], a[2]];
+  return Float64Array.of(
+    c + x * x * d, z * s + x * y * d, x * z * d - y * s, 0,
+    x * y * d - z * s, c + y * y * d, x * s + y * z * d, 0,
+    y * s + x * z * d, y * z * d - x * s, c + z * z * d, 0,
+    0, 0, 0, 1,
+  );
+}
+
+/**
+ * @param {Numbers} p
+ * @param {number} scale
+ */
+function placed(p, scale = 1) {
+  return Float64Array.of(scale, 0, 0, 0, 0, scale, 0, 0, 0, 0, scale, 0, p[0], p[1], p[2], 1);
+}
+
+/**
+ * A rotation from a quaternion (x, y, z, w) of any length.
+ * @param {Numbers} quat
+ */
+function rotation(quat) {
+  const [x, y, z, w] = Array.from(quat, (value) => value / Math.hypot(...Array.from(quat)));
+  const sine = Math.hypot(x, y, z);
+  return sine === 0 ? placed([0, 0, 0]) : turn([x / sine, y / sine, z / sine], 2 * Math.atan2(sine, w));
+}
+
+/**
+ * The product of two quaternions.
+ * @param {Numbers} a
+ * @param {Numbers} b
+ */
+function compose(a, b) {
+  const [x, y, z, w] = Array.from(a), [p, q, r, s] = Array.from(b);
+  return [
+    w * p + x * s + y * r - z * q, w * q - x * r + y * s + z * p,
+    w * r + x * q - y * p + z * s, w * s - x * p - y * q - z * r,
+  ];
+}
+
+/**
+ * @param {Numbers} a
+ * @param {Numbers} b
+ */
+function cross(a, b) {
+  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+}
+
+/**
+ * @param {Numbers} a
+ * @param {Numbers} b
+ */
+function dot(a, b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/**
+ * a + s b
+ * @param {Numbers} a
+ * @param {number} s
+ * @param {Numbers} b
+ */
+function plus(a, s, b) {
+  return [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
+}
+
+/** @param {Numbers} a */
+function unit(a) {
+  const length = Math.hypot(a[0], a[1], a[2]);
+  return [a[0] / length, a[1] / length, a[2] / length];
+}

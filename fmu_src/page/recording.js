@@ -1,0 +1,287 @@
+/**
+ * A session as a ROS 2 bag: an MCAP file of serialised messages, with where they come from.
+ *
+ * Sources: the MCAP specification, version 0; OMG, "DDS-XTypes" 1.3, section 7.4.1, plain CDR.
+ */
+
+const TIME = `MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec`;
+const HEADER = `MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id`;
+const POINT = `MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z`;
+const QUATERNION = `MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w`;
+const POSE = `MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation`;
+/** @param {...string} parts */
+const definition = (...parts) => `${parts.join(`\n${"=".repeat(80)}\n`)}\n`;
+/** @type {Record<string, string>} */
+const DEFINITIONS = {
+  "sensor_msgs/msg/JointState": definition(
+    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort", HEADER, TIME),
+  "geometry_msgs/msg/PointStamped": definition(
+    "std_msgs/Header header\ngeometry_msgs/Point point", HEADER, TIME, POINT),
+  "geometry_msgs/msg/PoseStamped": definition(
+    "std_msgs/Header header\ngeometry_msgs/Pose pose", HEADER, TIME, POSE, POINT, QUATERNION),
+};
+const QOS = `- {history: 1, depth: 10, reliability: 1, durability: 2, deadline: {sec: 9223372036, nsec: 854775807},
+  lifespan: {sec: 9223372036, nsec: 854775807}, liveliness: 1,
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}, avoid_ros_namespace_conventions: false}
+`;
+const MAGIC = [0x89, 0x4d, 0x43, 0x41, 0x50, 0x30, 0x0d, 0x0a];
+const CHUNK = 1 << 20; // bytes
+const OP = {
+  header: 1, footer: 2, schema: 3, channel: 4, message: 5, chunk: 6, messageIndex: 7, chunkIndex: 8,
+  statistics: 11, metadata: 12, metadataIndex: 13, dataEnd: 15,
+};
+
+/** Bytes that grow, little endian. */
+class Bytes {
+  constructor() {
+    this.view = new DataView(new ArrayBuffer(1024));
+    this.length = 0;
+  }
+
+  /**
+   * @param {number} size
+   * @returns {number} where room for so many bytes is
+   */
+  room(size) {
+    if (this.length + size > this.view.byteLength) {
+      const longer = new Uint8Array(2 * (this.length + size));
+      longer.set(this.content);
+      this.view = new DataView(longer.buffer);
+    }
+    this.length += size;
+    return this.length - size;
+  }
+
+  get content() {
+    return new Uint8Array(this.view.buffer, 0, this.length);
+  }
+
+  /**
+   * Whole numbers.
+   * @param {number} size in bits
+   * @param {...(number | bigint)} values
+   */
+  put(size, ...values) {
+    for (const value of values) {
+      const at = this.room(size / 8);
+      if (size === 64) this.view.setBigUint64(at, BigInt(value), true);
+      else if (size === 32) this.view.setUint32(at, Number(value), true);
+      else if (size === 16) this.view.setUint16(at, Number(value), true);
+      else this.view.setUint8(at, Number(value));
+    }
+    return this;
+  }
+
+  /** @param {ArrayLike<number>} values */
+  doubles(values) {
+    for (let i = 0; i < values.length; i++) {
+      const at = this.room(8);
+      this.view.setFloat64(at, values[i], true);
+    }
+    return this;
+  }
+
+  /** @param {Uint8Array | number[]} content */
+  raw(content) {
+    const at = this.room(content.length);
+    new Uint8Array(this.view.buffer).set(content, at);
+    return this;
+  }
+
+  /**
+   * A text behind its length.
+   * @param {string} text
+   * @param {string} end
+   */
+  text(text, end = "") {
+    const content = new TextEncoder().encode(text + end);
+    return this.put(32, content.length).raw(content);
+  }
+
+  /**
+   * Gap before numbers of a size, in CDR, which counts from behind its first 4 bytes.
+   * @param {number} size
+   */
+  align(size) {
+    return this.raw(new Uint8Array((size - ((this.length - 4) % size)) % size));
+  }
+
+  /**
+   * @param {number} opcode
+   * @param {Bytes} content
+   */
+  record(opcode, content) {
+    return this.put(8, opcode).put(64, content.length).raw(content.content);
+  }
+}
+
+/** @param {Record<string, string>} entries */
+function textMap(entries) {
+  const content = new Bytes();
+  for (const [key, value] of Object.entries(entries)) content.text(key).text(value);
+  return new Bytes().put(32, content.length).raw(content.content);
+}
+
+/**
+ * A message's beginning.
+ * @param {bigint} stamp ns
+ * @param {string} frame
+ */
+function headed(stamp, frame) {
+  const second = 1000000000n;
+  return new Bytes().raw([0, 1, 0, 0]).put(32, stamp / second, stamp % second).text(frame, "\0");
+}
+
+/**
+ * The messages of a session, in the order of its samples.
+ * @param {Session} session
+ * @param {Robot} robot
+ */
+function* messages(session, robot) {
+  const { facts } = session, start = BigInt(session.begun) * 1000000n;
+  const root = String(facts.provenance.root), names = facts.joints.map((joint) => joint.name);
+  for (let k = 0; k < session.count; k++) {
+    const stamp = start + BigInt(Math.round(session.time(k) * 1e9));
+    const state = headed(stamp, "").align(4).put(32, names.length);
+    for (const name of names) state.align(4).text(name, "\0");
+    for (const group of ["q", "v", "tau"]) state.align(4).put(32, names.length).align(8).doubles(session.at(group, k));
+    yield { topic: "/joint_states", stamp, data: state.content };
+    const place = transform(robot.frame(robot.links(session.at("q", k))), [0, 0, 0]);
+    yield { topic: "/end_effector", stamp, data: point(stamp, root, place, session.at("quat", k)) };
+    if (session.groups.has("x_des")) {
+      facts.axes.split("").forEach((axis, i) => (place["xyz".indexOf(axis)] = session.at("x_des", k)[i]));
+      yield { topic: "/target", stamp, data: point(stamp, root, place, session.at("quat_des", k)) };
+    }
+  }
+}
+
+/**
+ * @param {bigint} stamp
+ * @param {string} frame
+ * @param {number[]} place
+ * @param {Float64Array} quat
+ */
+function point(stamp, frame, place, quat) {
+  return headed(stamp, frame).align(8).doubles(place).doubles(quat).content;
+}
+
+/**
+ * Where the session comes from, as a bag's run.json has it.
+ * @param {Session} session
+ */
+function provenance(session) {
+  return JSON.stringify({
+    format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
+    command_line: "", input_changes: session.changes,
+  });
+}
+
+/**
+ * The session as an MCAP file.
+ * @param {Session} session
+ * @param {Robot} robot
+ */
+function mcap(session, robot) {
+  const pose = session.groups.has("quat") ? "geometry_msgs/msg/PoseStamped" : "geometry_msgs/msg/PointStamped";
+  const topics = ["/joint_states", "/end_effector", ...(session.groups.has("x_des") ? ["/target"] : [])];
+  const types = ["sensor_msgs/msg/JointState", pose], start = BigInt(session.begun) * 1000000n;
+  const end = start + BigInt(Math.round(session.time(session.k) * 1e9)), described = new Bytes();
+  types.forEach((type, i) =>
+    described.record(OP.schema, new Bytes().put(16, i + 1).text(type).text("ros2msg").text(DEFINITIONS[type])));
+  topics.forEach((topic, i) =>
+    described.record(OP.channel, new Bytes().put(16, i + 1, i ? 2 : 1).text(topic).text("cdr")
+      .raw(textMap({ offered_qos_profiles: QOS, topic_type_hash: "" }).content)));
+  const file = new Bytes().raw(MAGIC).record(OP.header, new Bytes().text("ros2").text("twodof")).raw(described.content);
+  const indexes = new Bytes(), chunk = new Chunk(topics);
+  let chunks = 0;
+  const flush = () => {
+    if (chunk.empty) return;
+    indexes.record(OP.chunkIndex, chunk.write(file));
+    chunks += 1;
+  };
+  for (const { topic, stamp, data } of messages(session, robot)) {
+    chunk.add(topics.indexOf(topic) + 1, stamp, data);
+    if (chunk.records.length > CHUNK) flush();
+  }
+  flush();
+  const at = file.length, told = new Bytes().text("twodof").raw(textMap({ "run.json": provenance(session) }).content);
+  file.record(OP.metadata, told);
+  const metadata = new Bytes().put(64, at, file.length - at).text("twodof");
+  file.record(OP.dataEnd, new Bytes().put(32, 0));
+  const summary = file.length, statistics = new Bytes();
+  statistics.put(64, session.count * topics.length).put(16, 2).put(32, topics.length, 0, 1, chunks).put(64, start, end);
+  statistics.put(32, 10 * topics.length);
+  topics.forEach((_, i) => statistics.put(16, i + 1).put(64, session.count));
+  file.raw(described.content).record(OP.statistics, statistics).raw(indexes.content);
+  file.record(OP.metadataIndex, metadata);
+  return file.record(OP.footer, new Bytes().put(64, summary, 0).put(32, 0)).raw(MAGIC).content;
+}
+
+/** Messages that are stored together, with where each is. */
+class Chunk {
+  records = new Bytes();
+  /** @type {[bigint, number][][]} times and places of each topic's messages */
+  places = [];
+  /** @type {bigint[]} */
+  times = [];
+
+  /** @param {string[]} topics */
+  constructor(topics) {
+    this.topics = topics;
+    this.begin();
+  }
+
+  begin() {
+    this.records = new Bytes();
+    this.places = this.topics.map(() => []);
+    this.times = [];
+  }
+
+  get empty() {
+    return this.records.length === 0;
+  }
+
+  /**
+   * @param {number} channel
+   * @param {bigint} stamp
+   * @param {Uint8Array} data
+   */
+  add(channel, stamp, data) {
+    this.places[channel - 1].push([stamp, this.records.length]);
+    this.times.push(stamp);
+    this.records.record(OP.message, new Bytes().put(16, channel).put(32, 0).put(64, stamp, stamp).raw(data));
+  }
+
+  /**
+   * Append it and its indexes, and begin anew; the record of where they are.
+   * @param {Bytes} file
+   */
+  write(file) {
+    const { records, places } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
+    const content = new Bytes().put(64, start, end, records.length).put(32, 0).text("").put(64, records.length);
+    file.record(OP.chunk, content.raw(records.content));
+    const size = file.length - at, offsets = new Bytes(), first = file.length;
+    places.forEach((entries, i) => {
+      offsets.put(16, i + 1).put(64, file.length);
+      const index = new Bytes().put(16, i + 1).put(32, 16 * entries.length);
+      for (const [stamp, place] of entries) index.put(64, stamp, place);
+      file.record(OP.messageIndex, index);
+    });
+    this.begin();
+    return new Bytes().put(64, start, end, at, size).put(32, offsets.length).raw(offsets.content)
+      .put(64, file.length - first).text("").put(64, records.length, records.length);
+  }
+}

@@ -1,0 +1,247 @@
+/** The scene in 3D, by WebGL 2: triangles with a colour, and lines of some pixels. */
+
+const SOLID = [
+  `#version 300 es
+  uniform mat4 view, model; uniform vec3 low; uniform float size;
+  layout(location = 0) in vec3 place; layout(location = 1) in vec3 normal;
+  out vec3 turned;
+  void main() {
+    turned = mat3(model) * normal;
+    gl_Position = view * model * vec4(low + size * place, 1.0);
+  }`,
+  `#version 300 es
+  precision highp float;
+  uniform vec3 light; uniform vec4 colour;
+  in vec3 turned; out vec4 shown;
+  void main() {
+    float lit = dot(normalize(turned), light);
+    shown = vec4(colour.rgb * (0.55 + 0.35 * lit + 0.15 * max(lit, 0.0)), colour.a);
+  }`,
+];
+const LINES = [
+  `#version 300 es
+  uniform mat4 view; uniform vec2 pixel;
+  layout(location = 0) in vec3 from; layout(location = 1) in vec3 to;
+  layout(location = 2) in vec4 colour; layout(location = 3) in float width;
+  out vec4 tint;
+  void main() {
+    vec4 a = view * vec4(from, 1.0), b = view * vec4(to, 1.0);
+    vec2 along = normalize((b.xy / b.w - a.xy / a.w) / pixel + vec2(1e-9, 0.0));
+    float side = float(gl_VertexID & 1) * 2.0 - 1.0;
+    gl_Position = gl_VertexID < 2 ? a : b;
+    gl_Position.xy += side * width * vec2(-along.y, along.x) * pixel * gl_Position.w;
+    tint = colour;
+  }`,
+  `#version 300 es
+  precision mediump float;
+  in vec4 tint; out vec4 shown;
+  void main() { shown = tint; }`,
+];
+const CREASE = 0.8; // cosine of the angle between faces from which on their edge is sharp
+const LINE_SIZE = 11; // numbers of one
+
+class Scene {
+  /** @type {number[]} */
+  lines = [];
+  /** @type {{mesh: number, model: Float64Array, colour: number[]}[]} */
+  solids = [];
+
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {Facts} facts
+   * @param {ArrayBuffer} meshes vertices and triangles, one mesh after the other
+   */
+  constructor(canvas, facts, meshes) {
+    const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
+    if (!gl) throw new Error("this browser shows no 3D: it has no WebGL 2");
+    this.gl = gl;
+    this.canvas = canvas;
+    this.solid = this.program(SOLID);
+    this.line = this.program(LINES);
+    this.facts = facts;
+    let offset = 0;
+    this.meshes = facts.meshes.map((mesh) => {
+      const places = new Uint16Array(meshes, offset, 3 * mesh.vertices);
+      offset += 4 * Math.ceil(places.byteLength / 4);
+      const triangles = new Uint32Array(meshes, offset, 3 * mesh.triangles);
+      offset += triangles.byteLength;
+      return { ...mesh, ...this.upload(places, triangles) };
+    });
+    this.linesBuffer = /** @type {WebGLBuffer} */ (gl.createBuffer());
+    this.linesArray = gl.createVertexArray();
+    gl.bindVertexArray(this.linesArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.linesBuffer);
+    [[3, 0], [3, 3], [4, 6], [1, 10]].forEach(([size, first], i) => {
+      gl.enableVertexAttribArray(i);
+      gl.vertexAttribPointer(i, size, gl.FLOAT, false, 4 * LINE_SIZE, 4 * first);
+      gl.vertexAttribDivisor(i, 1);
+    });
+    gl.enable(gl.DEPTH_TEST);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    this.begin();
+  }
+
+  /**
+   * @param {string[]} sources
+   * @returns {WebGLProgram}
+   */
+  program(sources) {
+    const { gl } = this, program = /** @type {WebGLProgram} */ (gl.createProgram());
+    sources.forEach((source, i) => {
+      const shader = /** @type {WebGLShader} */ (gl.createShader(i ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER));
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    });
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
+      throw new Error(`the scene cannot be drawn: ${gl.getProgramInfoLog(program)}`);
+    return program;
+  }
+
+  /**
+   * @param {Uint16Array} places
+   * @param {Uint32Array} triangles
+   */
+  upload(places, triangles) {
+    const { gl } = this, array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    const corners = new Uint16Array(4 * triangles.length);
+    triangles.forEach((vertex, i) => {
+      for (let k = 0; k < 3; k++) corners[4 * i + k] = places[3 * vertex + k];
+    });
+    const buffers = [
+      [corners, gl.UNSIGNED_SHORT, 8], [cornerNormals(places, triangles), gl.BYTE, 4],
+    ];
+    for (const [i, [content, type, stride]] of buffers.entries()) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, /** @type {Uint16Array} */ (content), gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(i);
+      gl.vertexAttribPointer(i, 3, Number(type), true, Number(stride), 0);
+    }
+    return { array, count: triangles.length };
+  }
+
+  /** Forget what was to be drawn. */
+  begin() {
+    this.lines = [];
+    this.solids = [];
+  }
+
+  /**
+   * A mesh; one that does not cover what is behind it is seen before all that do.
+   * @param {number} mesh
+   * @param {Float64Array} model
+   * @param {number[]} colour red, green, blue, and how much it covers
+   */
+  addSolid(mesh, model, colour) {
+    this.solids.push({ mesh, model, colour });
+  }
+
+  /**
+   * Lines from point to point, of a width in pixels.
+   * @param {number[][]} points
+   * @param {number[]} colour red, green, blue, and how much it covers
+   * @param {number} width
+   */
+  addLine(points, colour, width) {
+    for (let i = 1; i < points.length; i++) this.lines.push(...points[i - 1], ...points[i], ...colour, width);
+  }
+
+  /**
+   * Show what was added.
+   * @param {Camera} camera
+   * @param {number[]} background
+   */
+  draw(camera, background) {
+    const { gl, canvas } = this;
+    const ratio = Math.min(devicePixelRatio, 2);
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((n) => Math.max(1, Math.round(n * ratio)));
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    camera.aspect = width / height;
+    const view = camera.matrix();
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(background[0], background[1], background[2], 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const light = unit(plus(plus(camera.back, 0.5, camera.up), 0.3, camera.right));
+    this.drawSolids(this.solids.filter(({ colour }) => colour[3] === 1), view, light);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.BLEND);
+    this.drawSolids(this.solids.filter(({ colour }) => colour[3] < 1), view, light);
+    gl.useProgram(this.line);
+    gl.bindVertexArray(this.linesArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.linesBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(this.lines), gl.DYNAMIC_DRAW);
+    gl.uniformMatrix4fv(gl.getUniformLocation(this.line, "view"), false, new Float32Array(view));
+    gl.uniform2f(gl.getUniformLocation(this.line, "pixel"), ratio / width, ratio / height);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.lines.length / LINE_SIZE);
+    gl.disable(gl.BLEND);
+    this.begin();
+  }
+
+  /**
+   * @param {Scene["solids"]} solids
+   * @param {Float64Array} view
+   * @param {number[]} light
+   */
+  drawSolids(solids, view, light) {
+    const { gl, solid } = this;
+    /** @param {string} name */
+    const at = (name) => gl.getUniformLocation(solid, name);
+    gl.useProgram(solid);
+    gl.uniformMatrix4fv(at("view"), false, new Float32Array(view));
+    gl.uniform3fv(at("light"), light);
+    for (const { mesh, model, colour } of solids) {
+      const { low, size, array, count } = this.meshes[mesh];
+      gl.bindVertexArray(array);
+      gl.uniformMatrix4fv(at("model"), false, new Float32Array(model));
+      gl.uniform4fv(at("colour"), colour);
+      gl.uniform3fv(at("low"), low);
+      gl.uniform1f(at("size"), size);
+      gl.drawArrays(gl.TRIANGLES, 0, count);
+    }
+  }
+}
+
+/**
+ * The normals of a mesh at each corner of its triangles, four bytes each: the mean of the faces about
+ * the vertex that are not at a sharp edge to the corner's own.
+ * @param {Uint16Array} places
+ * @param {Uint32Array} triangles
+ */
+function cornerNormals(places, triangles) {
+  const faces = new Float64Array(triangles.length); // of an area's length
+  const [begins, around] = facesAround(places.length / 3, triangles);
+  for (let t = 0; t < triangles.length; t += 3) {
+    const [a, b, c] = [0, 1, 2].map((k) => places.subarray(3 * triangles[t + k], 3 * triangles[t + k] + 3));
+    faces.set(cross(plus([b[0], b[1], b[2]], -1, a), plus([c[0], c[1], c[2]], -1, a)), t);
+  }
+  const normals = new Int8Array(4 * triangles.length);
+  for (let corner = 0; corner < triangles.length; corner++) {
+    const own = corner - (corner % 3), vertex = triangles[corner];
+    const [x, y, z] = [faces[own], faces[own + 1], faces[own + 2]], length = Math.hypot(x, y, z);
+    let sum = [0, 0, 0];
+    for (let i = begins[vertex]; i < begins[vertex + 1]; i++) {
+      const f = around[i], other = [faces[f], faces[f + 1], faces[f + 2]];
+      const smooth = x * other[0] + y * other[1] + z * other[2] > CREASE * length * Math.hypot(...other);
+      if (f === own || smooth) sum = plus(sum, 1, other);
+    }
+    const scale = 127 / (Math.hypot(...sum) || 1);
+    normals.set(sum.map((value) => value * scale), 4 * corner);
+  }
+  return normals;
+}
+
+/**
+ * First corners of the triangles about each vertex, and where those of a vertex begin.
+ * @param {number} count of vertices
+ * @param {Uint32Array} triangles
+ */
+function facesAround(count, triangles) {
+  const begins = new Uint32Array(count + 1), around = new Uint32Array(triangles.length);
+  for (const vertex of triangles) begins[vertex + 1] += 1;
+  for (let i = 0; i < count; i++) begins[i + 1] += begins[i];
+  const next = begins.slice();
+  triangles.forEach((vertex, corner) => (around[next[vertex]++] = corner - (corner % 3)));
+  return [begins, around];
+}

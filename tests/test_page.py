@@ -1,0 +1,404 @@
+"""The page of an FMU, in a browser without a network, against FMPy and other readers of bags."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import xml.etree.ElementTree as ET
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import (
+    HOSTILE,
+    LINKS,
+    PATIENCE,
+    VIEWPORT,
+    assert_shown_as_text,
+    chromium,
+    direction,
+    hostile_arm,
+    picture,
+    pixels,
+    press,
+    until,
+)
+from harness import needs
+from mcap_ros2.reader import read_ros2_messages
+from native_models import robots_folder
+from playwright.sync_api import Browser, Page
+from rosbags.rosbag2 import Reader
+
+import twodof
+from twodof.errors import BagError, PageError
+from twodof.experiments import resolve
+from twodof.export.arm_page import FUNCTIONS, SCRIPTS
+from twodof.export.compiler import UNITS, compile_web_module
+from twodof.fmu import instantiate
+from twodof.plots.track import read_tracks
+
+ROOT = Path(__file__).parents[1]
+ASSETS = ROOT / "fmu_src" / "page"
+READY = "#arm-scene[data-ready]"
+SAMPLES = "() => [...arm.data.subarray(0, arm.count * arm.width)]"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as started:
+        yield started
+
+
+@contextmanager
+def shown(browser: Browser, path: Path, **context: object) -> Iterator[Page]:
+    """A page from its file, without a network; it asks for nothing and complains of nothing."""
+    with browser.new_context(
+        viewport=VIEWPORT, offline=True, accept_downloads=True, **context
+    ) as opened:
+        opened.set_default_timeout(1e3 * PATIENCE)
+        page = opened.new_page()
+        said: list[str] = []
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("console", lambda message: said.append(message.text))
+        page.on("request", lambda request: said.append(request.url))
+        page.goto(path.as_uri())
+        page.wait_for_selector(READY)
+        yield page
+        assert said == [path.as_uri()]
+
+
+@pytest.fixture(scope="module")
+def arm(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default arm's page."""
+    return twodof.page(native_path, tmp_path_factory.mktemp("page") / "arm.html")
+
+
+def built(folder: Path, name: str, **options: object) -> Path:
+    """A native FMU of a robot of the package example-robot-data."""
+    urdf = next(robots_folder().rglob(f"{name}.urdf"))
+    chosen = twodof.FmuOptions(
+        urdf=urdf, mesh_dir=robots_folder().parent, native=True, **options
+    )  # fmt: skip
+    return twodof.build_fmu(folder / f"{name}.fmu", chosen)
+
+
+@pytest.fixture(scope="module")
+def panda(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("panda")
+    return built(folder, "panda", frame="panda_hand_tcp", control="pose")
+
+
+def stepped(path: Path, parameters: dict, script: dict[int, dict], steps: int) -> np.ndarray:
+    """Samples by FMPy, N × (q, v, x, tau): inputs set before steps by number."""
+    fmu = twodof.load_fmu(path)
+    names = [name for group in ("q", "v", "x", "tau") for name in fmu.vector(group)]
+    with instantiate(fmu) as instance:
+        instance.initialise(0.0, inf, resolve(fmu, parameters))
+        read = instance.reader(names)
+        rows = [[*read()]]
+        for k in range(steps):
+            instance.set(resolve(fmu, script.get(k, {})))
+            instance.step(k * 0.01, 0.01)
+            rows.append([*read()])
+    return np.array(rows)
+
+
+def played(page: Page, parameters: dict, script: dict[int, dict], steps: int) -> np.ndarray:
+    """The same by the page."""
+    if page.locator("#arm-play").text_content() == "Pause":
+        press(page, "Pause")
+    columns = page.evaluate(
+        """([parameters, script, steps]) => {
+            arm.startAgain(true);
+            for (const [name, value] of Object.entries(parameters)) arm.set(name, value);
+            for (let k = 0; k < steps; k++) {
+                for (const [name, value] of Object.entries(script[k] ?? {})) arm.set(name, value);
+                arm.step();
+            }
+            const groups = ["q", "v", "x", "tau"];
+            return Array.from({length: arm.count},
+                (_, k) => groups.flatMap(group => [...arm.at(group, k)]));
+        }""",
+        [parameters, {str(k): values for k, values in script.items()}, steps],
+    )
+    return np.array(columns)
+
+
+SESSION = {
+    0: {"x_des": [0.22, 0.02]},
+    200: {"Kp": 90.0, "Kd": [25.0, 30.0]},
+    350: {"f_ext": [2.0, -1.0, 0.0]},
+    450: {"f_ext": 0.0, "x_des": [0.14, 0.16]},
+    700: {"tau_ext": [0.3, -0.1], "x_des[1]": 0.17},
+}
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_session_has_the_numbers_of_the_fmu(browser, tmp_path, native_path, fmi) -> None:
+    path = native_path
+    if fmi == 3:
+        path = twodof.build_fmu(tmp_path / "three.fmu", twodof.FmuOptions(native=True, fmi=3))
+    parameters = {"payload": 0.7, "limit_effort": True}
+    expected = stepped(path, parameters, SESSION, 1000)
+    with shown(browser, twodof.page(path, tmp_path / "arm.html")) as page:
+        actual = played(page, parameters, SESSION, 1000)
+    assert actual.shape == expected.shape == (1001, 8)
+    assert np.ptp(expected[:, 0]) > 0.5  # it moved
+    np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-12)
+
+
+def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
+    script = {
+        0: {"x_des": [0.45, 0.2, 0.4], "quat_des": [0.9, 0.1, 0.3, 0.2]},
+        300: {"Kp_rot": 80.0, "f_ext": [0.0, 5.0, -20.0]},
+    }
+    path = twodof.page(panda, tmp_path / "panda.html")
+    assert path.stat().st_size < 6e6
+    expected = stepped(panda, {}, script, 1000)
+    with shown(browser, path) as page:
+        actual = played(page, {}, script, 1000)
+    np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-12)
+
+
+def test_the_arm_runs_in_real_time_and_is_seen_where_it_is(browser, arm) -> None:
+    assert arm.stat().st_size < 1.5e6
+    with shown(browser, arm) as page:
+        count = page.evaluate(
+            """() => new Promise(resolve => {
+                const start = performance.now(), first = arm.k;
+                setTimeout(() => requestAnimationFrame(() =>
+                    resolve((arm.k - first) / ((performance.now() - start) / 10))), 3000);
+            })"""
+        )
+        assert 0.5 < count < 1.2  # of the steps that the clock asks for; the frames may be slow
+        press(page, "Pause")
+        page.evaluate("() => { arm.startAgain(true); arm.step(500); }")
+        q1, q2 = page.evaluate("() => [...arm.at('q')]")
+        links = [direction(pixels(picture(page), colour)) for colour in LINKS]
+        for seen, angle in zip(links, (q1, q1 + q2)):
+            assert abs(np.sin(seen - angle)) < 0.05
+
+
+def test_what_the_buttons_and_keys_do(browser, arm) -> None:
+    with shown(browser, arm) as page:
+        page.locator("#arm-scene").click()
+        page.keyboard.press(" ")
+        assert page.locator("#arm-play").text_content() == "Play"
+        k = page.evaluate("arm.k")
+        press(page, "Step")
+        assert page.evaluate("arm.k") == k + 1
+        page.get_by_label("Kp, 1/s2").fill("77")
+        page.keyboard.press("Enter")
+        assert page.evaluate("arm.held('Kp')") == [77, 77]
+        press(page, "Reset")
+        assert page.evaluate("[arm.k, ...arm.held('Kp')]") == [0, 77, 77]
+        press(page, "Defaults")
+        assert page.evaluate("[arm.k, ...arm.held('Kp')]") == [0, 50, 50]
+        page.evaluate("arm.set('x_des', [0.25, 0.5])")
+        until(page, lambda text: "target out of reach" in text, said)
+        page.evaluate("arm.set('x_des', [0.2, 0.05]); arm.set('q_max[1]', 0.5)")
+        until(page, lambda text: "joint1 at limit" in text, said)
+
+
+def said(page: Page) -> str:
+    return str(page.locator("#arm-said").text_content())
+
+
+def test_the_target_is_dragged_in_the_plane(browser, arm) -> None:
+    with shown(browser, arm) as page:
+        press(page, "Pause")
+        before = page.evaluate("arm.held('x_des')")
+        box = page.locator("#arm-scene").bounding_box()
+        target = until(page, lambda found: found is not None, target_place)
+        page.mouse.move(*target)
+        page.mouse.down()
+        page.mouse.move(target[0] - 60, target[1] - 30, steps=3)
+        page.mouse.up()
+        x, y = np.array(page.evaluate("arm.held('x_des')")) - before
+        assert x < -0.01 and abs(y / x + 0.5) < 0.02  # twice as far to the left as upwards
+        page.mouse.move(box["x"] + 40, box["y"] + 40)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 90, box["y"] + 90, steps=3)  # beside it: the target stays
+        page.mouse.up()
+        assert page.evaluate("arm.held('x_des')") == [before[0] + x, before[1] + y]
+
+
+def target_place(page: Page) -> tuple[float, float] | None:
+    """The middle of the target's ball in the window."""
+    shown = picture(page).astype(int)
+    r, g, b = np.moveaxis(shown, -1, 0)
+    ball = np.argwhere((r - b > 100) & (g < 105) & (r < 225))
+    box = page.locator("#arm-scene").bounding_box()
+    if not len(ball):
+        return None
+    y, x = np.median(ball, axis=0)
+    return float(box["x"] + x), float(box["y"] + y)
+
+
+def download(page: Page, folder: Path) -> Path:
+    with page.expect_download() as waiting:
+        press(page, "Download")
+    path = folder / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    return path
+
+
+def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path) -> None:
+    page_path = twodof.page(panda, tmp_path / "panda.html", settings={"Kd": 30.0})
+    with shown(browser, page_path) as page:
+        script = {0: {"x_des": [0.45, 0.2, 0.4]}, 40: {"Kp": 70.0}}
+        played(page, {"payload": 0.5}, script, 3000)
+        width = page.evaluate("arm.width")
+        rows = np.array(page.evaluate(SAMPLES)).reshape(-1, width)
+        path = download(page, tmp_path)
+    n = 8
+    bag = twodof.read_bag(path)
+    assert bag.joints == twodof.load_fmu(panda).joints
+    np.testing.assert_array_equal(bag.q, rows[:, :n])
+    np.testing.assert_array_equal(bag.v, rows[:, n : 2 * n])
+    assert np.diff(bag.stamps).tolist() == [10_000_000] * 3000
+    messages = [m.ros_msg for m in read_ros2_messages(path, topics=["/joint_states"])]
+    np.testing.assert_array_equal([m.effort for m in messages], bag.tau)
+    np.testing.assert_array_equal([m.position for m in messages], bag.q)
+    assert messages[0].name == list(bag.joints)
+    with Reader(path) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+    assert counts == dict.fromkeys(("/joint_states", "/end_effector", "/target"), 3001)
+    told = bag.provenance
+    assert told["fmu"]["guid"] == twodof.load_fmu(panda).guid
+    assert told["start_values"]["payload"] == 0.5 and told["start_values"]["Kd[1]"] == 30.0
+    assert [time for time, _ in told["input_changes"]] == [0, 0.4]
+    np.testing.assert_array_equal(bag.target[1:], np.tile([0.45, 0.2, 0.4], (3000, 1)))
+    poses = [m.ros_msg.pose for m in read_ros2_messages(path, topics=["/end_effector"])]
+    places = [(p.position.x, p.position.y, p.position.z) for p in poses]
+    np.testing.assert_allclose(places, rows[:, 2 * n : 2 * n + 3], rtol=0.0, atol=1e-12)
+    assert read_tracks([path])[0].motion is not None
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(BagError, match="ends in the middle"):
+        twodof.read_bag(path)
+
+
+def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:
+    robot = hostile_arm()
+    robot.find("joint").set("name", HOSTILE + "j" * (1000 - len(HOSTILE)))
+    (tmp_path / "hostile.urdf").write_text(ET.tostring(robot, encoding="unicode"))
+    frame = robot.findall("link")[-1].get("name")
+    options = twodof.FmuOptions(
+        urdf=tmp_path / "hostile.urdf", frame=frame, control="joint", native=True
+    )
+    fmu = twodof.build_fmu(tmp_path / "hostile.fmu", options)
+    with shown(browser, twodof.page(fmu, tmp_path / "hostile.html")) as page:
+        assert_shown_as_text(page, "joint2")
+
+
+def test_what_an_fmu_refuses_is_said_and_changes_nothing(browser, arm) -> None:
+    with shown(browser, arm) as page:
+        press(page, "Pause")
+        before = page.evaluate("[arm.k, ...arm.at('q')]")
+        page.get_by_text("parameters, which begin the run anew").click()
+        refused = page.evaluate(
+            "() => { try { arm.set('rtol', 0); } catch (error) { return error.message; } }"
+        )
+        assert "rtol = 0 must be > 0" in refused
+        assert page.evaluate("arm.held('rtol')") == [1e-3]
+        assert before[0] >= 0
+        for name, value, message in (
+            ("nothing", 1, "there is no variable 'nothing'"),
+            ("q[1]", 1, "output, cannot be set"),
+            ("Kp", [1], "Kp has 2 elements"),
+            ("Kp", True, "is not a number"),
+        ):
+            text = page.evaluate(
+                "([n, v]) => { try { arm.set(n, v); } catch (error) { return error.message; } }",
+                [name, value],
+            )
+            assert message in text
+
+
+def test_the_policy_allows_its_own_script_alone(arm) -> None:
+    text = arm.read_text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "://" not in re.sub(r"<script.*?</script>", "", text, flags=re.S)
+
+
+def test_the_documentation_of_a_native_fmu_is_alive(browser, native_path, tmp_path) -> None:
+    def index(path: Path) -> bytes:
+        with zipfile.ZipFile(path) as archive:
+            return archive.read("documentation/index.html")
+
+    (tmp_path / "index.html").write_bytes(index(native_path))
+    with shown(browser, tmp_path / "index.html") as page:
+        assert page.get_by_role("heading", name="Equations").is_visible()
+        press(page, "Pause")
+        page.get_by_role("heading", name="Equations").click()
+        page.keyboard.press(" ")  # which is the page's own, outside of the arm
+        assert page.locator("#arm-play").text_content() == "Play"
+        assert played(page, {}, {}, 100)[-1] == pytest.approx(
+            stepped(native_path, {}, {}, 100)[-1], rel=0.0, abs=1e-12
+        )
+    still = tmp_path / "still.fmu"
+    still.write_bytes(native_path.read_bytes())
+    options = twodof.FmuOptions(native=True, live_documentation=False)
+    assert b"<script" not in index(twodof.build_fmu(still, options))  # which is written anew
+    alive = twodof.build_fmu(still, twodof.FmuOptions(native=True))
+    assert alive.read_bytes() == native_path.read_bytes()
+
+
+def test_equal_fmus_make_equal_pages(native_path, arm, tmp_path) -> None:
+    assert twodof.page(native_path, tmp_path / "again.html").read_bytes() == arm.read_bytes()
+
+
+def test_the_engine_imports_nothing(native_path, arm, tmp_path) -> None:
+    with zipfile.ZipFile(native_path) as archive:
+        sources = {
+            Path(name).name: archive.read(name)
+            for name in archive.namelist()
+            if name.startswith("sources/")
+        }
+    module = compile_web_module(
+        {**sources, "page.c": (ASSETS / "page.c").read_bytes()}, (*UNITS, "page.c"), FUNCTIONS
+    )
+    sections = set()
+    position = 8
+    while position < len(module):
+        kind, size, shift = module[position], 0, 0
+        position += 1
+        while True:
+            byte = module[position]
+            position += 1
+            size |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                break
+        sections.add(kind)
+        position += size
+    assert 10 in sections and 2 not in sections  # code, and no imports
+    assert len(module) < 100_000
+
+
+def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:
+    with pytest.raises(PageError, match="has no plant in C"):
+        twodof.page(fmu_path, tmp_path / "x.html")
+    assert not (tmp_path / "x.html").exists()
+
+
+def test_the_scripts_are_typed_and_short() -> None:
+    assert {path.name for path in ASSETS.glob("*.js")} == set(SCRIPTS)
+    for name in SCRIPTS:
+        lines = (ASSETS / name).read_text().splitlines()
+        begin = 0
+        for i, line in enumerate(lines):  # functions and methods begin and end at one indent
+            if re.match(r"( {2})?(async )?(function\*? )?[\w$]+\(.*\) \{$", line):
+                begin, indent = i, len(line) - len(line.lstrip())
+            if begin and re.match(rf" {{{indent}}}}}$", line):
+                assert i - begin < 60, f"{name}:{begin + 1}"
+    done = subprocess.run(
+        [needs("tsc"), "-p", str(ROOT / "tests/tsconfig.json")], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout

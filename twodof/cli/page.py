@@ -1,0 +1,39 @@
+"""page: a native FMU in one HTML file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from .common import chosen_fmu, parse_settings, print_table
+from .options import add_set_option, add_step_option
+
+
+def add(verbs: Any) -> None:
+    """Add the verb and its options."""
+    page = verbs.add_parser(
+        "page", help="write a robot as one HTML file that runs",
+        description="Write a native FMU as one HTML file: the robot in 3D, its plant running in the"
+        " browser, a target to drag. It needs no network and no server.",
+    )  # fmt: skip
+    page.add_argument(
+        "fmu", nargs="?", metavar="FMU|URDF", help="default: the default arm's native FMU"
+    )
+    page.add_argument("-o", dest="output", metavar="FILE.html", help="default: <name>.html")
+    add_step_option(page)
+    add_set_option(page)
+    page.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Do it; the exit status."""
+    from ..pages.arm import page
+
+    options.native = not options.fmu or Path(options.fmu).suffix in (".urdf", ".xacro")
+    fmu = chosen_fmu(options)
+    output = options.output or fmu.with_suffix(".html").name
+    path = page(fmu, output, step=options.step, settings=parse_settings(options.settings))
+    size = path.stat().st_size / 1024
+    print_table(("FMU", str(fmu)), ("page", f"{path} ({size:.0f} KB); it needs no network"))
+    return 0

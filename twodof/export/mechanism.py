@@ -1,0 +1,111 @@
+"""The robot's kinematics and dynamics as C: ``mechanism.c`` of the native flavour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..plant.robot import Robot
+from ..plant.variables import Variable
+from .bodies import Array, Body, Mechanism, mechanism
+from .recursions import (
+    inverse_dynamics,
+    mass_matrix,
+    solve_by_factors,
+    solve_by_recursion,
+    task_frame,
+)
+from .straight_line import Expression, Value, c_function, cosine, operations, sine
+
+
+def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
+    """The text of ``mechanism.c``: the robot's kinematics and dynamics, without loops."""
+    n, constants = len(robot.joints), mechanism(robot)
+    joint = np.array(
+        [
+            (Expression(f"joint[{i}].c"), 0.0 if slides else Expression(f"joint[{i}].s"))
+            for i, slides in enumerate(constants.prismatic)
+        ]
+    )
+    a, tau, force = _variables("a", n), _variables("tau", n), _variables("force", 3)
+    x, R, J, drift = task_frame(constants, joint, _variables("v", n))
+    rows = ["xyz".index(axis) for axis in robot.axes]
+    frame = _elements("task->x", x[rows])
+    if any(variable.group == "quat_des" for variable in table):
+        rows += [3, 4, 5]
+        frame |= _elements("task->R", R)
+    frame |= _elements("task->J", J[rows]) | _elements("task->drift", drift[rows])
+    bodies, load = _loaded(constants)
+    effort = inverse_dynamics(
+        constants, bodies, joint, _variables("v", n), a, _variables("gravity", 3)
+    )
+    ways = [solve_by_factors(mass_matrix(constants, bodies, joint), tau)]
+    if robot.coupling is None:
+        ways.append(solve_by_recursion(constants, bodies, joint, tau))
+    in_all = "const JointPosition joint[N_BODIES]"
+    functions = {
+        f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
+        f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
+        f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements(
+            "tau", J[:3].T.dot(force)
+        ),
+        "load_carrier(double payload, const double place[3], Carrier *carrier)": load,
+        f"inverse_dynamics({in_all}, const Carrier *carrier, const double v[N_JOINTS],"
+        " const double a[N_JOINTS], const double gravity[3], double tau[N_JOINTS])": _elements(
+            "tau", effort
+        ),
+        f"acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
+        " double a[N_JOINTS])": _elements("a", min(ways, key=operations)),
+    }
+    return MECHANISM + "".join(
+        "\n" + c_function(f"void {head}", results, HELD) for head, results in functions.items()
+    )
+
+
+MECHANISM = """\
+/* The robot's kinematics and dynamics, generated from its URDF: recursions over its joints,
+   done with expressions, so that what its constants make 0 or 1 costs nothing. */
+#include "mechanism.h"
+
+#include <math.h>
+"""
+HELD = ("carrier->", "gravity[", "payload", "place[")
+"""Parameters, along which there are no derivatives."""
+LOWER = np.tril_indices(3)
+
+
+def _places(robot: Mechanism) -> dict[str, Value]:
+    angles = robot.G.dot(_variables("q", robot.G.shape[1])) + robot.c
+    places: dict[str, Value] = {}
+    for i, (angle, slides) in enumerate(zip(angles, robot.prismatic)):
+        places[f"joint[{i}].c"] = angle if slides else cosine(angle)
+        places[f"joint[{i}].s"] = 0.0 if slides else sine(angle)
+    return places
+
+
+def _loaded(robot: Mechanism) -> tuple[list[Body], dict[str, Value]]:
+    """The bodies, that with the payload as variables; and what these are."""
+    carrier, place = robot.path[-1], _variables("place", 3)
+    loaded = robot.body[carrier].with_point(
+        Expression("payload"), robot.frame_p + robot.frame_R.dot(place)
+    )
+    load = {"carrier->mass": loaded.mass}
+    load |= _elements("carrier->moment", loaded.moment)
+    load |= _elements("carrier->inertia", loaded.inertia[LOWER])
+    inertia = np.zeros((3, 3), dtype=object)
+    inertia[LOWER] = inertia.T[LOWER] = _variables("carrier->inertia", 6)
+    bodies = list(robot.body)
+    bodies[carrier] = Body(Expression("carrier->mass"), _variables("carrier->moment", 3), inertia)
+    return bodies, load
+
+
+def _variables(name: str, count: int) -> Array:
+    return np.array([Expression(f"{name}[{i}]") for i in range(count)], dtype=object)
+
+
+def _elements(name: str, values: Array) -> dict[str, Value]:
+    """Each element of an array by its name in C."""
+    return {
+        name + "".join(f"[{i}]" for i in place): value for place, value in np.ndenumerate(values)
+    }

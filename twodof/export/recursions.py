@@ -1,0 +1,278 @@
+"""Kinematics and dynamics of a robot, as recursions over its joints.
+
+They are written for arrays of numbers or of expressions (``straight_line``): from the one comes a
+value, from the other the C code that computes it. Vectors and matrices of a body are in the frame
+of its joint, whose axis is z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .bodies import Array, Body, Mechanism
+
+
+def placements(robot: Mechanism, joint: Array) -> tuple[list[Array], list[Array]]:
+    """R(q), p(q) of each joint's frame in its parent's: a = R b + p.
+
+    Args:
+        robot: the mechanism.
+        joint: N × 2, cosine and sine of a joint's angle, or the displacement of one that slides.
+    """
+    rotations, origins = [], []
+    for R, p, slides, (c, s) in zip(robot.R, robot.p, robot.prismatic, joint):
+        if slides:
+            rotations.append(R)
+            origins.append(p + R[:, 2] * c)
+        else:
+            x, y, z = R.T
+            rotations.append(np.array([x * c + y * s, y * c - x * s, z]).T)
+            origins.append(p)
+    return rotations, origins
+
+
+def task_frame(robot: Mechanism, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+    """The task frame in the root's axes: position, rotation, Jacobian and drift.
+
+        ω_i = ω_p + z_i v_i,   α_i = α_p + ω_p × z_i v_i,   with q̈ = 0
+        a_i = a_p + α_p × r + ω_p × (ω_p × r), and 2 ω_p × z_i v_i of a sliding joint
+        J_i = z_i × (x − o_i), or z_i of a sliding joint
+
+    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 3.1 and 7.3.
+
+    Returns:
+        x (3), R (3 × 3), J (6 × n: linear, angular), J̇ v (6).
+    """
+    rotations, origins = placements(robot, joint)
+    rates = robot.G.dot(v)
+    R: Array = np.eye(3)
+    x = omega = alpha = a = np.zeros(3)
+    axes, places = [], []
+    for i in (*robot.path, None):
+        r = R.dot(robot.frame_p if i is None else origins[i])
+        x = x + r
+        a = a + cross(alpha, r) + cross(omega, cross(omega, r))
+        if i is None:
+            break
+        R = R.dot(rotations[i])
+        motion = R[:, 2] * rates[i]
+        coriolis = cross(omega, motion)
+        if robot.prismatic[i]:
+            a = a + 2.0 * coriolis
+        else:
+            alpha, omega = alpha + coriolis, omega + motion
+        axes.append(R[:, 2])
+        places.append(x)
+    columns = np.zeros((len(robot.parent), 6), dtype=object)
+    for i, z, o in zip(robot.path, axes, places):
+        still = np.zeros(3)
+        columns[i] = [*z, *still] if robot.prismatic[i] else [*cross(z, x - o), *z]
+    return x, R.dot(robot.frame_R), columns.T.dot(robot.G), np.array([*a, *alpha])
+
+
+def inverse_dynamics(
+    robot: Mechanism, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
+) -> Array:
+    """τ = M(q) a + h(q, v): outwards the motion, inwards the forces.
+
+        f = m a + α × d + ω × (ω × d),   n = I α + ω × I ω + d × a     with d = m c
+
+    Gravity enters as an acceleration of the root upwards. Source: Luh, Walker & Paul, "On-line
+    computational scheme for mechanical manipulators", ASME J. Dyn. Sys. 102(2), 1980.
+    """
+    rotations, origins = placements(robot, joint)
+    rates, accelerations = robot.G.dot(v), robot.G.dot(a)
+    zero = np.zeros(3)
+    motions: list[tuple[Array, Array, Array]] = []
+    force, moment = [], []
+    for i, parent in enumerate(robot.parent):
+        omega, alpha, linear = motions[parent] if parent >= 0 else (zero, zero, -gravity)
+        R, p = rotations[i], origins[i]
+        linear = linear + cross(alpha, p) + cross(omega, cross(omega, p))
+        omega, alpha, linear = (R.T.dot(each) for each in (omega, alpha, linear))
+        coriolis = np.array([omega[1] * rates[i], -omega[0] * rates[i], 0.0])
+        along = np.array([0.0, 0.0, 1.0])
+        if robot.prismatic[i]:
+            linear = linear + 2.0 * coriolis + along * accelerations[i]
+        else:
+            alpha = alpha + coriolis + along * accelerations[i]
+            omega = omega + along * rates[i]
+        motions.append((omega, alpha, linear))
+        b = body[i]
+        f = linear * b.mass + cross(alpha, b.moment) + cross(omega, cross(omega, b.moment))
+        n = b.inertia.dot(alpha) + cross(omega, b.inertia.dot(omega)) + cross(b.moment, linear)
+        force.append(f)
+        moment.append(n)
+    tau = np.zeros(len(robot.parent), dtype=object)
+    for i in reversed(range(len(robot.parent))):
+        parent = robot.parent[i]
+        tau[i] = (force if robot.prismatic[i] else moment)[i][2]
+        if parent >= 0:
+            f = rotations[i].dot(force[i])
+            force[parent] = force[parent] + f
+            moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + cross(origins[i], f)
+    effort: Array = robot.G.T.dot(tau)
+    return effort
+
+
+def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:
+    """M(q), n × n, by composite bodies: what each joint and all behind it weigh.
+
+    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2.
+    """
+    rotations, origins = placements(robot, joint)
+    composite, n = list(body), len(robot.parent)
+    M = np.zeros((n, n), dtype=object)
+    for i in reversed(range(n)):
+        b, slides = composite[i], robot.prismatic[i]
+        f = np.array([0.0, 0.0, b.mass]) if slides else np.array([-b.moment[1], b.moment[0], 0.0])
+        t = np.array([b.moment[1], -b.moment[0], 0.0]) if slides else b.inertia[:, 2]
+        k = i
+        while True:
+            M[i, k] = M[k, i] = f[2] if robot.prismatic[k] else t[2]
+            if robot.parent[k] < 0:
+                break
+            f, t = rotations[k].dot(f), rotations[k].dot(t)
+            t = t + cross(origins[k], f)
+            k = robot.parent[k]
+        if robot.parent[i] >= 0:
+            moved = _moved(b, rotations[i], origins[i])
+            whole = composite[robot.parent[i]]
+            composite[robot.parent[i]] = Body(
+                whole.mass + moved.mass,
+                whole.moment + moved.moment,
+                whole.inertia + moved.inertia,
+            )
+    reduced: Array = robot.G.T.dot(M).dot(robot.G)
+    return reduced
+
+
+def solve_by_factors(M: Array, tau: Array) -> Array:
+    """M⁻¹τ by M = Lᵀ D L, from the last joint inwards: between branches of a tree all stays 0.
+
+    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.5.
+    """
+    L, a = M.copy(), np.array(tau, dtype=object)  # M, row by row replaced by L
+    n = len(a)
+    inverse = [0.0] * n
+    for k in reversed(range(n)):
+        inverse[k] = 1.0 / L[k, k]
+        for i in reversed(range(k)):
+            share = L[k, i] * inverse[k]
+            for j in range(i + 1):
+                L[i, j] = L[i, j] - share * L[k, j]
+            a[i] = a[i] - share * a[k]
+            L[k, i] = share
+    for k in range(n):
+        a[k] = a[k] * inverse[k]
+        for i in range(k):
+            a[k] = a[k] - L[k, i] * a[i]
+    return a
+
+
+def solve_by_recursion(robot: Mechanism, body: Sequence[Body], joint: Array, tau: Array) -> Array:
+    """M⁻¹τ by articulated bodies, without velocities and gravity; no joint mimics another.
+
+        n = A α + B a,  f = Bᵀ α + C a                    what a joint feels, inwards
+        U = I s,  D = sᵀ U,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
+        q̈ = (u − Uᵀ a)/D                                                 outwards
+
+    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 7.3.
+    """
+    rotations, origins = placements(robot, joint)
+    n = len(robot.parent)
+    A = [b.inertia for b in body]
+    B = [_skew(b.moment) for b in body]
+    C = [np.eye(3) * b.mass for b in body]
+    bias = [(np.zeros(3), np.zeros(3))] * n
+    U: list[tuple[Array, Array]] = [bias[0]] * n
+    u, inverse = [0.0] * n, [0.0] * n
+    for i in reversed(range(n)):
+        slides, parent = robot.prismatic[i], robot.parent[i]
+        angular, linear = (B[i][:, 2], C[i][:, 2]) if slides else (A[i][:, 2], B[i][2])
+        U[i] = angular, linear
+        inverse[i] = 1.0 / U[i][slides][2]
+        u[i] = tau[i] - bias[i][slides][2]
+        if parent < 0:
+            continue
+        per_angular, per_linear = angular * inverse[i], linear * inverse[i]
+        left = (
+            A[i] - np.outer(per_angular, angular),
+            B[i] - np.outer(per_angular, linear),
+            C[i] - np.outer(per_linear, linear),
+        )
+        if slides:  # along its axis a joint passes nothing on
+            left[1][:, 2] = left[2][:, 2] = left[2][2] = 0.0
+        else:
+            left[0][:, 2] = left[0][2] = left[1][2] = 0.0
+        b_angular, b_linear = bias[i]
+        f = rotations[i].dot(b_linear + per_linear * u[i])
+        t = rotations[i].dot(b_angular + per_angular * u[i]) + cross(origins[i], f)
+        bias[parent] = bias[parent][0] + t, bias[parent][1] + f
+        moved = _moved_articulated(left, rotations[i], origins[i])
+        A[parent], B[parent], C[parent] = (
+            whole + part for whole, part in zip((A[parent], B[parent], C[parent]), moved)
+        )
+    a = np.zeros(n, dtype=object)
+    motion: list[tuple[Array, Array]] = []
+    for i, parent in enumerate(robot.parent):
+        alpha, linear = motion[parent] if parent >= 0 else (np.zeros(3), np.zeros(3))
+        linear = rotations[i].T.dot(linear + cross(alpha, origins[i]))
+        alpha = rotations[i].T.dot(alpha)
+        a[i] = (u[i] - U[i][0].dot(alpha) - U[i][1].dot(linear)) * inverse[i]
+        along = np.array([0.0, 0.0, 1.0]) * a[i]
+        motion.append((alpha, linear + along) if robot.prismatic[i] else (alpha + along, linear))
+    return a
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a × b"""
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def _moved(b: Body, R: Array, p: Array) -> Body:
+    """A body in the frame in which its own is placed at (R, p)."""
+    d = R.dot(b.moment)
+    T = R.dot(b.inertia)
+    # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
+    half = d + p * (0.5 * b.mass)
+    spread = 2.0 * half.dot(p)
+    inertia = np.zeros((3, 3), dtype=object)
+    for r in range(3):
+        for k in range(r + 1):
+            entry = T[r].dot(R[k]) - half[r] * p[k] - p[r] * half[k]
+            inertia[r, k] = inertia[k, r] = entry + spread if r == k else entry
+    return Body(b.mass, d + p * b.mass, inertia)
+
+
+def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -> list[Array]:
+    """A, B, C in the frame in which their own is placed at (R, p)."""
+    A, B, C = blocks
+    A, C = _rotated(A, R), _rotated(C, R)
+    B = R.dot(B).dot(R.T)
+    P = _skew(p)
+    G = B + P.dot(C)
+    return [_symmetric(A + P.dot(B.T) - G.dot(P)), G, C]
+
+
+def _rotated(S: Array, R: Array) -> Array:
+    """R S Rᵀ of a symmetric S."""
+    return _symmetric(R.dot(S).dot(R.T))
+
+
+def _symmetric(S: Array) -> Array:
+    """S, whose upper triangle is taken to be its lower one."""
+    S = S.copy()
+    for r in range(3):
+        for k in range(r):
+            S[k, r] = S[r, k]
+    return S
+
+
+def _skew(a: Array) -> Array:
+    """[a]×, so that [a]× b = a × b."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])

@@ -1,0 +1,225 @@
+"""C code without loops or branches, from calculations that Python has done with expressions.
+
+What is 0 or 1 in a robot's constants leaves no arithmetic behind, what appears twice is computed
+once. Source: Frigerio, Buchli, Caldwell & Semini, "RobCoGen", J. Softw. Eng. Robot. 7(1), 2016,
+for what that is worth to a robot's dynamics.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+WIDTH = 100
+"""Characters of a line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Expression:
+    """A value of C: the name of a variable, or an operation on expressions and numbers."""
+
+    operation: str
+    operands: tuple[Value, ...] = ()
+
+    def __neg__(self) -> Value:
+        return self.operands[0] if self.operation == "neg" else Expression("neg", (self,))
+
+    def __add__(self, other: Value) -> Value:
+        if isinstance(other, Expression) and other.operation == "neg":
+            return self - other.operands[0]
+        if self.operation == "neg" and other != 0.0:
+            return other - self.operands[0]
+        return self if other == 0.0 else Expression("+", (self, other))
+
+    def __sub__(self, other: Value) -> Value:
+        if isinstance(other, Expression) and other.operation == "neg":
+            return self + other.operands[0]
+        return self if other == 0.0 else Expression("-", (self, other))
+
+    def __rsub__(self, other: float) -> Value:
+        return -self if other == 0.0 else Expression("-", (other, self))
+
+    def __mul__(self, other: Value) -> Value:
+        if isinstance(other, Expression):
+            if "neg" in (self.operation, other.operation):
+                a = self.operands[0] if self.operation == "neg" else self
+                b = other.operands[0] if other.operation == "neg" else other
+                return a * b if self.operation == other.operation else -(a * b)
+            return Expression("*", (self, other))
+        if other == 0.0:
+            return 0.0
+        if other < 0.0:
+            return -(self * -other)
+        if self.operation == "neg":
+            return -(self.operands[0] * other)
+        return self if other == 1.0 else Expression("*", (self, other))
+
+    def __truediv__(self, other: Value) -> Value:
+        return Expression("/", (self, other))
+
+    def __rtruediv__(self, other: float) -> Value:
+        return Expression("/", (other, self)) if other else 0.0
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+Value = Expression | float
+
+
+def cosine(angle: Value) -> Value:
+    """Of an angle, rad."""
+    return Expression("cos", (angle,))
+
+
+def sine(angle: Value) -> Value:
+    """Of an angle, rad."""
+    return Expression("sin", (angle,))
+
+
+def operations(results: Iterable[Value]) -> int:
+    """How many operations a calculation takes."""
+    nodes, _ = _ordered(results)
+    return sum(1 for _, operands in nodes if operands)
+
+
+def c_function(head: str, results: Mapping[str, Value], held: Sequence[str] = ()) -> str:
+    """A function that assigns each result to the variable of its name, real or complex.
+
+    Complex numbers are x + i h dx with an h whose square vanishes, so that real parts are computed
+    as such, and imaginary ones by the rules of differentiation.
+
+    Args:
+        head: of the function.
+        results: values by lvalue; no lvalue may be a variable of one of the values.
+        held: what names of variables begin with that have no imaginary part.
+    """
+    varied: dict[str, Value] = {}
+    with_variations = _with_variations(results.values(), tuple(held))
+    for value, variation in with_variations:
+        varied[f"const Real re{len(varied)}"] = value
+        varied[f"const Real im{len(varied)}"] = variation
+    combined = "".join(
+        f"\n    {target} = re{2 * i} + UNIT * im{2 * i + 1};" for i, target in enumerate(results)
+    )
+    body = f"#ifdef IS_COMPLEX\n{_statements(varied, 'Real')}{combined}\n#else\n"
+    body += f"{_statements(results, 'double')}\n#endif"
+    parameters = re.findall(r"(\w+)(?:\[\w+\])?[,)]", head)
+    unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
+    ignored = "".join(f"    (void){name};\n" for name in unused)
+    head = textwrap.fill(head, WIDTH, subsequent_indent="    ", break_on_hyphens=False)
+    return f"{head}\n{{\n{ignored}{body}\n}}\n"
+
+
+def _statements(results: Mapping[str, Value], kind: str) -> str:
+    nodes, places = _ordered(results.values())
+    uses = Counter(places) + Counter(operand for _, operands in nodes for operand in operands)
+    texts: list[str] = []
+    lines: list[str] = []
+    for place, (operation, operands) in enumerate(nodes):
+        text = _c(operation, [texts[operand] for operand in operands])
+        if operands and (uses[place] > 1 or len(text) > WIDTH - 40):
+            lines.append(f"    const {kind} t{place} = {_bare(text)};")
+            text = f"t{place}"
+        texts.append(text)
+    lines += [
+        f"    {target} = {_bare(texts[place])};"
+        for target, place in zip(results, places, strict=True)
+    ]
+    return "\n".join(lines)
+
+
+def _with_variations(results: Iterable[Value], held: tuple[str, ...]) -> list[tuple[Value, Value]]:
+    """The real parts of values, and how these vary with the imaginary parts of variables."""
+    nodes, places = _ordered(results)
+    pairs: list[tuple[Value, Value]] = []
+    for operation, operands in nodes:
+        (a, da), (b, db) = ([pairs[operand] for operand in operands] + [(0.0, 0.0)] * 2)[:2]
+        if operation == "+":
+            pair = a + b, da + db
+        elif operation == "-":
+            pair = a - b, da - db
+        elif operation == "*":
+            pair = a * b, a * db + da * b
+        elif operation == "/":
+            quotient = a / b
+            pair = quotient, (da - quotient * db) / b
+        elif operation == "neg":
+            pair = -a, -da
+        elif operation == "cos":
+            pair = cosine(a), -(sine(a) * da)
+        elif operation == "sin":
+            pair = sine(a), cosine(a) * da
+        elif _is_number(operation):
+            pair = float(operation), 0.0
+        elif operation.startswith(held):
+            pair = Expression(f"creal({operation})"), 0.0
+        else:
+            pair = Expression(f"creal({operation})"), Expression(f"cimag({operation})")
+        pairs.append(pair)
+    return [pairs[place] for place in places]
+
+
+def _is_number(operation: str) -> bool:
+    return operation[0] in "-.0123456789"
+
+
+def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]], list[int]]:
+    """Operations in an order in which they can be done, equal ones once; the results' places."""
+    nodes: list[tuple[str, tuple[int, ...]]] = []
+    place_of: dict[tuple[str, tuple[int, ...]], int] = {}
+    seen: dict[int, int] = {}
+    wanted = list(results)
+
+    def place(value: Value) -> int:
+        operands: tuple[int, ...] = ()
+        if isinstance(value, Expression):
+            operation = value.operation
+            operands = tuple(seen[id(operand)] for operand in value.operands)
+            if operation in "+*":
+                operands = tuple(sorted(operands))
+        else:
+            operation = repr(float(value))
+        key = operation, operands
+        if key not in place_of:
+            place_of[key] = len(nodes)
+            nodes.append(key)
+        return place_of[key]
+
+    for result in wanted:
+        pending: list[Value] = [result]
+        while pending:  # deeper than Python's recursion may go
+            value = pending[-1]
+            inner = value.operands if isinstance(value, Expression) else ()
+            missing = [operand for operand in inner if id(operand) not in seen]
+            if missing:
+                pending += reversed(missing)
+            else:
+                seen[id(value)] = place(value)
+                pending.pop()
+    return nodes, [seen[id(result)] for result in wanted]
+
+
+def _c(operation: str, operands: list[str]) -> str:
+    if not operands:
+        return operation
+    if operation == "neg":
+        return f"(-{operands[0]})"
+    if len(operands) == 1:
+        return f"{operation}({_bare(operands[0])})"
+    return f"({operands[0]} {operation} {operands[1]})"
+
+
+def _bare(text: str) -> str:
+    """Without the parentheses around all of it."""
+    if not text.startswith("("):
+        return text
+    depth = 0
+    for place, letter in enumerate(text):
+        depth += (letter == "(") - (letter == ")")
+        if depth == 0:
+            return text[1:-1] if place == len(text) - 1 else text
+    return text

@@ -1,0 +1,154 @@
+"""What a robot's links look like: the visual shapes of its URDF as triangles."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..plant.urdf import RobotError, Urdf
+from .kinematics import Array, Placement
+from .meshes import Colour, Part, ReadMesh, mesh_parts
+
+Indices = NDArray[np.uint32]
+
+NO_MATERIAL = (0.62, 0.66, 0.70)
+STICKS = ((0.0, 0.447, 0.698), (0.835, 0.369, 0.0), (0.0, 0.620, 0.451), (0.8, 0.475, 0.655))
+BALL = (0.275, 0.306, 0.345)
+SIDES = 24  # of what is round
+
+
+class Shape(NamedTuple):
+    """Triangles on a link: V × 3 in m, in the axes of a place in the link's frame, and T × 3."""
+
+    link: str
+    place: Placement
+    colour: Colour
+    vertices: Array
+    triangles: Indices
+
+
+def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
+    """The visual shapes of all links, and the names of the meshes that are not at hand.
+
+    Where there are none, sticks and balls show where the joints are.
+
+    Args:
+        robot: its meshes are named ``package://meshes/…``.
+        read: where they are from.
+
+    Raises:
+        RobotError: a shape is not described by numbers.
+    """
+    shapes, missing = [], []
+    for link in robot.tree.findall("link"):
+        name = str(link.get("name"))
+        for visual in link.findall("visual"):
+            geometry = visual.find("geometry")
+            if geometry is None or not len(geometry):
+                continue
+            element = geometry[0]
+            try:
+                place, colour = origin(visual.find("origin")), _colour(robot.tree, visual)
+                parts = _parts(element, read)
+            except ValueError as error:
+                raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
+            shapes += [Shape(name, place, p.colour or colour, *p[:2]) for p in parts]
+            if element.tag == "mesh" and not parts:
+                missing.append(element.get("filename", "").removeprefix("package://"))
+    return shapes or _sticks(robot), missing
+
+
+def _parts(element: ET.Element, read: ReadMesh) -> list[Part]:
+    """Of a URDF's geometry; none where it is of an unknown kind or its mesh is not at hand."""
+
+    def number(key: str) -> float:
+        return float(element.get(key, 1))
+
+    if element.tag == "mesh":
+        name = element.get("filename", "").removeprefix("package://")
+        return mesh_parts(name, read, floats(element, "scale", "1 1 1"))
+    if element.tag == "box":
+        corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+        return [Part(corners * floats(element, "size", "1 1 1"), BOX, None)]
+    if element.tag == "sphere":
+        return [Part(*sphere(number("radius")), None)]
+    if element.tag == "cylinder":
+        return [Part(*cylinder(number("radius"), number("length")), None)]
+    return []
+
+
+BOX = np.array(
+    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6),
+     (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)], dtype=np.uint32,
+)  # fmt: skip
+
+
+def sphere(radius: float) -> tuple[Array, Indices]:
+    """About the origin."""
+    polar = np.linspace(0.0, math.pi, SIDES // 2 + 1)
+    return _turned(radius * np.sin(polar), -radius * np.cos(polar))
+
+
+def cylinder(radius: float, length: float) -> tuple[Array, Indices]:
+    """About the origin, along z."""
+    return _turned(np.array([0.0, radius, radius, 0.0]), length / 2 * np.array([-1, -1, 1, 1]))
+
+
+def _turned(radii: Array, heights: Array) -> tuple[Array, Indices]:
+    """The surface that a line of points turns into about z."""
+    angle = np.linspace(0.0, 2 * math.pi, SIDES, endpoint=False)
+    x, y = np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle))
+    vertices = np.stack([x, y, np.repeat(heights[:, None], SIDES, axis=1)], axis=-1)
+    here = np.arange(SIDES)
+    beside = (here + 1) % SIDES
+    rows = np.arange(len(radii) - 1)[:, None] * SIDES
+    low, high = rows + SIDES, rows  # the line goes upwards: seen from outside, counterclockwise
+    quads = [(high + here, high + beside, low + beside), (high + here, low + beside, low + here)]
+    triangles = np.concatenate([np.stack(q, axis=-1).reshape(-1, 3) for q in quads])
+    return vertices.reshape(-1, 3), triangles.astype(np.uint32)
+
+
+def _sticks(robot: Urdf) -> list[Shape]:
+    """A ball at each joint, and a stick from each link's origin to those of its children."""
+    joints = list(robot.joints.values())
+    radius = 0.05 * max((float(np.linalg.norm(joint.xyz)) for joint in joints), default=0.0)
+    still = Rotation.identity()
+    shapes = []
+    for i, joint in enumerate(joints):
+        place = Placement(np.array(joint.xyz), still)
+        shapes.append(Shape(joint.parent, place, BALL, *sphere(1.4 * radius)))
+        length = float(np.linalg.norm(joint.xyz))
+        if length > radius:
+            along = Rotation.align_vectors([joint.xyz], [(0.0, 0.0, 1.0)])[0]
+            place = Placement(np.array(joint.xyz) / 2, along)
+            stick = cylinder(radius, length)
+            shapes.append(Shape(joint.parent, place, STICKS[i % len(STICKS)], *stick))
+    return shapes
+
+
+def _colour(tree: ET.Element, visual: ET.Element) -> Colour:
+    material = visual.find("material")
+    if material is not None:
+        named = [m for m in tree.findall("material") if m.get("name") == material.get("name")]
+        for candidate in (material, *named):
+            if (colour := candidate.find("color")) is not None:
+                r, g, b = floats(colour, "rgba", "1 1 1 1")[:3].tolist()
+                return r, g, b
+    return NO_MATERIAL
+
+
+def floats(element: ET.Element | None, key: str, default: str) -> Array:
+    """The numbers of an attribute."""
+    text = default if element is None else element.get(key, default)
+    return np.array([float(word) for word in text.split()])
+
+
+def origin(element: ET.Element | None) -> Placement:
+    """URDF's xyz and rpy, about the fixed axes x, y and z."""
+    rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0"))
+    return Placement(floats(element, "xyz", "0 0 0"), rotation)
