@@ -32,11 +32,11 @@ SCRIPTS = (
 )  # fmt: skip
 """In the order in which they are read."""
 FUNCTIONS = (
-    "engine_instantiate", "engine_message", "engine_forget", "engine_allocate",
-    "fmi2SetupExperiment", "fmi2EnterInitializationMode", "fmi2ExitInitializationMode",
-    "fmi2Reset", "fmi2SetReal", "fmi2GetReal", "fmi2SetBoolean", "fmi2DoStep",
+    "engine_instantiate", "engine_message", "engine_forget", "engine_allocate", "engine_reset",
+    "engine_initialise", "engine_set_reals", "engine_set_boolean", "engine_get_reals",
+    "engine_step",
 )  # fmt: skip
-"""Of FMI and of page.c, which the page calls."""
+"""Of page.c, which the page calls."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
 POLICY = (
     "default-src 'none'; script-src 'sha256-{script}' 'wasm-unsafe-eval';"
@@ -53,8 +53,8 @@ class Arm:
     Attributes:
         name, guid, file: of the FMU.
         robot: name of the robot; frame, root, axes, control, joints as in ``Fmu``.
-        variables: one for each of the FMU's: name, value reference, causality, unit, start and
-            description.
+        variables: one for each of the FMU's, elements of vectors by themselves: name, value
+            reference, causality, unit, start and description.
         step: communication step, s.
         urdf: text of resources/robot.urdf.
         read: gives its meshes.
