@@ -72,12 +72,12 @@ class Model:
     def reference(self, name: str) -> int:
         return next(i for i, v in enumerate(self.table) if name in (v.name, v.group))
 
-    def sources(self, *more: Path) -> dict[str, bytes]:
-        headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
-        files = engine_sources(self.control)
+    def sources(self, *more: Path, fmi: int = 2) -> dict[str, bytes]:
+        headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{fmi}*.h")
+        files = engine_sources(self.control, fmi)
         files |= {path.name: path.read_bytes() for path in (*headers, *more)}
         files["mechanism.c"] = mechanism_source(self.robot, self.table).encode()
-        files["model.h"] = model_header(self.robot, self.table, self.control, GUID).encode()
+        files["model.h"] = model_header(self.robot, self.table, self.control, GUID, fmi).encode()
         return files
 
 
@@ -239,9 +239,9 @@ def engine(name: str, control: str = "task") -> Engine:
     return Engine(model(name, control))
 
 
-def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
+def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2) -> Path:
     """C files of the tests, which include the FMU's, compiled by the machine's own compiler."""
-    files = of.sources(*more)
+    files = of.sources(*more, fmi=fmi)
     digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
     folder = SCRATCH / digest
     output = folder / "program"

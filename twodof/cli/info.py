@@ -128,6 +128,7 @@ def _print_fmu(fmu: Fmu) -> None:
     ]
     print_table(
         ("FMU", f"{fmu.path} ({fmu.name}, {fmu.description.generationTool})"),
+        ("FMI", fmu.description.fmiVersion),
         ("digest", fmu.guid),
         ("platforms", ", ".join(fmu.platforms) or "none"),
         ("capabilities", ", ".join(capabilities)),

@@ -22,7 +22,7 @@ from .options import add_fmu, add_run_options, add_time_options
 
 if TYPE_CHECKING:
     from ..experiments import Experiment
-    from ..master import Sample, Sink
+    from ..sample import Sample, Sink
 
 
 def add(verbs: Any) -> None:
@@ -69,7 +69,7 @@ def progress() -> list[Sink]:
         return []
     from tqdm import tqdm
 
-    from ..master import Sink
+    from ..sample import Sink
 
     class Progress(Sink):
         def begin(self, run: Experiment) -> Progress:

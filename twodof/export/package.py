@@ -21,11 +21,13 @@ from ..plant.urdf import RobotError, read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
 from .arm_page import CONTAINER, Arm, LivePart, live_part
-from .compiler import compiles_for_the_web, host_platform
+from .compiler import PLATFORMS, compiles_for_the_web, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
 from .model_description import DEFAULT_STEP, model_description
+from .model_description3 import model_description3
+from .native import engine_variables
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)
@@ -61,7 +63,9 @@ class FmuOptions:
         native: the plant as compiled C instead of Python code.
         live_documentation: put the arm, alive, into the documentation of a native FMU, where
             there is a compiler for it; its meshes are then in the FMU twice.
-        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64"; empty: this machine's.
+        fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
+        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or of FMI 3.0
+            "x86_64-linux", "aarch64-linux"; empty: this machine's.
     """
 
     urdf: Path | None = None
@@ -76,6 +80,7 @@ class FmuOptions:
     name: str = "TwoDof"
     link_environment: bool = False
     native: bool = False
+    fmi: int | None = None
     live_documentation: bool = True
     platforms: tuple[str, ...] = ()
 
@@ -135,7 +140,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     files.update(flavour.files)
 
     def describe(guid: str) -> bytes:
-        return model_description(
+        description = model_description(
             robot,
             table,
             options.control,
@@ -146,6 +151,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
             exchanges=flavour.exchanges,
             source_files=flavour.source_files,
         )
+        return model_description3(description) if flavour.fmi == 3 else description
 
     digest = hashlib.sha256(describe(""))
     for name in sorted(files):
@@ -168,7 +174,8 @@ def _finish(
     binaries = flavour.finish(guid)
     live = LivePart("", "")
     if _is_live(options):
-        live = _live_part(options, robot, table, guid, {**files, **binaries})
+        variables = engine_variables(robot, table, options.control, flavour.fmi)
+        live = _live_part(options, robot, variables, guid, {**files, **binaries})
     return binaries | documentation(
         robot,
         table,
@@ -215,17 +222,27 @@ def _flavour(
     starts: Mapping[str, Any],
 ) -> Flavour:
     if not options.native:
-        if options.platforms:
-            raise BuildError("platforms can be chosen for the native flavour only, `native=True`")
+        if options.platforms or options.fmi:
+            raise BuildError(
+                "the platforms and the version of FMI can be chosen for the native flavour only,"
+                " `native=True`"
+            )
         return python_flavour(
             robot, options.control, urdf, starts, options.name, options.link_environment
         )
     if options.link_environment:
         raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
-    platforms = options.platforms or (host_platform(),)
+    fmi = options.fmi or (2 if options.platforms or host_platform() else 3)
+    if fmi not in PLATFORMS:
+        raise BuildError(f"there is no FMI {fmi} here, `fmi` is 2 or 3")
+    platforms = options.platforms or (host_platform(fmi),)
     if platforms == ("",):
         raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
-    return native_flavour(robot, options.control, table, options.name, platforms)
+    for platform in platforms:
+        if platform not in PLATFORMS[fmi]:
+            names = ", ".join(PLATFORMS[fmi])
+            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}")
+    return native_flavour(robot, options.control, table, options.name, platforms, fmi)
 
 
 def _mesh_dir(options: FmuOptions) -> Path | None:
