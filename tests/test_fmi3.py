@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes
 import functools
 import re
+import struct
 import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
 
 import fmpy
+import lxml.etree
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
@@ -155,6 +157,33 @@ def test_co_simulation_equals_that_of_fmi_2_bit_for_bit(pair, robot, control):
 def test_nothing_is_wrong_with_the_description(pair):
     for robot, control in (("twodof", "task"), ("panda_finger", "task")):
         assert validate_fmu(str(pair(robot, control)[1])) == []
+
+
+def test_terminals_and_the_icon(pair):
+    schema = Path(fmpy.__file__).parent / "schema/fmi3/fmi3TerminalsAndIcons.xsd"
+    for control in CONTROLS:
+        fmu = pair("twodof", control)[1]
+        with zipfile.ZipFile(fmu) as archive:
+            text = archive.read("terminalsAndIcons/terminalsAndIcons.xml")
+            icon = archive.read("terminalsAndIcons/icon.png")
+            assert "model.png" not in archive.namelist()
+        root = lxml.etree.fromstring(text)
+        lxml.etree.XMLSchema(lxml.etree.parse(schema)).assertValid(root)
+        place = {key: float(value) for key, value in root.find(".//Icon").items()}
+        width, height = struct.unpack(">II", icon[16:24])
+        assert width / height == (place["x2"] - place["x1"]) / (place["y2"] - place["y1"])
+        inputs = {
+            v.name
+            for v in fmpy.read_model_description(str(fmu)).modelVariables
+            if v.causality == "input" and v.name[0] != "K"  # gains are nobody's to connect
+        }
+        members = {
+            terminal.get("name"): {member.get("variableName") for member in terminal}
+            for terminal in root.iter("Terminal")
+        }
+        assert members["joints"] == {"q", "v", "tau"}
+        assert members["targets"] | members["forces"] == inputs
+        assert members["forces"] == {"tau_ext", "f_ext"}
 
 
 def test_description_has_the_variables_of_fmi_2_as_arrays(pair):
