@@ -12,6 +12,7 @@ import zipfile
 from pathlib import Path
 
 import fmpy
+import fmpy.build
 import lxml.etree
 import numpy as np
 import pytest
@@ -238,6 +239,14 @@ def test_adjoint_derivatives_are_the_transpose(pair, control):
             scale = max(1.0, np.abs(directional).max())
             assert np.abs(directional - adjoint).max() <= 1e-12 * scale, (unknown, known)
     assert np.abs(jacobians(instance, "x", "q")[0]).max() > 0.01
+
+
+def test_a_sweep_is_that_of_fmi_2(pair):
+    two, three = (
+        twodof.sweep(fmu, grid={"Kp": [20.0, 60.0], "x_des[2]": [0.1]}, stop_time=0.5, workers=1)
+        for fmu in pair()
+    )
+    assert two.equals(three) and len(set(two["peak_velocity"])) == 2
 
 
 # --- what is refused ---
