@@ -47,12 +47,7 @@ LIBRARIES = {
     "pyarrow": {"sweeps"},
     "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
     "rosbags": {"ros", "bag"},
-    "scipy": {
-        "export",
-        "geometry",
-        "ros",
-        "pages",
-    },  # its rotations: of joints that are locked, for all, to URDF's rpy, to viser's wxyz
+    "scipy": {"export", "geometry"},  # its rotations: of joints that are locked, for all
     "simpleeval": {"export"},
     "tqdm": {"cli"},
     "trimesh": {"geometry"},

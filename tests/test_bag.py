@@ -918,3 +918,13 @@ def test_memory_does_not_grow_with_the_run(fmu_path: Path, tmp_path: Path, stora
     )
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000
+
+
+def test_definitions_are_those_of_humble() -> None:
+    from twodof.ros.messages import DEFINITIONS
+    from twodof.ros.messages import STORE as OURS
+
+    for name in DEFINITIONS:
+        assert OURS.fielddefs[name][1] == STORE.fielddefs[name][1]
+        assert OURS.hash_rihs01(name) == STORE.hash_rihs01(name)
+        assert OURS.generate_msgdef(name) == STORE.generate_msgdef(name)

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 from bags import START, STORAGES, assert_consistent, both_storages, logging, read_with_rosbags
 
-from twodof.bag.records import Allowance, DamageError, read_messages, storage_files
+from twodof.bag.contents import read_messages, storage_files
+from twodof.bag.records import Allowance, DamageError
 from twodof.cli import info
 from twodof.cli.main import main
 

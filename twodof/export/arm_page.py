@@ -135,7 +135,7 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
     """What the page knows of its FMU, and the content of its meshes."""
     urdf = read_urdf(arm.urdf)
     shapes, _ = link_shapes(urdf, arm.read)
-    ball = Shape("", Placement(np.zeros(3), Rotation.identity()), (0, 0, 0), *sphere(1.0))
+    ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
     packed = [_mesh(shape) for shape in [ball, *shapes]]
     links, number = _links(urdf, arm.joints)
     facts = {
@@ -177,12 +177,11 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
         waiting.remove(joint)
         number[joint.child] = len(links)
         column, ratio, offset = kinematics.column(joint)
+        turn = Rotation.from_euler("xyz", joint.rpy).as_matrix()
         links.append(
             {
                 "parent": number[joint.parent],
-                "place": _matrix(
-                    Placement(np.array(joint.xyz), Rotation.from_euler("xyz", joint.rpy))
-                ),
+                "place": _matrix(Placement(np.array(joint.xyz), turn)),
                 "axis": joint.axis,
                 "prismatic": joint.prismatic,
                 "column": -1 if column is None else column,
@@ -196,7 +195,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
 def _matrix(place: Placement) -> list[float]:
     """4 × 4, by columns, as WebGL has it."""
     matrix = np.eye(4)
-    matrix[:3, :3] = place.rotation.as_matrix()
+    matrix[:3, :3] = place.rotation
     matrix[:3, 3] = place.translation
     values: list[float] = matrix.T.reshape(-1).tolist()
     return values

@@ -14,10 +14,11 @@ from ..errors import InputError, PublishError, SimulationError
 from ..experiments import NANOSECONDS, Experiment, Setting, experiment
 from ..fmu import Fmu
 from ..master import RealTime, Sample, Sink, Summary, at_rest, simulate
+from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic
 from .listener import Listener
-from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, Serialised
+from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages
 from .network import Network, network, open_domain
 
 # isort: split
@@ -162,11 +163,11 @@ class Publisher(Sink):
         self._sample = sample
         self._publish(self._messages.of(sample))
 
-    def _publish(self, messages: list[tuple[str, Serialised]]) -> None:
-        for name, cdr in messages:
+    def _publish(self, messages: Mapping[str, Rows]) -> None:
+        for name, rows in messages.items():
             writer = self._writers[name]
             try:
-                writer.write(writer.data_type(cdr))
+                writer.write(writer.data_type(rows.tobytes()))
             except core.DDSException as error:
                 self._warn(name, f"messages on {name} are lost: {error}")
 
