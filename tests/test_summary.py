@@ -37,9 +37,9 @@ def file_of(bag: Path) -> Path:
 
 
 def ends(bag: Path) -> list[object]:
-    recording, count = read_ends(bag)
+    recording = read_ends(bag)
     parts = (recording.stamps, recording.q, recording.v, recording.tau)
-    return [count, recording.joints, recording.topics, *(part.tolist() for part in parts)]
+    return [recording.count, recording.joints, recording.topics, *(part.tolist() for part in parts)]
 
 
 def without_checksum(file: Path) -> None:
@@ -147,8 +147,8 @@ def test_ends_of_another_writer_in_any_order(tmp_path: Path, name: str) -> None:
                 writer.add_message(other, stamp + 7, bytes(4 + stamp), stamp + 7)
         writer.finish()
     assert read_summary(file) is not None
-    recording, count = read_ends(file.parent)
-    assert (count, recording.q.tolist()) == (400, [[0.0], [399.0]])
+    recording = read_ends(file.parent)
+    assert (recording.count, recording.q.tolist()) == (400, [[0.0], [399.0]])
 
 
 def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path: Path) -> None:

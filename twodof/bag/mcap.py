@@ -127,9 +127,11 @@ def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
     length = end - turn[0]
     rows = every[: len(every) // length * length].reshape(-1, length)
     heads = np.concatenate([np.arange(place, place + HEAD.size + 2) for place in turn]) - turn[0]
-    channels = rows[0, heads].reshape(len(turn), -1)[:, HEAD.size :]
+    channels = {chunk[place + HEAD.size : place + HEAD.size + 2] for place in turn}
+    if len(channels) < len(turn):
+        return rows[:1]
     count, ahead = 1, 16
-    while count < len(rows) and len(np.unique(channels, axis=0)) == len(turn):
+    while count < len(rows):
         same = (rows[count : count + ahead, heads] == rows[0, heads]).all(axis=1)
         if not same.all():
             return rows[: count + int(np.argmin(same))]

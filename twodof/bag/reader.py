@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ..files import is_being_written
 from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, STORE, TARGET
 from .contents import read_messages, storage_files
+from .outline import Indices, Outline
 from .provenance import read_provenance
 from .recording import Array, Heard, Recording, Stamps, TopicCount
 from .records import Allowance, DamageError
@@ -32,11 +33,27 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: it is no bag, is unfinished or damaged, or has no joint states.
     """
-    return _read(Path(path), _JointStates, _Targets())[0]
+    return _read(Path(path), _JointStates, _Targets())
 
 
-def read_ends(path: str | Path) -> tuple[Recording, int]:
-    """The first and the last joint state of a bag, and how many it has.
+def read_outline(
+    path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]
+) -> Recording:
+    """A bag as ``read_bag`` gives it, but of more than ``most`` samples fewer, for drawing.
+
+    Args:
+        path: the bag's folder.
+        most: samples that are in memory, besides those of a chunk of the bag.
+        lines: that are drawn over time beside positions and velocities, of a part of the bag.
+
+    Raises:
+        BagError: as ``read_bag``; and what ``lines`` raises.
+    """
+    return _read(Path(path), _JointStates, _Targets(), Outline(most, lines))
+
+
+def read_ends(path: str | Path) -> Recording:
+    """The first and the last joint state of a bag.
 
     By the summaries of its files, where all have one that can be believed.
 
@@ -78,11 +95,20 @@ def _refusing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tuple[Recording, int]:
-    """What a kind of reader keeps of a bag's joint states, and how many there are."""
+def _read(
+    path: Path,
+    kind: type[_JointStates],
+    targets: _Targets | None,
+    outline: Outline | None = None,
+) -> Recording:
+    """What a kind of reader keeps of a bag's joint states, and of these an outline."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states = "", kind(path)
-    allowance = Allowance()
+    allowance, thinned = Allowance(), False
+
+    def thin(outline: Outline) -> None:
+        states.keep(outline.choose(_recording(path, counts, chosen, states, targets)))
+
     with _refusing(path):
         for file in whole_bag(path):
             for channel, stamps, messages in read_messages(file, allowance):
@@ -92,12 +118,13 @@ def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tup
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamps, messages)
-                elif (
-                    targets is not None
-                    and channel.topic == TARGET
-                    and channel.type in (POINT, POSE)
-                ):
+                        if outline is not None and len(states) > outline.most:
+                            thin(outline)
+                            thinned = True
+                elif targets and channel.topic == TARGET and channel.type in (POINT, POSE):
                     targets.add(stamps, messages)
+    if outline is not None and thinned:
+        thin(outline)  # the end alike
     return _recording(path, counts, chosen, states, targets)
 
 
@@ -107,12 +134,13 @@ def _recording(
     chosen: str,
     states: _JointStates,
     targets: _Targets | None,
-) -> tuple[Recording, int]:
+) -> Recording:
     if not counts[chosen, JOINT_STATE]:
         raise BagError(f"'{path}' has no joint states, no messages of type {JOINT_STATE}")
     stamps, q, v, tau = states.arrays()
     return Recording(
         path=path,
+        count=counts[chosen, JOINT_STATE],
         topics=tuple(TopicCount(*topic, count) for topic, count in sorted(counts.items())),
         stamps=stamps,
         joints=states.names,
@@ -121,7 +149,7 @@ def _recording(
         tau=tau,
         heard=targets.heard(stamps) if targets is not None else None,
         provenance=read_provenance(path),
-    ), counts[chosen, JOINT_STATE]
+    )
 
 
 def whole_bag(path: Path) -> list[Path]:
@@ -162,6 +190,15 @@ class _JointStates:
         self._stamps.frombytes(stamps.tobytes())
         for stored, part in zip(self._numbers, numbers, strict=True):
             stored.frombytes(part.tobytes())
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def keep(self, chosen: Indices) -> None:
+        """Drop all but some of those that ``arrays`` gives."""
+        stamps, *numbers = self.arrays()
+        self._stamps = array("q", stamps[chosen].tobytes())
+        self._numbers = [array("d", part[chosen].tobytes()) for part in numbers]
 
     def arrays(self) -> tuple[Stamps, Array, Array, Array]:
         """Stamps, positions, velocities, efforts by ascending stamps."""
@@ -229,8 +266,10 @@ class _Targets:
             return
         self._sound &= self._frame in (None, frame)
         self._frame = frame
-        self._stamps.frombytes(stamps.tobytes())
-        self._points.frombytes(points.tobytes())
+        told = np.ones(len(stamps), bool)  # a point that is repeated says nothing new
+        told[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
+        self._stamps.frombytes(stamps[told].tobytes())
+        self._points.frombytes(points[told].tobytes())
 
     def heard(self, stamps: Stamps) -> Heard | None:
         """The latest by each of these stamps; None where there are none, or not of one frame."""

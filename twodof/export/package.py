@@ -36,6 +36,8 @@ DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 
 MAX_PAGE = 512 * 1024**2  # bytes of documentation
+ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
+"""By version of FMI."""
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -158,7 +160,7 @@ def _compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
         digest.update(name.encode() + b"\0" + files[name])
     guid = digest.hexdigest()
     files["modelDescription.xml"] = describe(guid)
-    files["model.png"] = data_file("fmu_src", "model.png").read_bytes()
+    files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
     return flavour, files, partial(_finish, options, robot, table, flavour, guid, files)
 
 

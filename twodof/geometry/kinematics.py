@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from ..plant.urdf import Joint, Urdf
 
 Array = NDArray[np.float64]
-BLOCK = 50_000  # samples
+BLOCK = 10_000  # samples, whose arrays a cache holds
 
 
 class Placement(NamedTuple):
@@ -80,15 +80,28 @@ class Kinematics:
 
     def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
         """Where a joint's child is in its parent; q is N × joints, rad or m; one where it rests."""
-        column, ratio, offset = self.column(joint)
-        moved = np.full((1, 1), offset)
-        if column is not None:
-            moved = moved + ratio * np.asarray(q, dtype=np.float64)[:, column, None]
-        origin, along = self._origins[joint.name], moved * joint.axis
+        origin, along = self._origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
             return Placement(joint.xyz + turned(origin, along), origin[None])
         turn = Rotation.from_rotvec(along).as_matrix()
         return Placement(np.asarray(joint.xyz, dtype=np.float64)[None], origin @ turn)
+
+    def pose(self, joint: Joint, q: ArrayLike) -> Array:
+        """The same as N × 7, or 1 × 7: m, and a unit quaternion x, y, z, w."""
+        moved, still = self._moved(joint, q), Rotation.from_matrix(self._origins[joint.name])
+        if joint.prismatic:
+            place = joint.xyz + moved * still.apply(joint.axis)
+            return np.hstack([place, np.broadcast_to(still.as_quat(), (len(moved), 4))])
+        half = still * Rotation.from_quat([*joint.axis, 0.0])  # a half turn
+        quat = np.cos(moved / 2) * still.as_quat() + np.sin(moved / 2) * half.as_quat()
+        return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
+
+    def _moved(self, joint: Joint, q: ArrayLike) -> Array:
+        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests."""
+        column, ratio, offset = self.column(joint)
+        if column is None:
+            return np.full((1, 1), offset)
+        return offset + ratio * np.asarray(q, dtype=np.float64)[:, column, None]
 
     def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
         """Where the root is, and the child of each joint of a chain that begins there."""
@@ -100,9 +113,28 @@ class Kinematics:
 
     def path(self, link: str, q: ArrayLike) -> Array:
         """Positions of a link's origin in the root frame, N × 3, m."""
-        q, chain = np.asarray(q, dtype=np.float64), self.urdf.chain(link)
-        blocks = [q[k : k + BLOCK] for k in range(0, len(q), BLOCK)]  # matrices take room
-        return np.concatenate([self.along(chain, block)[-1].translation for block in blocks])
+        q = np.asarray(q, dtype=np.float64)
+        path = np.empty((len(q), 3))
+        for k in range(0, len(q), BLOCK):
+            point: Array = np.zeros((1, 3))
+            for joint in reversed(self.urdf.chain(link)):
+                point = self._seen_from_parent(joint, q[k : k + BLOCK], point)
+            path[k : k + BLOCK] = point
+        return path
+
+    def _seen_from_parent(self, joint: Joint, q: Array, point: Array) -> Array:
+        """A point of the child, in the parent; N × 3, or 1 × 3 where none before it moves.
+
+        By Rodrigues' formula, p = a (a·p) + cos q (p − a (a·p)) + sin q a × p.
+        """
+        moved, axis = self._moved(joint, q), np.array(joint.axis)
+        origin = self._origins[joint.name].T
+        if joint.prismatic:
+            return np.asarray(joint.xyz + (point + moved * axis) @ origin)
+        along, across = np.outer(axis, axis), np.cross(np.eye(3), axis)
+        turned = np.cos(moved) * (point @ ((np.eye(3) - along) @ origin))
+        turned += np.sin(moved) * (point @ (-across @ origin))
+        return np.asarray(joint.xyz + point @ (along @ origin) + turned)
 
     def links(self, q: ArrayLike) -> dict[str, Placement]:
         """Where all links are in the root frame."""

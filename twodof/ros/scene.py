@@ -61,13 +61,7 @@ class Scene:
 
         One N × 7 array each, or 1 × 7 where it is fixed: m, and a unit quaternion x, y, z, w.
         """
-        transforms = []
-        for joint in joints:
-            place = self._kinematics.in_parent(joint, q)
-            n = max(len(place.translation), len(place.rotation))
-            parts = np.broadcast_to(place.translation, (n, 3)), np.broadcast_to(place.quat, (n, 4))
-            transforms.append(np.hstack(parts))
-        return transforms
+        return [self._kinematics.pose(joint, q) for joint in joints]
 
     def end_effector(self, q: Array) -> Array:
         """Positions of the end effector in the root frame, N × 3, m."""
