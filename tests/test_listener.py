@@ -353,7 +353,8 @@ def test_the_clock_is_that_of_the_simulation(
     stamps = [seconds * SECOND + rest for _, _, _, (seconds, rest) in told]
     last = 100 * SECOND + round(simulated * 100) * SECOND // 100
     assert stamps == [last - k * SECOND // 100 for k in range(len(stamps))][::-1]
-    assert stamps == [stamp_of(m[0]) for m in node.messages("/joint_states")][-len(stamps) :]
+    states = [stamp_of(m[0]) for m in node.messages("/joint_states")]
+    assert stamps[-len(states) :] == states[-len(stamps) :]  # who was found first is heard longer
     wall = (told[-1][2] - told[0][2]) / SECOND
     assert (stamps[-1] - stamps[0]) / SECOND / wall == pytest.approx(speed, rel=0.1)
 
