@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +19,7 @@ from rosbags.interfaces import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ..errors import BagError
+from ..errors import BagError, InputError
 from ..experiments import Experiment, Value
 from ..fmu import read_resource
 from ..plant.urdf import Joint, RobotError
@@ -64,6 +65,16 @@ DEFINITIONS = {
 STORE = get_typestore(Stores.EMPTY)
 for _name, _text in DEFINITIONS.items():
     STORE.register(get_types_from_msg(_text, _name))
+
+
+def check_name(argument: str, name: str) -> None:
+    """Refuse what is no name of ROS 2.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    if name and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
+        raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
 
 
 class Topic(NamedTuple):
