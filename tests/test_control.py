@@ -12,7 +12,8 @@ from native_models import ROBOTS, Engine, Reduced, engine, model
 from scipy.integrate import solve_ivp
 
 import twodof
-from twodof.export.package import FmuOptions, build_fmu
+from twodof.export.options import FmuOptions
+from twodof.export.package import build_fmu
 
 EVERY_ROBOT = ("twodof", *ROBOTS)
 CONTROLS = ("task", "pose", "joint", "effort")
