@@ -5,12 +5,15 @@ from __future__ import annotations
 import ctypes
 import functools
 import re
+import struct
 import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
 
 import fmpy
+import fmpy.build
+import lxml.etree
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
@@ -157,6 +160,33 @@ def test_nothing_is_wrong_with_the_description(pair):
         assert validate_fmu(str(pair(robot, control)[1])) == []
 
 
+def test_terminals_and_the_icon(pair):
+    schema = Path(fmpy.__file__).parent / "schema/fmi3/fmi3TerminalsAndIcons.xsd"
+    for control in CONTROLS:
+        fmu = pair("twodof", control)[1]
+        with zipfile.ZipFile(fmu) as archive:
+            text = archive.read("terminalsAndIcons/terminalsAndIcons.xml")
+            icon = archive.read("terminalsAndIcons/icon.png")
+            assert "model.png" not in archive.namelist()
+        root = lxml.etree.fromstring(text)
+        lxml.etree.XMLSchema(lxml.etree.parse(schema)).assertValid(root)
+        place = {key: float(value) for key, value in root.find(".//Icon").items()}
+        width, height = struct.unpack(">II", icon[16:24])
+        assert width / height == (place["x2"] - place["x1"]) / (place["y2"] - place["y1"])
+        inputs = {
+            v.name
+            for v in fmpy.read_model_description(str(fmu)).modelVariables
+            if v.causality == "input" and v.name[0] != "K"  # gains are nobody's to connect
+        }
+        members = {
+            terminal.get("name"): {member.get("variableName") for member in terminal}
+            for terminal in root.iter("Terminal")
+        }
+        assert members["joints"] == {"q", "v", "tau"}
+        assert members["targets"] | members["forces"] == inputs
+        assert members["forces"] == {"tau_ext", "f_ext"}
+
+
 def test_description_has_the_variables_of_fmi_2_as_arrays(pair):
     two, three = (fmpy.read_model_description(str(fmu)) for fmu in pair("twodof", "pose"))
     flat = {}
@@ -209,6 +239,14 @@ def test_adjoint_derivatives_are_the_transpose(pair, control):
             scale = max(1.0, np.abs(directional).max())
             assert np.abs(directional - adjoint).max() <= 1e-12 * scale, (unknown, known)
     assert np.abs(jacobians(instance, "x", "q")[0]).max() > 0.01
+
+
+def test_a_sweep_is_that_of_fmi_2(pair):
+    two, three = (
+        twodof.sweep(fmu, grid={"Kp": [20.0, 60.0], "x_des[2]": [0.1]}, stop_time=0.5, workers=1)
+        for fmu in pair()
+    )
+    assert two.equals(three) and len(set(two["peak_velocity"])) == 2
 
 
 # --- what is refused ---

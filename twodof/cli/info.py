@@ -127,7 +127,10 @@ def _print_fmu(fmu: Fmu) -> None:
         if getattr(simulation, name)
     ]
     print_table(
-        ("FMU", f"{fmu.path} ({fmu.name}, {fmu.description.generationTool})"),
+        (
+            "FMU",
+            f"{fmu.path} ({', '.join(filter(None, (fmu.name, fmu.description.generationTool)))})",
+        ),
         ("FMI", fmu.description.fmiVersion),
         ("digest", fmu.guid),
         ("platforms", ", ".join(fmu.platforms) or "none"),

@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
+ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
+"""By version of FMI."""
 
 
 def is_live(options: FmuOptions) -> bool:
@@ -83,7 +85,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
         digest.update(name.encode() + b"\0" + files[name])
     guid = digest.hexdigest()
     files["modelDescription.xml"] = describe(guid)
-    files["model.png"] = data_file("fmu_src", "model.png").read_bytes()
+    files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
     return flavour, files, partial(_finish, options, robot, table, flavour, guid, files)
 
 

@@ -20,7 +20,7 @@ from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, UNITS, compile_library
 from .mechanism import mechanism_source
-from .model_description3 import build_description
+from .model_description3 import build_description, terminals_and_icons
 from .native import model_header
 
 LOG = logging.getLogger(__name__)
@@ -134,7 +134,10 @@ def native_flavour(
     sources = engine_sources(control, fmi)
     sources["mechanism.c"] = mechanism_source(robot, table).encode()
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS[fmi]})
-    described = {"buildDescription.xml": build_description(name, UNITS)} if fmi == 3 else {}
+    described = {}
+    if fmi == 3:
+        described["sources/buildDescription.xml"] = build_description(name, UNITS)
+        described["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table)
 
     def header(guid: str) -> Files:
         return {"model.h": model_header(robot, table, control, guid, fmi).encode()}
@@ -152,8 +155,8 @@ def native_flavour(
         exchanges=True,
         fmi=fmi,
         files={
-            f"sources/{path}": content
-            for path, content in {**sources, **header(""), **described}.items()
+            **{f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
+            **described,
         },
         source_files=UNITS,
         platforms=platforms,

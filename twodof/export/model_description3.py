@@ -1,12 +1,15 @@
-"""modelDescription.xml of FMI 3.0, from that of FMI 2.0: elements of vectors become arrays.
+"""The XML files of FMI 3.0. modelDescription.xml is made of that of FMI 2.0: elements of vectors
+become arrays.
 
-Source: FMI 3.0.2, section 2.4.
+Source: FMI 3.0.2, sections 2.4 to 2.6.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+
+from ..plant.variables import DISTURBANCES, Variable
 
 INDICATORS, TIME = "event_indicators", "time"
 ATTRIBUTES = {
@@ -18,6 +21,11 @@ ATTRIBUTES = {
 """What has another name in 3.0; others that are not there any more are in GONE."""
 GONE = ("numberOfEventIndicators", "canNotUseMemoryManagementFunctions",
         "completedIntegratorStepNotNeeded")  # fmt: skip
+TERMINALS = {
+    "targets": "where the robot is meant to be, or the effort of a controller",
+    "joints": "positions, velocities and efforts of the joints",
+    "forces": "what acts on the robot from outside",
+}
 TYPES = {"Real": "Float64", "Boolean": "Boolean"}
 
 
@@ -44,6 +52,10 @@ def model_description3(description: bytes) -> bytes:
     _variables(root, scalars, vectors, references, indicators)
     _structure(root, vectors, references)
     _annotations(root)
+    return _text(root)
+
+
+def _text(root: ET.Element) -> bytes:
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
@@ -172,6 +184,30 @@ def build_description(identifier: str, units: Sequence[str]) -> bytes:
     for name in units:
         ET.SubElement(files, "SourceFile", name=name)
     ET.SubElement(build, "Library", name="m")
-    ET.indent(root)
-    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text + b"\n"
+    return _text(root)
+
+
+def terminals_and_icons(table: Sequence[Variable]) -> bytes:
+    """The text of terminalsAndIcons.xml: how the icon lies, and what belongs together in a plug."""
+    groups = dict.fromkeys(variable.group for variable in table)
+    terminals = {
+        "targets": [group for group in groups if group.endswith(("_des", "_cmd"))],
+        "joints": ["q", "v", "tau"],
+        "forces": list(DISTURBANCES),
+    }
+    root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
+    graphic = ET.SubElement(root, "GraphicalRepresentation")
+    place = {"x1": "-15", "y1": "-10", "x2": "15", "y2": "10"}  # as wide as high as the icon is
+    ET.SubElement(graphic, "CoordinateSystem", place, suggestedScalingFactorTo_mm="1")
+    ET.SubElement(graphic, "Icon", place)
+    parent = ET.SubElement(root, "Terminals")
+    for name, members in terminals.items():
+        terminal = ET.SubElement(
+            parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name]
+        )
+        for group in members:
+            ET.SubElement(
+                terminal, "TerminalMemberVariable", variableName=group, memberName=group,
+                variableKind="signal",
+            )  # fmt: skip
+    return _text(root)
