@@ -22,8 +22,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from ..errors import BagError
 from ..experiments import Experiment, Value
 from ..fmu import read_resource
-from ..master import Sample
 from ..plant.urdf import Joint, RobotError
+from ..sample import Sample
 from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
 
 if TYPE_CHECKING:
