@@ -23,6 +23,8 @@ ROOMS = {
     "export": "makes an FMU of the plant, and runs none",
     "fmu": "an FMU's file and an instance of it, whoever made it",
     "experiments": "what an FMU is to do, checked",
+    "sample": "what is known at one communication point, and who takes it",
+    "pace": "when what is done is due, by the wall clock",
     "linear": "an FMU's derivatives, at an operating point that is checked",
     "master": "does it",
     "ros": "what ROS 2 is told of a run",

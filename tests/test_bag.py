@@ -58,7 +58,7 @@ from twodof.bag.storage import BagWriter
 from twodof.errors import BagError, InputError
 from twodof.experiments import Experiment
 from twodof.files import is_being_written
-from twodof.master import Sample
+from twodof.sample import Sample
 
 KIB, MIB = 1024, 1024**2
 
@@ -893,7 +893,7 @@ MEMORY = """
 import sys
 import twodof
 from sinks import Memory
-from twodof.master import Sample
+from twodof.sample import Sample
 
 fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu)

@@ -301,7 +301,7 @@ from twodof.ros.messages import POSE, STREAM
 from twodof.ros.network import network, open_domain
 from twodof.ros.dds import dds_qos, dds_type
 
-domain, _ = open_domain(network())
+domain = open_domain(network())
 participant = DomainParticipant(network().domain)
 writer = DataWriter(
     participant, Topic(participant, "rt/target_command", dds_type(POSE)), dds_qos(STREAM, POSE)

@@ -30,9 +30,9 @@ from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 import twodof
-from twodof.master import Sample
 from twodof.plant.urdf import Joint
 from twodof.ros.scene import Scene
+from twodof.sample import Sample
 
 START = 1_700_000_000  # s since the epoch
 SECOND = 1_000_000_000  # ns

@@ -23,7 +23,7 @@ from harness import Driver, in_child_process
 from oracles import REST, position, task_error
 
 from twodof import FmuOptions, build_fmu
-from twodof.export.package import DEFAULT_ARM
+from twodof.export.composition import DEFAULT_ARM
 from twodof.files import data_file
 from twodof.plant.plant import Plant
 from twodof.plant.robot import load_robot

@@ -19,9 +19,9 @@ from rosbags.rosbag2 import WriterError
 from ..errors import BagError
 from ..experiments import Experiment, Value
 from ..files import lock, read_file, sync
-from ..master import Sample, Sink
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, STORE, Messages
+from ..sample import Sample, Sink
 from .provenance import KEY, ProvenanceFile, read_provenance
 from .storage import (
     BATCH_SIZE,

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..errors import InputError, PublishError
 from ..experiments import Experiment, Value, resolve
-from ..master import Sample, Sink
+from ..sample import Sample, Sink
 from .cdr import Rows
 from .messages import STORE, Messages
 

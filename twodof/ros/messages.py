@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,8 +22,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from ..errors import BagError
 from ..experiments import Experiment, Value
 from ..fmu import read_resource
-from ..master import Sample
 from ..plant.urdf import Joint, RobotError
+from ..sample import Sample
 from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
 
 if TYPE_CHECKING:
@@ -62,8 +63,9 @@ DEFINITIONS = {
 }
 """As Humble has them; rosbags' store of all of Humble's takes longer to import than NumPy."""
 STORE = get_typestore(Stores.EMPTY)
-for _name, _text in DEFINITIONS.items():
-    STORE.register(get_types_from_msg(_text, _name))
+STORE.register(
+    dict(chain(*(get_types_from_msg(text, name).items() for name, text in DEFINITIONS.items())))
+)
 
 
 class Topic(NamedTuple):
