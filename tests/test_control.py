@@ -12,7 +12,8 @@ from native_models import deviation, engine, loaded, model, random_plant
 from scipy.integrate import solve_ivp
 
 import twodof
-from twodof.export.package import FmuOptions, build_fmu
+from twodof.export.options import FmuOptions
+from twodof.export.package import build_fmu
 
 CONTROLS = ("task", "pose", "joint", "effort")
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .errors import TwoDofError as TwoDofError
     from .experiments import Experiment as Experiment
     from .experiments import experiment as experiment
-    from .export.package import FmuOptions as FmuOptions
+    from .export.options import FmuOptions as FmuOptions
     from .export.package import build_fmu as build_fmu
     from .fmu import Fmu as Fmu
     from .fmu import load_fmu as load_fmu
@@ -53,7 +53,8 @@ _HOMES = {
     "bag.writer": ("Bag",),
     "errors": ("TwoDofError",),
     "experiments": ("Experiment", "experiment"),
-    "export.package": ("FmuOptions", "build_fmu"),
+    "export.options": ("FmuOptions",),
+    "export.package": ("build_fmu",),
     "fmu": ("Fmu", "load_fmu"),
     "linear": ("LinearModel", "linearise"),
     "master": ("Summary", "samples", "simulate"),

@@ -78,7 +78,8 @@ def call(options: argparse.Namespace) -> int:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
     if options.orientation and options.control != "task":
         raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
-    from ..export.package import FmuOptions, build_fmu
+    from ..export.options import FmuOptions
+    from ..export.package import build_fmu
 
     gravity = None if options.gravity is None else tuple(options.gravity)
     chosen = FmuOptions(

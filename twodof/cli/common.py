@@ -143,7 +143,8 @@ def fast_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else the default arm's, native where it can be built."""
     if options.fmu:
         return Path(options.fmu)
-    from ..export.package import FmuOptions, build_fmu
+    from ..export.options import FmuOptions
+    from ..export.package import build_fmu
 
     try:
         return build_fmu(None, FmuOptions(native=True))
@@ -161,7 +162,8 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
             )
         return Path(options.fmu)
     from ..export.compiler import host_platform
-    from ..export.package import FmuOptions, build_fmu
+    from ..export.options import FmuOptions
+    from ..export.package import build_fmu
 
     native = options.native or host_platform() != "linux64"
     robot = Path(options.fmu) if options.fmu else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -63,8 +64,9 @@ DEFINITIONS = {
 }
 """As Humble has them; rosbags' store of all of Humble's takes longer to import than NumPy."""
 STORE = get_typestore(Stores.EMPTY)
-for _name, _text in DEFINITIONS.items():
-    STORE.register(get_types_from_msg(_text, _name))
+STORE.register(
+    dict(chain(*(get_types_from_msg(text, name).items() for name, text in DEFINITIONS.items())))
+)
 
 
 def check_name(argument: str, name: str) -> None:
