@@ -34,7 +34,7 @@ ROBOTS = (
     "tiago_description/robots/tiago_no_hand.urdf", "baxter_description/urdf/baxter.urdf",
 )  # fmt: skip
 GROUPS = ("q", "v", "x", "tau")
-STEP, STEPS, ROUNDS = 0.01, 100, 15
+STEP, STEPS, ROUNDS = 0.01, 100, 60
 
 
 def simulated(path: Path) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-import functools
+import os
 import re
 import struct
 import subprocess
@@ -323,6 +323,7 @@ def test_call_order(pair):
     a.exitInitializationMode()
     assert a.doStep(0.0, 0.01) == (False, False, False, 0.01)
     a.refused("communication point 0.5 s is not", "doStep", 0.5, 0.01)
+    a.refused("communication point inf s is not", "doStep", np.inf, 0.01)
     a.refused("ends after the stop time", "doStep", 0.01, 0.02)
     assert a.get("time") == [0.01]
     a.terminate()
@@ -365,14 +366,25 @@ def test_random_calls_under_sanitizers(length):
     assert done.stdout.startswith(f"{count} sequences")
 
 
+@pytest.mark.long
+def test_instances_in_threads_share_nothing(length):
+    """Random calls on instances of several threads at once, under ThreadSanitizer."""
+    count = length(25_000, 500)
+    flags = ("-g", "-O1", "-pthread", "-fsanitize=thread")
+    program = executable(model("twodof"), HERE / "fuzz3.c", fmi=3, flags=flags)
+    done = subprocess.run([program, str(count), "2", "4"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(f"{count} sequences") == 4
+
+
 # --- the sources ---
 
 FMUS = (("A_", "task", 3), ("B_", "joint", 3), ("C_", "effort", 2))
 
 
-def embedded(pair, folder, target):
+def embedded(pair, folder, target, suffix=""):
     """The program of embedded.c, and what it is told: three FMUs' tokens and references of q."""
-    compiler, objects, arguments = [*ZIG, target, *FLAGS], [], []
+    compiler, objects, arguments = [*ZIG, target, *FLAGS, "-w"], [], []
     folder.mkdir(exist_ok=True)
     needs("ziglang")
     for prefix, control, fmi in FMUS:
@@ -390,20 +402,31 @@ def embedded(pair, folder, target):
             )
             objects.append(output)
     headers = [f"-I{folder / prefix / 'sources'}" for prefix in ("A_", "C_")]
-    program = folder / "embedded"
+    program = folder / f"embedded{suffix}"
     command = [*compiler, *headers, "-o", program, HERE / "embedded.c", *objects]
     subprocess.run([*command, "-lm"], check=True)
     return program, arguments, objects
 
 
-def test_three_fmus_in_one_program(pair, tmp_path):
-    program, arguments, objects = embedded(pair, tmp_path, *TARGETS["x86_64-linux"])
+@pytest.fixture(scope="module")
+def here(pair, tmp_path_factory):
+    """embedded.c for Linux x86-64: what it prints, 50 rows of three arms' joints; its objects."""
+    folder = tmp_path_factory.mktemp("embedded")
+    program, arguments, objects = embedded(pair, folder, *TARGETS["x86_64-linux"])
+    return printed([program, *arguments]), objects
+
+
+def printed(command, **environment):
+    text = subprocess.check_output(command, text=True, env={**os.environ, **environment})
+    return np.array(text.split(), dtype=float).reshape(50, 6)
+
+
+def test_three_fmus_in_one_program(pair, here):
+    rows, objects = here
     table = subprocess.check_output(["nm", "-g", "--defined-only", *objects], text=True)
     symbols = [line.split()[2] for line in table.splitlines() if len(line.split()) == 3]
     assert len(symbols) == len(set(symbols)) > 190
     assert all(re.match("[ABC]_", symbol) for symbol in symbols)
-    printed = subprocess.check_output([program, *arguments], text=True)
-    rows = np.array([line.split() for line in printed.splitlines()], dtype=float)
     alone = [
         [sample.q for sample in twodof.samples(pair("twodof", control)[fmi - 2], stop_time=5.0)]
         for _, control, fmi in FMUS
@@ -411,22 +434,59 @@ def test_three_fmus_in_one_program(pair, tmp_path):
     assert np.array_equal(rows, np.hstack(alone)[10::10])  # the same compiler made them
 
 
-def test_aarch64_equals_x86_64(pair, tmp_path):
+def test_aarch64_equals_x86_64(pair, here, tmp_path):
     """The sources, compiled for a Raspberry Pi or a Jetson, and run in an emulator.
 
     On the same C library: another's sin and cos differ in the last bit, of which the bare arm,
     whose motion is chaotic, makes 4e-11 in 5 s.
     """
-    emulator = needs("qemu-aarch64", "qemu-aarch64-static")
-    targets = [*TARGETS["x86_64-linux"], *TARGETS["aarch64-linux"]]
-    folders = [tmp_path / target for target in targets]
-    (native, arguments, _), (small, _, _) = map(functools.partial(embedded, pair), folders, targets)
-    expected = subprocess.check_output([native, *arguments], text=True).split()
-    assert small.read_bytes()[18:20] == b"\xb7\x00"  # EM_AARCH64
-    command = [emulator, "-L", "/usr/aarch64-linux-gnu", small, *arguments]
-    printed = subprocess.check_output(command, text=True).split()
-    difference = np.array(printed, dtype=float) - np.array(expected, dtype=float)
-    assert len(printed) == 300 and np.abs(difference).max() <= 1e-12
+    emulator = needs("qemu-aarch64", "qemu-aarch64-static"), "-L", "/usr/aarch64-linux-gnu"
+    program, arguments, _ = embedded(pair, tmp_path, *TARGETS["aarch64-linux"])
+    assert program.read_bytes()[18:20] == b"\xb7\x00"  # EM_AARCH64
+    assert np.abs(printed([*emulator, program, *arguments]) - here[0]).max() <= 1e-12
+
+
+def test_windows_equals_linux(pair, here, tmp_path):
+    """In wine; the bare arm's chaos over 2 s only, for Windows' sin and cos are others."""
+    wine = needs("wine64", "wine", "/usr/lib/wine/wine64")
+    program, arguments, _ = embedded(pair, tmp_path, *TARGETS["x86_64-windows"], suffix=".exe")
+    there = printed(
+        [wine, program, *arguments],
+        WINEPREFIX=str(tmp_path / "wine"), WINEDEBUG="-all", WINEDLLOVERRIDES="mscoree,mshtml=",
+    )  # fmt: skip
+    assert np.abs(there - here[0])[:, :4].max() <= 1e-12
+    assert np.abs(there - here[0])[:20].max() <= 1e-12
+
+
+MACHINES = {
+    "x86_64-linux": (".so", b"\x7fELF", 18, 62),
+    "aarch64-linux": (".so", b"\x7fELF", 18, 183),
+    "x86_64-windows": (".dll", b"MZ", 0x3C, 0x8664),
+    "x86_64-darwin": (".dylib", b"\xcf\xfa\xed\xfe", 4, 7),  # with a bit of 64 bits
+    "aarch64-darwin": (".dylib", b"\xcf\xfa\xed\xfe", 4, 12),
+}
+"""Beginning of the file, where it says for which machine it is, and what."""
+
+
+def test_libraries_for_every_platform_from_here(tmp_path):
+    needs("ziglang")
+    chosen = FmuOptions(
+        native=True, fmi=3, platforms=(*MACHINES,), control="joint", live_documentation=False
+    )
+    fmu = build_fmu(tmp_path / "TwoDof.fmu", chosen)
+    header = (Path(fmpy.__file__).parent / "c-code/fmi3Functions.h").read_text()
+    functions = set(re.findall(r"TYPE +(fmi3\w+);", header))
+    assert len(functions) == 75
+    with zipfile.ZipFile(fmu) as archive:
+        for platform, (suffix, magic, place, machine) in MACHINES.items():
+            data = archive.read(f"binaries/{platform}/TwoDof{suffix}")
+            if suffix == ".dll":
+                place = struct.unpack_from("<I", data, place)[0] + 4
+            assert data.startswith(magic)
+            assert struct.unpack_from("<H", data, place)[0] == machine
+            names = {word.decode() for word in re.findall(rb"fmi3[A-Z]\w+(?=\0)", data)}
+            assert functions <= names, platform
+    assert twodof.load_fmu(fmu).platforms == tuple(sorted(MACHINES))
 
 
 def test_fmpy_rebuilds_the_library_from_the_sources(pair, tmp_path):

@@ -407,6 +407,7 @@ def test_what_is_refused_is_logged_keeps_the_state_and_discards_the_next_step(fm
         (0.03 + 1e-8, 0.01, "is not the time of the FMU"),
         (float("nan"), 0.01, "is not the time of the FMU"),
         (0.03, 0.0, "fmi2DoStep: the step 0.0 s must be finite and > 0"),
+        (float("inf"), 0.01, "is not the time of the FMU"),
         (0.03, -0.01, "must be finite and > 0"),
         (0.03, float("nan"), "must be finite and > 0"),
         (0.03, float("inf"), "must be finite and > 0"),

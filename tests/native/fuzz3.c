@@ -3,8 +3,9 @@
    Compiled with AddressSanitizer and UndefinedBehaviorSanitizer. Every call that is illegal in an
    instance's phase is refused and leaves the instance's state as it was.
 
-       fuzz3 SEQUENCES SEED */
+       fuzz3 SEQUENCES SEED [THREADS]    as many sequences in each thread, at the same time */
 #include <math.h>
+#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -20,8 +21,8 @@
     } while (0)
 
 enum { LONGEST = 40, MANY = 4, ROOM = N_VARIABLES };
-static uint64_t seed;
-static long logged, refused, done;
+static __thread uint64_t seed;
+static __thread long logged, refused, done;
 
 static unsigned pick(unsigned below) /* xorshift64* */
 {
@@ -252,19 +253,42 @@ static void sequence(void)
     fmi3FreeInstance(c);
 }
 
+typedef struct {
+    long sequences;
+    uint64_t seed;
+} Share;
+
+static void *run(void *given)
+{
+    const Share *share = given;
+    seed = share->seed;
+    for (long i = 0; i < share->sequences; i++)
+        sequence();
+    printf("%ld sequences, %ld calls done, %ld refused, %ld messages\n", share->sequences, done,
+           refused, logged);
+    return NULL;
+}
+
 int main(int count, char *argument[])
 {
+    enum { MOST = 16 };
     const long sequences = count > 1 ? atol(argument[1]) : 1000;
-    seed = count > 2 ? strtoull(argument[2], NULL, 10) * UINT64_C(0x9e3779b97f4a7c15) + 1 : 1;
+    const uint64_t first = count > 2 ? strtoull(argument[2], NULL, 10) : 0;
+    const int threads = count > 3 ? atoi(argument[3]) : 1;
+    pthread_t thread[MOST];
+    Share share[MOST];
+    CHECK(threads > 0 && threads <= MOST);
     CHECK(!fmi3InstantiateModelExchange("x", "wrong", NULL, 0, 0, NULL, log_message));
     CHECK(!fmi3InstantiateModelExchange(NULL, MODEL_GUID, NULL, 0, 0, NULL, NULL));
     CHECK(!fmi3InstantiateScheduledExecution("x", MODEL_GUID, "", 0, 0, NULL, log_message, NULL,
                                              NULL, NULL));
     CHECK(fmi3Reset(NULL) == fmi3Error);
     fmi3FreeInstance(NULL);
-    for (long i = 0; i < sequences; i++)
-        sequence();
-    printf("%ld sequences, %ld calls done, %ld refused, %ld messages\n", sequences, done, refused,
-           logged);
+    for (int i = 0; i < threads; i++) {
+        share[i] = (Share){sequences, (first + (uint64_t)i) * UINT64_C(0x9e3779b97f4a7c15) + 1};
+        CHECK(!pthread_create(&thread[i], NULL, run, &share[i]));
+    }
+    for (int i = 0; i < threads; i++)
+        CHECK(!pthread_join(thread[i], NULL));
     return 0;
 }
