@@ -17,6 +17,7 @@ import pytest
 
 import twodof
 from twodof.cli.main import main
+from twodof.version import versions
 
 PROGRAM = """
 import twodof
@@ -40,6 +41,7 @@ for name in {names!r}:
 from pathlib import Path
 import twodof
 from twodof.cli.main import main
+from twodof.version import versions
 """
 
 RUN = """
@@ -265,3 +267,10 @@ def test_the_shell_completes_verbs_and_options(tmp_path: Path) -> None:
             check=True,
         )  # fmt: skip
         assert expected in answer.read_text()
+
+
+def test_versions_are_of_what_is_installed() -> None:
+    """Where there is no Pinocchio, a run still says what made it."""
+    assert versions("numpy", "no-such-package") == {
+        "twodof": twodof.__version__, "numpy": np.__version__,
+    }  # fmt: skip

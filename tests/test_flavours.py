@@ -128,6 +128,9 @@ def test_the_shipped_arm_s_file_is_known_by_what_it_was_made_of(tmp_path, monkey
     with pytest.raises(ComposedError):
         build_fmu(path, FmuOptions(native=True))
     path.write_bytes(content)
+    with monkeypatch.context() as patch, pytest.raises(ComposedError):
+        patch.setattr("twodof.export.package.versions", lambda *names: {"pin": "0"})
+        build_fmu(path, FmuOptions(native=True))
     monkeypatch.setattr("twodof.export.package.data_file", lambda name: tmp_path)
     with pytest.raises(ComposedError):
         build_fmu(path, FmuOptions(native=True))

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 __version__ = "0.1.0"
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Of this package, and of others that are installed."""
+    """Of this package, and of others as far as they are installed: Pinocchio is not everywhere."""
     import importlib.metadata  # takes longer than all else that a short command needs
 
-    installed = {name: importlib.metadata.version(name) for name in packages}
-    return {"twodof": __version__, **installed}
+    known = {"twodof": __version__}
+    for name in packages:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            known[name] = importlib.metadata.version(name)
+    return known

@@ -10,12 +10,14 @@ from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError
 from ..files import check_archive, data_file, read_member, write_file
-from ..version import __version__
+from ..version import versions
 from .compiler import compiles_for_the_web, host_platform
 from .options import FmuOptions
 
 MADE_OF = ("fmu_src", "urdf", "meshes", "export", "geometry", "plant")
 """Folders of what is shipped."""
+TOOLS = ("pin", "numpy", "scipy", "coal", "ziglang")
+"""Packages whose other versions may make another FMU of the same."""
 MAX_PAGE = 512 * 1024**2  # bytes of documentation
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
@@ -56,7 +58,7 @@ def _shipped(options: FmuOptions) -> bytes:
     """A digest of all that the shipped arm's native FMU is made of, on this machine."""
     digest = hashlib.sha256()
     machine = host_platform(2), host_platform(3), compiles_for_the_web()
-    digest.update(repr((__version__, options, machine)).encode())
+    digest.update(repr((versions(*TOOLS), options, machine)).encode())
     for folder in map(data_file, MADE_OF):
         for file in sorted(folder.rglob("*")):
             if file.is_file() and file.suffix != ".pyc":
