@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +38,19 @@ class JointTrack:
         unit: "rad" or "m"; "" where no robot tells which.
         low, high: limits of the run, or else of the URDF; None where there is none or it is not
             known.
-        q, v: positions and velocities, N values each; v is empty where the bag has none.
+        effort: limit of the URDF, N·m or N; None likewise.
+        q, v, tau: positions, velocities and efforts, N values each; v and tau are empty where they
+            are not known.
     """
 
     name: str
     unit: str
     low: float | None
     high: float | None
+    effort: float | None
     q: Array
     v: Array
+    tau: Array
 
     @property
     def at_limit(self) -> bool:
@@ -128,6 +132,31 @@ def read_tracks(
     return [_track(bag, text, str(urdf), frame) for bag in recordings]
 
 
+def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
+    """The tracks with those joints alone, in that order.
+
+    Raises:
+        PlotError: no track has a joint of such a name.
+    """
+    known = dict.fromkeys(joint.name for track in tracks for joint in track.joints)
+    for name in names:
+        if name not in known:
+            raise PlotError(f"no joint '{name}'; there are: {', '.join(known)}")
+    order = list(dict.fromkeys(names))
+    return [
+        replace(
+            track,
+            joints=tuple(
+                sorted(
+                    (joint for joint in track.joints if joint.name in order),
+                    key=lambda joint: order.index(joint.name),
+                )
+            ),
+        )
+        for track in tracks
+    ]
+
+
 def _read_urdf(path: Path) -> str:
     try:
         return read_file(path, MAX_URDF).decode("utf-8")
@@ -176,19 +205,33 @@ def _with_robot(
 def _joints(bag: Recording, names: Sequence[str], robot: Robot | None) -> tuple[JointTrack, ...]:
     starts = bag.provenance.get("start_values", {})
     joints = []
+    efforts = _efforts(bag)
+    limited = bool(bag.provenance) and bool(bag.schedule[0][1].get("limit_effort"))
     for i, name in enumerate(names):
-        unit = ""
+        unit, effort = "", None
         low, high = starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]")
         if robot is not None and name in robot.urdf.joints:
             joint = robot.urdf.joints[name]
             unit = "m" if joint.prismatic else "rad"
             low = joint.low if low is None else low
             high = joint.high if high is None else high
+            effort = joint.effort if joint.effort < UNBOUNDED else None
         low = None if low is None or low <= -UNBOUNDED else low
         high = None if high is None or high >= UNBOUNDED else high
         v = bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0)
-        joints.append(JointTrack(name, unit, low, high, bag.q[:, i], v))
+        tau = efforts[:, i] if efforts.shape == bag.q.shape else np.empty(0)
+        if limited and effort is not None:  # of commands; efforts in a bag are within it
+            tau = np.clip(tau, -effort, effort)
+        joints.append(JointTrack(name, unit, low, high, effort, bag.q[:, i], v, tau))
     return tuple(joints)
+
+
+def _efforts(bag: Recording) -> Array:
+    """Those of the bag; of a bare plant, what it was told to apply, N × n; N × 0 where unknown."""
+    n = len(bag.joints)
+    if bag.tau.size or not bag.provenance or f"tau_cmd[{n}]" not in bag.schedule[0][1]:
+        return bag.tau
+    return bag.held("tau_cmd", n)
 
 
 def _in_robot_order(bag: Recording, robot: Robot, names: Sequence[str], values: Array) -> Array:
