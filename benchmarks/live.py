@@ -29,7 +29,7 @@ STEP = 0.01
 
 def bare_loop(seconds: float) -> None:
     """Print how many deadlines a loop missed that does nothing else, and the worst in s."""
-    from twodof.master import RealTime
+    from twodof.pace import RealTime
 
     print("begins", flush=True)
     pace = RealTime()

@@ -41,7 +41,7 @@ def account(name: str, times: list[float]) -> None:
 
 def bare_loop(count: int) -> None:
     """A loop that does nothing else."""
-    from twodof.master import RealTime
+    from twodof.pace import RealTime
 
     pace, times = RealTime(), []
     for k in range(count):
@@ -62,7 +62,7 @@ def receive() -> None:
     from twodof.ros.messages import JOINT_STATE, STREAM
     from twodof.ros.network import Network, open_domain
 
-    _domain, _interfaces = open_domain(Network(DOMAIN, loopback=True))
+    _domain = open_domain(Network(DOMAIN, loopback=True))
     participant = DomainParticipant(DOMAIN)
     topic = Topic(participant, "rt/joint_states", dds_type(JOINT_STATE))
     reader = DataReader(participant, topic, dds_qos(STREAM, JOINT_STATE))
@@ -94,7 +94,7 @@ def main() -> None:
         return receive()
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, Publisher, build_fmu, experiment, simulate
-    from twodof.master import RealTime
+    from twodof.pace import RealTime
     from twodof.ros.network import Network
 
     with tempfile.TemporaryDirectory() as folder:

@@ -115,7 +115,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         if not self._allowed("fmi2DoStep"):
             self._refused = ""  # this discard is its answer
             return False
-        if not abs(current_time - self._time) <= TIME_TOLERANCE * max(1.0, abs(current_time)):
+        if not abs(current_time - self._time) <= TIME_TOLERANCE * max(1.0, abs(self._time)):
             return self._discard(
                 f"fmi2DoStep: the communication point {current_time!r} s is not"
                 f" the time of the FMU, {self._time!r} s"

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from twodof.experiments import Experiment
-from twodof.master import Sample
+from twodof.sample import Sample
 
 STORAGES = ("mcap", "sqlite3")
 START = 1_700_000_000  # s since the epoch

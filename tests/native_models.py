@@ -10,6 +10,7 @@ import os
 import subprocess
 import tempfile
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,12 +72,12 @@ class Model:
     def reference(self, name: str) -> int:
         return next(i for i, v in enumerate(self.table) if name in (v.name, v.group))
 
-    def sources(self, *more: Path) -> dict[str, bytes]:
-        headers = (Path(fmpy.__file__).parent / "c-code").glob("fmi2*.h")
-        files = engine_sources(self.control)
+    def sources(self, *more: Path, fmi: int = 2) -> dict[str, bytes]:
+        headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{fmi}*.h")
+        files = engine_sources(self.control, fmi)
         files |= {path.name: path.read_bytes() for path in (*headers, *more)}
         files["mechanism.c"] = mechanism_source(self.robot, self.table).encode()
-        files["model.h"] = model_header(self.robot, self.table, self.control, GUID).encode()
+        files["model.h"] = model_header(self.robot, self.table, self.control, GUID, fmi).encode()
         return files
 
 
@@ -84,24 +85,35 @@ class Model:
 def model(name: str, control: str = "task") -> Model:
     """The shipped arm, or a robot of ROBOTS at the middle of its limits."""
     if name == "twodof":
-        robot = load_robot((ROOT / "urdf" / "2dof.urdf").read_text(), "EndEffector", "xy")
+        robot = load_robot(urdf_path(name).read_text(), "EndEffector", "xy")
         starts = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
         starts["quat_des"] = (0.0, 0.0, math.sin(0.425), math.cos(0.425))
         return Model(robot, variable_table(robot, starts, control), starts, control)
-    path, frame, axes = ROBOTS[name]
-    text = (robots_folder() / path).read_text()
-    return from_urdf(text, frame, axes, control)
+    _, frame, axes = ROBOTS.get(name) or (name, last_link(name), "xyz")
+    return from_urdf(urdf_path(name).read_text(), frame, axes, control)
 
 
-@functools.cache
-def coupling(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """G and c of the positions G q + c of all joints of Pinocchio's model, from <mimic> alone."""
-    robot = model(name).robot
-    names = list(robot.model.names)[1:]
-    path = ROOT / "urdf" / "2dof.urdf" if name == "twodof" else robots_folder() / ROBOTS[name][0]
+def urdf_path(name: str) -> Path:
+    """The URDF of the shipped arm, or of a robot of ROBOTS, or one below robots_folder()."""
+    if name == "twodof":
+        return ROOT / "urdf" / "2dof.urdf"
+    return robots_folder() / (ROBOTS[name][0] if name in ROBOTS else name)
+
+
+def last_link(name: str) -> str:
+    """The link that the last joint of a URDF moves."""
+    joints = [
+        j for j in ET.parse(urdf_path(name)).iter("joint") if j.get("type", "fixed") != "fixed"
+    ]
+    return joints[-1].find("child").get("link")
+
+
+def coupling(name: str, joints: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """G and c of the positions G q + c of joints, else Pinocchio's, from <mimic> alone."""
+    names = list(joints or model(name).robot.model.names)[0 if joints else 1 :]
     mimics = {
         str(joint.get("name")): mimic
-        for joint in ET.parse(path).iter("joint")
+        for joint in ET.parse(urdf_path(name)).iter("joint")
         for mimic in joint.findall("mimic")
     }
     alone = [name for name in names if name not in mimics]
@@ -227,9 +239,9 @@ def engine(name: str, control: str = "task") -> Engine:
     return Engine(model(name, control))
 
 
-def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
+def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2) -> Path:
     """C files of the tests, which include the FMU's, compiled by the machine's own compiler."""
-    files = of.sources(*more)
+    files = of.sources(*more, fmi=fmi)
     digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
     folder = SCRATCH / digest
     output = folder / "program"
@@ -245,3 +257,30 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = ()) -> Path:
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
     return output
+
+
+def deviation(a, b) -> float:
+    """The largest difference, of the largest of b or of one."""
+    return np.abs(np.subtract(a, b)).max() / max(1.0, np.abs(b).max())
+
+
+def loaded(plant) -> pin.Model:
+    """Pinocchio's model with the payload as a body of its own."""
+    robot = plant.robot
+    reference = robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    frame = reference.frames[robot.frame_id]
+    placement = frame.placement * pin.SE3(np.eye(3), np.array(plant.payload_com))
+    reference.appendBodyToJoint(
+        frame.parentJoint, pin.Inertia(plant.payload, np.zeros(3), np.zeros((3, 3))), placement
+    )
+    return reference
+
+
+def random_plant(name: str, control: str, rng):
+    plant = model(name, control).plant()
+    n = len(plant.q)
+    plant.q, plant.v = rng.uniform(-2, 2, n).tolist(), rng.normal(0, 2, n).tolist()
+    plant.f_ext, plant.tau_ext = rng.normal(0, 5, 3).tolist(), rng.normal(0, 3, n).tolist()
+    plant.payload, plant.payload_com = rng.uniform(0, 3), rng.normal(0, 0.1, 3).tolist()
+    return plant

@@ -23,6 +23,8 @@ ROOMS = {
     "export": "makes an FMU of the plant, and runs none",
     "fmu": "an FMU's file and an instance of it, whoever made it",
     "experiments": "what an FMU is to do, checked",
+    "sample": "what is known at one communication point, and who takes it",
+    "pace": "when what is done is due, by the wall clock",
     "linear": "an FMU's derivatives, at an operating point that is checked",
     "master": "does it",
     "ros": "what ROS 2 is told of a run",
@@ -48,12 +50,7 @@ LIBRARIES = {
     "pyarrow": {"sweeps"},
     "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
     "rosbags": {"ros", "bag"},
-    "scipy": {
-        "export",
-        "geometry",
-        "ros",
-        "pages",
-    },  # its rotations: of joints that are locked, for all, to URDF's rpy, to viser's wxyz
+    "scipy": {"export", "geometry"},  # its rotations: of joints that are locked, for all
     "simpleeval": {"export"},
     "tqdm": {"cli"},
     "trimesh": {"geometry"},

@@ -58,7 +58,7 @@ from twodof.bag.storage import BagWriter
 from twodof.errors import BagError, InputError
 from twodof.experiments import Experiment
 from twodof.files import is_being_written
-from twodof.master import Sample
+from twodof.sample import Sample
 
 KIB, MIB = 1024, 1024**2
 
@@ -576,8 +576,8 @@ def test_joint_states_are_read_as_rosbags_reads_them_in_whatever_form(tmp_path: 
     for i, state in enumerate(sorted(expected)):
         q, v = found.q[i].tobytes(), found.v[i].tobytes()
         assert (found.stamps[i], q, v) == (state.log_time, state.position, state.velocity)
-    ends, count = read_ends(tmp_path / "bag")
-    assert count == 60
+    ends = read_ends(tmp_path / "bag")
+    assert ends.count == found.count == 60
     np.testing.assert_array_equal(ends.stamps, found.stamps[[0, -1]])
     np.testing.assert_array_equal(ends.q, found.q[[0, -1]])
     np.testing.assert_array_equal(ends.v, found.v[[0, -1]])
@@ -893,7 +893,7 @@ MEMORY = """
 import sys
 import twodof
 from sinks import Memory
-from twodof.master import Sample
+from twodof.sample import Sample
 
 fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu)
@@ -918,3 +918,13 @@ def test_memory_does_not_grow_with_the_run(fmu_path: Path, tmp_path: Path, stora
     )
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000
+
+
+def test_definitions_are_those_of_humble() -> None:
+    from twodof.ros.messages import DEFINITIONS
+    from twodof.ros.messages import STORE as OURS
+
+    for name in DEFINITIONS:
+        assert OURS.fielddefs[name][1] == STORE.fielddefs[name][1]
+        assert OURS.hash_rihs01(name) == STORE.hash_rihs01(name)
+        assert OURS.generate_msgdef(name) == STORE.generate_msgdef(name)

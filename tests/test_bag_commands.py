@@ -14,24 +14,25 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 import twodof
 from twodof.cli.main import main
-from twodof.ros.messages import JOINT_STATE, POINT, STORE, Message
+from twodof.ros.messages import JOINT_STATE, POINT, STORE
 
 BEGIN = 1_700_000_000_000_000_000
 STEP = 10_000_000  # ns
 
 
 def header(stamp: int, frame: str = "") -> Any:
-    time = Message["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-    return Message["std_msgs/msg/Header"](time, frame)
+    time = STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    return STORE.types["std_msgs/msg/Header"](time, frame)
 
 
 def joint_state(stamp: int, names: Sequence[str], *numbers: Sequence[float]) -> Any:
     parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
-    return Message[JOINT_STATE](header(stamp), [*names], *parts)
+    return STORE.types[JOINT_STATE](header(stamp), [*names], *parts)
 
 
 def point(stamp: int, x: float, y: float) -> Any:
-    return Message[POINT](header(stamp, "world"), Message["geometry_msgs/msg/Point"](x, y, 0.0))
+    place = STORE.types["geometry_msgs/msg/Point"](x, y, 0.0)
+    return STORE.types[POINT](header(stamp, "world"), place)
 
 
 def write(path: Path, messages: Sequence[tuple[str, int, Any]], **options: Any) -> Path:

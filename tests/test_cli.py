@@ -119,7 +119,7 @@ FMI1 = (
 )
 FMI3 = (
     '<fmiModelDescription fmiVersion="3.0" modelName="m" instantiationToken="t">'
-    '<CoSimulation modelIdentifier="m"/><ModelVariables>'
+    '<ModelExchange modelIdentifier="m"/><ModelVariables>'
     '<Float64 name="time" valueReference="0" causality="independent"/>'
     '<Float64 name="q[1]" valueReference="1" causality="output"/>'
     '<Float64 name="v[1]" valueReference="2" causality="output"/></ModelVariables>'
@@ -260,7 +260,7 @@ BAD: dict[str, Case] = {
     "FMU damaged": (fmu(description(), change=damaged), RUN_BAD, "'bad.fmu'"),
     "FMU encrypted": (fmu(description(), change=encrypted), RUN_BAD, "'bad.fmu'"),
     "FMI 1.0": (fmu(FMI1), RUN_BAD, "'bad.fmu' is FMI 1.0 .*FMI 2.0"),
-    "FMI 3.0": (fmu(FMI3), RUN_BAD, "'bad.fmu' is FMI 3.0 .*FMI 2.0 co-simulation is needed"),
+    "FMI 3.0": (fmu(FMI3), RUN_BAD, "'bad.fmu' is FMI 3.0 .*FMI 2.0 or 3.0 co-simulation"),
     "FMI 3.0, info": (fmu(FMI3), INFO, "'bad.fmu' is FMI 3.0"),
     "model exchange": (
         fmu(description(kind="ModelExchange")), RUN_BAD, "'bad.fmu' is FMI 2.0 model exchange",

@@ -106,7 +106,9 @@ def held(x_des, xd_des=(0.0, 0.0), xdd_des=(0.0, 0.0), Kp=(50.0, 50.0), Kd=(40.0
 
 def test_held_inputs_from_rest_give_the_textbook_solution() -> None:
     step, steps = 0.01, 500
-    error = task_error((0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], step, steps)
+    error = task_error(
+        (0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], step, np.arange(steps + 1)
+    )
     expected = oracles.task_error(np.array([0.03, 0.13]), 50.0, 40.0, step * np.arange(steps + 1))
     np.testing.assert_allclose(error, expected, rtol=0.0, atol=1e-15)
 
@@ -124,7 +126,7 @@ def test_inputs_that_change_give_what_an_integrator_gives() -> None:
     """Targets, velocities, accelerations and gains, of which some are zero, change on the way."""
     step, steps = 0.01, 300
     x, v = np.array([0.23, 0.18]), np.array([0.4, -0.2])
-    error = task_error(tuple(x), tuple(v), SCHEDULE, step, steps)
+    error = task_error(tuple(x), tuple(v), SCHEDULE, step, np.arange(steps + 1))
     assert error.shape == (steps + 1, 2)
     np.testing.assert_array_equal(error[0], x - SCHEDULE[0][1].x_des)
     ends = [k for k, _ in SCHEDULE[1:]] + [steps]
@@ -146,20 +148,29 @@ def test_inputs_that_change_give_what_an_integrator_gives() -> None:
 
 def test_at_a_change_the_error_is_still_that_from_the_target_before() -> None:
     schedule = [(0, held((0.2, 0.05))), (3, held((5.0, 5.0)))]
-    error = task_error((0.23, 0.18), (0.0, 0.0), schedule, 0.01, 6)
-    before = task_error((0.23, 0.18), (0.0, 0.0), schedule[:1], 0.01, 6)
+    error = task_error((0.23, 0.18), (0.0, 0.0), schedule, 0.01, np.arange(7))
+    before = task_error((0.23, 0.18), (0.0, 0.0), schedule[:1], 0.01, np.arange(7))
     np.testing.assert_array_equal(error[:4], before[:4])
     assert (error[4:] < -4.0).all()
 
 
+def test_some_samples_have_the_error_that_they_have_among_all() -> None:
+    """As of a bag that was recovered, or thinned out; also where none is between two changes."""
+    steps = np.array([0, 1, 2, 69, 70, 72, 150, 151, 299])
+    some, every = (
+        task_error((0.23, 0.18), (0.4, -0.2), SCHEDULE, 0.01, k) for k in (steps, np.arange(300))
+    )
+    np.testing.assert_allclose(some, every[steps], rtol=0.0, atol=1e-15)
+
+
 def test_a_run_without_steps() -> None:
-    error = task_error((0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], 0.01, 0)
+    error = task_error((0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], 0.01, np.zeros(1, int))
     np.testing.assert_allclose(error, [[0.03, 0.13]], rtol=1e-15)
 
 
 @pytest.mark.filterwarnings("error")
 def test_gains_that_make_it_explode_warn_of_nothing() -> None:
     wild = held((0.2, 0.05), Kp=(-1e4, 50.0), Kd=(-1e4, 1e8))
-    error = task_error((0.23, 0.18), (0.0, 0.0), [(0, wild)], 0.1, 1000)
+    error = task_error((0.23, 0.18), (0.0, 0.0), [(0, wild)], 0.1, np.arange(1001))
     assert not np.isfinite(error[-1, 0])
     assert error[-1, 1] == pytest.approx(0.13, rel=1e-3)

@@ -12,7 +12,7 @@ import pytest
 import twodof
 from twodof.errors import InputError
 from twodof.ros.commands import MAX_COMMAND, RAMP, CommandError, Commands, Watchdog
-from twodof.ros.messages import JOINT_STATE, POINT, STORE, Message
+from twodof.ros.messages import JOINT_STATE, POINT, STORE
 
 Build = Callable[..., twodof.Fmu]
 
@@ -32,13 +32,15 @@ def joint_state(
     names: tuple[str, ...] = (), q: tuple[float, ...] = (), v: tuple[float, ...] = (),
     tau: tuple[float, ...] = (), stamp: tuple[int, int] = (0, 0),
 ) -> bytes:  # fmt: skip
-    header = Message["std_msgs/msg/Header"](
-        stamp=Message["builtin_interfaces/msg/Time"](*stamp), frame_id=""
+    header = STORE.types["std_msgs/msg/Header"](
+        stamp=STORE.types["builtin_interfaces/msg/Time"](*stamp), frame_id=""
     )
     import numpy as np
 
     arrays = [np.array(part, float) for part in (q, v, tau)]
-    return bytes(STORE.serialize_cdr(Message[JOINT_STATE](header, [*names], *arrays), JOINT_STATE))
+    return bytes(
+        STORE.serialize_cdr(STORE.types[JOINT_STATE](header, [*names], *arrays), JOINT_STATE)
+    )
 
 
 def test_joints_are_matched_by_name_in_any_order_and_number(arm: Build) -> None:

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 from bags import START, STORAGES, assert_consistent, both_storages, logging, read_with_rosbags
 
-from twodof.bag.records import Allowance, DamageError, read_messages, storage_files
+from twodof.bag.contents import read_messages, storage_files
+from twodof.bag.records import Allowance, DamageError
 from twodof.cli import info
 from twodof.cli.main import main
 
@@ -95,7 +96,7 @@ def test_signals_leave_a_complete_bag(
 LOOP = """
 import sys
 import twodof
-from twodof.master import Sample
+from twodof.sample import Sample
 fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu, stop_time=1e4)
 inputs = dict(run.start_values)

@@ -78,9 +78,9 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("twodof.export.compiler.host_platform", lambda: "darwin64")
+    monkeypatch.setattr("twodof.export.compiler.host_platform", lambda fmi=2: "darwin64")
     monkeypatch.setattr(
-        "twodof.export.package.host_platform", lambda: "linux64"
+        "twodof.export.composition.host_platform", lambda fmi=2: "linux64"
     )  # what can run here
     assert main(["run", "--stop-time", "0.1", "-o", "bag"]) == 0
     captured = capsys.readouterr()
@@ -89,7 +89,7 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
 
 
 def test_a_machine_that_is_no_fmi_platform_needs_to_be_told_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("twodof.export.package.host_platform", lambda: "")
+    monkeypatch.setattr("twodof.export.composition.host_platform", lambda fmi=2: "")
     with pytest.raises(twodof.TwoDofError, match="choose one with `platforms`"):
         build_fmu(tmp_path / "A.fmu", FmuOptions(native=True))
 
@@ -106,3 +106,28 @@ def test_options_that_do_not_fit_a_flavour_are_refused(options, message, tmp_pat
     with pytest.raises(twodof.TwoDofError, match=message):
         build_fmu(tmp_path / "A.fmu", options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_shipped_arm_s_file_is_known_by_what_it_was_made_of(tmp_path, monkeypatch):
+    """Without composing another, unless options or what is shipped are others, or it is damaged."""
+
+    class ComposedError(Exception):
+        pass
+
+    def compose(options):
+        raise ComposedError
+
+    path = build_fmu(tmp_path / "A.fmu", FmuOptions(native=True))
+    content = path.read_bytes()
+    monkeypatch.setattr("twodof.export.composition.compose", compose)
+    assert build_fmu(path, FmuOptions(native=True)).read_bytes() == content
+    for other in ({"control": "joint"}, {"live_documentation": False}, {"q_start": (0.4, 0.3)}):
+        with pytest.raises(ComposedError):
+            build_fmu(path, FmuOptions(native=True, **other))
+    path.write_bytes(content[:-100])
+    with pytest.raises(ComposedError):
+        build_fmu(path, FmuOptions(native=True))
+    path.write_bytes(content)
+    monkeypatch.setattr("twodof.export.package.data_file", lambda name: tmp_path)
+    with pytest.raises(ComposedError):
+        build_fmu(path, FmuOptions(native=True))

@@ -13,7 +13,7 @@ from twodof.cli.common import parse_settings
 from twodof.errors import InputError
 from twodof.experiments import Setting, read_changes, resolve
 from twodof.fmu import Fmu
-from twodof.master import Sample
+from twodof.sample import Sample
 
 
 @pytest.fixture(scope="module")

@@ -309,6 +309,37 @@ def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
     }  # fmt: skip
 
 
+def test_several_robots_are_in_step_and_apart(
+    bare: Callable[[int], Path], jointed: Path, tmp_path: Path, number: int, listen: Listen
+) -> None:
+    """One clock and its stamps for all, each at its time; who commands one moves one."""
+    robots = [f"left={jointed}", f"right={jointed}", str(bare(2))]
+    names = ("left", "right", "Bare2")
+    topics = [f"/{name}/joint_states" for name in names]
+    node = listen(*(f"{t}=state" for t in topics), "/clock=clock", "/right/joint_commands=command")
+    bag = tmp_path / "bag"
+    with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "6") as process:  # type: ignore[arg-type]
+        node.hears("/Bare2/joint_states", more=50)
+        node.say("/right/joint_commands 1 0 joint1,joint2 0.9,-0.6 0,0 -")
+        _, err = ended(process)
+    assert err.startswith("WARNING: no command for 0.5 s: the last one is held")
+    assert err.count("WARNING") == 1
+    bags = [recorded(tmp_path / f"bag_{name}")["/joint_states"] for name in names]
+    stamps = [stamp_of(state[0]) for state in bags[0]]
+    assert len(stamps) == 601 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
+    for topic, states in zip(topics, bags):
+        heard = node.messages(topic)
+        assert len(heard) > 500 and heard == states[-len(heard) :]
+    arrivals = [[it[2] for it in node.told if it[:2] == ["message", t]][-500:] for t in topics]
+    apart = np.ptp(arrivals, axis=0)
+    usual, most = np.quantile(apart, (0.5, 0.99)) / 1e6
+    print(f"three robots within {usual:.3f} ms, 99 % within {most:.3f} ms")
+    ends = [state[-1][2] for state in bags]
+    assert np.abs(np.subtract(ends[1], [0.9, -0.6])).max() < 1e-3
+    alone = [[*s.q] for s in twodof.samples(jointed, step=0.01, stop_time=6.0)]
+    assert [state[2] for state in bags[0]] == alone
+
+
 @pytest.mark.parametrize("speed", [0.1, 1.0, 10.0])
 def test_the_clock_is_that_of_the_simulation(
     native_path: Path, number: int, listen: Listen, speed: float
@@ -322,7 +353,8 @@ def test_the_clock_is_that_of_the_simulation(
     stamps = [seconds * SECOND + rest for _, _, _, (seconds, rest) in told]
     last = 100 * SECOND + round(simulated * 100) * SECOND // 100
     assert stamps == [last - k * SECOND // 100 for k in range(len(stamps))][::-1]
-    assert stamps == [stamp_of(m[0]) for m in node.messages("/joint_states")][-len(stamps) :]
+    states = [stamp_of(m[0]) for m in node.messages("/joint_states")]
+    assert stamps[-len(states) :] == states[-len(stamps) :]  # who was found first is heard longer
     wall = (told[-1][2] - told[0][2]) / SECOND
     assert (stamps[-1] - stamps[0]) / SECOND / wall == pytest.approx(speed, rel=0.1)
 

@@ -22,7 +22,7 @@ from sinks import Memory
 import twodof
 from twodof.errors import FmuError, InputError, SimulationError
 from twodof.files import TEMPORARY, temporary_folder
-from twodof.master import RealTime
+from twodof.pace import RealTime
 
 
 class Recorder(twodof.Sink):
@@ -252,6 +252,7 @@ class Clock:
 def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr("twodof.master.time", clock)
+    monkeypatch.setattr("twodof.pace.time", clock)
     return clock
 
 

@@ -254,6 +254,7 @@ def test_refusals_name_the_culprit():
     arm.refused(r"x_des\[1\] is of type Real", "setString", [0], ["a"])
     arm.refused("communication point 0.1 s is not the time of the FMU, 0 s", "doStep", 0.1, 0.01)
     arm.refused("communication point nan s", "doStep", np.nan, 0.01)
+    arm.refused("communication point inf s", "doStep", np.inf, 0.01)
     for h in (0.0, -0.01, np.nan, np.inf):
         arm.refused("the step .* must be finite and > 0", "doStep", 0.0, h)
     assert arm.status("doStep", 0.9e-9, 0.01) == OK

@@ -359,7 +359,7 @@ def refused(folder: Path, *platforms: str) -> str:
 
 
 def test_unknown_platform(tmp_path, monkeypatch, capsys):
-    expected = "there is no platform 'solaris'; there are linux64, win64, darwin64"
+    expected = "FMI 2.0 has no platform 'solaris'; there are linux64, win64, darwin64"
     assert refused(tmp_path, "solaris") == expected
     monkeypatch.chdir(tmp_path)
     assert main(["build", "--native", "--platform", "solaris"]) == 1

@@ -137,10 +137,14 @@ SESSION = {
 }
 
 
-def test_a_session_has_the_numbers_of_the_fmu(browser, arm, native_path) -> None:
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_session_has_the_numbers_of_the_fmu(browser, tmp_path, native_path, fmi) -> None:
+    path = native_path
+    if fmi == 3:
+        path = twodof.build_fmu(tmp_path / "three.fmu", twodof.FmuOptions(native=True, fmi=3))
     parameters = {"payload": 0.7, "limit_effort": True}
-    expected = stepped(native_path, parameters, SESSION, 1000)
-    with shown(browser, arm) as page:
+    expected = stepped(path, parameters, SESSION, 1000)
+    with shown(browser, twodof.page(path, tmp_path / "arm.html")) as page:
         actual = played(page, parameters, SESSION, 1000)
     assert actual.shape == expected.shape == (1001, 8)
     assert np.ptp(expected[:, 0]) > 0.5  # it moved

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from oracles import LINK, REST, TwoLinkArm, drift, jacobian, position, task_error
 
-from twodof.export.package import DEFAULT_ARM
+from twodof.export.composition import DEFAULT_ARM
 from twodof.files import data_file
 from twodof.plant import task_control
 from twodof.plant.plant import DiscardError, ParameterError, Plant

@@ -40,12 +40,12 @@ from sinks import Collector
 import twodof
 from twodof.cli.main import main
 from twodof.errors import PlotError, TwoDofError
-from twodof.master import Sample
 from twodof.plots.figure import file_kind, save
 from twodof.plots.interactive import in_workspace, over_time
 from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks, with_joints
 from twodof.plots.words import labels
+from twodof.sample import Sample
 
 START = 1_700_000_000  # s since the epoch
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -295,11 +295,13 @@ import sys, time
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
-from twodof.ros.messages import POSE, STORE, STREAM, Message, _place
+import numpy as np
+from twodof.ros.cdr import Layout, Numbers, Stamp
+from twodof.ros.messages import POSE, STREAM
 from twodof.ros.network import network, open_domain
 from twodof.ros.dds import dds_qos, dds_type
 
-domain, _ = open_domain(network())
+domain = open_domain(network())
 participant = DomainParticipant(network().domain)
 writer = DataWriter(
     participant, Topic(participant, "rt/target_command", dds_type(POSE)), dds_qos(STREAM, POSE)
@@ -309,7 +311,8 @@ print("ready", flush=True)
 while not writer.get_matched_subscriptions():
     time.sleep(0.01)
 for frame, xyz, quat in said:
-    writer.write(writer.data_type(STORE.serialize_cdr(_place(0, frame, xyz, quat), POSE)))
+    said = Layout(Stamp(), frame, Numbers(7)).pack(np.array([0]), np.array([[*xyz, *quat]]))
+    writer.write(writer.data_type(said.tobytes()))
     time.sleep(0.3)
 time.sleep(60)
 """

@@ -576,7 +576,7 @@ def test_fsync_waits_for_the_disk_at_each_flush(
     script = """
 import sys
 import twodof
-from twodof.master import Sample
+from twodof.sample import Sample
 fmu, path, storage, fsync = sys.argv[1:]
 run = twodof.experiment(fmu)
 inputs = dict(run.start_values)

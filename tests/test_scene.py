@@ -18,7 +18,7 @@ import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import oracles
@@ -30,8 +30,9 @@ from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 import twodof
-from twodof.master import Sample
-from twodof.ros.scene import Scene, Transform
+from twodof.plant.urdf import Joint
+from twodof.ros.scene import Scene
+from twodof.sample import Sample
 
 START = 1_700_000_000  # s since the epoch
 SECOND = 1_000_000_000  # ns
@@ -48,6 +49,27 @@ Placements = dict[str, np.ndarray]
 
 
 # --- poses ---
+
+
+class Transform(NamedTuple):
+    """Pose of a child link in its parent link: m, and a unit quaternion (x, y, z, w)."""
+
+    parent: str
+    child: str
+    translation: tuple[float, ...]
+    rotation: tuple[float, ...]
+
+
+def transforms_of(scene: Scene, joints: Iterable[Joint], q: np.ndarray) -> list[list[Transform]]:
+    """Of some joints, at each of N positions; all of a scene's at once, as a bag has them."""
+    each = [np.broadcast_to(part, (len(q), 7)) for part in scene.transforms(joints, q)]
+    return [
+        [
+            Transform(joint.parent, joint.child, tuple(part[k, :3]), tuple(part[k, 3:]))
+            for joint, part in zip(joints, each)
+        ]
+        for k in range(len(q))
+    ]
 
 
 def pose(translation: Iterable[float], rotation: Rotation) -> np.ndarray:
@@ -112,9 +134,10 @@ def test_transforms_are_the_placements_of_pinocchio(robot: str) -> None:
     joints = moving_joints(robot)[::-1]  # not in the order of the file
     scene = Scene(robot, joints, ET.fromstring(robot).find("link").get("name"), nothing)
     random = np.random.default_rng(0)
-    for _ in range(10):
-        q = random.uniform(-4.0, 4.0, len(joints))
-        transforms = [*scene.fixed, *scene.moving(q.tolist())]
+    several = random.uniform(-4.0, 4.0, (10, len(joints)))
+    for q, transforms in zip(
+        several, transforms_of(scene, [*scene.fixed, *scene.moving], several), strict=True
+    ):
         for transform in transforms:
             assert np.linalg.norm(transform.rotation) == pytest.approx(1.0, abs=1e-14)
         assert_same_poses(chained(transforms), placements(robot, joints, q), robot)
@@ -128,12 +151,14 @@ def test_fixed_joint_may_have_a_zero_axis() -> None:
         "</joint></robot>"
     )
     expected = [Transform("a", "b", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))]
-    assert Scene(urdf, [], "b", nothing).fixed == expected
+    scene = Scene(urdf, [], "b", nothing)
+    assert transforms_of(scene, scene.fixed, np.empty((1, 0))) == [expected]
 
 
 def test_quaternion_is_x_y_z_w_with_the_sign_of_the_right_hand(fmu_urdf: str) -> None:
     scene = Scene(fmu_urdf, ["joint1", "joint2"], "EndEffector", nothing)
-    first, second = scene.moving([math.pi / 2, -math.pi / 3])
+    q = np.array([[math.pi / 2, -math.pi / 3]])
+    ((first, second),) = transforms_of(scene, scene.moving, q)
     np.testing.assert_allclose(first.rotation, [0.0, 0.0, 0.5**0.5, 0.5**0.5], atol=1e-15)
     np.testing.assert_allclose(second.rotation, [0.0, 0.0, -0.5, 0.75**0.5], atol=1e-15)
 
@@ -145,7 +170,8 @@ def test_quaternion_is_right_near_half_turns(axis: str, angle: float) -> None:
         '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
         f'<parent link="a"/><child link="b"/><axis xyz="{axis}"/></joint></robot>'
     )
-    (found,) = Scene(urdf, ["j"], "b", nothing).moving([angle])
+    scene = Scene(urdf, ["j"], "b", nothing)
+    ((found,),) = transforms_of(scene, scene.moving, np.array([[angle]]))
     direction = np.array(axis.split(), dtype=float)
     expected = Rotation.from_rotvec(angle * direction / np.linalg.norm(direction))
     np.testing.assert_allclose(
@@ -159,10 +185,9 @@ def test_end_effector_is_where_pinocchio_has_it(robot: str) -> None:
     last = ET.fromstring(robot).findall("link")[-1].get("name", "")
     scene = Scene(robot, joints, last, nothing)
     random = np.random.default_rng(1)
-    for _ in range(10):
-        q = random.uniform(-4.0, 4.0, len(joints))
-        expected = placements(robot, joints, q)[last][:3, 3]
-        np.testing.assert_allclose(scene.end_effector(q.tolist()), expected, rtol=0.0, atol=1e-12)
+    several = random.uniform(-4.0, 4.0, (10, len(joints)))
+    expected = [placements(robot, joints, q)[last][:3, 3] for q in several]
+    np.testing.assert_allclose(scene.end_effector(several), expected, rtol=0.0, atol=1e-12)
 
 
 # --- topics of a bag ---

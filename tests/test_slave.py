@@ -23,7 +23,7 @@ from harness import Driver, in_child_process
 from oracles import REST, position, task_error
 
 from twodof import FmuOptions, build_fmu
-from twodof.export.package import DEFAULT_ARM
+from twodof.export.composition import DEFAULT_ARM
 from twodof.files import data_file
 from twodof.plant.plant import Plant
 from twodof.plant.robot import load_robot
@@ -407,6 +407,7 @@ def test_what_is_refused_is_logged_keeps_the_state_and_discards_the_next_step(fm
         (0.03 + 1e-8, 0.01, "is not the time of the FMU"),
         (float("nan"), 0.01, "is not the time of the FMU"),
         (0.03, 0.0, "fmi2DoStep: the step 0.0 s must be finite and > 0"),
+        (float("inf"), 0.01, "is not the time of the FMU"),
         (0.03, -0.01, "must be finite and > 0"),
         (0.03, float("nan"), "must be finite and > 0"),
         (0.03, float("inf"), "must be finite and > 0"),

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import twodof
 from twodof.cli.main import main
-from twodof.export.package import FmuOptions, build_fmu
+from twodof.export.options import FmuOptions
+from twodof.export.package import build_fmu
 from twodof.export.urdf_source import end_effector, lock_joints
 from twodof.files import data_file
 from twodof.plant.robot import load_robot

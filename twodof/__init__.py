@@ -20,18 +20,16 @@ if TYPE_CHECKING:
     from .errors import TwoDofError as TwoDofError
     from .experiments import Experiment as Experiment
     from .experiments import experiment as experiment
-    from .export.package import FmuOptions as FmuOptions
+    from .export.options import FmuOptions as FmuOptions
     from .export.package import build_fmu as build_fmu
     from .fmu import Fmu as Fmu
     from .fmu import load_fmu as load_fmu
     from .linear import LinearModel as LinearModel
     from .linear import linearise as linearise
-    from .master import RealTime as RealTime
-    from .master import Sample as Sample
-    from .master import Sink as Sink
     from .master import Summary as Summary
     from .master import samples as samples
     from .master import simulate as simulate
+    from .pace import RealTime as RealTime
     from .pages.arm import page as page
     from .pages.live import live as live
     from .pages.replay import view as view
@@ -39,6 +37,9 @@ if TYPE_CHECKING:
     from .ros.foxglove import Foxglove as Foxglove
     from .ros.publisher import Publisher as Publisher
     from .ros.publisher import publish as publish
+    from .ros.publisher import publish_together as publish_together
+    from .sample import Sample as Sample
+    from .sample import Sink as Sink
     from .sweeps.coordinator import sweep as sweep
     from .sweeps.results import read_sweep as read_sweep
 
@@ -51,16 +52,19 @@ _HOMES = {
     "bag.writer": ("Bag",),
     "errors": ("TwoDofError",),
     "experiments": ("Experiment", "experiment"),
-    "export.package": ("FmuOptions", "build_fmu"),
+    "export.options": ("FmuOptions",),
+    "export.package": ("build_fmu",),
     "fmu": ("Fmu", "load_fmu"),
     "linear": ("LinearModel", "linearise"),
-    "master": ("RealTime", "Sample", "Sink", "Summary", "samples", "simulate"),
+    "master": ("Summary", "samples", "simulate"),
+    "pace": ("RealTime",),
     "pages.arm": ("page",),
     "pages.live": ("live",),
     "pages.replay": ("view",),
     "plots.runs": ("plot",),
     "ros.foxglove": ("Foxglove",),
-    "ros.publisher": ("Publisher", "publish"),
+    "ros.publisher": ("Publisher", "publish", "publish_together"),
+    "sample": ("Sample", "Sink"),
     "sweeps.coordinator": ("sweep",),
     "sweeps.results": ("read_sweep",),
 }

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate, chain, count
-from math import asin, dist, hypot, inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,152 +30,31 @@ from .experiments import (
     resolve,
 )
 from .fmu import Fmu, Instance, instantiate
+from .pace import RealTime
+from .sample import Sample, Sink
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    pass
 
-LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
 OUTPUTS = ("q", "v", "x", "tau", "quat")
 
 
-class Sample(NamedTuple):
-    """What is known at one communication point.
-
-    Attributes:
-        k: communication steps done so far.
-        t: time, s.
-        q, v: joint positions (rad, m) and velocities, n values each.
-        x: position of the end effector along the task axes, m; empty if the FMU has none.
-        tau: control effort applied, N·m or N; empty if the FMU has none.
-        inputs: values of all inputs by name, as they are at t.
-        since: the communication point from which on the inputs have had these values, s.
-        stamp: of the messages that tell of it, ns since the epoch.
-        quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has
-            none.
-    """
-
-    k: int
-    t: float
-    q: tuple[float, ...]
-    v: tuple[float, ...]
-    x: tuple[float, ...]
-    tau: tuple[float, ...]
-    inputs: Mapping[str, Value]
-    since: float
-    stamp: int
-    quat: tuple[float, ...] = ()
-
-    @property
-    def target(self) -> tuple[float, ...] | None:
-        """x_des, m, one value for each of x; None where the FMU has no such inputs."""
-        return self._given("x_des", len(self.x))
-
-    @property
-    def target_quat(self) -> tuple[float, ...] | None:
-        """quat_des at length 1; None where the FMU has no such inputs, or they are 0."""
-        given = self._given("quat_des", len(self.quat)) or ()
-        length = hypot(*given)
-        return tuple(value / length for value in given) if length else None
-
-    def _given(self, group: str, size: int) -> tuple[float, ...] | None:
-        values = [self.inputs.get(f"{group}[{k + 1}]") for k in range(size)]
-        return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
-
-    @property
-    def error(self) -> float | None:
-        """Distance of the end effector from its target, m; None where there is no target."""
-        return None if self.target is None else dist(self.x, self.target)
-
-    @property
-    def turn_error(self) -> float | None:
-        """Angle between the end effector's orientation and its target, rad; None without one."""
-        if self.target_quat is None:
-            return None
-        apart = (
-            dist(self.quat, self.target_quat),
-            hypot(*map(sum, zip(self.quat, self.target_quat))),
-        )
-        return 4.0 * asin(min(1.0, 0.5 * min(apart)))
-
-
-class Sink:
-    """Consumer of samples: a context that is given the experiment and then each sample.
-
-    One of one's own needs ``write`` alone; the rest does nothing here.
-
-    ::
-
-        with sink.begin(run):
-            for sample in samples(run):
-                sink.write(sample)
-    """
-
-    def begin(self, run: Experiment) -> Self:
-        """Take the experiment whose samples come; itself, to be entered."""
-        return self
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: Any) -> None:
-        pass
-
-    def write(self, sample: Sample) -> None:
-        """Take one sample."""
-
-
+Stop = Callable[[], bool]
+Samples = Generator[Sample, Mapping[str, Setting] | None, None]
 Resume = Callable[[Sample, SimulationError], Mapping[str, Setting] | None]
 """What a run goes on with after a step that was discarded: the sample before it, and the reason."""
-
-
-class RealTime:
-    """Paces a run to the wall clock.
-
-    Args:
-        speed: s of the run in a second.
-
-    Attributes:
-        missed: samples that were ready only after their time.
-        worst: the largest delay, s.
-    """
-
-    def __init__(self, speed: float = 1.0) -> None:
-        if not 0.0 < speed < inf:
-            raise InputError(f"`speed` {speed:g} is no factor")
-        self._speed, self.missed = speed, 0
-        self.worst = 0.0
-        self._start: float | None = None
-
-    def restart(self) -> None:
-        """The next sample is due at once, and those after it by that."""
-        self._start = None
-
-    def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until ``elapsed`` s of the run are due since the first call, or ``stop`` is true."""
-        now = time.perf_counter()
-        elapsed /= self._speed
-        if self._start is None:
-            self._start = now - elapsed
-        due = self._start + elapsed
-        left = due - now
-        while left > 0.0 and not stop():
-            time.sleep(min(left, LONGEST_SLEEP))
-            left = due - time.perf_counter()
-        if due < now:
-            self.missed += 1
-            self.worst = max(self.worst, now - due)
 
 
 def samples(
     run: Experiment | Fmu | str | Path,
     *,
     pace: RealTime | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Stop = lambda: False,
     ready: Callable[[], object] = lambda: None,
     resume: Resume = lambda sample, error: None,
     instance: Instance | None = None,
     **options: Any,
-) -> Generator[Sample, Mapping[str, Setting] | None, None]:
+) -> Samples:
     """Run an FMU; the initial state, then one sample a communication step.
 
     A loop of one's own may answer a sample with new inputs, ``run.send({"x_des": (0.2, 0.1)})``,
@@ -227,8 +107,8 @@ def samples(
 
 
 def _inputs(run: Experiment) -> dict[str, Value]:
-    variables = run.fmu.variables
-    return {n: v for n, v in run.start_values.items() if variables[n].causality == "input"}
+    kinds = run.fmu.variables
+    return {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
 
 
 def _changes_until(
@@ -276,9 +156,8 @@ def _resumed(
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
     """Start values of a robot that rests where a sample has it, and is meant to be there.
 
-    With them a run can go on after a step that was discarded: across a singularity, speeds can
-    escape to infinity in finite time after a target that is out of reach. None where the FMU has
-    no such variables.
+    With them a run can go on after a discarded step: across a singularity, speeds can escape to
+    infinity in finite time. None where the FMU has no such variables.
     """
     still = (0.0,) * len(sample.v)
     start = {"q_start": sample.q, "v_start": still}
@@ -314,7 +193,7 @@ def simulate(
     run: Experiment | Fmu | str | Path,
     *sinks: Sink,
     pace: RealTime | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Stop = lambda: False,
     instance: Instance | None = None,
     steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
     resume: Resume = lambda sample, error: None,
@@ -329,21 +208,61 @@ def simulate(
     """
     if not isinstance(run, Experiment):
         run = experiment(run, **options)
+    member = Member(run, sinks, steer, resume, instance)
+    return simulate_together([member], pace=pace, stop=stop)[0]
+
+
+class Member(NamedTuple):
+    """One of several runs that go on together; the fields are the arguments of ``simulate``."""
+
+    run: Experiment
+    sinks: Sequence[Sink]
+    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None
+    resume: Resume = lambda sample, error: None
+    instance: Instance | None = None
+
+
+def simulate_together(
+    members: Sequence[Member], *, pace: RealTime | None = None, stop: Stop = lambda: False
+) -> list[Summary]:
+    """Run FMUs in one loop: all reach a communication point before one goes on from it.
+
+    Args:
+        members: of one start time, step, stop time and, where there are several, first stamp.
+        pace, stop: as of ``simulate``, for all of them.
+
+    Raises:
+        InputError: their times differ.
+        FmuError, SimulationError: as of ``simulate``.
+    """
+    times = {(run.start_time, run.step, run.steps, run.stamp_start) for run, *_ in members}
+    start, stamp, ended = members[0].run.start_time, members[0].run.stamp_start, False
+    if len(times) > 1 or (stamp is None and len(members) > 1):
+        raise InputError("what runs together has one start time, step, stop time and first stamp")
     with ExitStack() as stack:
 
-        def begin() -> None:
-            for sink in sinks:
-                stack.enter_context(sink.begin(run))
+        def begin(member: Member) -> None:
+            for sink in member.sinks:
+                stack.enter_context(sink.begin(member.run))
 
-        source = samples(run, pace=pace, stop=stop, ready=begin, resume=resume, instance=instance)
-        sample = next(stack.enter_context(closing(source)))
+        sources = []
+        for member in members:
+            run, _, _, resume, own, ready = *member, partial(begin, member)
+            source = samples(run, stop=lambda: ended, ready=ready, resume=resume, instance=own)
+            sources.append(stack.enter_context(closing(source)))
+        latest = [next(source) for source in sources]
         started = time.perf_counter()
         while True:
-            for sink in sinks:
-                sink.write(sample)
-            answer = steer()
+            if pace is not None:
+                pace.wait(latest[0].t - start, stop)
+            for member, sample in zip(members, latest):
+                for sink in member.sinks:
+                    sink.write(sample)
+            answers = [member.steer() for member in members]
+            ended = stop()
             try:
-                sample = source.send(answer)
+                latest = [source.send(answer) for source, answer in zip(sources, answers)]
             except StopIteration:
                 break
-        return Summary(sample, time.perf_counter() - started, sample.k < run.steps)
+        taken = time.perf_counter() - started
+    return [Summary(s, taken, s.k < run.steps) for s, (run, *_) in zip(latest, members)]

@@ -28,7 +28,9 @@ static Real largest_of(const Real change[], int count)
 #else
 #define COMPLEX 1
 #include <complex.h>
-#undef I /* a name like others */
+#undef I     /* a name like others */
+#undef creal /* musl's macros are casts to double, which will be another type */
+#undef cimag
 
 static const Real STEP = 1e-100;
 static const double _Complex UNIT = (double _Complex)_Complex_I;

@@ -156,12 +156,12 @@ fmi2Status fmi2SetBoolean(fmi2Component component, const fmi2ValueReference vr[]
     fmi2Status fmi2Get##Name(fmi2Component component, const fmi2ValueReference vr[], size_t count, \
                              fmi2##Name value[])                                                   \
     {                                                                                              \
-        return (fmi2Status)other_variables(component, GET_OTHER, vr, count, value);                \
+        return (fmi2Status)other_variables(component, GET_OTHER, vr, count, value, count);         \
     }                                                                                              \
     fmi2Status fmi2Set##Name(fmi2Component component, const fmi2ValueReference vr[], size_t count, \
                              const fmi2##Name value[])                                             \
     {                                                                                              \
-        return (fmi2Status)other_variables(component, SET_OTHER, vr, count, value);                \
+        return (fmi2Status)other_variables(component, SET_OTHER, vr, count, value, count);         \
     }
 OTHER_TYPE(Integer)
 OTHER_TYPE(String)

@@ -9,6 +9,7 @@
 #include "saved_state.c"
 #if FMI == 3
 #include "fmi3.c"
+#include "fmi3_unsupported.c"
 #else
 #include "fmi2.c"
 #endif

@@ -76,7 +76,7 @@ typedef enum {
     SIZE_OF_STATE, SERIALIZE, DESERIALIZE, ENTER_EVENT_MODE, NEW_DISCRETE_STATES,
     ENTER_CONTINUOUS_TIME_MODE, COMPLETED_INTEGRATOR_STEP, SET_TIME, SET_CONTINUOUS_STATES,
     GET_DERIVATIVES, GET_EVENT_INDICATORS, GET_CONTINUOUS_STATES, GET_NOMINALS,
-    GET_DIRECTIONAL_DERIVATIVE, GET_ADJOINT_DERIVATIVE, N_CALLS
+    GET_DIRECTIONAL_DERIVATIVE, GET_ADJOINT_DERIVATIVE, COUNT_STATES, N_CALLS
 } Call;
 
 /* A call's name, as messages say it, the phases in which it is allowed, and of which kind it is, where of one alone. */
@@ -188,7 +188,7 @@ INTERNAL Status set_booleans(void *component, const Reference vr[], size_t count
 
 /* Variables of a type that the FMU does not have: any reference is refused, none is fine. */
 INTERNAL Status other_variables(void *component, Call call, const Reference vr[], size_t count,
-                                const void *value);
+                                const void *value, size_t n_values);
 
 /* The change of the unknowns where the knowns, states and inputs, change by the seed. */
 INTERNAL Status directional_derivative(void *component, const Reference unknown[],

@@ -7,9 +7,9 @@
 
 static const double TIME_TOLERANCE = 1e-9;
 
-static int is_far(double a, double b)
+static int is_far(double point, double time)
 {
-    return !(fabs(a - b) <= TIME_TOLERANCE * fmax(1.0, fabs(a)));
+    return !(fabs(point - time) <= TIME_TOLERANCE * fmax(1.0, fabs(time)));
 }
 
 /* Say why a step cannot be done, and what would help. */

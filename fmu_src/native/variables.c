@@ -87,11 +87,11 @@ static void set(Instance *instance, Reference vr, double value)
 
 /* Variables after the derivatives of the states, that FMI 3.0 has: the event indicators and the time. */
 #if FMI == 3
-enum { END_OF_RATES = INDICATORS };
+enum { END_OF_RATES = EVENT_INDICATORS };
 static void update_others(State *state)
 {
     update_stops(state);
-    event_indicators(&state->plant, &state->stops, &state->plant.value[INDICATORS]);
+    event_indicators(&state->plant, &state->stops, &state->plant.value[EVENT_INDICATORS]);
     state->plant.value[TIME] = state->time;
 }
 #else
@@ -195,10 +195,10 @@ Status set_booleans(void *component, const Reference vr[], size_t count, const B
 }
 
 Status other_variables(void *component, Call call, const Reference vr[], size_t count,
-                       const void *value)
+                       const void *value, size_t n_values)
 {
     Instance *instance = enter(component, call);
-    return instance && known(instance, call, OTHER, vr, count, value, 0) ? OK : ERROR;
+    return instance && known(instance, call, OTHER, vr, count, value, n_values) ? OK : ERROR;
 }
 
 /* What of the computed variables derivatives of the unknowns by the knowns need; -1, which is logged,

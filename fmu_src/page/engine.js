@@ -1,9 +1,9 @@
 /**
- * The FMU's engine, compiled to WebAssembly: FMI 2.0 calls by value reference.
+ * The FMU's engine, compiled to WebAssembly: the functions of page.c, by value reference.
  *
  * @typedef {Object} Variable one of the FMU's
  * @property {string} name
- * @property {number} reference
+ * @property {number} reference of an element of a vector its own, in a row
  * @property {string} causality
  * @property {string} unit
  * @property {number | boolean | null} start
@@ -20,8 +20,7 @@ class Engine {
     this.calls = /** @type {Functions} */ (/** @type {unknown} */ (instance.exports));
     this.memory = /** @type {WebAssembly.Memory} */ (instance.exports.memory);
     this.calls._initialize();
-    this.component = this.calls.engine_instantiate();
-    if (!this.component) throw new Error(this.said());
+    this.call("engine_instantiate");
     this.room = 0;
     this.references = this.values = 0;
   }
@@ -38,13 +37,13 @@ class Engine {
   }
 
   /**
-   * Call a function of FMI; what is worse than a warning is thrown, in the FMU's own words.
+   * Call a function; what is worse than a warning is thrown, in the FMU's own words.
    * @param {string} name
    * @param {number[]} values
    */
   call(name, ...values) {
     this.calls.engine_forget();
-    if (this.calls[name](this.component, ...values) >= ERROR) throw new Error(this.said() || name);
+    if (this.calls[name](...values) >= ERROR) throw new Error(this.said() || name);
   }
 
   /** @param {number[]} references */
@@ -64,36 +63,32 @@ class Engine {
   setReal(references, values) {
     this.prepare(references);
     new Float64Array(this.memory.buffer, this.values, values.length).set(values);
-    this.call("fmi2SetReal", this.references, references.length, this.values);
+    this.call("engine_set_reals", this.references, references.length, this.values);
   }
 
   /**
-   * @param {number[]} references
-   * @param {boolean[]} values
+   * @param {number} reference
+   * @param {boolean} value
    */
-  setBoolean(references, values) {
-    this.prepare(references);
-    new Int32Array(this.memory.buffer, this.values, values.length).set(values.map(Number));
-    this.call("fmi2SetBoolean", this.references, references.length, this.values);
+  setBoolean(reference, value) {
+    this.call("engine_set_boolean", reference, Number(value));
   }
 
   /** @param {number[]} references */
   getReal(references) {
     this.prepare(references);
-    this.call("fmi2GetReal", this.references, references.length, this.values);
+    this.call("engine_get_reals", this.references, references.length, this.values);
     return new Float64Array(this.memory.buffer, this.values, references.length);
   }
 
   /** Back to the beginning, before initialisation. */
   reset() {
-    this.call("fmi2Reset");
+    this.call("engine_reset");
   }
 
   /** Go through initialisation, at time 0 and without an end. */
   initialise() {
-    this.call("fmi2SetupExperiment", 0, 0, 0, 0, 0);
-    this.call("fmi2EnterInitializationMode");
-    this.call("fmi2ExitInitializationMode");
+    this.call("engine_initialise");
   }
 
   /**
@@ -101,6 +96,6 @@ class Engine {
    * @param {number} h s
    */
   step(t, h) {
-    this.call("fmi2DoStep", t, h, 1);
+    this.call("engine_step", t, h);
   }
 }

@@ -115,11 +115,11 @@ class Session {
 
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
-    const references = (/** @type {[string, Value][]} */ chosen) => chosen.map(([name]) => this.variable(name).reference);
-    const real = pairs.filter(([, value]) => typeof value === "number");
-    const truth = pairs.filter(([, value]) => typeof value === "boolean");
-    if (real.length) this.engine.setReal(references(real), real.map(([, value]) => Number(value)));
-    if (truth.length) this.engine.setBoolean(references(truth), truth.map(([, value]) => Boolean(value)));
+    const reals = pairs.filter(([, value]) => typeof value === "number");
+    const references = reals.map(([name]) => this.variable(name).reference);
+    if (reals.length) this.engine.setReal(references, reals.map(([, value]) => Number(value)));
+    for (const [name, value] of pairs)
+      if (typeof value === "boolean") this.engine.setBoolean(this.variable(name).reference, value);
   }
 
   /**

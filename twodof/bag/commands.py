@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 
 from ..errors import BagError, InputError
 from ..experiments import NANOSECONDS, Changes, resolve
 from ..files import shown
 from ..fmu import Fmu, load_fmu
+from ..ros.cdr import Rows
 from ..ros.commands import CommandError, Commands
 from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES
+from .contents import read_messages
 from .provenance import KNOWN_UNTIL, read_provenance
 from .reader import whole_bag
-from .records import Allowance, DamageError, read_messages
+from .records import Allowance, DamageError
 
 MAX_COMMANDS = 1_000_000
 SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of what a robot did
@@ -49,12 +51,14 @@ def read_commands(fmu: Fmu | str | Path, path: str | Path, topic: str | None = N
         messages = chain.from_iterable(read_messages(file, allowance) for file in files)
         found: dict[str, list[tuple[int, str, bytes]]] = {}
         begins: dict[str, int] = {}
-        for channel, stamp, data in messages:
+        for channel, stamps, data in messages:
             if channel.type == JOINT_STATE:
-                begins[channel.topic] = min(stamp, begins.get(channel.topic, stamp))
+                first = int(stamps.min())
+                begins[channel.topic] = min(first, begins.get(channel.topic, first))
             wanted = channel.topic not in SAMPLES if topic is None else channel.topic == topic
             if channel.type in follows.types and wanted:
-                found.setdefault(channel.topic, []).append((stamp, channel.type, data))
+                told = zip(stamps.tolist(), repeat(channel.type), map(Rows.tobytes, data))
+                found.setdefault(channel.topic, []).extend(told)
     except (OSError, DamageError) as error:
         raise BagError(f"cannot read the bag '{path}': {error}") from error
     chosen = _only(found, path, topic, follows)

@@ -11,7 +11,8 @@ from ..errors import BagError
 from ..experiments import Changes, Experiment
 from ..files import read_file
 from ..version import versions
-from .records import DamageError, read_metadata
+from .mcap import read_metadata
+from .records import DamageError
 
 FILE = "run.json"
 FORMAT = 1

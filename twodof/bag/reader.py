@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,15 @@ import numpy as np
 
 from ..errors import BagError
 from ..files import is_being_written
-from ..ros.cdr import JointStateLayout, MixtureError, unpack_point
+from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, STORE, TARGET
+from .contents import read_messages, storage_files
+from .outline import Indices, Outline
 from .provenance import read_provenance
 from .recording import Array, Heard, Recording, Stamps, TopicCount
-from .records import Allowance, Channel, DamageError, read_messages, storage_files
+from .records import Allowance, DamageError
+from .summary import read_summary
 
-BATCH = 1024**2  # bytes of messages that are decoded at once
 MAX_JOINT_STATE = 1024**2  # bytes; some ten thousand joints
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -29,38 +33,59 @@ def read_bag(path: str | Path) -> Recording:
     Raises:
         BagError: it is no bag, is unfinished or damaged, or has no joint states.
     """
-    return _read(Path(path), _JointStates, _Targets())[0]
+    return _read(Path(path), _JointStates, _Targets())
 
 
-def read_ends(path: str | Path) -> tuple[Recording, int]:
-    """The first and the last joint state of a bag, and how many it has.
+def read_outline(
+    path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]
+) -> Recording:
+    """A bag as ``read_bag`` gives it, but of more than ``most`` samples fewer, for drawing.
+
+    Args:
+        path: the bag's folder.
+        most: samples that are in memory, besides those of a chunk of the bag.
+        lines: that are drawn over time beside positions and velocities, of a part of the bag.
+
+    Raises:
+        BagError: as ``read_bag``; and what ``lines`` raises.
+    """
+    return _read(Path(path), _JointStates, _Targets(), Outline(most, lines))
+
+
+def read_ends(path: str | Path) -> Recording:
+    """The first and the last joint state of a bag.
+
+    By the summaries of its files, where all have one that can be believed.
 
     Raises:
         BagError: as ``read_bag``.
     """
-    return _read(Path(path), _Ends, None)
+    path = Path(path)
+    with _refusing(path):
+        summaries = [read_summary(file) for file in whole_bag(path)]
+        if None in summaries:
+            return _read(path, _Ends, None)
+        counts: Counter[tuple[str, str]] = Counter()
+        for summary in filter(None, summaries):
+            for number, count in summary.counts.items():
+                channel = summary.channels[number]
+                counts[channel.topic, channel.type] += count
+        stating = [topic for topic, kind in counts if kind == JOINT_STATE]
+        if len(stating) > 1 and JOINT_STATES not in stating:  # that which begins first in the file
+            return _read(path, _Ends, None)
+        chosen = JOINT_STATES if JOINT_STATES in stating else "".join(stating)
+        ends, allowance = _Ends(path), Allowance()
+        for summary in filter(None, summaries):
+            for batch in summary.ends(chosen, allowance):
+                ends.add(batch.stamps, batch.messages)
+        return _recording(path, counts, chosen, ends, None)
 
 
-def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tuple[Recording, int]:
-    """What a kind of reader keeps of a bag's joint states, and how many there are."""
-    counts: Counter[Channel] = Counter()
-    chosen, states = "", kind(path)
-    allowance = Allowance()
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    """Name the bag in what is wrong with its files."""
     try:
-        for file in whole_bag(path):
-            for channel, stamp, data in read_messages(file, allowance):
-                counts[channel] += 1
-                if channel.type == JOINT_STATE:
-                    if channel.topic != chosen and (not chosen or channel.topic == JOINT_STATES):
-                        chosen, states = channel.topic, kind(path)
-                    if channel.topic == chosen:
-                        states.add(stamp, data)
-                elif (
-                    targets is not None
-                    and channel.topic == TARGET
-                    and channel.type in (POINT, POSE)
-                ):
-                    targets.add(stamp, data)
+        yield
     except OSError as error:
         raise BagError(f"cannot read the bag '{path}': {error.strerror}") from error
     except DamageError as error:
@@ -68,15 +93,55 @@ def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tup
             f"cannot read the bag '{path}': {error};"
             f" 'twodof recover {path}' saves what comes before"
         ) from error
-    topics: Counter[tuple[str, str]] = Counter()
-    for channel, count in counts.items():
-        topics[channel.topic, channel.type] += count
-    if not topics[chosen, JOINT_STATE]:
+
+
+def _read(
+    path: Path,
+    kind: type[_JointStates],
+    targets: _Targets | None,
+    outline: Outline | None = None,
+) -> Recording:
+    """What a kind of reader keeps of a bag's joint states, and of these an outline."""
+    counts: Counter[tuple[str, str]] = Counter()
+    chosen, states = "", kind(path)
+    allowance, thinned = Allowance(), False
+
+    def thin(outline: Outline) -> None:
+        states.keep(outline.choose(_recording(path, counts, chosen, states, targets)))
+
+    with _refusing(path):
+        for file in whole_bag(path):
+            for channel, stamps, messages in read_messages(file, allowance):
+                counts[channel.topic, channel.type] += len(stamps)
+                if channel.type == JOINT_STATE:
+                    if channel.topic != chosen and (not chosen or channel.topic == JOINT_STATES):
+                        chosen, states = channel.topic, kind(path)
+                    if channel.topic == chosen:
+                        states.add(stamps, messages)
+                        if outline is not None and len(states) > outline.most:
+                            thin(outline)
+                            thinned = True
+                elif targets and channel.topic == TARGET and channel.type in (POINT, POSE):
+                    targets.add(stamps, messages)
+    if outline is not None and thinned:
+        thin(outline)  # the end alike
+    return _recording(path, counts, chosen, states, targets)
+
+
+def _recording(
+    path: Path,
+    counts: Counter[tuple[str, str]],
+    chosen: str,
+    states: _JointStates,
+    targets: _Targets | None,
+) -> Recording:
+    if not counts[chosen, JOINT_STATE]:
         raise BagError(f"'{path}' has no joint states, no messages of type {JOINT_STATE}")
     stamps, q, v, tau = states.arrays()
     return Recording(
         path=path,
-        topics=tuple(TopicCount(*topic, count) for topic, count in sorted(topics.items())),
+        count=counts[chosen, JOINT_STATE],
+        topics=tuple(TopicCount(*topic, count) for topic, count in sorted(counts.items())),
         stamps=stamps,
         joints=states.names,
         q=q,
@@ -84,7 +149,7 @@ def _read(path: Path, kind: type[_JointStates], targets: _Targets | None) -> tup
         tau=tau,
         heard=targets.heard(stamps) if targets is not None else None,
         provenance=read_provenance(path),
-    ), topics[chosen, JOINT_STATE]
+    )
 
 
 def whole_bag(path: Path) -> list[Path]:
@@ -110,7 +175,7 @@ def whole_bag(path: Path) -> list[Path]:
 
 
 class _JointStates:
-    """The joint states of one topic, decoded in batches."""
+    """The joint states of one topic, decoded as they come."""
 
     def __init__(self, path: Path) -> None:
         self.names: tuple[str, ...] = ()
@@ -118,20 +183,25 @@ class _JointStates:
         self._layout: JointStateLayout | None = None
         self._stamps = array("q")
         self._numbers = [array("d") for _ in range(3)]
-        self._batch: list[bytes] = []
-        self._held = 0  # bytes in the batch
 
-    def add(self, stamp: int, data: bytes) -> None:
-        self._stamps.append(stamp)
-        self._batch.append(data)
-        self._held += len(data)
-        if self._held > BATCH:
-            self._decode()
+    def add(self, stamps: Stamps, messages: Rows) -> None:
+        """Take N joint states."""
+        numbers = self._decoded(messages)
+        self._stamps.frombytes(stamps.tobytes())
+        for stored, part in zip(self._numbers, numbers, strict=True):
+            stored.frombytes(part.tobytes())
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def keep(self, chosen: Indices) -> None:
+        """Drop all but some of those that ``arrays`` gives."""
+        stamps, *numbers = self.arrays()
+        self._stamps = array("q", stamps[chosen].tobytes())
+        self._numbers = [array("d", part[chosen].tobytes()) for part in numbers]
 
     def arrays(self) -> tuple[Stamps, Array, Array, Array]:
         """Stamps, positions, velocities, efforts by ascending stamps."""
-        if self._batch:
-            self._decode()
         stamps = np.asarray(self._stamps)
         q, v, effort = (np.asarray(n).reshape(len(stamps), -1) for n in self._numbers)
         if np.any(np.diff(stamps) < 0):
@@ -139,38 +209,44 @@ class _JointStates:
             stamps, q, v, effort = stamps[order], q[order], v[order], effort[order]
         return stamps, q, v, effort
 
-    def _decode(self) -> None:
-        batch, self._batch, self._held = self._batch, [], 0
-        largest = max(map(len, batch))
-        if largest > MAX_JOINT_STATE:
-            raise BagError(f"'{self._path}' has a joint state of {largest} bytes")
+    def _decoded(self, messages: Rows) -> list[Array]:
+        if messages.shape[1] > MAX_JOINT_STATE:
+            raise BagError(f"'{self._path}' has a joint state of {messages.shape[1]} bytes")
+        message = messages[0].tobytes()
         try:
             if self._layout is None:
-                first: Any = STORE.deserialize_cdr(batch[0], JOINT_STATE)
+                first: Any = STORE.deserialize_cdr(message, JOINT_STATE)
                 sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
                 self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
                 self.names = tuple(first.name)
-            numbers = self._layout.unpack(batch)
+            return self._layout.read(messages)
         except MixtureError as error:
             raise BagError(f"'{self._path}' has joint states of different {error}") from error
         except Exception as error:  # rosbags raises anything where a message is no JointState
-            packed = batch[0].startswith(ZSTD_MAGIC)
+            packed = message.startswith(ZSTD_MAGIC)
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
-        for stored, part in zip(self._numbers, numbers, strict=True):
-            stored.frombytes(part.tobytes())
 
 
 class _Ends(_JointStates):
     """The first and the last joint state of one topic."""
 
-    def add(self, stamp: int, data: bytes) -> None:
-        if not self._batch:
-            self._stamps, self._batch = array("q", (stamp, stamp)), [data, data]
-        elif stamp < self._stamps[0]:
-            self._stamps[0], self._batch[0] = stamp, data
-        elif stamp >= self._stamps[1]:
-            self._stamps[1], self._batch[1] = stamp, data
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._ends: list[tuple[int, Rows]] = []
+
+    def add(self, stamps: Stamps, messages: Rows) -> None:
+        """Take N joint states, of which one may be the first and one the last."""
+        first, last = int(np.argmin(stamps)), len(stamps) - 1 - int(np.argmax(stamps[::-1]))
+        some = [*self._ends, *((int(stamps[k]), messages[k : k + 1]) for k in (first, last))]
+        earliest = min(some, key=lambda end: end[0])
+        self._ends = [earliest, max(reversed(some), key=lambda end: end[0])]
+
+    def arrays(self) -> tuple[Stamps, Array, Array, Array]:
+        """Of these two."""
+        for stamp, message in self._ends:
+            super().add(np.array([stamp]), message)
+        return super().arrays()
 
 
 class _Targets:
@@ -181,17 +257,19 @@ class _Targets:
         self._sound = True
         self._stamps, self._points = array("q"), array("d")
 
-    def add(self, stamp: int, data: bytes) -> None:
-        """Take a PointStamped, or a PoseStamped, which begins alike."""
+    def add(self, stamps: Stamps, messages: Rows) -> None:
+        """Take PointStampeds, or PoseStampeds, which begin alike."""
         try:
-            frame, point = unpack_point(data)
-        except (IndexError, struct.error):
+            frame, points = unpack_points(messages)
+        except (MixtureError, IndexError, struct.error):
             self._sound = False
             return
         self._sound &= self._frame in (None, frame)
         self._frame = frame
-        self._stamps.append(stamp)
-        self._points.extend(point)
+        told = np.ones(len(stamps), bool)  # a point that is repeated says nothing new
+        told[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
+        self._stamps.frombytes(stamps[told].tobytes())
+        self._points.frombytes(points[told].tobytes())
 
     def heard(self, stamps: Stamps) -> Heard | None:
         """The latest by each of these stamps; None where there are none, or not of one frame."""

@@ -56,9 +56,12 @@ class Heard:
 class Recording:
     """A bag read back; N samples of n joints, m task axes.
 
+    All samples of the bag, or where it has many and is to be drawn, some of them.
+
     Attributes:
         path: the bag's folder.
         topics: all topics of the bag.
+        count: samples of the bag.
         stamps: time stamps of the joint states, ns since the epoch, N, ascending.
         joints: joint names.
         q, v: positions (rad, m) and velocities, N × n.
@@ -69,6 +72,7 @@ class Recording:
 
     path: Path
     topics: tuple[TopicCount, ...]
+    count: int
     stamps: Stamps
     joints: tuple[str, ...]
     q: Array
@@ -79,7 +83,7 @@ class Recording:
 
     def __repr__(self) -> str:
         return (
-            f"<Recording '{self.path}': {len(self.stamps)} samples in {self.t[-1]:g} s"
+            f"<Recording '{self.path}': {self.count} samples in {self.t[-1]:g} s"
             f" of {', '.join(self.joints)}>"
         )
 
@@ -113,13 +117,13 @@ class Recording:
             BagError: the bag has no provenance, or one that does not fit the samples.
         """
         step = self.provenance.get("step", 0.0)
-        least = self.t[-1] / (MOST_LOST * len(self.t))
+        least = self.t[-1] / (MOST_LOST * max(self.count, len(self.t)))
         if not (0.0 < step < inf and least <= step):
             raise BagError(f"the run.json in '{self.path}' does not fit its samples")
         steps: NDArray[np.int64] = np.rint(self.t / step).astype(np.int64)
         return steps
 
-    @property
+    @cached_property
     def target(self) -> Array:
         """Target position in effect up to each sample, along the task axes, m, N × m.
 

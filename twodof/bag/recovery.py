@@ -21,7 +21,8 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from ..errors import BagError
 from ..files import lock, read_file, sync
 from . import provenance
-from .records import Allowance, Channel, DamageError, read_messages, storage_files
+from .contents import read_messages, storage_files
+from .records import Allowance, Channel, DamageError
 from .storage import KINDS, MAX_METADATA, BagWriter, check_path
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
@@ -117,7 +118,8 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
         counts: Counter[str] = Counter()
         allowance = Allowance()
         for file in files:
-            counts.update(channel.topic for channel, _, _ in read_messages(file, allowance))
+            for channel, stamps, _ in read_messages(file, allowance):
+                counts[channel.topic] += len(stamps)
     except (OSError, DamageError):
         return None
     stated = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
@@ -138,11 +140,13 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
         topics = _Topics(writer)
         for file in files:
             try:
-                for channel, stamp, data in read_messages(file, allowance):
+                for channel, stamps, messages in read_messages(file, allowance):
                     if channel.serialization != "cdr":
                         others.add(channel.topic)
                         continue
-                    writer.write(topics.connection(channel), stamp, data)
+                    connection = topics.connection(channel)
+                    for stamp, message in zip(stamps.tolist(), messages):
+                        writer.write(connection, stamp, message.tobytes())
             except DamageError as error:
                 damage.append(str(error))
     if others:

@@ -9,10 +9,15 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+import struct
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal
+from zlib import crc32
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionMode
@@ -20,6 +25,10 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from ..errors import BagError
+from ..ros.cdr import Rows
+from .mcap import HEAD, MAGIC, MESSAGE
+
+Stamps = NDArray[np.int64]
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 MAX_METADATA = 64 * 1024**2  # bytes
@@ -29,12 +38,42 @@ REMOVED = "it was removed while it was being written"
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
 OVERHEAD = 64  # bytes that a message takes beside its data until it is flushed
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
+RECORD = np.dtype(
+    [
+        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
+        ("times", "<u8", 2),
+    ]
+)  # fmt: skip
+"""What MCAP has before the data of a message."""
+CHECKSUM = struct.Struct("<I8s")  # of the summary, and the magic: the end of a file
+FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # place of the summary, of its offsets; and these
 
 
 class McapStorage(McapWriter):
     """MCAP whose chunks are cut at each flush."""
 
     _end = 0  # of the last chunk that got through
+
+    def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
+        """Write messages, of each connection one by each of N stamps."""
+        if not messages:
+            return
+        parts, ends, chunk = [], [0], self.chunk
+        for connection, rows in messages.items():
+            head = np.zeros(len(stamps), RECORD)
+            head["opcode"], head["length"] = MESSAGE, RECORD.itemsize - HEAD.size + rows.shape[1]
+            head["channel"], head["times"] = connection, stamps[:, None]
+            parts += [head.view(np.uint8).reshape(-1, RECORD.itemsize), rows]
+            ends.append(ends[-1] + RECORD.itemsize + rows.shape[1])
+            self.channel_stats[connection] += len(stamps)
+        begin, times = chunk.bio.tell(), stamps.tolist()
+        for connection, offset in zip(messages, ends):
+            places = range(begin + offset, begin + ends[-1] * len(times), ends[-1])
+            chunk.msgs[connection] += zip(times, places)
+        chunk.bio.write(np.hstack(parts).tobytes())
+        for of in (self, chunk):
+            of.message_start_time = min(of.message_start_time, min(times))
+            of.message_end_time = max(of.message_end_time, max(times))
 
     def close_chunk(self) -> None:
         """Write the pending chunk and its index."""
@@ -48,6 +87,17 @@ class McapStorage(McapWriter):
         self.bio.flush()
         if sync:
             os.fsync(self.bio.fileno())
+
+    def close(self, version: int, metadata: str) -> None:
+        """Write the summary, and its checksum, which rosbags leaves out."""
+        super().close(version, metadata)
+        with self.path.open("r+b") as file:
+            file.seek(-FOOTER.size, os.SEEK_END)
+            start, *_ = FOOTER.unpack(file.read())
+            file.seek(start)
+            checksum = crc32(file.read()[: -CHECKSUM.size])
+            file.seek(-CHECKSUM.size, os.SEEK_END)
+            file.write(CHECKSUM.pack(checksum, MAGIC))
 
     def salvage(self) -> None:
         """After a failed flush: bring the file into a state from which the next can go on."""
@@ -71,6 +121,12 @@ class Sqlite3Storage(Sqlite3Writer):
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
         """Keep a message until the next flush."""
         self._rows.append((connection.id, timestamp, data))
+
+    def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
+        """Keep messages until the next flush, of each connection one by each of N stamps."""
+        parts = [(number, rows.tobytes(), rows.shape[1]) for number, rows in messages.items()]
+        for k, stamp in enumerate(stamps.tolist()):
+            self._rows += [(n, stamp, data[k * size : (k + 1) * size]) for n, data, size in parts]
 
     def flush(self, sync: bool) -> None:
         """Hand all messages to the operating system, and with ``sync`` to the disk."""
@@ -124,6 +180,15 @@ class BagWriter(Writer):
         self._pending += OVERHEAD + len(data)
         if self._pending > BATCH_SIZE:
             self.flush()
+
+    def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
+        """Write messages, of each connection one by each of N stamps; they wait for a flush."""
+        assert self.storage is not None
+        self.storage.write_all(stamps, messages)
+        for connection in messages:
+            self.counts[connection] += len(stamps)
+        self.min_timestamp = min(self.min_timestamp, int(stamps.min()))
+        self.max_timestamp = max(self.max_timestamp, int(stamps.max()))
 
     def flush(self) -> None:
         """Hand all messages to the operating system.

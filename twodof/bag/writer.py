@@ -8,27 +8,29 @@ import shutil
 import sqlite3
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
 
-from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
 
 from ..errors import BagError
 from ..experiments import Experiment, Value
 from ..files import lock, read_file, sync
-from ..master import Sample, Sink
-from ..ros.messages import JOINT_STATES, STORE, Messages, Serialised
+from ..ros.cdr import Rows
+from ..ros.messages import JOINT_STATES, STORE, Messages
+from ..sample import Sample, Sink
 from .provenance import KEY, ProvenanceFile, read_provenance
 from .storage import (
     BATCH_SIZE,
     MAX_METADATA,
+    OVERHEAD,
     REMOVED,
     STORAGES,
     BagWriter,
+    Stamps,
     check_path,
 )
 
@@ -44,9 +46,9 @@ class Bag(Sink):
     Left in whatever way, the bag is closed and readable with every sample written so far; while
     the run goes on, what is older than a second survives the death of the process.
 
-    Messages are serialised where ``write`` is called, and stored by a thread of the bag's own:
-    Ctrl-C, which Python raises in the main thread, so never comes between the bytes of a message,
-    and what is written reaches the disk also while the FMU takes its time for a step.
+    Samples are serialised, many at a time, and stored by a thread of the bag's own: Ctrl-C, which
+    Python raises in the main thread, so never comes between the bytes of a message, and what is
+    written reaches the disk also while the FMU takes its time for a step.
 
     Args:
         path: folder of the bag; must not exist, unless ``overwrite`` and it is a bag.
@@ -100,6 +102,7 @@ class Bag(Sink):
         self._run = run
         self._inputs = run.start_values
         self._messages = Messages(run, scene=self._scene, effort=self._effort)
+        self._most = BATCH_SIZE // (self._messages.size + OVERHEAD * len(self._messages.topics))
         return self
 
     def __enter__(self) -> Bag:
@@ -113,9 +116,9 @@ class Bag(Sink):
             raise BagError(f"cannot write the bag '{self.path}': {error}") from error
         except (OSError, sqlite3.Error) as error:
             raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
-        self._queue: deque[tuple[Connection, int, Serialised]] = deque()
+        self._queue: deque[bytes] = deque()  # numbers of samples
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
-        self._given = self._taken = 0  # bytes, counted by one thread each
+        self._taken = 0  # samples, counted by the thread
         self._due: SimpleQueue[None] = SimpleQueue()
         self._stores = 0
         self._closing = self._closed = self._ended = False
@@ -128,11 +131,11 @@ class Bag(Sink):
         if self._failure is not None:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
-        self._note(sample)
-        if first := not self._given:
-            self._give(self._messages.latched(sample.stamp), sample.stamp)
-        self._give(self._messages.of(sample), sample.stamp)
-        if first or self._given - self._taken > BATCH_SIZE:
+        if sample.inputs is not self._inputs:
+            self._note(sample)
+        self._queue.append(self._messages.numbers(sample))
+        self.count += 1
+        if self.count == 1 or self.count - self._taken > self._most:
             self._flush()
 
     def _flush(self) -> None:
@@ -152,12 +155,10 @@ class Bag(Sink):
 
     def _note(self, sample: Sample) -> None:
         """Queue what changed of the inputs since the sample before."""
-        if sample.inputs is not self._inputs:
-            changed = {n: v for n, v in sample.inputs.items() if v != self._inputs.get(n)}
-            if changed:
-                self._changes.append((sample.since, changed))
+        changed = {n: v for n, v in sample.inputs.items() if v != self._inputs.get(n)}
+        if changed:
+            self._changes.append((sample.since, changed))
         self._inputs = sample.inputs
-        self.count += 1
 
     def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
         self._closing = True
@@ -179,7 +180,7 @@ class Bag(Sink):
             self._connections = {
                 name: self._writer.add_connection(
                     name, topic.type, typestore=STORE, offered_qos_profiles=[topic.qos]
-                )
+                ).id
                 for name, topic in self._messages.topics.items()
             }
             self._writer.flush()
@@ -194,12 +195,6 @@ class Bag(Sink):
             with suppress(OSError):
                 os.close(self._lock)
             raise
-
-    def _give(self, messages: Iterable[tuple[str, Serialised]], stamp: int) -> None:
-        """Queue messages for the thread."""
-        for topic, data in messages:
-            self._queue.append((self._connections[topic], stamp, data))
-            self._given += len(data)
 
     def _keep_storing(self) -> None:
         """The thread: stores what is queued twice a second, and when asked to; then closes."""
@@ -224,17 +219,26 @@ class Bag(Sink):
 
     def _store(self) -> None:
         """Changes of inputs before the messages that show what they did."""
-        count, changes = len(self._queue), list(self._changes)
+        samples, changes = list(self._queue), list(self._changes)
         self._provenance.add(changes)
         for _ in changes:
             self._changes.popleft()
         if self._fsync and changes:
             sync(self._provenance.path)
-        for _ in range(count):
-            connection, stamp, data = self._queue.popleft()
-            self._writer.write(connection, stamp, data)
-            self._taken += len(data)
+        if samples:
+            stamps, messages = self._messages.of_all(b"".join(samples))
+            if not self._taken:
+                self._give(stamps[:1], self._messages.latched(stamps[0]))
+            self._give(stamps, messages)
+            for _ in samples:
+                self._queue.popleft()
+            self._taken += len(samples)
         self._writer.flush()
+
+    def _give(self, stamps: Stamps, messages: Mapping[str, Rows]) -> None:
+        """Hand messages to the writer, of each topic one by each stamp."""
+        rows = {self._connections[topic]: rows for topic, rows in messages.items()}
+        self._writer.write_all(stamps, rows)
 
     def _close(self) -> None:
         """Close the bag; after a failure give up the reserve and store what is still there."""
@@ -262,7 +266,7 @@ class Bag(Sink):
         reason = REMOVED if gone else _reason(failure)
         reason = f"cannot go on writing the bag '{self.path}': {reason}"
         if self._closed:
-            kept = self._writer.counts[self._connections[JOINT_STATES].id]
+            kept = self._writer.counts[self._connections[JOINT_STATES]]
             return BagError(f"{reason}; it is closed with its first {kept} samples")
         if not gone:
             return BagError(f"{reason}; then make it whole with 'twodof recover {self.path}'")

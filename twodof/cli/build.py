@@ -62,7 +62,12 @@ def add(verbs: Any) -> None:
     )  # fmt: skip
     build.add_argument(
         "--platform", dest="platforms", action="append", default=[], metavar="P",
-        help="of a native FMU: linux64, win64, darwin64 or all; repeatable (this machine's)",
+        help="of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
+        " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
+    )  # fmt: skip
+    build.add_argument(
+        "--fmi", type=int, choices=(2, 3),
+        help="version of a native FMU (2; 3 on machines that 2 has no name for)",
     )  # fmt: skip
     build.set_defaults(call=call)
 
@@ -73,7 +78,8 @@ def call(options: argparse.Namespace) -> int:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
     if options.orientation and options.control != "task":
         raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
-    from ..export.package import FmuOptions, build_fmu
+    from ..export.options import FmuOptions
+    from ..export.package import build_fmu
 
     gravity = None if options.gravity is None else tuple(options.gravity)
     chosen = FmuOptions(
@@ -89,8 +95,9 @@ def call(options: argparse.Namespace) -> int:
         name=options.name,
         link_environment=options.link_environment,
         native=options.native,
+        fmi=options.fmi,
         live_documentation=not options.no_live_documentation,
-        platforms=_platforms(options.platforms),
+        platforms=_platforms(options.platforms, options.fmi or 2),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # other platforms take minutes
     path = build_fmu(options.output, chosen)
@@ -117,7 +124,7 @@ def _locks(texts: Sequence[str]) -> dict[str, float]:
     return locks
 
 
-def _platforms(chosen: Sequence[str]) -> tuple[str, ...]:
-    from ..export.compiler import TARGETS
+def _platforms(chosen: Sequence[str], fmi: int) -> tuple[str, ...]:
+    from ..export.compiler import PLATFORMS
 
-    return tuple(TARGETS) if "all" in chosen else tuple(dict.fromkeys(chosen))
+    return PLATFORMS[fmi] if "all" in chosen else tuple(dict.fromkeys(chosen))

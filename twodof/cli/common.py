@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ..bag.writer import Bag
     from ..experiments import Experiment, Setting
     from ..fmu import Fmu
-    from ..master import RealTime, Summary
+    from ..master import Summary
+    from ..pace import RealTime
 
 INTERRUPTED = 130
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM")
@@ -142,7 +143,8 @@ def fast_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else the default arm's, native where it can be built."""
     if options.fmu:
         return Path(options.fmu)
-    from ..export.package import FmuOptions, build_fmu
+    from ..export.options import FmuOptions
+    from ..export.package import build_fmu
 
     try:
         return build_fmu(None, FmuOptions(native=True))
@@ -160,7 +162,8 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
             )
         return Path(options.fmu)
     from ..export.compiler import host_platform
-    from ..export.package import FmuOptions, build_fmu
+    from ..export.options import FmuOptions
+    from ..export.package import build_fmu
 
     native = options.native or host_platform() != "linux64"
     robot = Path(options.fmu) if options.fmu else None
@@ -168,10 +171,32 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
         print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
     if robot is None:
         return build_fmu(None, FmuOptions(native=native))
-    stem = robot.name.removesuffix(".xacro").removesuffix(".urdf")
+    return build_fmu(None, FmuOptions(urdf=robot, name=identifier(robot), native=native))
+
+
+def identifier(robot: Path) -> str:
+    """A robot's name for a program, from that of its file."""
+    stem = robot.name.removesuffix(".xacro").removesuffix(".urdf").removesuffix(".fmu")
     name = re.sub(r"\W", "_", stem, flags=re.ASCII)
-    name = name if name.isidentifier() else f"robot_{name}"
-    return build_fmu(None, FmuOptions(urdf=robot, name=name, native=native))
+    return name if name.isidentifier() else f"robot_{name}"
+
+
+def facts_of(
+    run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None
+) -> dict[str, Any]:
+    """How a run went, for another program."""
+    last = summary.last
+    return dict(
+        fmu=str(run.fmu.path),
+        bag=None if bag is None else str(bag.path),
+        joint_states=last.k + 1,
+        end_time=last.t,
+        stopped=summary.stopped,
+        q=last.q, v=last.v, x=last.x, x_des=last.target, error=summary.error,
+        wall_time=summary.wall_time,
+        missed=None if pace is None else pace.missed,
+        worst=None if pace is None else pace.worst,
+    )  # fmt: skip
 
 
 def print_summary(
@@ -185,17 +210,7 @@ def print_summary(
     last = summary.last
     simulated = last.k * run.step
     if options.json:
-        print_json(
-            fmu=str(run.fmu.path),
-            bag=None if bag is None else str(bag.path),
-            joint_states=last.k + 1,
-            end_time=last.t,
-            stopped=summary.stopped,
-            q=last.q, v=last.v, x=last.x, x_des=last.target, error=summary.error,
-            wall_time=summary.wall_time,
-            missed=None if pace is None else pace.missed,
-            worst=None if pace is None else pace.worst,
-        )  # fmt: skip
+        print_json(**facts_of(run, bag, summary, pace))
         return
     rows = [("FMU", f"{run.fmu.path}")]
     for name, value in parse_settings(options.settings).items():

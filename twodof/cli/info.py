@@ -36,7 +36,7 @@ def call(options: argparse.Namespace) -> int:
     elif path.is_dir():
         from ..bag.reader import read_ends
 
-        (_print_bag_json if options.json else _print_bag)(*read_ends(path))
+        (_print_bag_json if options.json else _print_bag)(read_ends(path))
     elif path.suffix in (".mcap", ".db3", ".parquet") and path.is_file():
         what = "sweep" if path.suffix == ".parquet" else "bag"
         raise InputError(f"'{path}' is a {what}'s file; give the {what}'s folder, '{path.parent}'")
@@ -70,12 +70,12 @@ def _print_fmu_json(fmu: Fmu) -> None:
     )  # fmt: skip
 
 
-def _print_bag_json(bag: Recording, count: int) -> None:
+def _print_bag_json(bag: Recording) -> None:
     print_json(
         kind="bag",
         path=str(bag.path),
         joints=bag.joints,
-        joint_states=count,
+        joint_states=bag.count,
         first_stamp=int(bag.stamps[0]),
         last_stamp=int(bag.stamps[-1]),
         q=[bag.q[0].tolist(), bag.q[-1].tolist()],
@@ -127,7 +127,11 @@ def _print_fmu(fmu: Fmu) -> None:
         if getattr(simulation, name)
     ]
     print_table(
-        ("FMU", f"{fmu.path} ({fmu.name}, {fmu.description.generationTool})"),
+        (
+            "FMU",
+            f"{fmu.path} ({', '.join(filter(None, (fmu.name, fmu.description.generationTool)))})",
+        ),
+        ("FMI", fmu.description.fmiVersion),
         ("digest", fmu.guid),
         ("platforms", ", ".join(fmu.platforms) or "none"),
         ("capabilities", ", ".join(capabilities)),
@@ -158,13 +162,13 @@ def _start(text: str) -> str:
     return "none" if abs(value) > 1e300 else f"{value:g}"
 
 
-def _print_bag(run: Recording, count: int) -> None:
+def _print_bag(run: Recording) -> None:
     duration = float(run.t[-1])
-    rate = (count - 1) / duration if duration else 0.0
+    rate = (run.count - 1) / duration if duration else 0.0
     rows = [
         ("bag", str(run.path)),
         ("joints", ", ".join(run.joints)),
-        ("duration", f"{duration:g} s, {count} joint states, {rate:g} Hz"),
+        ("duration", f"{duration:g} s, {run.count} joint states, {rate:g} Hz"),
         ("first stamp", f"{run.stamps[0] / 1e9:.9f} s"),
         ("first state", _state(run, 0)),
         ("last state", _state(run, -1)),

@@ -6,10 +6,7 @@ import argparse
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Of a run that may leave a bag."""
-    parser.add_argument(
-        "fmu", nargs="?", metavar="FMU|URDF", help="default: TwoDof.fmu, built if need be"
-    )
+    """Of a run that may leave a bag, but for what is run."""
     parser.add_argument(
         "--native", action="store_true", help="build and run the native default FMU instead"
     )
@@ -31,6 +28,13 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     add_json_option(parser)
     parser.add_argument(
         "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
+    )
+
+
+def add_fmu(parser: argparse.ArgumentParser) -> None:
+    """What is run."""
+    parser.add_argument(
+        "fmu", nargs="?", metavar="FMU|URDF", help="default: TwoDof.fmu, built if need be"
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .common import (
@@ -13,7 +14,10 @@ from .common import (
     asked_to_stop,
     bag_of,
     experiment_of,
+    facts_of,
+    identifier,
     in_options,
+    print_json,
     print_next,
     print_summary,
     print_table,
@@ -22,6 +26,7 @@ from .common import (
 from .options import add_run_options
 
 if TYPE_CHECKING:
+    from ..experiments import Experiment
     from ..ros.foxglove import Foxglove
     from ..ros.publisher import Publisher
 
@@ -36,7 +41,14 @@ def add(verbs: Any) -> None:
         " ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and"
         " CYCLONEDDS_URI.",
     )  # fmt: skip
-    publish.add_argument("-o", dest="output", metavar="BAG", help="record a bag too")
+    publish.add_argument(
+        "robots", nargs="*", metavar="[NAME=]FMU|URDF",
+        help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME"
+        " or its file's",
+    )  # fmt: skip
+    publish.add_argument(
+        "-o", dest="output", metavar="BAG", help="record a bag too; of several, BAG_NAME of each"
+    )
     publish.add_argument("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
     publish.add_argument(
         "--rate", type=float, default=100.0, metavar="HZ", help="steps a second (%(default)g)"
@@ -86,36 +98,69 @@ def _add_loop_options(publish: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
-    from ..master import RealTime
+    from ..pace import RealTime
     from ..ros.network import network
-    from ..ros.publisher import Publisher, publish
+    from ..ros.publisher import Publisher, publish, publish_together
 
     if not 0.0 < options.rate < math.inf:
         raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")
     if options.output is None and (options.overwrite or options.fsync):
         raise CommandLineError("--overwrite and --fsync are for a bag; name it with -o")
-    place = network(subnet=options.subnet)
-    endless = options.stop_time is None
-    run = experiment_of(options, math.inf if endless else options.stop_time, 1.0 / options.rate)
-    bag = bag_of(options, options.output) if options.output else None
-    wire = Publisher(
-        place, scene=options.scene, effort=options.effort, clock=options.clock,
-        namespace=options.namespace, state_topic=options.state_topic,
+    robots = _robots(options)
+    bags = {
+        name: bag_of(options, f"{options.output}_{name}" if name else options.output)
+        for name in robots if options.output
+    }  # fmt: skip
+    wire: dict[str, Any] = dict(
+        place=network(subnet=options.subnet), scene=options.scene, effort=options.effort,
+        clock=options.clock, namespace=options.namespace, state_topic=options.state_topic,
         command_topic=options.command_topic, lockstep=options.lockstep, timeout=options.timeout,
-        on_timeout=options.on_timeout, opened=_print_network,
+        on_timeout=options.on_timeout,
+        opened=_print_network if not options.json else lambda wire: None,
     )  # fmt: skip
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
-    viewer = _foxglove(options) if options.foxglove else None
     with asked_to_stop() as asked:
-        summary = publish(
-            run, *filter(None, [viewer, bag]), wire=wire, pace=pace, stop=asked,
-            steer=viewer.command if viewer else dict,
-        )  # fmt: skip
-    print_summary(options, run, bag, summary, pace)
-    if bag is not None and not options.json:
-        print_next(f"twodof plot {quote(bag.path)}", f"ros2 bag play {quote(bag.path)}")
-    return INTERRUPTED if summary.stopped else 0
+        if "" in robots:
+            viewer = _foxglove(options) if options.foxglove else None
+            summary = publish(
+                robots[""], *filter(None, [viewer, *bags.values()]), wire=Publisher(**wire),
+                pace=pace, stop=asked, steer=viewer.command if viewer else dict,
+            )  # fmt: skip
+            summaries = {"": summary}
+        else:
+            sinks = {name: [bag] for name, bag in bags.items()}
+            summaries = publish_together(robots, sinks=sinks, pace=pace, stop=asked, **wire)
+    if options.json:
+        facts = {
+            name: facts_of(robots[name], bags.get(name), summary, pace)
+            for name, summary in summaries.items()
+        }
+        print_json(**facts.get("", facts))
+    else:
+        for name, summary in summaries.items():
+            print_summary(options, robots[name], bags.get(name), summary, pace)
+    if bags and not options.json:
+        paths = [quote(bag.path) for bag in bags.values()]
+        print_next(f"twodof plot {' '.join(paths)}", f"ros2 bag play {paths[0]}")
+    return INTERRUPTED if any(summary.stopped for summary in summaries.values()) else 0
+
+
+def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
+    """What is to be run, by namespace; what is alone needs none."""
+    robots: dict[str, Experiment] = {}
+    stop_time = math.inf if options.stop_time is None else options.stop_time
+    for given in options.robots or [""]:
+        name, equals, options.fmu = given.partition("=")
+        if not equals or Path(given).exists():
+            options.fmu = given
+            name = identifier(Path(given)) if len(options.robots) > 1 else ""
+        if name in robots:
+            raise CommandLineError(f"two robots are '{name}'; call them NAME={options.fmu}")
+        robots[name] = experiment_of(options, stop_time, 1.0 / options.rate)
+    if options.foxglove and "" not in robots:
+        raise CommandLineError("--foxglove serves one robot")
+    return robots
 
 
 def _foxglove(options: argparse.Namespace) -> Foxglove:

@@ -18,11 +18,11 @@ from .common import (
     print_summary,
     quote,
 )
-from .options import add_run_options, add_time_options
+from .options import add_fmu, add_run_options, add_time_options
 
 if TYPE_CHECKING:
     from ..experiments import Experiment
-    from ..master import Sample, Sink
+    from ..sample import Sample, Sink
 
 
 def add(verbs: Any) -> None:
@@ -34,13 +34,15 @@ def add(verbs: Any) -> None:
     run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
     add_time_options(run)
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
+    add_fmu(run)
     add_run_options(run)
     run.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
-    from ..master import RealTime, simulate
+    from ..master import simulate
+    from ..pace import RealTime
 
     if options.stop_time == math.inf:
         raise CommandLineError(
@@ -67,7 +69,7 @@ def progress() -> list[Sink]:
         return []
     from tqdm import tqdm
 
-    from ..master import Sink
+    from ..sample import Sink
 
     class Progress(Sink):
         def begin(self, run: Experiment) -> Progress:

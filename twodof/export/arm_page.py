@@ -32,11 +32,11 @@ SCRIPTS = (
 )  # fmt: skip
 """In the order in which they are read."""
 FUNCTIONS = (
-    "engine_instantiate", "engine_message", "engine_forget", "engine_allocate",
-    "fmi2SetupExperiment", "fmi2EnterInitializationMode", "fmi2ExitInitializationMode",
-    "fmi2Reset", "fmi2SetReal", "fmi2GetReal", "fmi2SetBoolean", "fmi2DoStep",
+    "engine_instantiate", "engine_message", "engine_forget", "engine_allocate", "engine_reset",
+    "engine_initialise", "engine_set_reals", "engine_set_boolean", "engine_get_reals",
+    "engine_step",
 )  # fmt: skip
-"""Of FMI and of page.c, which the page calls."""
+"""Of page.c, which the page calls."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
 POLICY = (
     "default-src 'none'; script-src 'sha256-{script}' 'wasm-unsafe-eval';"
@@ -53,8 +53,8 @@ class Arm:
     Attributes:
         name, guid, file: of the FMU.
         robot: name of the robot; frame, root, axes, control, joints as in ``Fmu``.
-        variables: one for each of the FMU's: name, value reference, causality, unit, start and
-            description.
+        variables: one for each of the FMU's, elements of vectors by themselves: name, value
+            reference, causality, unit, start and description.
         step: communication step, s.
         urdf: text of resources/robot.urdf.
         read: gives its meshes.
@@ -135,7 +135,7 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
     """What the page knows of its FMU, and the content of its meshes."""
     urdf = read_urdf(arm.urdf)
     shapes, _ = link_shapes(urdf, arm.read)
-    ball = Shape("", Placement(np.zeros(3), Rotation.identity()), (0, 0, 0), *sphere(1.0))
+    ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
     packed = [_mesh(shape) for shape in [ball, *shapes]]
     links, number = _links(urdf, arm.joints)
     facts = {
@@ -177,12 +177,11 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
         waiting.remove(joint)
         number[joint.child] = len(links)
         column, ratio, offset = kinematics.column(joint)
+        turn = Rotation.from_euler("xyz", joint.rpy).as_matrix()
         links.append(
             {
                 "parent": number[joint.parent],
-                "place": _matrix(
-                    Placement(np.array(joint.xyz), Rotation.from_euler("xyz", joint.rpy))
-                ),
+                "place": _matrix(Placement(np.array(joint.xyz), turn)),
                 "axis": joint.axis,
                 "prismatic": joint.prismatic,
                 "column": -1 if column is None else column,
@@ -196,7 +195,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
 def _matrix(place: Placement) -> list[float]:
     """4 × 4, by columns, as WebGL has it."""
     matrix = np.eye(4)
-    matrix[:3, :3] = place.rotation.as_matrix()
+    matrix[:3, :3] = place.rotation
     matrix[:3, 3] = place.translation
     values: list[float] = matrix.T.reshape(-1).tolist()
     return values

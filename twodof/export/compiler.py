@@ -19,12 +19,23 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "linux64": ("x86_64-linux-gnu.2.17",),
     "win64": ("x86_64-windows-gnu",),
     "darwin64": ("x86_64-macos.11.0", "aarch64-macos.11.0"),
+    "x86_64-linux": ("x86_64-linux-gnu.2.17",),
+    "aarch64-linux": ("aarch64-linux-gnu.2.17",),
+    "x86_64-windows": ("x86_64-windows-gnu",),
+    "x86_64-darwin": ("x86_64-macos.11.0",),
+    "aarch64-darwin": ("aarch64-macos.11.0",),
 }
 """zig's targets by FMI platform; several are joined into one universal library."""
+PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name),
+             3: tuple(name for name in TARGETS if "-" in name)}  # fmt: skip
+"""By version of FMI."""
 ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
 UNITS = ("directional.c", "fmu.c")
 """The C files that are compiled; they include the others."""
-EXTENSIONS = {"linux64": ".so", "win64": ".dll", "darwin64": ".dylib"}
+EXTENSIONS = {
+    name: ".dylib" if "macos" in zig[0] else ".dll" if "windows" in zig[0] else ".so"
+    for name, zig in TARGETS.items()
+}
 FLAGS = (
     "-std=c99", "-O2", "-ffp-contract=off", "-fcx-limited-range", "-fno-math-errno",
     "-fno-tree-slp-vectorize", "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic",
@@ -63,7 +74,7 @@ def compile_library(
         output = name + EXTENSIONS[platform]
         built = []
         for compiler in _compilers(platform):
-            _run([*compiler, *FLAGS, *flags, *_link_flags(platform, output), *units], folder)
+            _run([*compiler, *FLAGS, *flags, *_link_flags(output), *units], folder)
             built.append((folder / output).read_bytes())
     return built[0] if len(built) == 1 else universal(built)
 
@@ -96,9 +107,14 @@ def compiles_for_the_web() -> bool:
     return importlib.util.find_spec("ziglang") is not None
 
 
-def host_platform() -> str:
-    """FMI platform of this machine; "" where the native flavour knows none."""
-    if host.machine().lower() in ("x86_64", "amd64") or sys.platform == "darwin":
+def host_platform(fmi: int = 2) -> str:
+    """FMI platform of this machine, in a version's words; "" where there is no name for it."""
+    machine = host.machine().lower()
+    architecture = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
+    if fmi == 3:
+        name = f"{architecture}-{'windows' if sys.platform == 'win32' else sys.platform}"
+        return name if name in TARGETS else ""
+    if architecture == "x86_64" or sys.platform == "darwin":
         return {"linux": "linux64", "win32": "win64", "darwin": "darwin64"}.get(sys.platform, "")
     return ""
 
@@ -126,11 +142,13 @@ def _compilers(platform: str) -> list[list[str]]:
     if compiles_for_the_web():  # zig, which compiles for everything
         return [[*ZIG, target] for target in TARGETS[platform]]
     own = next((cc for cc in ("cc", "gcc", "clang") if shutil.which(cc)), None)
-    if platform == host_platform() and own:
+    here = [name for name in (host_platform(2), host_platform(3)) if name]
+    if platform in here and own:
         architectures = ["-arch", "x86_64", "-arch", "arm64"] if platform == "darwin64" else []
         return [[own, *architectures]]
-    missing = f"this machine's own compiler builds for {host_platform() or 'no FMI platform'} only"
-    if platform == host_platform():
+    there = " or ".join(here) or "no FMI platform"
+    missing = f"this machine's own compiler builds for {there} only"
+    if platform in here:
         missing = "this machine has no C compiler"
     raise BuildError(
         f"cannot compile for {platform}: {missing}; install the package 'ziglang'"
@@ -138,12 +156,12 @@ def _compilers(platform: str) -> list[list[str]]:
     )
 
 
-def _link_flags(platform: str, output: str) -> list[str]:
+def _link_flags(output: str) -> list[str]:
     """Flags that leave nothing of this machine and this moment in the library."""
     flags = ["-shared", "-s", "-o", output]
-    if platform == "linux64":
+    if output.endswith(".so"):
         return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
-    if platform == "darwin64":
+    if output.endswith(".dylib"):
         return [*flags, f"-Wl,-install_name,@rpath/{output}"]
     return flags
 

@@ -20,6 +20,7 @@ from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, UNITS, compile_library
 from .mechanism import mechanism_source
+from .model_description3 import build_description, terminals_and_icons
 from .native import model_header
 
 LOG = logging.getLogger(__name__)
@@ -30,7 +31,11 @@ Files = dict[str, bytes]
 PYTHONFMU_FILES = (
     "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
 )  # fmt: skip
-FMI_HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
+FMI_HEADERS = {
+    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
+"""By version of FMI."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,7 @@ class Flavour:
     Attributes:
         attributes: of <CoSimulation> in the model description, and of <ModelExchange>.
         exchanges: whether it has Model Exchange too.
+        fmi: version of FMI, 2 or 3.
         files: resources and sources; the GUID is a digest of them.
         source_files: names under sources/ that a tool compiles.
         platforms: FMI platforms of the binaries.
@@ -51,6 +57,7 @@ class Flavour:
 
     attributes: Mapping[str, str]
     exchanges: bool
+    fmi: int
     files: Files
     source_files: Sequence[str]
     platforms: Sequence[str]
@@ -87,6 +94,7 @@ def python_flavour(
     return Flavour(
         attributes={"needsExecutionTool": "true"},
         exchanges=False,
+        fmi=2,
         files={f"resources/{path}": content for path, content in resources.items()},
         source_files=(),
         platforms=("linux64",),
@@ -97,12 +105,13 @@ def python_flavour(
     )
 
 
-def engine_sources(control: str) -> Files:
-    """The engine's C files with one control law: a bare plant has no code of another."""
+def engine_sources(control: str, fmi: int = 2) -> Files:
+    """The engine's C files with one control law and the functions of one version of FMI."""
     law = "task" if control == "pose" else control
     left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
     left_out |= set() if law == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
     left_out |= set() if control == "pose" else {"orientation.c", "orientation.h"}
+    left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c", "fmi3_unsupported.c"}
     return {
         path.name: path.read_bytes()
         for path in data_file("fmu_src", "native").iterdir()
@@ -111,18 +120,27 @@ def engine_sources(control: str) -> Files:
 
 
 def native_flavour(
-    robot: Robot, control: str, table: Sequence[Variable], name: str, platforms: Sequence[str]
+    robot: Robot,
+    control: str,
+    table: Sequence[Variable],
+    name: str,
+    platforms: Sequence[str],
+    fmi: int = 2,
 ) -> Flavour:
     """The plant as C99 sources, compiled for the platforms."""
     fmpy = find_spec("fmpy")  # it comes with the headers of the standard
     assert fmpy is not None and fmpy.origin is not None
     headers = Path(fmpy.origin).parent / "c-code"
-    sources = engine_sources(control)
+    sources = engine_sources(control, fmi)
     sources["mechanism.c"] = mechanism_source(robot, table).encode()
-    sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS})
+    sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS[fmi]})
+    described = {}
+    if fmi == 3:
+        described["sources/buildDescription.xml"] = build_description(name, UNITS)
+        described["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table)
 
     def header(guid: str) -> Files:
-        return {"model.h": model_header(robot, table, control, guid).encode()}
+        return {"model.h": model_header(robot, table, control, guid, fmi).encode()}
 
     def finish(guid: str) -> Files:
         files = {f"sources/{path}": content for path, content in header(guid).items()}
@@ -135,7 +153,11 @@ def native_flavour(
     return Flavour(
         attributes={"needsExecutionTool": "false", "providesDirectionalDerivative": "true"},
         exchanges=True,
-        files={f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
+        fmi=fmi,
+        files={
+            **{f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
+            **described,
+        },
         source_files=UNITS,
         platforms=platforms,
         finish=finish,

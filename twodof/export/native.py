@@ -1,8 +1,7 @@
 """The native flavour: the header of a robot's constants, and compiling the C engine with it.
 
-The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``model.h``, in which
-each joint turns about, or slides along, the z axis of its own frame: frames are rotated here, once,
-so that the engine has one kind of axis. Pinocchio has read the URDF.
+The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``model.h``; the robot's
+dynamics are ``mechanism.c``. Pinocchio has read the URDF.
 """
 
 from __future__ import annotations
@@ -42,6 +41,7 @@ def model_header(
     n, m = len(robot.joints), len(robot.axes)
     if n > MAX_JOINTS:
         raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
+    table = engine_variables(robot, table, control, fmi)
     groups = [variable.group for variable in table]
     sections = [
         "/* Constants of a robot, generated from its URDF. SI units. */\n"
@@ -66,6 +66,19 @@ def model_header(
         "#endif\n",
     ]
     return "\n".join(sections)
+
+
+def engine_variables(
+    robot: Robot, table: Sequence[Variable], control: str, fmi: int
+) -> Sequence[Variable]:
+    """The variables by value reference: in FMI 3.0 event indicators and the time are among them."""
+    if fmi == 2:
+        return table
+    first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
+    count = count_event_indicators(robot, control)
+    places = [*(("event_indicators", i) for i in range(count)), ("time", None)]
+    added = [Variable(group, i, "local", "", None, "") for group, i in places]
+    return [*table[:first], *added, *table[first:]]
 
 
 def _value_references(groups: Sequence[str]) -> str:

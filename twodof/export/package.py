@@ -1,83 +1,23 @@
-"""From a URDF to an FMU: what goes into the zip, its digest, and the zip itself."""
+"""An FMU's file: whether it is there already, and the zip."""
 
 from __future__ import annotations
 
 import hashlib
 import io
-import logging
-import math
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from ..errors import ZIP_ERRORS, BuildError
 from ..files import check_archive, data_file, read_member, write_file
-from ..plant.plant import Plant
-from ..plant.robot import Robot, load_robot
-from ..plant.urdf import RobotError, read_urdf
-from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
-from .arm_page import CONTAINER, Arm, LivePart, live_part
 from .compiler import compiles_for_the_web, host_platform
-from .documentation import documentation
-from .flavours import Files, Flavour, native_flavour, python_flavour
-from .meshes import collect_meshes
-from .model_description import DEFAULT_STEP, model_description
-from .urdf_source import end_effector, lock_joints, read_text, without_meshes
+from .options import FmuOptions
 
-logger = logging.getLogger(__name__)
-
-DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
-"""Start values of the shipped arm; nothing else knows that it has two joints."""
-
+MADE_OF = ("fmu_src", "urdf", "meshes", "export", "geometry", "plant")
+"""Folders of what is shipped."""
 MAX_PAGE = 512 * 1024**2  # bytes of documentation
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-
-
-@dataclass(frozen=True)
-class FmuOptions:
-    """What an FMU is made of.
-
-    Attributes:
-        urdf: the URDF or xacro file; None for the shipped planar arm.
-        mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
-        frame: link whose origin is controlled; None: "EndEffector", or the only link without
-            a link behind it.
-        lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
-        meshes: whether to carry them.
-        axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
-        gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else
-            (0, 0, −9.81).
-        q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
-            else 0 where the limits allow and their middle where not.
-        control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
-            frame's orientation), "joint" or "effort".
-        name: model name and identifier.
-        link_environment: remember the folders of this Python's packages in the FMU; not for the
-            native flavour, which needs none.
-        native: the plant as compiled C instead of Python code.
-        live_documentation: put the arm, alive, into the documentation of a native FMU, where
-            there is a compiler for it; its meshes are then in the FMU twice.
-        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64"; empty: this machine's.
-    """
-
-    urdf: Path | None = None
-    mesh_dir: Path | None = None
-    frame: str | None = None
-    lock: Mapping[str, float] = field(default_factory=dict)
-    meshes: bool = True
-    axes: str | None = None
-    gravity: tuple[float, float, float] | None = None
-    q_start: tuple[float, ...] | None = None
-    control: str = "task"
-    name: str = "TwoDof"
-    link_environment: bool = False
-    native: bool = False
-    live_documentation: bool = True
-    platforms: tuple[str, ...] = ()
 
 
 def build_fmu(output: str | Path | None = None, options: FmuOptions | None = None) -> Path:
@@ -98,194 +38,47 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
     options = options or FmuOptions()
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = Path(output if output is not None else default)
-    flavour, files, finish = _compose(options)
-    live = _is_live(options)
-    if not _holds(path, files["modelDescription.xml"], flavour.platforms, live):
-        _write_zip(path, {**files, **finish()})
+    made_of = _shipped(options) if options.native and options.urdf is None else b""
+    if made_of and _made_of(path) == made_of:
+        return path
+    from .composition import compose, is_live  # Pinocchio and SciPy take most of a run's time
+
+    flavour, files, finish = compose(options)
+    held = not made_of and _holds(
+        path, files["modelDescription.xml"], flavour.platforms, is_live(options)
+    )
+    if not held:
+        _write_zip(path, {**files, **finish()}, made_of)
     return path
 
 
-def _is_live(options: FmuOptions) -> bool:
-    """Whether the arm is in the documentation, alive."""
-    return options.native and options.live_documentation and compiles_for_the_web()
+def _shipped(options: FmuOptions) -> bytes:
+    """A digest of all that the shipped arm's native FMU is made of, on this machine."""
+    digest = hashlib.sha256()
+    machine = host_platform(2), host_platform(3), compiles_for_the_web()
+    digest.update(repr((__version__, options, machine)).encode())
+    for folder in map(data_file, MADE_OF):
+        for file in sorted(folder.rglob("*")):
+            if file.is_file() and file.suffix != ".pyc":
+                digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest().encode()
 
 
-def _compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
-    """The flavour, what the GUID is of, and what gives all other files: it compiles."""
-    if not options.name.isidentifier() or not options.name.isascii():
-        raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
-    if options.control not in CONTROLS:
-        raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
-    path = options.urdf or data_file("urdf", "2dof.urdf")
-    mesh_dir = _mesh_dir(options)
-    text = read_text(path, mesh_dir)
+def _made_of(path: Path) -> bytes:
+    """The digest that an FMU has as the comment of its zip."""
     try:
-        text = lock_joints(text, options.lock) if options.lock else text
-        frame = options.frame or end_effector(read_urdf(text))
-    except RobotError as error:
-        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
-    options = replace(options, frame=frame)
-    if not options.meshes:
-        text = without_meshes(text)
-    robot, table, starts = _model(options, text)
-    urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
-    flavour = _flavour(options, robot, table, urdf, starts)
-    resources = {"robot.urdf": urdf.encode(), **meshes}
-    files = {f"resources/{name}": content for name, content in resources.items()}
-    files.update(flavour.files)
-
-    def describe(guid: str) -> bytes:
-        return model_description(
-            robot,
-            table,
-            options.control,
-            name=options.name,
-            guid=guid,
-            version=__version__,
-            flavour=flavour.attributes,
-            exchanges=flavour.exchanges,
-            source_files=flavour.source_files,
-        )
-
-    digest = hashlib.sha256(describe(""))
-    for name in sorted(files):
-        digest.update(name.encode() + b"\0" + files[name])
-    guid = digest.hexdigest()
-    files["modelDescription.xml"] = describe(guid)
-    files["model.png"] = data_file("fmu_src", "model.png").read_bytes()
-    return flavour, files, partial(_finish, options, robot, table, flavour, guid, files)
-
-
-def _finish(
-    options: FmuOptions,
-    robot: Robot,
-    table: Sequence[Variable],
-    flavour: Flavour,
-    guid: str,
-    files: Files,
-) -> Files:
-    """What the GUID is not of: binaries and documentation."""
-    binaries = flavour.finish(guid)
-    live = LivePart("", "")
-    if _is_live(options):
-        live = _live_part(options, robot, table, guid, {**files, **binaries})
-    return binaries | documentation(
-        robot,
-        table,
-        options.control,
-        flavour,
-        name=options.name,
-        guid=guid,
-        version=__version__,
-        urdf=files["resources/robot.urdf"].decode(),
-        live=live,
-    )
-
-
-def _live_part(
-    options: FmuOptions, robot: Robot, table: Sequence[Variable], guid: str, files: Files
-) -> LivePart:
-    """The arm of the FMU that has these files."""
-    variables = [
-        {
-            "name": variable.name, "reference": reference, "causality": variable.causality,
-            "unit": variable.unit, "start": variable.start, "description": variable.description,
-        }
-        for reference, variable in enumerate(table)
-        if variable.causality != "local"
-    ]  # fmt: skip
-    folder = "sources/"
-    return live_part(
-        Arm(
-            name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
-            joints=robot.joints, frame=robot.frame, root=robot.root, axes="".join(robot.axes),
-            control=options.control, variables=variables, step=DEFAULT_STEP,
-            urdf=files["resources/robot.urdf"].decode(),
-            read=lambda name: files.get(f"resources/{name}"),
-            sources={p[len(folder) :]: c for p, c in files.items() if p.startswith(folder)},
-        )
-    )  # fmt: skip
-
-
-def _flavour(
-    options: FmuOptions,
-    robot: Robot,
-    table: list[Variable],
-    urdf: str,
-    starts: Mapping[str, Any],
-) -> Flavour:
-    if not options.native:
-        if options.platforms:
-            raise BuildError("platforms can be chosen for the native flavour only, `native=True`")
-        return python_flavour(
-            robot, options.control, urdf, starts, options.name, options.link_environment
-        )
-    if options.link_environment:
-        raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
-    platforms = options.platforms or (host_platform(),)
-    if platforms == ("",):
-        raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
-    return native_flavour(robot, options.control, table, options.name, platforms)
-
-
-def _mesh_dir(options: FmuOptions) -> Path | None:
-    if options.mesh_dir is not None and not options.mesh_dir.is_dir():
-        raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
-    return options.mesh_dir if options.urdf else data_file("meshes")
-
-
-def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
-    """The robot, its variables, and the start values that are not the table's own."""
-    shipped = options.urdf is None
-    axes = options.axes or ("xy" if shipped else "xyz")
-    try:
-        assert options.frame is not None
-        robot = load_robot(urdf, options.frame, axes)
-    except RobotError as error:
-        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
-    for warning in robot.warnings:
-        logger.warning("%s: %s", options.urdf, warning)
-    if options.control == "pose" and sum(robot.moves_frame()) < len(axes) + 3:
-        logger.warning(
-            "%d joints move '%s': not every position and orientation of it can be reached together",
-            sum(robot.moves_frame()), robot.frame,
-        )  # fmt: skip
-    starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": _rest(robot)}
-    for key in ("gravity", "q_start"):
-        given = getattr(options, key)
-        if given is not None:
-            if not all(map(math.isfinite, given)):
-                raise BuildError(f"{key} {given} must be finite numbers")
-            starts[key] = tuple(float(value) for value in given)
-    if len(starts["q_start"]) != len(robot.joints):
-        raise BuildError(
-            f"q_start has {len(starts['q_start'])} values, the robot has {len(robot.joints)}"
-            f" joints: {', '.join(robot.joints)}"
-        )
-    if shipped and axes != "xy":
-        raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
-    if "x_des" not in CONTROLS[options.control].inputs:
-        starts.pop("x_des", None)
-    else:
-        at_rest = {"x_des": (0.0,) * len(axes), "quat_des": (0.0, 0.0, 0.0, 1.0), **starts}
-        plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
-        plant.initialise()
-        starts.setdefault("x_des", tuple(plant.x))
-        if options.control == "pose":
-            starts["quat_des"] = tuple(plant.quat)
-    return robot, variable_table(robot, starts, options.control), starts
-
-
-def _rest(robot: Robot) -> tuple[float, ...]:
-    """0 where it is inside the limits, else their middle."""
-    return tuple(
-        0.0 if low <= 0.0 <= high else 0.5 * (low + high)
-        for low, high in zip(robot.q_min, robot.q_max, strict=True)
-    )
+        check_archive(path)
+        with zipfile.ZipFile(path) as archive:
+            return archive.comment
+    except ZIP_ERRORS:
+        return b""
 
 
 def _holds(path: Path, description: bytes, platforms: Sequence[str], live: bool) -> bool:
     """Whether the file is already this FMU; its guid is a digest of all that matters."""
+    from .arm_page import CONTAINER
+
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -298,10 +91,11 @@ def _holds(path: Path, description: bytes, platforms: Sequence[str], live: bool)
         return False
 
 
-def _write_zip(path: Path, files: Files) -> None:
+def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
     """Sorted entries with fixed dates, so that equal inputs give equal bytes; whole or not."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.comment = comment
         for name in sorted(files):
             entry = zipfile.ZipInfo(name, ZIP_DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED

@@ -23,18 +23,32 @@ from scipy.spatial.transform import Rotation
 from ..plant.urdf import Joint, Urdf
 
 Array = NDArray[np.float64]
+BLOCK = 10_000  # samples, whose arrays a cache holds
 
 
 class Placement(NamedTuple):
-    """Where a frame is in another, at N samples: N × 3, m, and N rotations."""
+    """Where a frame is in another, at N samples: N × 3, m, and N × 3 × 3; one may stand for all.
+
+    Matrices: SciPy takes ten times as long for the product of two Rotations.
+    """
 
     translation: Array
-    rotation: Rotation
+    rotation: Array
 
     def __mul__(self, inner: Placement) -> Placement:  # type: ignore[override]
         """Where a frame is that is placed in this one."""
-        translation = self.translation + self.rotation.apply(inner.translation)
-        return Placement(translation, self.rotation * inner.rotation)
+        translation = self.translation + turned(self.rotation, inner.translation)
+        return Placement(translation, self.rotation @ inner.rotation)
+
+    @property
+    def quat(self) -> Array:
+        """Unit quaternions x, y, z, w, N × 4."""
+        return np.asarray(Rotation.from_matrix(self.rotation).as_quat())
+
+
+def turned(rotation: Array, vectors: ArrayLike) -> Array:
+    """R v at N samples."""
+    return np.asarray(np.einsum("...ij,...j->...i", rotation, np.asarray(vectors)))
 
 
 class Kinematics:
@@ -50,7 +64,8 @@ class Kinematics:
         self.urdf = urdf
         self._columns = {name: i for i, name in enumerate(joints)}
         self._origins = {
-            joint.name: Rotation.from_euler("xyz", joint.rpy) for joint in urdf.joints.values()
+            joint.name: Rotation.from_euler("xyz", joint.rpy).as_matrix()
+            for joint in urdf.joints.values()
         }
 
     def moves(self, joint: Joint) -> bool:
@@ -64,29 +79,62 @@ class Kinematics:
         return self._columns.get(joint.leader), joint.ratio, joint.offset
 
     def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
-        """Where a joint's child is in its parent; q is N × joints, rad or m."""
-        q = np.asarray(q, dtype=np.float64)
-        column, ratio, offset = self.column(joint)
-        moved = np.full((len(q), 1), offset)
-        if column is not None:
-            moved = moved + ratio * q[:, column, None]
-        origin, along = self._origins[joint.name], moved * joint.axis
+        """Where a joint's child is in its parent; q is N × joints, rad or m; one where it rests."""
+        origin, along = self._origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
-            turn = Rotation.from_rotvec(np.zeros_like(along))
-            return Placement(joint.xyz + origin.apply(along), origin * turn)
-        return Placement(np.tile(joint.xyz, (len(q), 1)), origin * Rotation.from_rotvec(along))
+            return Placement(joint.xyz + turned(origin, along), origin[None])
+        turn = Rotation.from_rotvec(along).as_matrix()
+        return Placement(np.asarray(joint.xyz, dtype=np.float64)[None], origin @ turn)
+
+    def pose(self, joint: Joint, q: ArrayLike) -> Array:
+        """The same as N × 7, or 1 × 7: m, and a unit quaternion x, y, z, w."""
+        moved, still = self._moved(joint, q), Rotation.from_matrix(self._origins[joint.name])
+        if joint.prismatic:
+            place = joint.xyz + moved * still.apply(joint.axis)
+            return np.hstack([place, np.broadcast_to(still.as_quat(), (len(moved), 4))])
+        half = still * Rotation.from_quat([*joint.axis, 0.0])  # a half turn
+        quat = np.cos(moved / 2) * still.as_quat() + np.sin(moved / 2) * half.as_quat()
+        return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
+
+    def _moved(self, joint: Joint, q: ArrayLike) -> Array:
+        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests."""
+        column, ratio, offset = self.column(joint)
+        if column is None:
+            return np.full((1, 1), offset)
+        return offset + ratio * np.asarray(q, dtype=np.float64)[:, column, None]
 
     def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
         """Where the root is, and the child of each joint of a chain that begins there."""
         n = len(np.asarray(q))
-        places = [Placement(np.zeros((n, 3)), Rotation.from_rotvec(np.zeros((n, 3))))]
+        places = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
         for joint in chain:
             places.append(places[-1] * self.in_parent(joint, q))
         return places
 
     def path(self, link: str, q: ArrayLike) -> Array:
         """Positions of a link's origin in the root frame, N × 3, m."""
-        return self.along(self.urdf.chain(link), q)[-1].translation
+        q = np.asarray(q, dtype=np.float64)
+        path = np.empty((len(q), 3))
+        for k in range(0, len(q), BLOCK):
+            point: Array = np.zeros((1, 3))
+            for joint in reversed(self.urdf.chain(link)):
+                point = self._seen_from_parent(joint, q[k : k + BLOCK], point)
+            path[k : k + BLOCK] = point
+        return path
+
+    def _seen_from_parent(self, joint: Joint, q: Array, point: Array) -> Array:
+        """A point of the child, in the parent; N × 3, or 1 × 3 where none before it moves.
+
+        By Rodrigues' formula, p = a (a·p) + cos q (p − a (a·p)) + sin q a × p.
+        """
+        moved, axis = self._moved(joint, q), np.array(joint.axis)
+        origin = self._origins[joint.name].T
+        if joint.prismatic:
+            return np.asarray(joint.xyz + (point + moved * axis) @ origin)
+        along, across = np.outer(axis, axis), np.cross(np.eye(3), axis)
+        turned = np.cos(moved) * (point @ ((np.eye(3) - along) @ origin))
+        turned += np.sin(moved) * (point @ (-across @ origin))
+        return np.asarray(joint.xyz + point @ (along @ origin) + turned)
 
     def links(self, q: ArrayLike) -> dict[str, Placement]:
         """Where all links are in the root frame."""
@@ -101,7 +149,7 @@ class Kinematics:
         for joint, place in zip(chain, places[1:]):
             column, ratio, _ = self.column(joint)
             if column is not None:
-                axis = ratio * place.rotation.apply(joint.axis)
+                axis = ratio * turned(place.rotation, joint.axis)
                 arm = end - place.translation
                 if joint.prismatic:
                     jacobian[:, :3, column] += axis

@@ -117,7 +117,7 @@ def _sticks(robot: Urdf) -> list[Shape]:
     """A ball at each joint, and a stick from each link's origin to those of its children."""
     joints = list(robot.joints.values())
     radius = 0.05 * max((float(np.linalg.norm(joint.xyz)) for joint in joints), default=0.0)
-    still = Rotation.identity()
+    still = np.eye(3)
     shapes = []
     for i, joint in enumerate(joints):
         place = Placement(np.array(joint.xyz), still)
@@ -125,7 +125,7 @@ def _sticks(robot: Urdf) -> list[Shape]:
         length = float(np.linalg.norm(joint.xyz))
         if length > radius:
             along = Rotation.align_vectors([joint.xyz], [(0.0, 0.0, 1.0)])[0]
-            place = Placement(np.array(joint.xyz) / 2, along)
+            place = Placement(np.array(joint.xyz) / 2, along.as_matrix())
             stick = cylinder(radius, length)
             shapes.append(Shape(joint.parent, place, STICKS[i % len(STICKS)], *stick))
     return shapes
@@ -150,5 +150,5 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
 
 def origin(element: ET.Element | None) -> Placement:
     """URDF's xyz and rpy, about the fixed axes x, y and z."""
-    rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0"))
+    rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0")).as_matrix()
     return Placement(floats(element, "xyz", "0 0 0"), rotation)

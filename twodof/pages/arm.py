@@ -64,9 +64,10 @@ def _arm(run: Experiment) -> Arm:
         )
     variables = [
         {
-            "name": name, "reference": variable.valueReference, "causality": variable.causality,
+            "name": name, "reference": variable.reference + variable.element,
+            "causality": variable.causality,
             "unit": variable.unit or "", "start": run.start_values.get(name),
-            "description": variable.description or "",
+            "description": variable.description,
         }
         for name, variable in fmu.variables.items()
         if variable.causality != "local"

@@ -18,7 +18,9 @@ from typing import Any, NamedTuple
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
 from ..experiments import Experiment, Setting, resolve
-from ..master import RealTime, Sample, at_rest, samples
+from ..master import at_rest, samples
+from ..pace import RealTime
+from ..sample import Sample
 
 MOST_ROWS = 10_000  # that wait for a page to ask
 IDLE = 0.05  # s between two looks at whether to go on

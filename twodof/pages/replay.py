@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ..bag.reader import read_bag
 from ..bag.recording import Recording
 from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
@@ -31,6 +30,7 @@ SLIDER_RATE = 4.0  # Hz: a slider that moves more often is hard to use in a slow
 TRAIL_TIME = 1.5  # s
 TRAIL_POINTS, PATH_POINTS = 60, 1500
 MOST_FRAMES = 2000
+MOST_SAMPLES = 1_000_000  # of which a quarter is shown at most where there are more
 
 
 class Replay:
@@ -66,10 +66,9 @@ class Replay:
             raise PageError("`mesh_dir` has the meshes of a URDF; give that with `urdf`")
         if fmu is not None and urdf is not None:
             raise PageError("`fmu` has the meshes of the bag's robot; leave it out beside `urdf`")
-        bag = bag if isinstance(bag, Recording) else read_bag(bag)
         self._page = page
-        self._track = track = read_tracks([bag], urdf=urdf, frame=frame)[0]
-        self._t = track.t
+        self._track = track = read_tracks([bag], urdf=urdf, frame=frame, most=MOST_SAMPLES)[0]
+        bag, self._t = track.recording, track.t
         self.remarks: list[str] = []
         self._figure: PageRobot | None = None
         if track.motion is None:
@@ -203,7 +202,9 @@ class Replay:
 
     def _tell(self, k: int) -> None:
         track = self._track
-        rows = {"time": f"{self._t[k]:.3f} s", "sample": f"{k} of {len(self._t) - 1}"}
+        rows = {"time": f"{self._t[k]:.3f} s"}
+        if track.recording.count == len(self._t):
+            rows["sample"] = f"{k} of {len(self._t) - 1}"
         for joint in track.joints:
             rows[joint.name] = f"{joint.q[k]:+.5f} {joint.unit}"
         if track.motion is not None:
@@ -309,8 +310,8 @@ def view(
         host, port: where to listen.
         robot: options of ``Replay``.
     """
-    bag = bag if isinstance(bag, Recording) else read_bag(bag)
-    with Page(f"twodof - {shown(bag.path.resolve().name)}", host, port) as page:
+    path = bag.path if isinstance(bag, Recording) else Path(bag)
+    with Page(f"twodof - {shown(path.resolve().name)}", host, port) as page:
         replay = Replay(page, bag, **robot)
         replay.add_controls()
         opened(page.url, replay.remarks)

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import PageError
 from ..geometry.kinematics import Array, Kinematics
@@ -56,7 +55,7 @@ class PageRobot:
             page.scene.add_mesh_simple(
                 f"{self._names[shape.link]}/shape{i}", shape.vertices, shape.triangles,
                 color=shape.colour, position=shape.place.translation,
-                wxyz=_wxyz(shape.place.rotation), flat_shading=True, side="double",
+                wxyz=_wxyz(shape.place.quat), flat_shading=True, side="double",
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
         self._place(robot.joints.values(), [0.0] * len(joints))
@@ -81,8 +80,8 @@ class PageRobot:
     def _place(self, joints: Iterable[Joint], q: Sequence[float]) -> None:
         for joint in joints:
             place, node = self._kinematics.in_parent(joint, [q]), self._nodes[joint.child]
-            node.position, node.wxyz = place.translation[0], _wxyz(place.rotation)[0]
+            node.position, node.wxyz = place.translation[0], _wxyz(place.quat[0])
 
 
-def _wxyz(rotation: Rotation) -> Array:
-    return np.roll(rotation.as_quat(), 1, axis=-1)
+def _wxyz(xyzw: Array) -> Array:
+    return np.roll(xyzw, 1)

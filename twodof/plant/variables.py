@@ -68,7 +68,7 @@ class Variable:
     @property
     def derivative_of(self) -> str:
         """Group of the state that it is the derivative of, "" where it is none."""
-        return self.group.removeprefix("der_") if self.causality == "local" else ""
+        return self.group.removeprefix("der_") if self.group.startswith("der_") else ""
 
     @property
     def type(self) -> str:

@@ -13,7 +13,6 @@ With the impulse response ψ, the step response γ = ∫ψ and φ = 1 − Kp γ 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from math import sqrt
 from typing import NamedTuple
 
@@ -91,34 +90,33 @@ def task_error(
     xd0: Sequence[float],
     schedule: Sequence[tuple[int, Held]],
     step: float,
-    steps: int,
+    steps: NDArray[np.int64],
 ) -> Array:
-    """x − x_des at times k·step, k = 0…steps; (steps + 1) × m.
+    """x − x_des at N communication points, N × m.
 
     Args:
         x0, xd0: position and velocity at the start, m and m/s, m values each.
         schedule: communication points, ascending from 0, and the inputs that hold from each on.
             At that point the error is still that from the target before.
         step: communication step, s.
-        steps: number of communication steps.
+        steps: number of communication steps before each, ascending from 0.
     """
-
-    @lru_cache
-    def after_steps(count: int, Kp: float, Kd: float) -> Responses:
-        return responses(np.arange(count + 1, dtype=np.float64) * step, Kp, Kd)
-
     x, xd = np.array(x0, dtype=np.float64), np.array(xd0, dtype=np.float64)
-    error = np.empty((steps + 1, len(x)))
-    error[0] = x - np.array(schedule[0][1].x_des)
-    ends = [k for k, _ in schedule[1:]] + [steps]
+    error = np.empty((len(steps), len(x)))
+    error[steps == 0] = x - np.array(schedule[0][1].x_des)
+    ends = [k for k, _ in schedule[1:]] + [int(steps[-1])]
     with np.errstate(over="ignore", invalid="ignore"):  # with negative gains it explodes
         for (k, held), end in zip(schedule, ends):
+            here = slice(*np.searchsorted(steps, (k, end), side="right"))
+            t = (np.append(steps[here], end) - k) * step  # at the last, what follows begins
+            gains = {*zip(held.Kp, held.Kd)}
+            solved = {each: responses(t, *each) for each in gains}
             for i, (x_des, xd_des, xdd_des, Kp, Kd) in enumerate(zip(*held)):
-                phi, psi, gamma, psi_rate = after_steps(end - k, Kp, Kd)
+                phi, psi, gamma, psi_rate = solved[Kp, Kd]
                 a = xdd_des + Kd * xd_des
                 e0, v0 = x[i] - x_des, xd[i]
                 e = phi * e0 + psi * v0 + gamma * a
-                error[k + 1 : end + 1, i] = e[1:]
+                error[here, i] = e[:-1]
                 x[i] = x_des + e[-1]
                 xd[i] = -Kp * psi[-1] * e0 + psi_rate[-1] * v0 + psi[-1] * a
     return error

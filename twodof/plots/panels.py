@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..bag.outline import extremes
 from .closed_form import Array
 from .scales import COLOURS, SMALLEST_EFFORT, SMALLEST_ERROR, SMALLEST_RANGE
 from .track import JointTrack, Track, number
@@ -168,17 +169,9 @@ def error_panel(tracks: Sequence[Track]) -> Panel | None:
 def outline(values: Array, chunks: int = CHUNKS) -> Any:
     """Indices of the samples with which a line over time looks as it does with all of them.
 
-    Of each of the chunks the first, last, smallest and largest, as in Jugel et al., "M4: a
-    visualization-oriented time series data aggregation", VLDB 7(10), 2014.
+    Of each of the chunks the first, last, smallest and largest.
     """
     n = len(values)
     if n <= 4 * chunks:
         return slice(None)
-    starts = np.arange(0, n, ceil(n / chunks))
-    size = int(starts[1])
-    parts = np.pad(values, (0, len(starts) * size - n), mode="edge").reshape(-1, size)
-    gaps = ~np.isfinite(parts)
-    kept = [starts, starts + size - 1]
-    kept.append(starts + np.argmin(np.where(gaps, np.inf, parts), axis=1))
-    kept.append(starts + np.argmax(np.where(gaps, -np.inf, parts), axis=1))
-    return np.unique(np.minimum(np.concatenate(kept), n - 1))
+    return extremes(np.arange(n) // ceil(n / chunks), [values])

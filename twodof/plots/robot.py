@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..geometry.kinematics import Array, Kinematics
+from ..geometry.kinematics import Array, Kinematics, turned
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
 
 DEFAULT_FRAME = "EndEffector"
@@ -137,7 +137,7 @@ def _reach(robot: Robot) -> Reach | None:
     places = robot.kinematics.along(chain, at_zero)[1:]
     turns = np.abs(
         [
-            place.rotation.apply(joint.axis)[0] * (not joint.prismatic)
+            turned(place.rotation, joint.axis)[0] * (not joint.prismatic)
             for joint, place in zip(chain, places)
             if joint.moves
         ]

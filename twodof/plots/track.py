@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..bag.provenance import KNOWN_UNTIL
-from ..bag.reader import read_bag
+from ..bag.reader import read_bag, read_outline
 from ..bag.recording import Recording, Schedule
 from ..errors import PlotError
 from ..files import read_file, shown
@@ -20,6 +20,7 @@ from .robot import Motion, Robot, is_singular, load_robot, motion_of
 
 AT_LIMIT = 1e-9  # of a limit's size
 NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
+MOST = 200_000  # samples of a bag that are drawn
 MAX_URDF = 8 * 1024**2
 UNITS = {
     "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
@@ -71,7 +72,7 @@ class Task:
         target: position in effect up to each sample, N × m; not a number where none was known yet.
         error: distance from the target, m, N values; likewise.
         closed_form: the same for the closed form; None where the gains are not known.
-        departure: the largest distance between the two positions, m; None likewise.
+        off: distance between the two positions, m, N values; None likewise.
         disturbances: what was at work that the closed form does not have.
     """
 
@@ -79,8 +80,13 @@ class Task:
     target: Array
     error: Array
     closed_form: Array | None
-    departure: float | None
+    off: Array | None
     disturbances: tuple[str, ...]
+
+    @property
+    def departure(self) -> float | None:
+        """The most that it is off the closed form, m."""
+        return None if self.off is None else float(self.off.max())
 
 
 @dataclass(frozen=True)
@@ -114,22 +120,43 @@ def read_tracks(
     *,
     urdf: str | Path | None = None,
     frame: str | None = None,
+    most: int = MOST,
 ) -> list[Track]:
     """Read bags and compute what there is to draw.
+
+    Of a bag alone, given by its folder, that has more than ``most`` samples, those are read with
+    which all lines over time look as with all samples; several are compared sample by sample.
 
     Args:
         bags: bags, or their folders.
         urdf: the robot of all of them; None: the one that each bag carries, if any.
         frame: the end effector's link; None: as in the run that made the bag, and for bags from
             elsewhere the URDF's "EndEffector", or the link behind most joints.
+        most: samples.
 
     Raises:
         BagError: a bag cannot be read.
         PlotError: the URDF is at fault, does not fit the bag, or there are no positions.
     """
     text = None if urdf is None else _read_urdf(Path(urdf))
-    recordings = [bag if isinstance(bag, Recording) else read_bag(bag) for bag in bags]
-    return [_track(bag, text, str(urdf), frame) for bag in recordings]
+
+    def track(bag: Recording) -> Track:
+        return _track(bag, text, str(urdf), frame)
+
+    if len(bags) == 1 and not isinstance(bags[0], Recording):
+        return [track(read_outline(bags[0], most, lambda part: _lines(track(part))))]
+    return [track(bag if isinstance(bag, Recording) else read_bag(bag)) for bag in bags]
+
+
+def _lines(track: Track) -> list[Array]:
+    """What is drawn over time beside positions and velocities, N values each."""
+    lines = [joint.tau for joint in track.joints if joint.tau.size]
+    if track.motion is not None:
+        lines += [*track.motion.path.T]
+    if track.task is not None:
+        found = (track.task.error, track.task.closed_form, track.task.off)
+        lines += [line for line in found if line is not None]
+    return lines
 
 
 def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
@@ -273,7 +300,7 @@ def _task(
     def vector(values: Mapping[str, Any], group: str) -> tuple[float, ...]:
         return tuple(float(values[f"{group}[{i + 1}]"]) for i in range(len(axes)))
 
-    closed_form = departure = None
+    closed_form = off = None
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.linalg.norm(x - target, axis=1)
         if not np.isfinite(x).all() or np.isinf(error).any():
@@ -281,14 +308,13 @@ def _task(
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
         if inputs_known and all(f"{g}[1]" in bag.schedule[0][1] for g in Held._fields):
             held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
-            step, last = bag.provenance["step"], int(bag.steps[-1])
             xd0 = (robot.kinematics.jacobian(robot.frame, q[:1])[0] @ v0)[axes]
-            e = task_error(x[0].tolist(), xd0.tolist(), held, step, last)[bag.steps]
+            e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
             closed_form = np.linalg.norm(e, axis=1)
-            departure = float(np.linalg.norm(x - target - e, axis=1).max())
-    astray = departure is not None and departure > NOTABLE
+            off = np.linalg.norm(x - target - e, axis=1)
+    astray = off is not None and bool(off.max() > NOTABLE)
     disturbances = _disturbances(bag.schedule, robot, joints, q, astray)
-    return Task(robot.axes, target, error, closed_form, departure, disturbances)
+    return Task(robot.axes, target, error, closed_form, off, disturbances)
 
 
 def _disturbances(

@@ -99,7 +99,7 @@ def summary(track: Track, first: Track | None = None) -> dict[str, str]:
         "bag": track.name,
         "robot": track.motion.robot if track.motion else "",
         "end effector": track.motion.frame if track.motion else "",
-        "duration": f"{number(float(track.t[-1]))} s, {len(track.t)} samples",
+        "duration": f"{number(float(track.t[-1]))} s, {track.recording.count} samples",
         **settings,
         "at a limit": ", ".join(stopped) or "no joint",
     }

@@ -12,7 +12,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from ..errors import PublishError
-from .messages import STORE, Serialised
+from .messages import STORE
 
 try:
     from cyclonedds import idl, qos, topic
@@ -28,12 +28,12 @@ class Carrier:
     What the bytes mean is rosbags' business.
     """
 
-    def __init__(self, cdr: Serialised) -> None:
+    def __init__(self, cdr: bytes) -> None:
         self.cdr = cdr
 
     def serialize(self, **_options: object) -> bytes:
         """The bytes, as Cyclone DDS asks for them."""
-        return bytes(self.cdr)
+        return self.cdr
 
     @classmethod
     def deserialize(cls, cdr: bytes) -> Carrier:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from threading import Lock
 from typing import Any
 
 from ..errors import InputError, PublishError
 from ..experiments import Experiment, Value, resolve
-from ..master import Sample, Sink
-from .messages import STORE, Messages, Serialised
+from ..sample import Sample, Sink
+from .cdr import Rows
+from .messages import STORE, Messages
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -95,9 +96,9 @@ class Foxglove(Sink):
             self._send(self._latched, sample.stamp)
         self._send(self._messages.of(sample), sample.stamp)
 
-    def _send(self, messages: Sequence[tuple[str, Serialised]], stamp: int) -> None:
-        for name, cdr in messages:
-            self._channels[name].log(bytes(cdr), log_time=stamp)
+    def _send(self, messages: Mapping[str, Rows], stamp: int) -> None:
+        for name, rows in messages.items():
+            self._channels[name].log(rows.tobytes(), log_time=stamp)
 
     def command(self) -> dict[str, Value]:
         """Gains that were set since the last call, as inputs of the FMU."""

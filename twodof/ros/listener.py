@@ -8,7 +8,8 @@ from functools import partial
 from typing import Any, TypeVar
 
 from ..experiments import NANOSECONDS
-from ..master import RealTime, Sample
+from ..pace import RealTime
+from ..sample import Sample
 from .commands import LONGEST_NAME, Command, CommandError, Commands, deserialise, warner
 from .dds import dds_qos, dds_topic
 from .messages import JOINT_STATE, POINT, POSE, STREAM

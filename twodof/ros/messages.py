@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Mapping
+from itertools import chain
+from struct import Struct
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -13,20 +17,21 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ..errors import BagError
-from ..experiments import NANOSECONDS, Experiment
+from ..experiments import Experiment, Value
 from ..fmu import read_resource
-from ..master import Sample
-from ..plant.urdf import RobotError
-from .cdr import JointStateLayout
+from ..plant.urdf import Joint, RobotError
+from ..sample import Sample
+from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
 
 if TYPE_CHECKING:
-    from .scene import Scene, Transform
+    from .scene import Scene
 
 JOINT_STATES = "/joint_states"
 JOINT_STATE = "sensor_msgs/msg/JointState"
+TRANSFORMS = "/tf"
 TARGET = "/target"
 END_EFFECTOR = "/end_effector"
 CLOCK = "/clock"
@@ -34,9 +39,33 @@ POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 FOREVER = QosTime(9223372036, 854775807)
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-Message = STORE.types
-Serialised = bytes | memoryview
+XYZ = "float64 x\nfloat64 y\nfloat64 z"
+DEFINITIONS = {
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "rosgraph_msgs/msg/Clock": "builtin_interfaces/Time clock",
+    "std_msgs/msg/Bool": "bool data",
+    "std_msgs/msg/UInt32": "uint32 data",
+    "std_msgs/msg/String": "string data",
+    JOINT_STATE: "std_msgs/Header header\nstring[] name\n"
+    "float64[] position\nfloat64[] velocity\nfloat64[] effort",
+    "geometry_msgs/msg/Point": XYZ,
+    "geometry_msgs/msg/Vector3": XYZ,
+    "geometry_msgs/msg/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1",
+    "geometry_msgs/msg/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    POINT: "std_msgs/Header header\ngeometry_msgs/Point point",
+    POSE: "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\n"
+    "geometry_msgs/Quaternion rotation",
+    "geometry_msgs/msg/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/Transform transform",
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+}
+"""As Humble has them; rosbags' store of all of Humble's takes longer to import than NumPy."""
+STORE = get_typestore(Stores.EMPTY)
+STORE.register(
+    dict(chain(*(get_types_from_msg(text, name).items() for name, text in DEFINITIONS.items())))
+)
 
 
 class Topic(NamedTuple):
@@ -65,7 +94,7 @@ LATCHED = _qos(1, QosDurability.TRANSIENT_LOCAL)
 SCENE_TOPICS = {
     "/robot_description": Topic("std_msgs/msg/String", LATCHED),
     "/tf_static": Topic("tf2_msgs/msg/TFMessage", LATCHED),
-    "/tf": Topic("tf2_msgs/msg/TFMessage", _qos(100, QosDurability.VOLATILE)),
+    TRANSFORMS: Topic("tf2_msgs/msg/TFMessage", _qos(100, QosDurability.VOLATILE)),
     TARGET: Topic(POINT, STREAM),
     END_EFFECTOR: Topic(POINT, STREAM),
 }
@@ -90,61 +119,84 @@ class Messages:
     def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False) -> None:
         if effort and not run.fmu.vector("tau"):
             raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
-        self._effort = effort
         self._scene = _load_scene(run) if scene else None
-        self._clock = clock
-        self._axes = run.fmu.axes
-        self._root = run.fmu.root
-        n = len(run.fmu.joints)
-        self._joint_state = JointStateLayout(run.fmu.joints, "", (n, n, n if effort else 0))
+        self._axes = ["xyz".index(axis) for axis in run.fmu.axes]
+        n, m, poses = len(run.fmu.joints), 0, False
+        efforts = n if effort else 0
+        layouts: dict[str, Layout] = {CLOCK: Layout(Stamp())} if clock else {}
+        layouts[JOINT_STATES] = JointStateLayout(run.fmu.joints, "", (n, n, efforts))
         self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM)}
-        if scene:
+        if self._scene is not None:
+            m, poses = len(run.fmu.vector("x_des")), bool(run.fmu.vector("quat_des"))
+            place = Layout(Stamp(), run.fmu.root, Numbers(7 if poses else 3))
+            layouts |= {TRANSFORMS: _tf_layout(self._scene.moving), TARGET: place}
+            layouts |= {END_EFFECTOR: place}
             self.topics |= SCENE_TOPICS
-            if run.fmu.vector("quat_des"):
+            if poses:
                 self.topics |= dict.fromkeys((TARGET, END_EFFECTOR), Topic(POSE, STREAM))
-            if not run.fmu.vector("x_des"):
-                del self.topics[TARGET]
+            if not m:
+                del self.topics[TARGET], layouts[TARGET]
         if clock:
             self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
+        self._layouts, turns = layouts, 4 * poses
+        sizes = {"q": n, "v": n, "tau": efforts, "quat": turns, "x_des": m, "quat_des": turns}
+        self._numbers = np.dtype([("stamp", "<i8"), *((k, "<f8", (c,)) for k, c in sizes.items())])
+        self._pack = Struct(f"<q{sum(sizes.values())}d").pack
+        self._inputs: Mapping[str, Value] = {}
+        self._target: tuple[float, ...] = ()
 
-    def of(self, sample: Sample) -> list[tuple[str, Serialised]]:
-        """Topics and messages of one sample."""
-        effort = sample.tau if self._effort else ()
-        state = self._joint_state.pack(sample.stamp, sample.q, sample.v, effort)
-        messages: list[tuple[str, Serialised]] = [(JOINT_STATES, state)]
-        if self._clock:
-            now = Message["rosgraph_msgs/msg/Clock"](clock=_time(sample.stamp))
-            messages.insert(0, self._serialise((CLOCK, now)))
+    @property
+    def size(self) -> int:
+        """Bytes of the messages of one sample."""
+        return sum(layout.size for layout in self._layouts.values())
+
+    def numbers(self, sample: Sample) -> bytes:
+        """What one sample's messages are made of; those of several, joined, give their messages.
+
+        Raises:
+            struct.error: the sample is not of this run.
+        """
+        given: tuple[float, ...] = sample.tau if self._numbers["tau"].shape[0] else ()
         if self._scene is not None:
-            messages += map(self._serialise, self._of_scene(self._scene, sample))
-        return messages
+            if sample.inputs is not self._inputs:
+                self._inputs = sample.inputs
+                self._target = (*(sample.target or ()), *(sample.target_quat or ()))
+            given = (*given, *sample.quat, *self._target)
+        return self._pack(sample.stamp, *sample.q, *sample.v, *given)
 
-    def latched(self, stamp: int) -> list[tuple[str, Serialised]]:
-        """Topics and messages that hold for the whole run: robot description, fixed transforms.
+    def of(self, sample: Sample) -> dict[str, Rows]:
+        """Messages of one sample, by topic."""
+        return self.of_all(self.numbers(sample))[1]
+
+    def of_all(self, numbers: bytes) -> tuple[NDArray[np.int64], dict[str, Rows]]:
+        """Stamps of N samples, ns, and their messages by topic."""
+        table = np.frombuffer(numbers, self._numbers)
+        parts = {CLOCK: [], JOINT_STATES: [table["q"], table["v"], table["tau"]]}
+        if self._scene is not None:
+            end_effector = self._scene.end_effector(table["q"])
+            target = end_effector.copy()  # an axis that is not controlled is left as it is
+            if TARGET in self._layouts:
+                target[:, self._axes] = table["x_des"]
+            parts |= {
+                TRANSFORMS: self._scene.transforms(self._scene.moving, table["q"]),
+                END_EFFECTOR: [np.hstack([end_effector, table["quat"]])],
+                TARGET: [np.hstack([target, table["quat_des"]])],
+            }
+        stamps = table["stamp"]
+        return stamps, {t: layout.pack(stamps, *parts[t]) for t, layout in self._layouts.items()}
+
+    def latched(self, stamp: int | np.int64) -> dict[str, Rows]:
+        """Messages that hold for the whole run: robot description, fixed transforms.
 
         Their stamp is given in ns since the epoch.
         """
         if self._scene is None:
-            return []
-        description = Message["std_msgs/msg/String"](data=self._scene.description)
-        fixed = _tf_message(stamp, self._scene.fixed)
-        told = (("/robot_description", description), ("/tf_static", fixed))
-        return [*map(self._serialise, told)]
-
-    def _serialise(self, topic_and_message: tuple[str, Any]) -> tuple[str, Serialised]:
-        topic, message = topic_and_message
-        return topic, STORE.serialize_cdr(message, self.topics[topic].type)
-
-    def _of_scene(self, scene: Scene, sample: Sample) -> Iterator[tuple[str, Any]]:
-        stamp = sample.stamp
-        yield "/tf", _tf_message(stamp, scene.moving(sample.q))
-        end_effector = scene.end_effector(sample.q)
-        if TARGET in self.topics:
-            target = list(end_effector)  # the target leaves an axis that is not controlled as it is
-            for axis, value in zip(self._axes, sample.target or ()):
-                target["xyz".index(axis)] = value
-            yield TARGET, _place(stamp, self._root, target, sample.target_quat)
-        yield END_EFFECTOR, _place(stamp, self._root, end_effector, sample.quat)
+            return {}
+        fixed = self._scene.transforms(self._scene.fixed, np.empty((1, 0)))
+        return {
+            "/robot_description": Layout(self._scene.description).pack([0]),
+            "/tf_static": _tf_layout(self._scene.fixed).pack(np.array([stamp]), *fixed),
+        }
 
 
 def _load_scene(run: Experiment) -> Scene:
@@ -159,37 +211,9 @@ def _load_scene(run: Experiment) -> Scene:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
 
 
-def _time(stamp: int) -> Any:
-    seconds, nanoseconds = divmod(stamp, NANOSECONDS)
-    return Message["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-
-
-def _header(stamp: int, frame: str) -> Any:
-    return Message["std_msgs/msg/Header"](stamp=_time(stamp), frame_id=frame)
-
-
-def _place(stamp: int, frame: str, xyz: Sequence[float], quat: Sequence[float] | None) -> Any:
-    """A PointStamped, or with an orientation a PoseStamped."""
-    x, y, z = xyz
-    point = Message["geometry_msgs/msg/Point"](x=x, y=y, z=z)
-    if not quat:
-        return Message[POINT](header=_header(stamp, frame), point=point)
-    qx, qy, qz, qw = quat
-    turn = Message["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw)
-    pose = Message["geometry_msgs/msg/Pose"](position=point, orientation=turn)
-    return Message[POSE](header=_header(stamp, frame), pose=pose)
-
-
-def _tf_message(stamp: int, transforms: Sequence[Transform]) -> Any:
-    messages = []
-    for parent, child, (x, y, z), (qx, qy, qz, qw) in transforms:
-        transform = Message["geometry_msgs/msg/Transform"](
-            translation=Message["geometry_msgs/msg/Vector3"](x=x, y=y, z=z),
-            rotation=Message["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
-        )
-        messages.append(
-            Message["geometry_msgs/msg/TransformStamped"](
-                header=_header(stamp, parent), child_frame_id=child, transform=transform
-            )
-        )
-    return Message["tf2_msgs/msg/TFMessage"](transforms=messages)
+def _tf_layout(joints: Iterable[Joint]) -> Layout:
+    """Of a TFMessage: a transform for each joint, from the parent link to the child link."""
+    parts: list[Stamp | str | Numbers] = []
+    for joint in joints:
+        parts += (Stamp(), joint.parent, joint.child, Numbers(7))
+    return Layout(len(parts) // 4, *parts)

@@ -138,8 +138,22 @@ def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
     return peers
 
 
-def open_domain(place: Network) -> tuple[Any, str]:
-    """A DDS domain, and the names of the interfaces that it uses.
+class OpenDomain(NamedTuple):
+    """A DDS domain, which is closed with its last reference; several publishers may share it.
+
+    Attributes:
+        place: the network.
+        interface: names of the network interfaces in use.
+        handle: Cyclone DDS's.
+    """
+
+    place: Network
+    interface: str
+    handle: Any
+
+
+def open_domain(place: Network) -> OpenDomain:
+    """The DDS domain of a network.
 
     Raises:
         PublishError: saying what Cyclone DDS says.
@@ -164,7 +178,7 @@ def open_domain(place: Network) -> tuple[Any, str]:
         raise PublishError(f"DDS domain {place.domain} cannot be opened: {said}{blame}")
     elif said:
         LOG.warning("Cyclone DDS: %s", said)
-    return opened, interfaces
+    return OpenDomain(place, interfaces, opened)
 
 
 def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:

@@ -5,20 +5,25 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from math import inf
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError, PublishError, SimulationError
 from ..experiments import NANOSECONDS, Experiment, Setting, experiment
 from ..fmu import Fmu
-from ..master import RealTime, Sample, Sink, Summary, at_rest, simulate
+from ..master import Member, Summary, at_rest, simulate_together
+from ..pace import RealTime
+from ..sample import Sample, Sink
+from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic
 from .listener import Listener
-from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, Serialised
-from .network import Network, network, open_domain
+from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages
+from .network import Network, OpenDomain, network, open_domain
 
 # isort: split
 from cyclonedds import core, domain, pub  # where missing, dds says so
@@ -33,7 +38,7 @@ class Publisher(Sink):
     """A sink that publishes each sample, and hears of targets and commands.
 
     Args:
-        place: the network; None: what the environment asks for.
+        place: the network, or one that is open already; None: what the environment asks for.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         clock: also the samples' stamps as /clock; and hear /pause and /step.
@@ -62,7 +67,7 @@ class Publisher(Sink):
 
     def __init__(
         self,
-        place: Network | None = None,
+        place: Network | OpenDomain | None = None,
         *,
         scene: bool = False,
         effort: bool = False,
@@ -84,7 +89,8 @@ class Publisher(Sink):
         if timeout is not None and not 0.0 < timeout < inf:
             raise InputError(f"`timeout` {timeout:g} is no time")
         self._opened = opened
-        self.place = network() if place is None else place
+        self._shared = place if isinstance(place, OpenDomain) else None
+        self.place = place.place if isinstance(place, OpenDomain) else place or network()
         self.interface, self.lockstep = "", lockstep
         self._scene, self._effort, self._clock = scene, effort, clock
         self._prefix = f"/{namespace.strip('/')}" if namespace else ""
@@ -134,7 +140,8 @@ class Publisher(Sink):
         return name if name.startswith("/") else f"{self._prefix}/{name}"
 
     def __enter__(self) -> Publisher:
-        self._domain, self.interface = open_domain(self.place)
+        self._domain = self._shared or open_domain(self.place)
+        self.interface = self._domain.interface
         try:
             participant = self._participant = domain.DomainParticipant(self.place.domain)
             self._writers = {
@@ -162,11 +169,11 @@ class Publisher(Sink):
         self._sample = sample
         self._publish(self._messages.of(sample))
 
-    def _publish(self, messages: list[tuple[str, Serialised]]) -> None:
-        for name, cdr in messages:
+    def _publish(self, messages: Mapping[str, Rows]) -> None:
+        for name, rows in messages.items():
             writer = self._writers[name]
             try:
-                writer.write(writer.data_type(cdr))
+                writer.write(writer.data_type(rows.tobytes()))
             except core.DDSException as error:
                 self._warn(name, f"messages on {name} are lost: {error}")
 
@@ -270,8 +277,57 @@ def publish(
     if pace is None and not wire.lockstep:
         pace = RealTime()
 
+    member = _member(run, wire, sinks, pace, stop, steer)
+    return simulate_together([member], pace=pace, stop=stop)[0]
+
+
+def publish_together(
+    robots: Mapping[str, Experiment],
+    *,
+    sinks: Mapping[str, Sequence[Sink]] = MappingProxyType({}),
+    place: Network | None = None,
+    clock: bool = False,
+    namespace: str = "",
+    pace: RealTime | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> dict[str, Summary]:
+    """Step several FMUs in one loop on a ROS 2 network, each in a namespace of its own.
+
+    Args:
+        robots: an experiment by namespace, all of the same times; their first stamp is one.
+        sinks: what consumes a robot's samples too.
+        place, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
+        pace, stop: as of ``publish``.
+
+    Raises:
+        FmuError, InputError, PublishError, SimulationError: as ``publish``.
+    """
+    if pace is None and not options.get("lockstep"):
+        pace = RealTime()
+    shared, now, members = open_domain(place or network()), time.time(), list[Member]()
+    for name, run in robots.items():
+        wire = Publisher(
+            shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options
+        )
+        stamped = run if run.stamp_start is not None else replace(run, stamp_start=now)
+        own = sinks.get(name, ())
+        members.append(_member(stamped, wire, own, pace, stop, lambda: None))
+    return dict(zip(robots, simulate_together(members, pace=pace, stop=stop)))
+
+
+def _member(
+    run: Experiment,
+    wire: Publisher,
+    sinks: Sequence[Sink],
+    pace: RealTime | None,
+    stop: Callable[[], bool],
+    steer: Callable[[], Mapping[str, Setting] | None],
+) -> Member:
+    """A run that is published, and follows what it is told; commands have the last word."""
+
     def asked() -> Mapping[str, Setting]:
         commands = wire.command(stop, pace) or {}
         return {**(steer() or {}), **commands}
 
-    return simulate(run, wire, *sinks, pace=pace, stop=stop, steer=asked, resume=wire.resume)
+    return Member(run, (wire, *sinks), asked, wire.resume)

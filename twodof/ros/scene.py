@@ -8,11 +8,9 @@ from __future__ import annotations
 import logging
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..geometry.kinematics import Array, Kinematics, Placement
 from ..geometry.meshes import load_mesh
@@ -21,15 +19,6 @@ from ..plant.urdf import Joint, RobotError, read_urdf
 
 LARGEST = 1e6  # m
 logger = logging.getLogger(__name__)
-
-
-class Transform(NamedTuple):
-    """Pose of a child link in its parent link: m, and a unit quaternion (x, y, z, w)."""
-
-    parent: str
-    child: str
-    translation: tuple[float, float, float]
-    rotation: tuple[float, float, float, float]
 
 
 class Scene:
@@ -44,7 +33,7 @@ class Scene:
     Attributes:
         description: the URDF with each mesh replaced by its best-fitting box or cylinder, which
             renders where the mesh files are not at hand.
-        fixed: transforms of the fixed joints.
+        fixed, moving: joints whose transforms hold for the whole run, and the others.
 
     Raises:
         RobotError: the URDF is not sound.
@@ -61,30 +50,22 @@ class Scene:
         if frame not in robot.links:
             raise RobotError(f"it has no link '{frame}'")
         self._kinematics, self._frame = Kinematics(robot, joints), frame
-        rest, self._moving = [0.0] * len(joints), []
-        self.fixed: list[Transform] = []
-        for joint in robot.joints.values():
-            if self._kinematics.moves(joint):
-                self._moving.append(joint)
-            else:
-                self.fixed.append(self._transform(joint, rest))
+        every = robot.joints.values()
+        self.moving = [joint for joint in every if self._kinematics.moves(joint)]
+        self.fixed = [joint for joint in every if not self._kinematics.moves(joint)]
         _replace_meshes(robot.tree, read)
         self.description = ET.tostring(robot.tree, encoding="unicode")
 
-    def moving(self, q: Sequence[float]) -> list[Transform]:
-        """Transforms of the moving joints at positions q (rad or m)."""
-        return [self._transform(joint, q) for joint in self._moving]
+    def transforms(self, joints: Iterable[Joint], q: Array) -> list[Array]:
+        """Of some joints' children in their parents, at N positions q, rad or m.
 
-    def _transform(self, joint: Joint, q: Sequence[float]) -> Transform:
-        place = self._kinematics.in_parent(joint, [q])
-        x, y, z = place.translation[0].tolist()
-        qx, qy, qz, qw = place.rotation.as_quat()[0].tolist()
-        return Transform(joint.parent, joint.child, (x, y, z), (qx, qy, qz, qw))
+        One N × 7 array each, or 1 × 7 where it is fixed: m, and a unit quaternion x, y, z, w.
+        """
+        return [self._kinematics.pose(joint, q) for joint in joints]
 
-    def end_effector(self, q: Sequence[float]) -> tuple[float, float, float]:
-        """Position of the end effector in the root frame, m."""
-        x, y, z = self._kinematics.path(self._frame, [q])[0].tolist()
-        return x, y, z
+    def end_effector(self, q: Array) -> Array:
+        """Positions of the end effector in the root frame, N × 3, m."""
+        return self._kinematics.path(self._frame, q)
 
 
 def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> None:
@@ -130,7 +111,7 @@ def _fit(
             round_size = np.array([r, height])
             candidates.append((math.pi * r * r * height, "cylinder", round_size, turned, middle))
     _, kind, size, rotation, centre = min(candidates, key=lambda candidate: candidate[0])
-    placement = Placement(rotation @ centre, Rotation.from_matrix(rotation))
+    placement = Placement(rotation @ centre, rotation)
     if kind == "box":
         return ET.Element("box", size=_text(size)), placement
     radius, length = (repr(float(value)) for value in size)
@@ -164,7 +145,7 @@ def _place(part: ET.Element, place: Placement) -> None:
     origin = part.find("origin")
     if origin is None:
         origin = ET.SubElement(part, "origin")
-    r = place.rotation.as_matrix()
+    r = place.rotation
     # roll from what yaw leaves: exact too where the two turn about one axis, as SciPy's are not
     yaw = math.atan2(r[1, 0], r[0, 0])
     sin, cos = math.sin(yaw), math.cos(yaw)

@@ -17,7 +17,8 @@ from ..errors import SimulationError
 from ..experiments import Experiment, Value, experiment, resolve
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
-from ..master import OUTPUTS, Sample, Sink, simulate
+from ..master import OUTPUTS, simulate
+from ..sample import Sample, Sink
 from .metrics import METRICS, Array, measure
 from .trace import trace
 

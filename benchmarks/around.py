@@ -1,0 +1,161 @@
+"""What the run around the native engine costs: logging, scenes, sweeps, start-up, big bags.
+
+    python benchmarks/around.py [MESSAGES]
+
+Processor time. What is compared takes turns, so that noise of the machine hits all alike; ratios
+are medians over the turns. Processes are measured whole, with their children. MESSAGES is the size
+of the big bag, ten million if it is not given, which takes some 1.3 GB of disk for a while.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+
+from run import STEP, processor, shipped_arm  # noqa: E402
+
+import twodof  # noqa: E402
+from twodof.export.compiler import compile_library, host_platform  # noqa: E402
+from twodof.export.flavours import native_flavour  # noqa: E402
+from twodof.plant.variables import variable_table  # noqa: E402
+from twodof.sweeps.runner import Job, Runner  # noqa: E402
+
+TURNS, SAMPLES, RUNS, STEPS = 5, 50_000, 20, 500
+MESSAGES = 10_000_000
+TWODOF = [sys.executable, "-m", "twodof"]
+
+
+def floor(folder: Path) -> Callable[[int, bool], float]:
+    """Processor time of a step in C, s, of a run of so many, logged or bare."""
+    arm, path = shipped_arm(), folder / "logged"
+    flavour = native_flavour(arm.robot, "task", variable_table(arm.robot, arm.starts), "logged", ())
+    sources = {Path(name).name: content for name, content in flavour.files.items()}
+    sources["logged_step.c"] = (HERE / "logged_step.c").read_bytes()
+    units = ("directional.c", "logged_step.c")
+    path.write_bytes(compile_library(sources, host_platform(), "logged", units=units))
+    cost = ctypes.CDLL(str(path)).logged_cost
+    cost.argtypes = (ctypes.c_double, ctypes.c_int, ctypes.c_char_p, ctypes.c_int)
+    cost.restype = ctypes.c_double
+    log = os.fsencode(folder / "log")
+    return lambda steps, logs: float(cost(STEP, steps, log, logs))
+
+
+def spent(work: Callable[[], object]) -> float:
+    begin = time.process_time()
+    work()
+    return time.process_time() - begin
+
+
+MEASURE = """
+import resource, subprocess, sys
+code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+sys.exit(code)
+"""
+
+
+def process(*arguments: str, folder: Path) -> tuple[float, float]:
+    """Processor time, s, and largest memory, MB, of a command and its children.
+
+    Started by a small process: at first a child counts the memory of the one that it comes from.
+    """
+    command = [sys.executable, "-S", "-c", MEASURE, *TWODOF, *arguments]
+    done = subprocess.run(command, cwd=folder, check=True, stdout=subprocess.PIPE, text=True)
+    seconds, memory = map(float, done.stdout.split())
+    return seconds, memory
+
+
+def big_bag(fmu: twodof.Fmu, path: Path, messages: int) -> None:
+    """The first ten seconds again and again, which takes less time than to simulate all."""
+    run = twodof.experiment(fmu, stop_time=messages * STEP, step=STEP, stamp_start=1_700_000_000)
+    with twodof.Bag(path).begin(run) as bag:
+        source = twodof.samples(run)
+        some = [next(source) for _ in range(1000)]
+        for k in range(messages):
+            sample = some[k % len(some)]
+            stamp = some[0].stamp + round(k * STEP * 1e9)
+            bag.write(sample._replace(k=k, t=k * STEP, stamp=stamp))
+        source.close()
+
+
+def print_steps(fmu: twodof.Fmu, in_c: Callable[[int, bool], float], folder: Path) -> None:
+    run = twodof.experiment(fmu, stop_time=SAMPLES * STEP, step=STEP)
+
+    def logged(**options: bool) -> float:
+        bag = twodof.Bag(folder / "bag", overwrite=True, **options)
+        return spent(lambda: twodof.simulate(run, bag)) / SAMPLES
+
+    turns = [(in_c(SAMPLES, True), logged(), logged(scene=True)) for _ in range(TURNS)]
+    in_c_alone, plain, scene = (1e6 * median(times) for times in zip(*turns))
+    print(f"\nA logged sample of a run of {SAMPLES}, default arm\n")
+    print(f"  C: doStep, getReal, CDR, write   {in_c_alone:7.1f} µs")
+    ratio = median(turn[1] / turn[0] for turn in turns)
+    print(f"  twodof.simulate and its bag      {plain:7.1f} µs  {ratio:.2f} of C; wanted <= 2.2")
+    ratio = median(turn[2] / turn[1] for turn in turns)
+    print(f"  with scene=True                  {scene:7.1f} µs  {ratio:.2f} of plain; wanted <= 2")
+
+
+def print_sweep(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> None:
+    options = {"stop_time": STEPS * STEP, "step": STEP, "settings": {}}
+    job = Job(fmu.path.read_bytes(), fmu.path.name, ("Kp",), options, None)
+    points = [(k, (40.0 + k,)) for k in range(RUNS)]
+    with Runner(job) as runner:
+        runner.run(points[0])
+        turns = [
+            (RUNS * STEPS * in_c(STEPS * RUNS, False), spent(lambda: runner.run_all(points)))
+            for _ in range(TURNS)
+        ]
+    bare, swept = (1e3 * median(times) / RUNS for times in zip(*turns))
+    ratio = median(turn[1] / turn[0] for turn in turns)
+    print(f"\nA run of a sweep, {STEPS} steps\n")
+    print(f"  C: doStep alone                  {bare:7.2f} ms")
+    print(f"  run, metrics and row             {swept:7.2f} ms  {ratio:.2f} of C; wanted <= 1.5")
+
+
+def print_processes(folder: Path, messages: int) -> None:
+    bag, count = "big", f"{messages:.0e} messages".replace("e+0", "e")
+    gains = ("--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16")
+    process("run", "--native", "-o", "run", folder=folder)  # which builds the FMU
+    rows = {
+        "twodof --version": (("--version",), 5, ""),
+        "run --native, 5 s": (("run", "--native", "-o", "run", "--overwrite"), 5, "0.25 s"),
+        "sweep of 320 runs": (("sweep", *gains), 1, "3 s"),
+        f"info of {count}": (("info", bag), 3, "0.5 s, 100 MB"),
+        f"plot of {count}": (("plot", bag, "-o", "big.png"), 1, "15 s, 400 MB"),
+    }
+    print("\nA process as a whole\n")
+    for name, (arguments, times, wanted) in rows.items():
+        costs = [process(*arguments, folder=folder) for _ in range(times)]
+        seconds, memory = (median(column) for column in zip(*costs))
+        bar = f"  wanted <= {wanted}" if wanted else ""
+        print(f"  {name:28} {seconds:7.2f} s {memory:6.0f} MB{bar}")
+
+
+def main() -> None:
+    """Measure and print."""
+    messages = int(sys.argv[1]) if sys.argv[1:] else MESSAGES
+    print(f"twodof {twodof.__version__}; {processor()}; processor time")
+    with tempfile.TemporaryDirectory(prefix="twodof_") as name:
+        folder = Path(name)
+        options = twodof.FmuOptions(native=True)
+        fmu = twodof.load_fmu(twodof.build_fmu(folder / "Native.fmu", options))
+        in_c = floor(folder)
+        print_steps(fmu, in_c, folder)
+        print_sweep(fmu, in_c)
+        big_bag(fmu, folder / "big", messages)
+        print_processes(folder, messages)
+
+
+if __name__ == "__main__":
+    main()

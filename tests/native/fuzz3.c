@@ -1,0 +1,294 @@
+/* Random legal and illegal calls of FMI 3.0, with NaN, infinities, wrong value references and wrong sizes
+   of arrays. What is common to the versions fuzz.c has: here it is the functions and their arrays.
+   Compiled with AddressSanitizer and UndefinedBehaviorSanitizer. Every call that is illegal in an
+   instance's phase is refused and leaves the instance's state as it was.
+
+       fuzz3 SEQUENCES SEED [THREADS]    as many sequences in each thread, at the same time */
+#include <math.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "fmu.c"
+
+#define CHECK(condition)                                                                     \
+    do {                                                                                     \
+        if (!(condition)) {                                                                  \
+            fprintf(stderr, "line %d: not %s\n", __LINE__, #condition);                      \
+            exit(1);                                                                         \
+        }                                                                                    \
+    } while (0)
+
+enum { LONGEST = 40, MANY = 4, ROOM = N_VARIABLES };
+static __thread uint64_t seed;
+static __thread long logged, refused, done;
+
+static unsigned pick(unsigned below) /* xorshift64* */
+{
+    seed ^= seed >> 12, seed ^= seed << 25, seed ^= seed >> 27;
+    return (unsigned)((seed * UINT64_C(2685821657736338717)) >> 33) % below;
+}
+
+static double number(void)
+{
+    static const double odd[] = {0.0, NAN, INFINITY, -INFINITY, 1e-320, 1e300, -1e6};
+    return pick(12) ? (pick(2001) - 1000.0) * 1e-3 : odd[pick(7)];
+}
+
+static void log_message(fmi3InstanceEnvironment environment, fmi3Status status,
+                        fmi3String category, fmi3String message)
+{
+    (void)environment;
+    CHECK(category && message && status <= fmi3Error && strlen(message) < 512);
+    logged++;
+}
+
+static Instance *create(void)
+{
+    return pick(2) ? fmi3InstantiateModelExchange("fuzz", MODEL_GUID, "", 0, pick(2), NULL,
+                                                  log_message)
+                   : fmi3InstantiateCoSimulation("fuzz", MODEL_GUID, NULL, 0, pick(2), 0, pick(2),
+                                                 NULL, 0, NULL, log_message, NULL);
+}
+
+/* References, mostly of vectors, and how many values they stand for; 0 where one is wrong. */
+static size_t references(Reference vr[MANY], size_t *count)
+{
+    size_t size = 0;
+    int right = 1;
+    *count = pick(MANY + 1);
+    for (size_t i = 0; i < MANY; i++) {
+        do
+            vr[i] = pick(N_VARIABLES);
+        while (pick(20) && EXTENT[vr[i]] == 0);
+        if (pick(40) == 0)
+            vr[i] = pick(2) ? N_VARIABLES + pick(3) : pick(1u << 31) << 1;
+        if (i < *count) {
+            right = right && vr[i] < N_VARIABLES && EXTENT[vr[i]] > 0;
+            size += vr[i] < N_VARIABLES ? (size_t)EXTENT[vr[i]] : 0;
+        }
+    }
+    return right ? size : 0;
+}
+
+/* Exactly as much memory as is said, so that none beyond is touched unseen. */
+static void *array(size_t size, size_t width)
+{
+    char *values = malloc(size * width + 1);
+    for (size_t i = 0; i < size && width == sizeof(double); i++)
+        ((double *)values)[i] = number();
+    if (width == 1)
+        memset(values, (int)pick(2), size);
+    return values;
+}
+
+static fmi3Status variables(Instance *c)
+{
+    Reference vr[MANY];
+    size_t count;
+    const size_t right = references(vr, &count), size = pick(10) ? right : pick(ROOM);
+    double *real = array(size, sizeof *real);
+    bool *truth = array(size, 1);
+    const Reference *place = pick(30) ? vr : NULL;
+    fmi3Status status = fmi3Error;
+    for (size_t i = 0, k = 0; i < count && right; k += (size_t)EXTENT[vr[i++]])
+        if (vr[i] == MAX_STEP && k < size && !(real[k] < 0.0) && real[k] < 1e-3)
+            real[k] = 1e-3; /* the master's choice alone: how long a step takes */
+    switch (pick(8)) {
+    case 0: status = fmi3GetBoolean(c, place, count, truth, size); break;
+    case 1: status = fmi3SetBoolean(c, place, count, truth, size); break;
+    case 2: status = fmi3GetInt32(c, place, count, (fmi3Int32 *)real, size); break;
+    case 3:
+        status = fmi3SetClock(c, place, count, truth); /* which are not told how many there are */
+        CHECK(status == fmi3Error || count == 0);
+        status = fmi3Error;
+        break;
+    case 4:
+    case 5: status = fmi3GetFloat64(c, place, count, pick(30) ? real : NULL, size); break;
+    default: status = fmi3SetFloat64(c, place, count, pick(30) ? real : NULL, size);
+    }
+    CHECK(status == fmi3Error || size == right);
+    free(real), free(truth);
+    return status;
+}
+
+static fmi3Status derivatives(Instance *c)
+{
+    Reference unknown[MANY], known[MANY];
+    size_t n_unknown, n_known;
+    const size_t rows = references(unknown, &n_unknown), columns = references(known, &n_known);
+    const size_t wrong = pick(10) == 0;
+    const int adjoint = (int)pick(2);
+    const size_t n_seed = (adjoint ? rows : columns) + wrong, n = adjoint ? columns : rows;
+    double *change = array(n_seed, sizeof *change), *result = array(n, sizeof *result);
+    if (pick(2)) /* what has a derivative */
+        unknown[0] = X, known[0] = Q, n_unknown = n_known = 1;
+    const fmi3Status status =
+        (adjoint ? fmi3GetAdjointDerivative : fmi3GetDirectionalDerivative)(
+            c, unknown, n_unknown, known, n_known, change, n_seed, result, n);
+    for (size_t i = 0; i < n && status == fmi3OK; i++)
+        CHECK(isfinite(result[i]));
+    free(change), free(result);
+    return status;
+}
+
+static fmi3Status saved_states(Instance *c, fmi3FMUState *saved)
+{
+    fmi3Byte bytes[sizeof(State) + 64];
+    fmi3FMUState other = NULL;
+    size_t size = 0;
+    switch (pick(4)) {
+    case 0: return fmi3GetFMUState(c, saved);
+    case 1: return fmi3SetFMUState(c, *saved);
+    case 2: return fmi3FreeFMUState(c, saved);
+    default:
+        if (!*saved)
+            return fmi3SerializedFMUStateSize(c, NULL, &size);
+        CHECK(fmi3SerializedFMUStateSize(c, *saved, &size) == fmi3OK && size <= sizeof bytes);
+        CHECK(fmi3SerializeFMUState(c, *saved, bytes, size) == fmi3OK);
+        bytes[pick((unsigned)size)] ^= (fmi3Byte)(1 << pick(8));
+        CHECK(fmi3DeserializeFMUState(c, bytes, size, &other) == fmi3Error && !other);
+        return fmi3Error;
+    }
+}
+
+/* Calls of the one kind; with what is right they are done where the standard allows them. */
+static fmi3Status of_a_kind(Instance *c)
+{
+    const int phase = c->state.phase, exchange = c->kind == MODEL_EXCHANGE;
+    const size_t wrong = pick(30) == 0;
+    bool flags[5];
+    double x[N_STATES + N_INDICATORS + 1], t;
+    size_t size;
+    fmi3Status status;
+    for (int i = 0; i < N_STATES; i++)
+        x[i] = number();
+    switch (pick(12)) {
+    case 0:
+    case 1:
+    case 2:
+    case 3:
+        t = pick(10) ? c->state.time : number();
+        status = fmi3DoStep(c, t, 0.01, false, flags, flags + 1, flags + 2, pick(30) ? &t : NULL);
+        CHECK(status == fmi3Error || phase == STEP);
+        return status;
+    case 4:
+        status = fmi3EnterEventMode(c);
+        CHECK((status == fmi3OK) == (phase == CONTINUOUS_TIME));
+        return status;
+    case 5:
+        status = fmi3UpdateDiscreteStates(c, flags, flags + 1, flags + 2, flags + 3,
+                                          wrong ? NULL : flags + 4, &t);
+        CHECK((status == fmi3OK) == (phase == EVENT && !wrong));
+        return status;
+    case 6:
+        status = fmi3EnterContinuousTimeMode(c);
+        CHECK((status == fmi3OK) == (phase == EVENT));
+        return status;
+    case 7: return fmi3CompletedIntegratorStep(c, true, flags, wrong ? NULL : flags + 1);
+    case 8: return fmi3SetContinuousStates(c, x, N_STATES + wrong);
+    case 9: return fmi3GetContinuousStateDerivatives(c, x, N_STATES + wrong);
+    case 10: return fmi3GetEventIndicators(c, x, N_INDICATORS + wrong);
+    default:
+        status = fmi3GetNumberOfContinuousStates(c, &size);
+        CHECK((status == fmi3OK) == exchange && (!exchange || size == N_STATES));
+        return pick(2) ? status : fmi3SetTime(c, number());
+    }
+}
+
+/* A call that only the phase makes legal. */
+static fmi3Status move(Instance *c)
+{
+    const int phase = c->state.phase;
+    const double start = pick(5) ? 0.0 : number(), end = pick(5) ? 9.0 : number();
+    fmi3Status status;
+    switch (pick(8)) {
+    case 0:
+    case 1:
+        status = fmi3EnterInitializationMode(c, pick(2), number(), start, pick(2), end);
+        CHECK(status == fmi3Error || (phase == INSTANTIATED && isfinite(start)));
+        CHECK(c->state.phase == (status == fmi3OK ? INITIALIZATION : phase));
+        return status;
+    case 2:
+    case 3:
+    case 4:
+        status = fmi3ExitInitializationMode(c);
+        CHECK(status == fmi3Error || phase == INITIALIZATION);
+        return status;
+    case 5: return pick(4) ? fmi3OK : fmi3Terminate(c);
+    case 6: return pick(4) ? fmi3OK : fmi3Reset(c);
+    default: return fmi3EnterConfigurationMode(c);
+    }
+}
+
+static void sequence(void)
+{
+    fmi3FMUState saved = NULL;
+    Instance *c = create();
+    CHECK(c);
+    for (unsigned i = 0, length = 1 + pick(LONGEST); i < length; i++) {
+        const State before = c->state;
+        fmi3Status status;
+        switch (pick(8)) {
+        case 0: status = saved_states(c, &saved); break;
+        case 1: status = derivatives(c); break;
+        case 2:
+        case 3: status = variables(c); break;
+        case 4:
+        case 5: status = of_a_kind(c); break;
+        default: status = move(c); break;
+        }
+        if (status == fmi3Error) {
+            refused++;
+            CHECK(c->state.phase == before.phase && c->state.time == before.time);
+            for (int k = 0; k < N_VARIABLES; k++)
+                if (k < FIRST_OUTPUT || k >= FIRST_PARAMETER)
+                    CHECK(c->state.plant.value[k] == before.plant.value[k]);
+        } else {
+            done++;
+        }
+    }
+    fmi3FreeFMUState(c, &saved);
+    fmi3FreeInstance(c);
+}
+
+typedef struct {
+    long sequences;
+    uint64_t seed;
+} Share;
+
+static void *run(void *given)
+{
+    const Share *share = given;
+    seed = share->seed;
+    for (long i = 0; i < share->sequences; i++)
+        sequence();
+    printf("%ld sequences, %ld calls done, %ld refused, %ld messages\n", share->sequences, done,
+           refused, logged);
+    return NULL;
+}
+
+int main(int count, char *argument[])
+{
+    enum { MOST = 16 };
+    const long sequences = count > 1 ? atol(argument[1]) : 1000;
+    const uint64_t first = count > 2 ? strtoull(argument[2], NULL, 10) : 0;
+    const int threads = count > 3 ? atoi(argument[3]) : 1;
+    pthread_t thread[MOST];
+    Share share[MOST];
+    CHECK(threads > 0 && threads <= MOST);
+    CHECK(!fmi3InstantiateModelExchange("x", "wrong", NULL, 0, 0, NULL, log_message));
+    CHECK(!fmi3InstantiateModelExchange(NULL, MODEL_GUID, NULL, 0, 0, NULL, NULL));
+    CHECK(!fmi3InstantiateScheduledExecution("x", MODEL_GUID, "", 0, 0, NULL, log_message, NULL,
+                                             NULL, NULL));
+    CHECK(fmi3Reset(NULL) == fmi3Error);
+    fmi3FreeInstance(NULL);
+    for (int i = 0; i < threads; i++) {
+        share[i] = (Share){sequences, (first + (uint64_t)i) * UINT64_C(0x9e3779b97f4a7c15) + 1};
+        CHECK(!pthread_create(&thread[i], NULL, run, &share[i]));
+    }
+    for (int i = 0; i < threads; i++)
+        CHECK(!pthread_join(thread[i], NULL));
+    return 0;
+}

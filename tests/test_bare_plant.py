@@ -1,0 +1,170 @@
+"""The plant without a controller: its accelerations, its stops, its energy.
+
+The oracles are Pinocchio and MuJoCo, each with the robot read from the URDF by itself.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+
+import mujoco
+import numpy as np
+import pytest
+from native_models import (
+    ROBOTS,
+    Reduced,
+    coupling,
+    deviation,
+    engine,
+    loaded,
+    model,
+    random_plant,
+    urdf_path,
+)
+
+EVERY_ROBOT = ("twodof", *ROBOTS)
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_bare_plant_is_pinocchios(name, length):
+    """q̈ with efforts, a force at the frame, damping and a payload, both flavours."""
+    native, rng = engine(name, "effort"), np.random.default_rng(1)
+    for _ in range(length(1000, 100)):
+        plant = random_plant(name, "effort", rng)
+        plant.tau_cmd = rng.normal(0, 20, native.n).tolist()
+        plant.prepare()
+        q, v = np.array(plant.q), np.array(plant.v)
+        reference = Reduced(loaded(plant), name)
+        J = reference.jacobian(q, plant.robot.frame_id)[:3]
+        effort = np.add(plant.tau_cmd, plant.tau_ext) + J.T @ plant.f_ext
+        effort -= np.array(plant.robot.damping) * v
+        expected = reference.forward_dynamics(q, v, effort)
+        ours, _ = plant._equations_of_motion()(q, v)
+        theirs = np.empty(native.n)
+        native.call("acceleration", native.values(plant), theirs)
+        M = reference.mass_matrix(q)
+        assert deviation(M @ ours, M @ expected) <= 1e-11
+        assert deviation(M @ theirs, M @ expected) <= 1e-11
+
+
+# Robots whose inertias MuJoCo takes as they are.
+MUJOCO = (
+    "twodof", "ur5", "panda", "z1", "double_pendulum", "baxter",
+    "ur_description/urdf/ur10_robot.urdf", "kinova_description/robots/kinova.urdf",
+    "xarm_description/urdf/xarm7.urdf", "so_arm_description/urdf/so101.urdf",
+    "a1_description/urdf/a1.urdf", "talos_data/robots/talos_left_arm.urdf",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MUJOCO)
+def test_bare_plant_is_mujocos(name, length):
+    """The forces that MuJoCo finds for our q̈, with damping, are those that made it."""
+    root = ET.parse(urdf_path(name)).getroot()
+    for link in root.iter("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", {"balanceinertia": "false"})
+    theirs = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+    theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    G, c = coupling(name, names := [theirs.joint(i).name for i in range(theirs.njnt)])
+    data, rng = mujoco.MjData(theirs), np.random.default_rng(5)
+    ours = model(name, "effort").plant().robot.joints
+    order = np.array([ours.index(joint) for joint in names if joint in ours])
+    for _ in range(length(1000, 100)):
+        plant = random_plant(name, "effort", rng)
+        plant.payload, plant.f_ext = 0.0, [0.0] * 3
+        theirs.opt.gravity[:] = plant.gravity
+        plant.tau_cmd = rng.normal(0, 20, len(ours)).tolist()
+        plant.prepare()
+        q, v = np.array(plant.q), np.array(plant.v)
+        acceleration, _ = plant._equations_of_motion()(q, v)
+        data.qpos, data.qvel = G @ q[order] + c, G @ v[order]
+        data.qacc = G @ np.array(acceleration)[order]
+        mujoco.mj_inverse(theirs, data)
+        effort = np.add(plant.tau_cmd, plant.tau_ext)[order]
+        assert deviation(G.T @ data.qfrc_inverse, effort) <= 1e-9
+
+
+# --- rigid stops ---
+
+
+def conditions(reference, q, v, a_free, W, a, low, high, held):
+    """The complementarity conditions of stops, with M by Pinocchio."""
+    for i in np.flatnonzero((q <= low) | (q >= high)):
+        side = -1.0 if q[i] >= high[i] else 1.0
+        assert side * v[i] >= -1e-12
+        if v[i] == 0.0:
+            assert side * a[i] >= -1e-9 * max(1.0, np.abs(a_free).max())
+    force = np.linalg.solve(W, a - a_free)
+    size = max(1.0, np.abs(force).max())
+    for i in range(len(q)):
+        side = -1.0 if q[i] >= high[i] else 1.0
+        if held[i]:
+            assert a[i] == 0.0 and side * force[i] >= -1e-9 * size
+        else:
+            assert abs(force[i]) <= 1e-9 * size
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_stops_satisfy_their_complementarity_conditions(name):
+    """Several joints at their limits, moving and pressed either way; the impulse too."""
+    native, rng = engine(name, "effort"), np.random.default_rng(3)
+    several = 0
+    for _ in range(100):
+        plant = model(name, "effort").plant()
+        q = rng.uniform(-1, 1, native.n)
+        v = rng.normal(0, 1, native.n) * (rng.random(native.n) < 0.7)
+        at = rng.integers(-1, 2, native.n)  # at the lower limit, at none, at the upper one
+        low, high = np.where(at < 0, q, q - 1.0), np.where(at > 0, q, q + 1.0)
+        plant.q, plant.v, plant.q_min, plant.q_max = (list(part) for part in (q, v, low, high))
+        plant.tau_cmd = rng.normal(0, 50, native.n).tolist()
+        values, a, held = native.values(plant), np.empty(native.n), np.empty(native.n)
+        native.call("stopped", values, a, held)
+        after = native.group(values, "v")
+        reference = plant.robot.model.copy()
+        reference.gravity.linear = np.array(plant.gravity)
+        reference = Reduced(reference, name)
+        M = reference.mass_matrix(q)
+        impulse = M @ (after - v)
+        size = max(1.0, np.abs(impulse).max())
+        for i in range(native.n):
+            if at[i] == 0:
+                assert abs(impulse[i]) <= 1e-11 * size
+            else:
+                assert -at[i] * impulse[i] >= -1e-11 * size
+                assert impulse[i] * after[i] == pytest.approx(0.0, abs=1e-10 * size)
+        damping = np.array(plant.robot.damping)
+        effort = plant.tau_cmd - damping * after
+        free = reference.forward_dynamics(q, after, effort)
+        conditions(reference, q, after, free, np.linalg.inv(M), a, low, high, held)
+        several += held.sum() > 1
+        kinetic = 0.5 * after @ M @ after - 0.5 * v @ M @ v
+        assert kinetic <= 1e-9 * max(1.0, 0.5 * v @ M @ v)
+    assert several or native.n < 3
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_a_fall_into_stops_never_gains_energy(name, length):
+    native, rng = engine(name, "effort"), np.random.default_rng(4)
+    plant = model(name, "effort").plant()
+    reference = plant.robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    reference = Reduced(reference, name)
+    plant.rtol, plant.atol = 1e-10, 1e-12
+    falls, at_stops = length(100, 20 if name in ("twodof", "ur5", "panda") else 2), 0
+    for _ in range(falls):
+        q = rng.uniform(-1, 1, native.n)
+        plant.q_min, plant.q_max = (q - 0.3).tolist(), (q + 0.3).tolist()
+        plant.q, plant.v = q.tolist(), rng.normal(0, 2, native.n).tolist()
+        values, before, stopped = native.values(plant), np.inf, False
+        for _ in range(100):
+            assert native.call("advance", values, 0.01) == 1
+            q, v = native.group(values, "q").copy(), native.group(values, "v").copy()
+            assert (q >= plant.q_min).all() and (q <= plant.q_max).all()
+            stopped |= bool(((q == plant.q_min) | (q == plant.q_max)).any())
+            energy = reference.energy(q, v)
+            scale = max(1.0, abs(energy))
+            assert energy <= before + 1e-9 * scale
+            before = energy
+        at_stops += stopped
+    assert at_stops > 0.9 * falls

@@ -1,0 +1,183 @@
+"""The summary at the end of an MCAP file: believed where its checksum and its numbers are right."""
+
+from __future__ import annotations
+
+import random
+import struct
+from itertools import groupby
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import pytest
+from bags import START, STORE
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import twodof
+from twodof.bag.contents import read_messages
+from twodof.bag.reader import read_ends
+from twodof.bag.records import Allowance
+from twodof.bag.summary import read_summary
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+FOOTER = 20 + 8  # its fields, and the magic behind it
+
+
+@pytest.fixture
+def bag(native_path: Path, tmp_path: Path) -> Path:
+    """Several chunks of a scene's topics."""
+    bag = twodof.Bag(tmp_path / "bag", scene=True)
+    twodof.simulate(native_path, bag, stop_time=30.0, stamp_start=START)
+    return bag.path
+
+
+def file_of(bag: Path) -> Path:
+    return bag / f"{bag.name}.mcap"
+
+
+def ends(bag: Path) -> list[object]:
+    recording = read_ends(bag)
+    parts = (recording.stamps, recording.q, recording.v, recording.tau)
+    return [recording.count, recording.joints, recording.topics, *(part.tolist() for part in parts)]
+
+
+def without_checksum(file: Path) -> None:
+    content = file.read_bytes()
+    file.write_bytes(content[:-12] + bytes(4) + content[-8:])
+
+
+def test_summary_is_that_of_the_mcap_project(bag: Path) -> None:
+    with file_of(bag).open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        theirs = reader.get_summary()
+        read = sum(1 for _ in reader.iter_messages())
+    ours = read_summary(file_of(bag))
+    assert ours is not None and theirs is not None and theirs.statistics is not None
+    assert ours.counts == theirs.statistics.channel_message_counts
+    assert sum(ours.counts.values()) == read == 4 * 3001 + 2
+    assert {n: c.topic for n, c in ours.channels.items()} == {
+        n: c.topic for n, c in theirs.channels.items()
+    }
+    assert [c.place for c in ours.chunks] == [c.chunk_start_offset for c in theirs.chunk_indexes]
+    assert len(ours.chunks) > 2
+
+
+def test_a_summary_says_what_reading_all_does(bag: Path) -> None:
+    by_summary = ends(bag)
+    without_checksum(file_of(bag))
+    assert read_summary(file_of(bag)) is None
+    assert ends(bag) == by_summary
+    whole = twodof.read_bag(bag)
+    assert by_summary[3] == [whole.stamps[0], whole.stamps[-1]]
+    assert by_summary[4] == [whole.q[0].tolist(), whole.q[-1].tolist()]
+
+
+def test_a_summary_is_not_read_with_all_that_comes_before(bag: Path) -> None:
+    expected, file = ends(bag), file_of(bag)
+    summary, content = read_summary(file), bytearray(file.read_bytes())
+    assert summary is not None
+    middle = summary.chunks[len(summary.chunks) // 2]
+    content[middle.place + 200 : middle.place + middle.length] = bytes(middle.length - 200)
+    file.write_bytes(content)
+    assert ends(bag) == expected
+    with pytest.raises(twodof.TwoDofError, match="damaged"):
+        twodof.read_bag(bag)
+
+
+def test_a_summary_with_a_flipped_bit_is_not_believed(bag: Path) -> None:
+    file, chance = file_of(bag), random.Random(17)
+    content = file.read_bytes()
+    (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
+    for _ in range(200):
+        damaged = bytearray(content)
+        damaged[chance.randrange(start, len(content))] ^= 1 << chance.randrange(8)
+        file.write_bytes(damaged)
+        assert read_summary(file) is None
+    for size in (*range(40), start, len(content) - 1):
+        file.write_bytes(content[:size])
+        assert read_summary(file) is None
+
+
+@pytest.mark.parametrize("field", [0, 22], ids=["messages", "chunks"])
+def test_numbers_that_contradict_each_other_are_not_believed(bag: Path, field: int) -> None:
+    """With a checksum that is right: messages and those by channel, chunks and their index."""
+    file = file_of(bag)
+    content = bytearray(file.read_bytes())
+    (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
+    place = start
+    while content[place] != 11:
+        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
+    content[place + 9 + field] ^= 1
+    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
+    file.write_bytes(content)
+    assert read_summary(file) is None
+
+
+def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag: Path) -> None:
+    file = file_of(bag)
+    summary, content = read_summary(file), bytearray(file.read_bytes())
+    assert summary is not None
+    content[summary.chunks[-1].place] = 7
+    file.write_bytes(content)
+    with pytest.raises(twodof.TwoDofError, match="is damaged at byte"):
+        read_ends(bag)
+
+
+@pytest.mark.parametrize("name", ["/joint_states", "/other"])
+def test_ends_of_another_writer_in_any_order(tmp_path: Path, name: str) -> None:
+    """Small chunks, whose stamps overlap; another topic in some of them."""
+    stamps = np.random.default_rng(3).permutation(400)
+    types, file = STORE.types, tmp_path / "bag" / "bag.mcap"
+    file.parent.mkdir()
+    (file.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1500)
+        writer.start()
+        schemas = {k: writer.register_schema(k, "ros2msg", b"") for k in (JOINT_STATE, "x/msg/Y")}
+        told = writer.register_channel(name, "cdr", schemas[JOINT_STATE])
+        other = writer.register_channel("/talk", "cdr", schemas["x/msg/Y"])
+        for stamp in stamps.tolist():
+            header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
+            q = np.array([float(stamp)])
+            state = types[JOINT_STATE](header, ["j"], q, q, np.empty(0))
+            data = bytes(STORE.serialize_cdr(state, JOINT_STATE))
+            writer.add_message(told, stamp, data, stamp)
+            if stamp % 3 == 0:
+                writer.add_message(other, stamp + 7, bytes(4 + stamp), stamp + 7)
+        writer.finish()
+    assert read_summary(file) is not None
+    recording = read_ends(file.parent)
+    assert (recording.count, recording.q.tolist()) == (400, [[0.0], [399.0]])
+
+
+def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path: Path) -> None:
+    """Of three channels and few lengths at random, with runs of turns among them."""
+    chance, file = random.Random(5), tmp_path / "x.mcap"
+    parts = [
+        [(chance.randrange(3), chance.choice((4, 8, 9))) for _ in range(chance.randrange(1, 7))]
+        * chance.choice((1, 1, 2, 50))
+        for _ in range(300)
+    ]
+    said = [
+        (channel, k, chance.randbytes(size))
+        for k, (channel, size) in enumerate(pair for part in parts for pair in part)
+    ]
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=30_000)
+        writer.start()
+        schema = writer.register_schema("x/msg/Y", "ros2msg", b"")
+        channels = [writer.register_channel(f"/{i}", "cdr", schema) for i in range(3)]
+        for channel, k, data in said:
+            writer.add_message(channels[channel], k, data, k)
+        writer.finish()
+    read: list[tuple[int, int, bytes]] = []
+    for channel, stamps, messages in read_messages(file, Allowance()):
+        for stamp, message in zip(stamps.tolist(), messages, strict=True):
+            read.append((int(channel.topic[1:]), stamp, message.tobytes()))
+    read.sort(key=lambda each: each[0])  # stable
+    expected = sorted(said, key=lambda each: each[0])
+    for (a, ours), (b, theirs) in zip(
+        groupby(read, lambda each: each[0]), groupby(expected, lambda each: each[0]), strict=True
+    ):
+        assert a == b and list(ours) == list(theirs)

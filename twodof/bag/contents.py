@@ -1,0 +1,38 @@
+"""The files of a bag, and the messages in them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from .mcap import mcap_messages
+from .records import Allowance, Batch, refusing_damage
+from .sqlite import sqlite3_messages
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The files that hold a bag's messages, in the order in which they were written.
+
+    An MCAP file alone, as pages and other tools write them, is a bag too.
+    """
+    if folder.suffix == ".mcap" and folder.is_file():
+        return [folder]
+    files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
+    return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
+
+
+def read_messages(file: Path, allowance: Allowance) -> Iterator[Batch]:
+    """All messages, those of a channel in the order of the file.
+
+    Args:
+        file: one of a bag's.
+        allowance: of the bag.
+
+    Raises:
+        DamageError: where the file ends in the middle or is not sound.
+        OSError: it cannot be read.
+    """
+    mcap = file.suffix == ".mcap"
+    with refusing_damage(file):
+        yield from mcap_messages(file, allowance) if mcap else sqlite3_messages(file)

@@ -1,0 +1,269 @@
+"""MCAP files, record by record, also where they end in the middle. Source: MCAP's specification."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, BinaryIO
+from zlib import crc32
+
+import lz4.frame
+import numpy as np
+
+from ..ros.cdr import Rows
+from .records import (
+    MAX_CHUNK,
+    MAX_RATIO,
+    MAX_TOPICS,
+    RECORD,
+    TEXT,
+    Allowance,
+    Batch,
+    Channel,
+    DamageError,
+    refusing_damage,
+)
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+MAGIC = b"\x89MCAP0\r\n"
+SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, FOOTER = 3, 4, 5, 6, 12, 2  # opcodes
+READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
+HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # with the record's head: channel, sequence, two times
+STAMP = slice(15, 23)  # the first of them
+MANY = 1000  # records outside of chunks
+
+
+def mcap_messages(path: Path, allowance: Allowance) -> Iterator[Batch]:
+    """All messages of a file; errors as of ``read_messages``."""
+    tables = Tables()
+    loose: list[bytes] = []  # records outside of chunks
+    try:
+        for opcode, content in _records(path, allowance):
+            allowance.left += MAX_RATIO * len(content)
+            if opcode != CHUNK:
+                loose.append(content)
+            if opcode == CHUNK or len(loose) > MANY:
+                before, loose = b"".join(loose), []
+                yield from messages_in(path, before, tables, allowance)
+            if opcode == CHUNK:
+                chunk = unpack_chunk(path, content, allowance)
+                yield from messages_in(path, chunk, tables, allowance)
+    except DamageError:  # what came before is sound
+        yield from messages_in(path, b"".join(loose), tables, allowance)
+        raise
+    yield from messages_in(path, b"".join(loose), tables, allowance)
+
+
+def read_metadata(path: Path, name: str, key: str) -> str:
+    """An entry of a file's own metadata; "" where it has none of that name.
+
+    Raises:
+        DamageError, OSError: as ``read_messages``.
+    """
+    with refusing_damage(path):
+        for _, content in _records(path, Allowance(), (METADATA,)):
+            found, _, position = fields("sI", content, HEAD.size)
+            if found == name:
+                return _entries(content[position:]).get(key, "")
+    return ""
+
+
+def messages_in(path: Path, chunk: bytes, tables: Tables, allowance: Allowance) -> Iterator[Batch]:
+    """The messages of a chunk.
+
+    Where messages of equal lengths come in turns, as a writer's of ROS 2 mostly do, all are taken
+    at once: record by record, Python would take a microsecond for each.
+    """
+    position = 0
+    seen: dict[bytes, int] = {}  # heads of the last records, which are messages, and their places
+
+    def alone(places: Iterable[int]) -> Iterator[Batch]:
+        for place in places:
+            yield tables.batch(path, np.frombuffer(chunk, np.uint8, offset=place)[None])
+
+    while position + HEAD.size <= len(chunk):
+        opcode, length = HEAD.unpack_from(chunk, position)
+        end = position + HEAD.size + length
+        if end > len(chunk) or not opcode:
+            break
+        head = chunk[position : position + HEAD.size + 2]
+        if head in seen:
+            turn = [place for place in seen.values() if place >= seen[head]]
+            yield from alone([*seen.values()][: -len(turn)])
+            rows = _turns(chunk, turn, position)
+            allowance.spend(RECORD * (len(rows) - 1) * len(turn))
+            for place in turn:
+                yield tables.batch(path, rows[:, place - turn[0] :])
+            position, seen = turn[0] + rows.size, {}
+            continue
+        allowance.spend(RECORD)
+        if opcode == MESSAGE:
+            seen[head] = position
+        elif opcode in (SCHEMA, CHANNEL):
+            yield from alone(seen.values())
+            seen = {}
+            allowance.spend(TEXT * length)
+            tables.add(path, opcode, chunk, position + HEAD.size)
+        position = end
+    yield from alone(seen.values())
+    if position < len(chunk):
+        raise DamageError(f"'{path.name}' has a damaged chunk")
+
+
+def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
+    """The records that begin at these places, up to an end, and as often as others alike follow.
+
+    One row a time; once where a channel has its turn twice, whose messages are to stay in order.
+    """
+    every = np.frombuffer(chunk, np.uint8, offset=turn[0])
+    length = end - turn[0]
+    rows = every[: len(every) // length * length].reshape(-1, length)
+    heads = np.concatenate([np.arange(place, place + HEAD.size + 2) for place in turn]) - turn[0]
+    channels = {chunk[place + HEAD.size : place + HEAD.size + 2] for place in turn}
+    if len(channels) < len(turn):
+        return rows[:1]
+    count, ahead = 1, 16
+    while count < len(rows):
+        same = (rows[count : count + ahead, heads] == rows[0, heads]).all(axis=1)
+        if not same.all():
+            return rows[: count + int(np.argmin(same))]
+        count, ahead = count + len(same), 2 * ahead
+    return rows[:count]
+
+
+class Tables:
+    """The channels of an MCAP file, as far as they are known."""
+
+    def __init__(self, channels: Mapping[int, Channel] = MappingProxyType({})) -> None:
+        self._schemas: dict[int, tuple[str, str]] = {0: ("", "")}
+        self.channels = dict(channels)
+
+    def add(self, path: Path, opcode: int, content: bytes, position: int) -> None:
+        """Take a schema or a channel, whose fields begin at a position."""
+        if opcode == SCHEMA:
+            number, name, _, text, _ = fields("Hsss", content, position)
+            self._schemas[number] = (name, text)
+            return
+        number, channel = _channel(content, position, self._schemas)
+        self.channels[number] = channel
+        if len(self.channels) > MAX_TOPICS:
+            raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
+
+    def batch(self, path: Path, rows: Rows) -> Batch:
+        """Messages whose records begin the rows, and are all of one channel and length."""
+        _, length, channel, *_ = MESSAGE_HEAD.unpack_from(rows[0])
+        end = HEAD.size + length
+        if end < MESSAGE_HEAD.size:
+            raise struct.error
+        stamps = np.ascontiguousarray(rows[:, STAMP]).view("<i8")[:, 0]
+        if stamps.min() < 0:
+            raise DamageError(f"'{path.name}' has a stamp beyond 2262")
+        return Batch(self.channels[channel], stamps, rows[:, MESSAGE_HEAD.size : end])
+
+
+def _records(
+    path: Path, allowance: Allowance, wanted: Sequence[int] = READ
+) -> Iterator[tuple[int, bytes]]:
+    """Opcode of each record up to the footer that is wanted, and the record with its head.
+
+    Of a chunk, the content alone.
+    """
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise DamageError(f"'{path.name}' is no MCAP file")
+        yield from _records_of(path, file, allowance, wanted)
+
+
+def _records_of(
+    path: Path, file: BinaryIO, allowance: Allowance, wanted: Sequence[int]
+) -> Iterator[tuple[int, bytes]]:
+    size, position = path.stat().st_size, len(MAGIC)
+    while True:
+        start = position
+        head = file.read(HEAD.size)
+        if len(head) < HEAD.size:
+            raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
+        opcode, length = HEAD.unpack(head)
+        allowance.spend(RECORD)
+        position += HEAD.size + length
+        if opcode == 0 or position > size:
+            raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
+        if opcode in wanted and length > MAX_CHUNK:
+            raise DamageError(f"'{path.name}' has a record of {length} bytes")
+        if opcode == FOOTER:
+            file.seek(length, 1)
+            if file.read(len(MAGIC)) != MAGIC:
+                raise DamageError(f"'{path.name}' ends in the middle, at byte {size}")
+            return
+        if opcode == CHUNK and opcode in wanted:
+            yield opcode, file.read(length)
+        elif opcode in wanted:
+            yield opcode, head + file.read(length)
+        elif length:
+            file.seek(length, 1)
+
+
+def unpack_chunk(path: Path, content: bytes, allowance: Allowance) -> bytes:
+    """The records of a chunk."""
+    _, _, size, crc, compression, length, start = fields("QQQIsQ", content, 0)
+    packed = content[start : start + length]
+    if size > MAX_CHUNK:
+        raise DamageError(f"'{path.name}' has a chunk of {size} bytes")
+    allowance.spend(size)
+    try:
+        if compression == "zstd":
+            packed = zstd.ZstdDecompressor().decompress(packed, max_length=size)
+        elif compression == "lz4":
+            packed = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
+        elif compression:
+            raise DamageError(f"'{path.name}' is compressed in an unknown way, '{compression}'")
+    except (zstd.ZstdError, RuntimeError, EOFError) as error:
+        raise DamageError(f"'{path.name}' has a damaged chunk") from error
+    if len(packed) != size or (crc and crc32(packed) != crc):
+        raise DamageError(f"'{path.name}' has a damaged chunk")
+    return packed
+
+
+def _channel(
+    content: bytes, position: int, schemas: dict[int, tuple[str, str]]
+) -> tuple[int, Channel]:
+    number, schema, topic, encoding, length, position = fields("HHssI", content, position)
+    entries = _entries(content[position : position + length])
+    name, definition = schemas[schema]
+    qos = entries.get("offered_qos_profiles", "")
+    return number, Channel(
+        topic, name, encoding, definition, qos, entries.get("topic_type_hash", "")
+    )
+
+
+def _entries(metadata: bytes) -> dict[str, str]:
+    entries, position = {}, 0
+    while position < len(metadata):
+        key, value, position = fields("ss", metadata, position)
+        entries[key] = value
+    return entries
+
+
+def fields(form: str, content: bytes, position: int) -> list[Any]:
+    """Fields of a record, and where they end; struct's letters, and s for a text and its length."""
+    values: list[Any] = []
+    for letter in form:
+        if letter == "s":
+            (length,) = struct.unpack_from("<I", content, position)
+            position += 4
+            if position + length > len(content):
+                raise struct.error
+            values.append(content[position : position + length].decode())
+            position += length
+        else:
+            values += struct.unpack_from(f"<{letter}", content, position)
+            position += struct.calcsize(f"<{letter}")
+    return [*values, position]

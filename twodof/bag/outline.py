@@ -1,0 +1,63 @@
+"""Few samples of a long recording, with which its lines over time look as they do with all.
+
+Of each of many spans of time the first and the last sample, and those where a line is lowest and
+highest, as in Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB
+7(10), 2014. Spans grow by doubling, so that the extremes of a longer one are among those of its
+halves: what was left out before is not missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .recording import Array, Recording
+
+Indices = NDArray[np.intp]
+
+
+class Outline:
+    """Chooses samples, from time to time, of those chosen before and those that came since.
+
+    Args:
+        most: samples that may wait to be chosen from, of which a quarter is left at most.
+        lines: gives those of a recording beside its positions and velocities, N values each.
+    """
+
+    def __init__(self, most: int, lines: Callable[[Recording], Sequence[Array]]) -> None:
+        self.most, self._lines = most, lines
+        self._span = 1  # ns
+
+    def choose(self, bag: Recording) -> Indices:
+        """Which samples are left."""
+        lines = [*bag.q.T, *bag.v.T, *self._lines(bag)]
+        duration = int(bag.stamps[-1] - bag.stamps[0])
+        while self._span < duration / self.most:
+            self._span *= 2
+        chosen = extremes(bag.stamps // self._span, lines)
+        while len(chosen) > self.most / 4 and self._span < duration:
+            self._span *= 2
+            chosen = extremes(bag.stamps // self._span, lines)
+        return chosen
+
+
+def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
+    """The first and last sample of each part, and where a line is lowest and highest in it.
+
+    Args:
+        parts: their numbers, N, ascending from 0 or more.
+        lines: N values each; what is not finite is no extreme.
+    """
+    starts = np.flatnonzero(np.diff(parts, prepend=-1))
+    sizes = np.diff(starts, append=len(parts))
+    kept = np.zeros(len(parts), bool)
+    kept[starts] = kept[starts + sizes - 1] = True
+    for line in lines:
+        line = np.where(np.isfinite(line), line, np.nan)
+        for extreme in (np.fmin, np.fmax):
+            found = np.flatnonzero(line == np.repeat(extreme.reduceat(line, starts), sizes))
+            kept[found[np.diff(parts[found], prepend=-1) > 0]] = True
+    return np.flatnonzero(kept)

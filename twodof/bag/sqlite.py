@@ -1,0 +1,123 @@
+"""SQLite files of ROS 2, row by row, also those that a writer left unfinished."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
+from itertools import groupby, islice
+from operator import length_hint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..files import temporary_folder
+from .records import MAX_TOPICS, Batch, Channel, DamageError
+
+PLAIN = ("CREATE TABLE ", "CREATE INDEX ")  # as SQLite begins its records of them
+TABLES = {  # of ROS 2, and their columns; those of older versions end earlier
+    "topics": "id name type serialization_format offered_qos_profiles type_description_hash",
+    "message_definitions": "id topic_type encoding encoded_message_definition",
+    "messages": "id topic_id timestamp data",
+}
+SCHEMA_STEPS = 1000  # of SQLite's machine, for which it reads a hundred of those
+SOME = 1000  # rows that are put together
+
+
+def sqlite3_messages(path: Path) -> Iterator[Batch]:
+    """All messages of a file; errors as of ``read_messages``."""
+    try:
+        with _database(path) as database:
+            channels = _sqlite3_channels(path, database)
+            rows = _rows(path, database, "messages")
+            while some := [*islice(rows, SOME)]:
+                waiting: dict[int, list[tuple[int, bytes]]] = {}
+                for _, topic, stamp, data in some:
+                    if not isinstance(stamp, int) or stamp < 0 or not isinstance(data, bytes):
+                        raise DamageError(f"'{path.name}' is damaged")
+                    waiting.setdefault(topic, []).append((stamp, data))
+                for topic, messages in waiting.items():
+                    yield from _batches(channels[topic], messages)
+    except sqlite3.Error as error:
+        raise DamageError(f"'{path.name}': {error}") from error
+
+
+@contextmanager
+def _database(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database of tables alone, without changing it.
+
+    Where a writer died over it, a copy is repaired. A journal can name that of several databases,
+    which SQLite would look for, anywhere, and delete; a copy that is longer names none.
+    """
+    unfinished = _unfinished(path)
+    with temporary_folder(path.absolute().parent.parent if unfinished else None) as folder:
+        uri = path.absolute().as_uri() + "?immutable=1"
+        if unfinished:
+            for file in (path, *unfinished):
+                copy = shutil.copyfile(file, folder / file.name)
+                if copy.name.endswith("-journal"):
+                    with copy.open("ab") as journal:
+                        journal.write(bytes(8))
+            uri = (folder / path.name).as_uri()
+        with closing(sqlite3.connect(uri, uri=True)) as database:
+            database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
+            tables = "SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"
+            schema = dict(database.execute(tables))
+            database.set_progress_handler(None, 0)
+            if not schema.keys() >= {"topics", "messages"}:
+                raise DamageError(f"'{path.name}' has no messages")
+            if not all(sql.startswith(PLAIN) for sql in schema.values()):
+                raise DamageError(f"'{path.name}' has views, triggers or virtual tables")
+            yield database
+
+
+def _unfinished(path: Path) -> list[Path]:
+    """The files that a writer which died leaves beside its database."""
+    files = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
+    return [file for file in files if file.is_file() and file.stat().st_size]
+
+
+def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
+    """Topics by their id."""
+    definitions = {row[1]: row[3] for row in _rows(path, database, "message_definitions")}
+    channels = {}
+    for number, topic, kind, serialization, qos, digest in _rows(path, database, "topics"):
+        definition = definitions.get(kind, "")
+        channel = Channel(topic, kind, serialization, definition, qos or "", digest or "")
+        if not all(isinstance(text, str) for text in channel):
+            raise DamageError(f"'{path.name}' is damaged")
+        channels[number] = channel
+        if len(channels) > MAX_TOPICS:
+            raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
+    return channels
+
+
+def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:
+    """The rows of a table of ROS 2, NULL in the columns that it has not or computes.
+
+    No more is believed to lie in them than there is room for in the files: pages can be linked in
+    a circle, or be part of many rows. Nor may there be others before them, to be passed by.
+    """
+    columns = TABLES[table].split()
+    infos = database.execute(f"PRAGMA table_xinfo({table})")
+    stored = ["" if computed else name for _, name, *_, computed in infos]
+    known = [name for name in columns if name in stored]
+    if stored[: len(known)] != known:
+        raise DamageError(f"'{path.name}' has {table} that are not those of ROS 2")
+    names = ", ".join(name if name in known else "NULL" for name in columns)
+    room = sum(file.stat().st_size for file in (path, *_unfinished(path)))
+    for row in database.execute(f"SELECT {names} FROM {table} NOT INDEXED") if stored else ():
+        room -= len(known) + sum(map(length_hint, row))
+        if room < 0:
+            raise DamageError(f"'{path.name}' is damaged")
+        yield row
+
+
+def _batches(channel: Channel, messages: Iterable[tuple[int, bytes]]) -> Iterator[Batch]:
+    """Stamps and messages, put together as long as they are equally long."""
+    for size, group in groupby(messages, lambda message: len(message[1])):
+        stamps, contents = zip(*group)
+        rows = np.frombuffer(b"".join(contents), np.uint8).reshape(len(stamps), size)
+        yield Batch(channel, np.array(stamps), rows)

@@ -1,0 +1,138 @@
+"""What an MCAP file's own summary says, where it can be believed.
+
+It is at the end of a file that was closed, with a checksum over all of it:
+
+    … | data end | schemas, channels, chunk indexes, statistics, … | footer | magic
+    footer   where the summary begins, where its offsets begin, CRC-32 of the summary and of these
+
+Source: MCAP's specification. A file without one, or without its checksum, is to be read instead.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from zlib import crc32
+
+from .mcap import CHANNEL, CHUNK, FOOTER, HEAD, MAGIC, SCHEMA, Tables, messages_in, unpack_chunk
+from .records import Allowance, Batch, Channel, DamageError, refusing_damage
+
+CHUNK_INDEX, STATISTICS = 8, 11  # opcodes
+FOOTER_FIELDS = struct.Struct("<QQI")
+END = HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
+STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
+CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, place, length, bytes of what follows
+MAX_SUMMARY = 64 * 1024**2
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Log times in ns, place and length of a chunk's record, and the channels in it."""
+
+    first: int
+    last: int
+    place: int
+    length: int
+    channels: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A file's channels by number, how many messages each has, and its chunks."""
+
+    path: Path
+    channels: dict[int, Channel]
+    counts: dict[int, int]
+    chunks: list[Chunk]
+
+    def ends(self, topic: str, allowance: Allowance) -> Iterator[Batch]:
+        """Batches among which are the first and the last message of a topic.
+
+        Raises:
+            DamageError: a chunk is not where it should be, or not sound.
+            OSError: the file cannot be read.
+        """
+        numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
+        chunks = [chunk for chunk in self.chunks if chunk.channels & numbers]
+        yield from self._until(sorted(chunks, key=lambda c: c.first), topic, allowance,
+                               lambda chunk, stamps: chunk.first > min(stamps))  # fmt: skip
+        yield from self._until(sorted(chunks, key=lambda c: -c.last), topic, allowance,
+                               lambda chunk, stamps: chunk.last < max(stamps))  # fmt: skip
+
+    def _until(
+        self, chunks: list[Chunk], topic: str, allowance: Allowance,
+        beyond: Callable[[Chunk, list[int]], bool],
+    ) -> Iterator[Batch]:  # fmt: skip
+        """The topic's messages, chunk by chunk, until one cannot have an earlier or later one."""
+        stamps: list[int] = []
+        with self.path.open("rb") as file, refusing_damage(self.path):
+            for chunk in chunks:
+                if stamps and beyond(chunk, stamps):
+                    return
+                file.seek(chunk.place)
+                opcode, length = HEAD.unpack(file.read(HEAD.size))
+                if opcode != CHUNK or HEAD.size + length != chunk.length:
+                    raise DamageError(f"'{self.path.name}' is damaged at byte {chunk.place}")
+                allowance.left += chunk.length
+                content = unpack_chunk(self.path, file.read(length), allowance)
+                for batch in messages_in(self.path, content, Tables(self.channels), allowance):
+                    if batch.channel.topic == topic:
+                        stamps += [int(batch.stamps.min()), int(batch.stamps.max())]
+                        yield batch
+
+
+def read_summary(path: Path) -> Summary | None:
+    """The summary of an MCAP file; None where it has none that can be believed.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    size = path.stat().st_size
+    if path.suffix != ".mcap" or size < END + len(MAGIC):
+        return None
+    with path.open("rb") as file:
+        file.seek(size - END)
+        end = file.read()
+        start, _, crc = FOOTER_FIELDS.unpack_from(end, HEAD.size)
+        length = size - END - start
+        sound = end.endswith(MAGIC) and HEAD.unpack_from(end) == (FOOTER, FOOTER_FIELDS.size)
+        if not sound or not crc or not 0 < start < size - END or length > MAX_SUMMARY:
+            return None
+        file.seek(start)
+        content = file.read(length)
+    if crc32(end[: HEAD.size + 16], crc32(content)) != crc:
+        return None
+    try:
+        return _summary(path, content, start)
+    except (struct.error, UnicodeDecodeError, KeyError, DamageError):
+        return None
+
+
+def _summary(path: Path, content: bytes, start: int) -> Summary | None:
+    """Of the records of a summary that begins at a place; None where they do not fit together."""
+    tables, chunks, counts = Tables(), [], None
+    position, said, chunk_count = 0, 0, 0
+    while position < len(content):
+        opcode, length = HEAD.unpack_from(content, position)
+        position += HEAD.size
+        if opcode in (SCHEMA, CHANNEL):
+            tables.add(path, opcode, content, position)
+        elif opcode == CHUNK_INDEX:
+            first, last, place, size, more = CHUNK_FIELDS.unpack_from(content, position)
+            offsets = content[position + CHUNK_FIELDS.size :][:more]
+            channels = frozenset(number for number, _ in struct.iter_unpack("<HQ", offsets))
+            chunks.append(Chunk(first, last, place, size, channels))
+        elif opcode == STATISTICS:
+            said, *_, chunk_count, _, _, size = STATISTICS_FIELDS.unpack_from(content, position)
+            pairs = content[position + STATISTICS_FIELDS.size :][:size]
+            counts = dict(struct.iter_unpack("<HQ", pairs))
+        position += length
+    whole = counts is not None and sum(counts.values()) == said and len(chunks) == chunk_count
+    inside = all(len(MAGIC) <= c.place and c.place + c.length <= start for c in chunks)
+    if counts is None or not whole or not inside:
+        return None
+    indexed = frozenset().union(*(chunk.channels for chunk in chunks))
+    used = {number: count for number, count in counts.items() if count}
+    return Summary(path, tables.channels, used, chunks) if used.keys() <= indexed else None

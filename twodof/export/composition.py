@@ -1,0 +1,228 @@
+"""What goes into an FMU's zip, and its digest: of a URDF and options."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..errors import BuildError
+from ..files import data_file
+from ..plant.plant import Plant
+from ..plant.robot import Robot, load_robot
+from ..plant.urdf import RobotError, read_urdf
+from ..plant.variables import CONTROLS, Variable, variable_table
+from ..version import __version__
+from .arm_page import Arm, LivePart, live_part
+from .compiler import PLATFORMS, compiles_for_the_web, host_platform
+from .documentation import documentation
+from .flavours import Files, Flavour, native_flavour, python_flavour
+from .meshes import collect_meshes
+from .model_description import DEFAULT_STEP, model_description
+from .model_description3 import model_description3
+from .native import engine_variables
+from .options import FmuOptions
+from .urdf_source import end_effector, lock_joints, read_text, without_meshes
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
+"""Start values of the shipped arm; nothing else knows that it has two joints."""
+ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
+"""By version of FMI."""
+
+
+def is_live(options: FmuOptions) -> bool:
+    """Whether the arm is in the documentation, alive."""
+    return options.native and options.live_documentation and compiles_for_the_web()
+
+
+def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
+    """The flavour, what the GUID is of, and what gives all other files: it compiles."""
+    if not options.name.isidentifier() or not options.name.isascii():
+        raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
+    if options.control not in CONTROLS:
+        raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
+    path = options.urdf or data_file("urdf", "2dof.urdf")
+    mesh_dir = _mesh_dir(options)
+    text = read_text(path, mesh_dir)
+    try:
+        text = lock_joints(text, options.lock) if options.lock else text
+        frame = options.frame or end_effector(read_urdf(text))
+    except RobotError as error:
+        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    options = replace(options, frame=frame)
+    if not options.meshes:
+        text = without_meshes(text)
+    robot, table, starts = _model(options, text)
+    urdf, meshes = collect_meshes(text, path.parent, mesh_dir)
+    flavour = _flavour(options, robot, table, urdf, starts)
+    resources = {"robot.urdf": urdf.encode(), **meshes}
+    files = {f"resources/{name}": content for name, content in resources.items()}
+    files.update(flavour.files)
+
+    def describe(guid: str) -> bytes:
+        description = model_description(
+            robot,
+            table,
+            options.control,
+            name=options.name,
+            guid=guid,
+            version=__version__,
+            flavour=flavour.attributes,
+            exchanges=flavour.exchanges,
+            source_files=flavour.source_files,
+        )
+        return model_description3(description) if flavour.fmi == 3 else description
+
+    digest = hashlib.sha256(describe(""))
+    for name in sorted(files):
+        digest.update(name.encode() + b"\0" + files[name])
+    guid = digest.hexdigest()
+    files["modelDescription.xml"] = describe(guid)
+    files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
+    return flavour, files, partial(_finish, options, robot, table, flavour, guid, files)
+
+
+def _finish(
+    options: FmuOptions,
+    robot: Robot,
+    table: Sequence[Variable],
+    flavour: Flavour,
+    guid: str,
+    files: Files,
+) -> Files:
+    """What the GUID is not of: binaries and documentation."""
+    binaries = flavour.finish(guid)
+    live = LivePart("", "")
+    if is_live(options):
+        variables = engine_variables(robot, table, options.control, flavour.fmi)
+        live = _live_part(options, robot, variables, guid, {**files, **binaries})
+    return binaries | documentation(
+        robot,
+        table,
+        options.control,
+        flavour,
+        name=options.name,
+        guid=guid,
+        version=__version__,
+        urdf=files["resources/robot.urdf"].decode(),
+        live=live,
+    )
+
+
+def _live_part(
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], guid: str, files: Files
+) -> LivePart:
+    """The arm of the FMU that has these files."""
+    variables = [
+        {
+            "name": variable.name, "reference": reference, "causality": variable.causality,
+            "unit": variable.unit, "start": variable.start, "description": variable.description,
+        }
+        for reference, variable in enumerate(table)
+        if variable.causality != "local"
+    ]  # fmt: skip
+    folder = "sources/"
+    return live_part(
+        Arm(
+            name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
+            joints=robot.joints, frame=robot.frame, root=robot.root, axes="".join(robot.axes),
+            control=options.control, variables=variables, step=DEFAULT_STEP,
+            urdf=files["resources/robot.urdf"].decode(),
+            read=lambda name: files.get(f"resources/{name}"),
+            sources={p[len(folder) :]: c for p, c in files.items() if p.startswith(folder)},
+        )
+    )  # fmt: skip
+
+
+def _flavour(
+    options: FmuOptions,
+    robot: Robot,
+    table: list[Variable],
+    urdf: str,
+    starts: Mapping[str, Any],
+) -> Flavour:
+    if not options.native:
+        if options.platforms or options.fmi:
+            raise BuildError(
+                "the platforms and the version of FMI can be chosen for the native flavour only,"
+                " `native=True`"
+            )
+        return python_flavour(
+            robot, options.control, urdf, starts, options.name, options.link_environment
+        )
+    if options.link_environment:
+        raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
+    fmi = options.fmi or (2 if options.platforms or host_platform() else 3)
+    if fmi not in PLATFORMS:
+        raise BuildError(f"there is no FMI {fmi} here, `fmi` is 2 or 3")
+    platforms = options.platforms or (host_platform(fmi),)
+    if platforms == ("",):
+        raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
+    for platform in platforms:
+        if platform not in PLATFORMS[fmi]:
+            names = ", ".join(PLATFORMS[fmi])
+            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}")
+    return native_flavour(robot, options.control, table, options.name, platforms, fmi)
+
+
+def _mesh_dir(options: FmuOptions) -> Path | None:
+    if options.mesh_dir is not None and not options.mesh_dir.is_dir():
+        raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
+    return options.mesh_dir if options.urdf else data_file("meshes")
+
+
+def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
+    """The robot, its variables, and the start values that are not the table's own."""
+    shipped = options.urdf is None
+    axes = options.axes or ("xy" if shipped else "xyz")
+    try:
+        assert options.frame is not None
+        robot = load_robot(urdf, options.frame, axes)
+    except RobotError as error:
+        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    for warning in robot.warnings:
+        logger.warning("%s: %s", options.urdf, warning)
+    if options.control == "pose" and sum(robot.moves_frame()) < len(axes) + 3:
+        logger.warning(
+            "%d joints move '%s': not every position and orientation of it can be reached together",
+            sum(robot.moves_frame()), robot.frame,
+        )  # fmt: skip
+    starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": _rest(robot)}
+    for key in ("gravity", "q_start"):
+        given = getattr(options, key)
+        if given is not None:
+            if not all(map(math.isfinite, given)):
+                raise BuildError(f"{key} {given} must be finite numbers")
+            starts[key] = tuple(float(value) for value in given)
+    if len(starts["q_start"]) != len(robot.joints):
+        raise BuildError(
+            f"q_start has {len(starts['q_start'])} values, the robot has {len(robot.joints)}"
+            f" joints: {', '.join(robot.joints)}"
+        )
+    if shipped and axes != "xy":
+        raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
+    if "x_des" not in CONTROLS[options.control].inputs:
+        starts.pop("x_des", None)
+    else:
+        at_rest = {"x_des": (0.0,) * len(axes), "quat_des": (0.0, 0.0, 0.0, 1.0), **starts}
+        plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
+        plant.initialise()
+        starts.setdefault("x_des", tuple(plant.x))
+        if options.control == "pose":
+            starts["quat_des"] = tuple(plant.quat)
+    return robot, variable_table(robot, starts, options.control), starts
+
+
+def _rest(robot: Robot) -> tuple[float, ...]:
+    """0 where it is inside the limits, else their middle."""
+    return tuple(
+        0.0 if low <= 0.0 <= high else 0.5 * (low + high)
+        for low, high in zip(robot.q_min, robot.q_max, strict=True)
+    )

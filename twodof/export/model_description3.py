@@ -1,0 +1,213 @@
+"""The XML files of FMI 3.0. modelDescription.xml is made of that of FMI 2.0: elements of vectors
+become arrays.
+
+Source: FMI 3.0.2, sections 2.4 to 2.6.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+
+from ..plant.variables import DISTURBANCES, Variable
+
+INDICATORS, TIME = "event_indicators", "time"
+ATTRIBUTES = {
+    "guid": "instantiationToken",
+    "canGetAndSetFMUstate": "canGetAndSetFMUState",
+    "canSerializeFMUstate": "canSerializeFMUState",
+    "providesDirectionalDerivative": "providesDirectionalDerivatives",
+}
+"""What has another name in 3.0; others that are not there any more are in GONE."""
+GONE = ("numberOfEventIndicators", "canNotUseMemoryManagementFunctions",
+        "completedIntegratorStepNotNeeded")  # fmt: skip
+TERMINALS = {
+    "targets": "where the robot is meant to be, or the effort of a controller",
+    "joints": "positions, velocities and efforts of the joints",
+    "forces": "what acts on the robot from outside",
+}
+TYPES = {"Real": "Float64", "Boolean": "Boolean"}
+
+
+def model_description3(description: bytes) -> bytes:
+    """The XML text, of that of FMI 2.0; with event indicators and the time, variables in 3.0."""
+    root = ET.fromstring(description)
+    indicators = int(root.get("numberOfEventIndicators", ""))
+    root.set("fmiVersion", "3.0")
+    for element in (root, *root.findall("ModelExchange"), *root.findall("CoSimulation")):
+        attributes = {ATTRIBUTES.get(k, k): v for k, v in element.items() if k not in GONE}
+        if element is not root:
+            attributes["providesAdjointDerivatives"] = "true"
+            for files in element.findall("SourceFiles"):
+                element.remove(files)
+        element.attrib.clear()
+        element.attrib.update(attributes)
+    for simple in root.iter("SimpleType"):
+        simple.tag = "Float64Type"
+        simple.attrib.update(simple[0].attrib)
+        simple.remove(simple[0])
+    scalars = list(root.iter("ScalarVariable"))
+    vectors = _vectors(scalars)
+    references = _references(vectors, indicators)
+    _variables(root, scalars, vectors, references, indicators)
+    _structure(root, vectors, references)
+    _annotations(root)
+    return _text(root)
+
+
+def _text(root: ET.Element) -> bytes:
+    ET.indent(root)
+    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"
+
+
+def _name(scalar: ET.Element) -> str:
+    """Of the vector: "x" of "x[1]", "der(q)" of "der(q[1])"."""
+    name = scalar.get("name", "")
+    before, bracket, after = name.partition("[")
+    return before + after.partition("]")[2] if bracket else name
+
+
+def _vectors(scalars: Sequence[ET.Element]) -> dict[str, list[int]]:
+    """Places of the elements of each vector and of each scalar, in order, by its name."""
+    vectors: dict[str, list[int]] = {}
+    for i, scalar in enumerate(scalars):
+        vectors.setdefault(_name(scalar), []).append(i)
+    return vectors
+
+
+def _references(vectors: dict[str, list[int]], indicators: int) -> dict[str, int]:
+    """Value references, of the first element; what 3.0 adds is before the parameters."""
+    first = vectors["q_start"][0]
+    shift = indicators + 1
+    references = {
+        name: places[0] + (shift if places[0] >= first else 0) for name, places in vectors.items()
+    }
+    return {**references, INDICATORS: first, TIME: first + indicators}
+
+
+def _variables(
+    root: ET.Element,
+    scalars: Sequence[ET.Element],
+    vectors: dict[str, list[int]],
+    references: dict[str, int],
+    indicators: int,
+) -> None:
+    variables = root.find("ModelVariables")
+    assert variables is not None
+    variables.clear()
+    for name, places in vectors.items():
+        elements = [{**scalars[i].attrib, **scalars[i][0].attrib} for i in places]
+        attributes = {"name": name}
+        attributes |= {
+            key: value
+            for key, value in elements[0].items()
+            if key != "name" and all(element.get(key) == value for element in elements)
+        }
+        attributes["valueReference"] = str(references[name])
+        attributes["description"] = _description(elements)
+        if "derivative" in attributes or "derivative" in elements[0]:
+            state = _name(scalars[int(elements[0]["derivative"]) - 1])
+            attributes["derivative"] = str(references[state])
+        if "start" in elements[0]:
+            attributes["start"] = " ".join(element["start"] for element in elements)
+        variable = ET.SubElement(variables, TYPES[scalars[places[0]][0].tag], attributes)
+        if "[" in scalars[places[0]].get("name", ""):
+            ET.SubElement(variable, "Dimension", start=str(len(places)))
+    time = {"causality": "independent", "variability": "continuous", "description": "time"}
+    ET.SubElement(
+        variables, "Float64",
+        {"name": TIME, "valueReference": str(references[TIME]), **time, "unit": "s"},
+    )  # fmt: skip
+    indicator = ET.SubElement(
+        variables, "Float64", name=INDICATORS, valueReference=str(references[INDICATORS]),
+        causality="local", variability="continuous", initial="calculated",
+        description="change their sign where a joint meets or leaves a stop, or J⁺ its rank",
+    )  # fmt: skip
+    ET.SubElement(indicator, "Dimension", start=str(indicators))
+    variables[:] = sorted(variables, key=lambda variable: int(variable.get("valueReference", "")))
+
+
+def _description(elements: Sequence[dict[str, str]]) -> str:
+    """What the vector is, and what each of its elements is, with its unit where that differs."""
+    texts = [element["description"] for element in elements]
+    if len(texts) == 1:
+        return texts[0]
+    parts = [text.split(", ") for text in texts]
+    same = next(i for i, column in enumerate(zip(*parts)) if len(set(column)) > 1)
+    common = ", ".join(parts[0][:same])
+    owners = [", ".join(part[same:]) for part in parts]
+    if len({element.get("unit") for element in elements}) > 1:
+        owners = [f"{own} [{element['unit']}]" for own, element in zip(owners, elements)]
+    return f"{common}: {'; '.join(owners)}"
+
+
+def _structure(root: ET.Element, vectors: dict[str, list[int]], references: dict[str, int]) -> None:
+    structure = root.find("ModelStructure")
+    assert structure is not None
+    name_of = {str(i + 1): name for name, places in vectors.items() for i in places}
+    unknowns: list[ET.Element] = []
+    for tag, group in (
+        ("Output", "Outputs"),
+        ("ContinuousStateDerivative", "Derivatives"),
+        ("InitialUnknown", "InitialUnknowns"),
+    ):
+        dependencies: dict[str, dict[str, None]] = {}
+        for unknown in structure.iterfind(f"{group}/Unknown"):
+            known = dependencies.setdefault(name_of[unknown.get("index", "")], {})
+            places = unknown.get("dependencies", "").split()
+            known.update(dict.fromkeys(name_of[place] for place in places))
+        for name, known in dependencies.items():
+            text = " ".join(str(references[k]) for k in known)
+            attributes = {"valueReference": str(references[name]), "dependencies": text}
+            unknowns.append(ET.Element(tag, attributes))
+    unknowns.append(ET.Element("EventIndicator", valueReference=str(references[INDICATORS])))
+    structure[:] = unknowns
+
+
+def _annotations(root: ET.Element) -> None:
+    vendor = root.find("VendorAnnotations")
+    assert vendor is not None
+    root.remove(vendor)
+    vendor.tag = "Annotations"
+    for tool in vendor:
+        tool.tag = "Annotation"
+        tool.set("type", tool.attrib.pop("name"))
+    root.append(vendor)
+
+
+def build_description(identifier: str, units: Sequence[str]) -> bytes:
+    """The text of sources/buildDescription.xml: what a tool compiles."""
+    root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+    build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
+    files = ET.SubElement(build, "SourceFileSet", language="C99")
+    for name in units:
+        ET.SubElement(files, "SourceFile", name=name)
+    ET.SubElement(build, "Library", name="m")
+    return _text(root)
+
+
+def terminals_and_icons(table: Sequence[Variable]) -> bytes:
+    """The text of terminalsAndIcons.xml: how the icon lies, and what belongs together in a plug."""
+    groups = dict.fromkeys(variable.group for variable in table)
+    terminals = {
+        "targets": [group for group in groups if group.endswith(("_des", "_cmd"))],
+        "joints": ["q", "v", "tau"],
+        "forces": list(DISTURBANCES),
+    }
+    root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
+    graphic = ET.SubElement(root, "GraphicalRepresentation")
+    place = {"x1": "-15", "y1": "-10", "x2": "15", "y2": "10"}  # as wide as high as the icon is
+    ET.SubElement(graphic, "CoordinateSystem", place, suggestedScalingFactorTo_mm="1")
+    ET.SubElement(graphic, "Icon", place)
+    parent = ET.SubElement(root, "Terminals")
+    for name, members in terminals.items():
+        terminal = ET.SubElement(
+            parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name]
+        )
+        for group in members:
+            ET.SubElement(
+                terminal, "TerminalMemberVariable", variableName=group, memberName=group,
+                variableKind="signal",
+            )  # fmt: skip
+    return _text(root)

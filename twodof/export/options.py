@@ -1,0 +1,53 @@
+"""What an FMU is asked to be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class FmuOptions:
+    """What an FMU is made of.
+
+    Attributes:
+        urdf: the URDF or xacro file; None for the shipped planar arm.
+        mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
+        frame: link whose origin is controlled; None: "EndEffector", or the only link without
+            a link behind it.
+        lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
+        meshes: whether to carry them.
+        axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
+        gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else
+            (0, 0, −9.81).
+        q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
+            else 0 where the limits allow and their middle where not.
+        control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
+            frame's orientation), "joint" or "effort".
+        name: model name and identifier.
+        link_environment: remember the folders of this Python's packages in the FMU; not for the
+            native flavour, which needs none.
+        native: the plant as compiled C instead of Python code.
+        live_documentation: put the arm, alive, into the documentation of a native FMU, where
+            there is a compiler for it; its meshes are then in the FMU twice.
+        fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
+        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or of FMI 3.0
+            "x86_64-linux", "aarch64-linux"; empty: this machine's.
+    """
+
+    urdf: Path | None = None
+    mesh_dir: Path | None = None
+    frame: str | None = None
+    lock: Mapping[str, float] = field(default_factory=dict)
+    meshes: bool = True
+    axes: str | None = None
+    gravity: tuple[float, float, float] | None = None
+    q_start: tuple[float, ...] | None = None
+    control: str = "task"
+    name: str = "TwoDof"
+    link_environment: bool = False
+    native: bool = False
+    fmi: int | None = None
+    live_documentation: bool = True
+    platforms: tuple[str, ...] = ()

@@ -1,0 +1,246 @@
+"""An FMU's file: what its description says, read and checked. Nothing of it is run."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import count, product, takewhile
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import fmpy
+from fmpy.model_description import ModelDescription, ModelVariable
+
+from ..errors import ZIP_ERRORS, FmuError
+from ..files import UnsafeArchiveError, check_archive, is_plain_xml, read_member
+
+MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
+MAX_RESOURCE = 256 * 1024**2
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A scalar variable, or one element of an array of FMI 3.0.
+
+    Attributes:
+        name: of an element with its 1-based indices, e.g. "q[1]", "der(q[1])".
+        causality, unit: as the description has them.
+        type: "Real" for Float64 too, "Boolean", or another as the description has it.
+        start: text of the start value; None where there is none.
+        description: of the scalar, or of the array as a whole.
+        reference: value reference.
+        element: 0-based place in the array, row by row.
+    """
+
+    name: str
+    causality: str
+    type: str
+    unit: str | None
+    start: str | None
+    description: str
+    reference: int
+    element: int = 0
+
+
+@dataclass(frozen=True, repr=False)
+class Fmu:
+    """An FMI 2.0 or 3.0 co-simulation FMU with outputs q[i] and v[i].
+
+    Attributes:
+        path: the file.
+        description: FMPy's model description.
+        variables: by name, in the order of the description.
+        platforms: FMI names of the platforms that it has binaries for, e.g. "linux64".
+        robot: name of the robot; "" where the FMU does not say.
+        joints: joint names, one for each q[i]; "joint1", … where the FMU does not say.
+        frame, root, axes: the task frame, the frame its position is expressed in and the task
+            axes; "" where the FMU does not say.
+        control: name of its control law, e.g. "task"; likewise.
+    """
+
+    path: Path
+    description: ModelDescription
+    variables: dict[str, Variable]
+    platforms: tuple[str, ...]
+    robot: str
+    joints: tuple[str, ...]
+    frame: str
+    root: str
+    axes: str
+    control: str
+
+    def __repr__(self) -> str:
+        return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"
+
+    @property
+    def name(self) -> str:
+        """The model's name."""
+        return str(self.description.modelName)
+
+    @property
+    def version(self) -> int:
+        """Of FMI: 2 or 3."""
+        return int(str(self.description.fmiVersion).partition(".")[0])
+
+    @property
+    def platform(self) -> str:
+        """Name of this machine in the FMU's version of FMI."""
+        return str(fmpy.platform if self.version == 2 else fmpy.platform_tuple)
+
+    @property
+    def guid(self) -> str:
+        """The FMU's GUID; for FMUs of this package the digest of all that matters."""
+        return str(self.description.guid)
+
+    @property
+    def library(self) -> str:
+        """Name of its binary on this platform."""
+        identifier = self.description.coSimulation.modelIdentifier
+        return f"{identifier}{fmpy.sharedLibraryExtension}"
+
+    @property
+    def urdf(self) -> str | None:
+        """The text of resources/robot.urdf, None where there is none."""
+        content = read_resource(self, "robot.urdf")
+        try:
+            return None if content is None else content.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise FmuError(f"'{self.path}': resources/robot.urdf is not UTF-8 text") from error
+
+    def vector(self, group: str) -> list[str]:
+        """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
+        if group in self.variables:
+            return [group]
+        names = (f"{group}[{i}]" for i in count(1))
+        return list(takewhile(self.variables.__contains__, names))
+
+    def groups(self, causality: str) -> dict[str, list[str]]:
+        """Vectors and scalars of one causality by group name."""
+        groups: dict[str, list[str]] = {}
+        for name, variable in self.variables.items():
+            if variable.causality == causality:
+                groups.setdefault(name.partition("[")[0], []).append(name)
+        return groups
+
+
+def load_fmu(path: str | Path) -> Fmu:
+    """Read and check an FMU's description; nothing of it is run or unzipped.
+
+    Raises:
+        FmuError: the file is missing, no zip, not FMI 2.0 or 3.0 co-simulation, unsafe to unzip, or
+            has no outputs q[i] and v[i].
+    """
+    path = Path(path)
+    xml, members = _read(path)
+    try:
+        with path.open("rb") as file:  # by its name FMPy would take an XML file too
+            description = fmpy.read_model_description(file, validate=True)
+        root = ET.fromstring(xml)
+    except Exception as error:  # FMPy raises bare exceptions of several libraries
+        raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
+    if not re.match(r"[23]\.0", description.fmiVersion) or description.coSimulation is None:
+        kind = "co-simulation" if description.coSimulation is not None else "model exchange"
+        form = f"FMI {description.fmiVersion} {kind}"
+        raise FmuError(f"'{path}' is {form}; FMI 2.0 or 3.0 co-simulation is needed")
+    simulation = root.find("CoSimulation[@providesDirectionalDerivatives]")
+    if simulation is not None:  # FMPy knows 2.0's word for it
+        derivatives = simulation.get("providesDirectionalDerivatives") in ("true", "1")
+        description.coSimulation.providesDirectionalDerivative = derivatives
+    fmu = Fmu(
+        path=path,
+        description=description,
+        variables={
+            scalar.name: scalar
+            for variable in description.modelVariables
+            for scalar in _scalars(variable)
+        },
+        platforms=_platforms(members, description.coSimulation.modelIdentifier),
+        **_vendor_annotation(root),
+    )
+    n = len(fmu.vector("q"))
+    if not fmu.joints:
+        fmu = replace(fmu, joints=tuple(f"joint{i + 1}" for i in range(n)))
+    logged = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
+    kinds = {(variable.causality, variable.type) for variable in logged}
+    if len(logged) != 2 * n or kinds != {("output", "Real")}:
+        raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
+    if len(fmu.joints) != n:
+        raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
+    return fmu
+
+
+def read_resource(fmu: Fmu, name: str) -> bytes | None:
+    """A file of the FMU's resources/ folder, None where it has no such file."""
+    try:
+        with zipfile.ZipFile(fmu.path) as archive:
+            return read_member(archive, f"resources/{name}", MAX_RESOURCE)
+    except KeyError:
+        return None
+    except ZIP_ERRORS as error:
+        raise FmuError(f"cannot read resources/{name} of '{fmu.path}': {error}") from error
+
+
+def _read(path: Path) -> tuple[bytes, list[str]]:
+    """modelDescription.xml and the members' names, after the checks that make unzipping safe."""
+    try:
+        check_archive(path)
+        with zipfile.ZipFile(path) as archive:
+            xml = read_member(archive, "modelDescription.xml", MAX_DESCRIPTION)
+    except FileNotFoundError as error:
+        raise FmuError(f"there is no FMU '{path}'; build one with 'twodof build'") from error
+    except OSError as error:
+        raise FmuError(f"cannot read '{path}': {error.strerror}") from error
+    except KeyError as error:
+        raise FmuError(f"'{path}' is no FMU: it has no modelDescription.xml") from error
+    except UnsafeArchiveError as error:
+        raise FmuError(f"'{path}': {error}") from error
+    except ZIP_ERRORS as error:
+        raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
+    if not is_plain_xml(xml):
+        raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
+    return xml, archive.namelist()
+
+
+def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
+    suffixes = {"linux": ".so", "win": ".dll", "windows": ".dll", "darwin": ".dylib"}
+    platforms = set()
+    for folder, platform, name in (m.split("/") for m in members if m.count("/") == 2):
+        suffix = suffixes.get(platform.rpartition("-")[2].rstrip("0123456789"), "")
+        if folder == "binaries" and name == identifier + suffix:
+            platforms.add(platform)
+    return tuple(sorted(platforms))
+
+
+def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
+    """What our own FMUs say of the robot; nothing, and no joints, where others made the FMU."""
+    robot = root.find("VendorAnnotations/Tool[@name='twodof']/Robot")
+    if robot is None:
+        robot = root.find("Annotations/Annotation[@type='twodof']/Robot")
+    if robot is None:
+        robot = ET.Element("Robot")
+    return {
+        "robot": robot.get("name", ""),
+        "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),
+        **{key: robot.get(key, "") for key in ("frame", "root", "axes", "control")},
+    }
+
+
+def _scalars(variable: ModelVariable) -> Iterator[Variable]:
+    """A scalar variable itself, or the elements of an array."""
+    kind = "Real" if variable.type == "Float64" else variable.type
+    rest = (variable.causality, kind, variable.unit)
+    text = variable.description or ""
+    if not variable.dimensions:
+        yield Variable(variable.name, *rest, variable.start, text, variable.valueReference)
+        return
+    starts: list[str | None] = list((variable.start or "").split())
+    starts = starts or [None]
+    inner = re.fullmatch(r"der\((.*)\)", variable.name)
+    for i, place in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
+        index = f"[{','.join(map(str, place))}]"
+        name = f"der({inner[1]}{index})" if inner else variable.name + index
+        start = starts[i % len(starts)]
+        yield Variable(name, *rest, start, text, variable.valueReference, i)

@@ -1,0 +1,295 @@
+"""An instance of an FMU. All of FMPy that runs something is here."""
+
+from __future__ import annotations
+
+import logging
+import os
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from ctypes import CFUNCTYPE, Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
+from itertools import accumulate, chain
+from math import inf
+from pathlib import Path
+from typing import Any, NoReturn
+
+import fmpy
+import numpy as np
+from fmpy import fmi2, fmi3
+from fmpy.fmi1 import FMICallException
+from fmpy.logging import addLoggerProxy
+from numpy.typing import NDArray
+
+from ..errors import ZIP_ERRORS, FmuError, SimulationError
+from ..export.python_wrapper import check_python_wrapper
+from ..files import temporary_folder
+from .description import Fmu
+
+logger = logging.getLogger("twodof.fmu")
+LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
+"""Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
+WARNING = fmi2.fmi2Warning
+Values = Array[c_double]
+DO_STEP3 = CFUNCTYPE(c_int, c_void_p, c_double, c_double, c_bool, *[c_void_p] * 4)
+GET2 = CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p)
+GET3 = CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p, c_size_t)
+"""With pointers of no type: a conversion to one of FMPy's typed ones takes a third of a µs."""
+
+
+class Instance:
+    """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
+
+    FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
+    SimulationError with the FMU's own words. What is called at each step goes past FMPy's checks.
+    """
+
+    def __init__(self, fmu: Fmu, folder: Path) -> None:
+        self._fmu = fmu
+        self._said = ""
+        self._fatal = False
+        self._ends = c_bool()  # what doStep of FMI 3.0 says
+        identifier = fmu.description.coSimulation.modelIdentifier
+        working_folder = os.getcwd()
+        try:
+            self._slave = self._instantiate(
+                guid=fmu.guid,
+                unzipDirectory=str(folder),
+                modelIdentifier=identifier,
+                instanceName=identifier,
+            )
+            self._component = self._slave.component
+        except Exception as error:  # FMPy raises bare exceptions
+            raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
+        finally:
+            os.chdir(working_folder)  # FMPy leaves it where a library cannot be loaded
+
+    def _instantiate(self, **what: str) -> Any:
+        slave = fmi2.FMU2Slave(**what)
+        self._callbacks = fmi2.fmi2CallbackFunctions(
+            logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
+            allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc),
+            freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free),
+        )
+        addLoggerProxy(byref(self._callbacks))
+        slave.instantiate(callbacks=self._callbacks, loggingOn=True)
+        self._do_step = slave.dll.fmi2DoStep
+        self._step_arguments: tuple[object, ...] = (1,)
+        return slave
+
+    def initialise(
+        self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
+    ) -> None:
+        """Set start values and go through initialisation mode; the stop time may be infinite."""
+        self.set(values)
+        stop = stop_time if stop_time < inf else None
+        self._accept(self._slave.setupExperiment, startTime=start_time, stopTime=stop)
+        self._accept(self._slave.enterInitializationMode)
+        self._accept(self._slave.exitInitializationMode)
+
+    def reset(self) -> None:
+        """Back to where it was when it was instantiated."""
+        self._accept(self._slave.reset)
+
+    def set(self, values: Mapping[str, float | bool]) -> None:
+        """Set variables by name."""
+        variables = [self._fmu.variables[name] for name in values]
+        for kind, setter in (("Real", self._slave.setReal), ("Boolean", self._slave.setBoolean)):
+            chosen = [variable for variable in variables if variable.type == kind]
+            if chosen:
+                references = [variable.reference for variable in chosen]
+                self._accept(setter, references, [values[variable.name] for variable in chosen])
+
+    def step(self, t: float, h: float) -> None:
+        """One communication step from t to t + h."""
+        self._said = ""
+        status = self._do_step(self._component, t, h, *self._step_arguments)
+        if status > WARNING or self._ends:
+            self._refuse(status)
+
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """A function that reads these Real variables, each time into the same place."""
+        n = len(names)
+        references = (c_uint * n)(*(self._fmu.variables[name].reference for name in names))
+        values = (c_double * n)()
+        get = GET2(("fmi2GetReal", self._slave.dll))
+        return self._reader(values, get, byref(references), n, byref(values))
+
+    def _reader(
+        self, values: Values, get: Callable[..., int], *arguments: object
+    ) -> Callable[[], Values]:
+        component = self._component
+
+        def read() -> Values:
+            self._said = ""
+            if (status := get(component, *arguments)) > WARNING:
+                self._refuse(status)
+            return values
+
+        return read
+
+    def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
+        """∂unknown/∂known at the instance's state, a row each of the unknown."""
+        references = [[self._fmu.variables[n].reference for n in u] for u in (unknown, known)]
+        columns = [
+            self._slave.getDirectionalDerivative(references[0], [k], [1.0]) for k in references[1]
+        ]
+        matrix: NDArray[np.float64] = np.array(columns).reshape(len(known), len(unknown)).T
+        return matrix
+
+    def free(self) -> None:
+        """End the instance; after a fatal failure the standard allows no further call."""
+        if self._fatal:
+            return
+        with suppress(FMICallException):  # it may have failed already, and is freed all the same
+            self._slave.terminate()
+        self._slave.freeInstance()
+
+    def _call(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
+        self._said = ""
+        try:
+            function(*arguments, **named)
+        except FMICallException as error:
+            self._refuse(error.status)
+
+    def _refuse(self, status: int) -> NoReturn:
+        """Raise what a call's status means, in the FMU's own words where it said something."""
+        self._fatal = status == fmi2.fmi2Fatal
+        outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
+        reason = f"a call failed, status {status}" if status > WARNING else "the FMU ends the run"
+        raise SimulationError(self._said or reason, outcome=outcome)
+
+    def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
+        """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
+        self._call(function, *arguments, **named)
+        if self._said:
+            raise SimulationError(self._said)
+
+    def _log(
+        self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
+    ) -> None:
+        message = text.decode("utf-8", "replace").strip()
+        if status > WARNING:
+            self._said = message
+        logger.log(LEVELS.get(status, logging.CRITICAL), message)
+
+
+class Instance3(Instance):
+    """One of FMI 3.0, whose vectors are set and read whole."""
+
+    def __init__(self, fmu: Fmu, folder: Path) -> None:
+        super().__init__(fmu, folder)
+        self._sizes = Counter(v.reference for v in fmu.variables.values())
+        self._arrays = self._starts()
+
+    def _instantiate(self, **what: str) -> Any:
+        slave = fmi3.FMU3Slave(**what)
+        slave.instantiate(logMessage=self._log_message, loggingOn=True)
+        results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
+        self._do_step = DO_STEP3(("fmi3DoStep", slave.dll))
+        self._step_arguments = (True, *results)
+        return slave
+
+    def _starts(self) -> dict[int, list[float | bool]]:
+        """Values of all that can be set, by value reference."""
+        arrays: dict[int, list[float | bool]] = {}
+        for variable in self._fmu.variables.values():
+            if variable.type in ("Real", "Boolean"):
+                text = variable.start or "0"
+                value = text in ("true", "1") if variable.type == "Boolean" else float(text)
+                arrays.setdefault(variable.reference, []).append(value)
+        return arrays
+
+    def initialise(
+        self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
+    ) -> None:
+        """As of FMI 2.0, which sets up the experiment by a call of its own."""
+        self.set(values)
+        stop = stop_time if stop_time < inf else None
+        self._accept(self._slave.enterInitializationMode, startTime=start_time, stopTime=stop)
+        self._accept(self._slave.exitInitializationMode)
+
+    def reset(self) -> None:
+        """Back to where it was when it was instantiated."""
+        super().reset()
+        self._arrays = self._starts()
+
+    def set(self, values: Mapping[str, float | bool]) -> None:
+        """Set variables by name; of a vector the others keep what was set last."""
+        variables = [self._fmu.variables[name] for name in values]
+        arrays = {v.reference: list(self._arrays[v.reference]) for v in variables}
+        for variable in variables:
+            arrays[variable.reference][variable.element] = values[variable.name]
+        for kind, setter in (("Real", self._slave.setFloat64), ("Boolean", self._slave.setBoolean)):
+            references = list(dict.fromkeys(v.reference for v in variables if v.type == kind))
+            if references:
+                values_of = chain.from_iterable(map(arrays.__getitem__, references))
+                self._accept(setter, references, list(values_of))
+        self._arrays.update(arrays)
+
+    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
+        """A function that reads these Real variables, each time into the same place."""
+        wanted = [self._fmu.variables[name] for name in names]
+        distinct = list(dict.fromkeys(variable.reference for variable in wanted))
+        first = dict(zip(distinct, accumulate((self._sizes[r] for r in distinct), initial=0)))
+        places = [first[variable.reference] + variable.element for variable in wanted]
+        size = sum(self._sizes[reference] for reference in distinct)
+        references = (c_uint * len(distinct))(*distinct)
+        whole = (c_double * size)()
+        get = GET3(("fmi3GetFloat64", self._slave.dll))
+        read = self._reader(whole, get, byref(references), len(distinct), byref(whole), size)
+        if places == [*range(size)]:
+            return read
+        values = (c_double * len(places))()
+
+        def read_elements() -> Values:
+            read()
+            values[:] = [whole[place] for place in places]
+            return values
+
+        return read_elements
+
+    def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
+        """∂unknown/∂known at the instance's state, a row each of the unknown."""
+        rows = [self._fmu.variables[name] for name in unknown]
+        columns = [self._fmu.variables[name] for name in known]
+        outer = {v.reference: np.zeros((self._sizes[v.reference], 0)) for v in rows}
+        for variable in columns:
+            seed = np.eye(self._sizes[variable.reference])[variable.element]
+            for reference, matrix in outer.items():
+                column = self._slave.getDirectionalDerivative(
+                    [reference], [variable.reference], seed, nSensitivity=len(matrix)
+                )
+                outer[reference] = np.column_stack([matrix, column])
+        return np.array([outer[v.reference][v.element] for v in rows]).reshape(
+            len(rows), len(columns)
+        )
+
+    def _log_message(self, _environment: object, status: int, category: bytes, text: bytes) -> None:
+        self._log(None, b"", status, category, text)
+
+
+@contextmanager
+def instantiate(fmu: Fmu) -> Iterator[Instance]:
+    """An instance of the FMU, unzipped into a temporary folder; freed at the end.
+
+    Raises:
+        FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
+    """
+    if fmu.platform not in fmu.platforms:
+        there = ", ".join(fmu.platforms) or "none"
+        reason = f"has no binary for this platform ({fmu.platform}), only for: {there}"
+        raise FmuError(f"'{fmu.path}' {reason}")
+    with temporary_folder() as folder:
+        try:
+            with zipfile.ZipFile(fmu.path) as archive:
+                archive.extractall(folder)
+        except ZIP_ERRORS as error:
+            raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
+        library = folder / "binaries" / fmu.platform / fmu.library
+        check_python_wrapper(fmu.path, library, folder)
+        instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder)
+        try:
+            yield instance
+        finally:
+            instance.free()

@@ -1,0 +1,49 @@
+"""When a sample is due: the pace of a run by the wall clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from math import inf
+
+from .errors import InputError
+
+LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
+
+
+class RealTime:
+    """Paces a run to the wall clock.
+
+    Args:
+        speed: s of the run in a second.
+
+    Attributes:
+        missed: samples that were ready only after their time.
+        worst: the largest delay, s.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        if not 0.0 < speed < inf:
+            raise InputError(f"`speed` {speed:g} is no factor")
+        self._speed, self.missed = speed, 0
+        self.worst = 0.0
+        self._start: float | None = None
+
+    def restart(self) -> None:
+        """The next sample is due at once, and those after it by that."""
+        self._start = None
+
+    def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
+        """Wait until ``elapsed`` s of the run are due since the first call, or ``stop`` is true."""
+        now = time.perf_counter()
+        elapsed /= self._speed
+        if self._start is None:
+            self._start = now - elapsed
+        due = self._start + elapsed
+        left = due - now
+        while left > 0.0 and not stop():
+            time.sleep(min(left, LONGEST_SLEEP))
+            left = due - time.perf_counter()
+        if due < now:
+            self.missed += 1
+            self.worst = max(self.worst, now - due)

@@ -1,0 +1,98 @@
+"""A sample of a run: what is known at one communication point, and who takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import asin, dist, hypot
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .experiments import Experiment, Value
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class Sample(NamedTuple):
+    """What is known at one communication point.
+
+    Attributes:
+        k: communication steps done so far.
+        t: time, s.
+        q, v: joint positions (rad, m) and velocities, n values each.
+        x: position of the end effector along the task axes, m; empty if the FMU has none.
+        tau: control effort applied, N·m or N; empty if the FMU has none.
+        inputs: values of all inputs by name, as they are at t.
+        since: the communication point from which on the inputs have had these values, s.
+        stamp: of the messages that tell of it, ns since the epoch.
+        quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has
+            none.
+    """
+
+    k: int
+    t: float
+    q: tuple[float, ...]
+    v: tuple[float, ...]
+    x: tuple[float, ...]
+    tau: tuple[float, ...]
+    inputs: Mapping[str, Value]
+    since: float
+    stamp: int
+    quat: tuple[float, ...] = ()
+
+    @property
+    def target(self) -> tuple[float, ...] | None:
+        """x_des, m, one value for each of x; None where the FMU has no such inputs."""
+        return self._given("x_des", len(self.x))
+
+    @property
+    def target_quat(self) -> tuple[float, ...] | None:
+        """quat_des at length 1; None where the FMU has no such inputs, or they are 0."""
+        given = self._given("quat_des", len(self.quat)) or ()
+        length = hypot(*given)
+        return tuple(value / length for value in given) if length else None
+
+    def _given(self, group: str, size: int) -> tuple[float, ...] | None:
+        values = [self.inputs.get(f"{group}[{k + 1}]") for k in range(size)]
+        return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
+
+    @property
+    def error(self) -> float | None:
+        """Distance of the end effector from its target, m; None where there is no target."""
+        return None if self.target is None else dist(self.x, self.target)
+
+    @property
+    def turn_error(self) -> float | None:
+        """Angle between the end effector's orientation and its target, rad; None without one."""
+        if self.target_quat is None:
+            return None
+        apart = (
+            dist(self.quat, self.target_quat),
+            hypot(*map(sum, zip(self.quat, self.target_quat))),
+        )
+        return 4.0 * asin(min(1.0, 0.5 * min(apart)))
+
+
+class Sink:
+    """Consumer of samples: a context that is given the experiment and then each sample.
+
+    One of one's own needs ``write`` alone; the rest does nothing here.
+
+    ::
+
+        with sink.begin(run):
+            for sample in samples(run):
+                sink.write(sample)
+    """
+
+    def begin(self, run: Experiment) -> Self:
+        """Take the experiment whose samples come; itself, to be entered."""
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        pass
+
+    def write(self, sample: Sample) -> None:
+        """Take one sample."""
