@@ -42,8 +42,9 @@ from twodof.cli.main import main
 from twodof.errors import PlotError, TwoDofError
 from twodof.plots.figure import file_kind, save
 from twodof.plots.interactive import in_workspace, over_time
+from twodof.plots.panels import with_joints
 from twodof.plots.runs import drawing, plot
-from twodof.plots.track import read_tracks, with_joints
+from twodof.plots.track import read_tracks
 from twodof.plots.words import labels
 from twodof.sample import Sample
 

@@ -47,8 +47,9 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _plot_bags(options: argparse.Namespace) -> int:
+    from ..plots.panels import with_joints
     from ..plots.runs import drawing
-    from ..plots.track import read_tracks, with_joints
+    from ..plots.track import read_tracks
     from ..plots.words import difference, labels, outcome
 
     tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)

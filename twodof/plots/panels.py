@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
 from math import ceil, floor, log10
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..bag.outline import extremes
+from ..errors import PlotError
 from .closed_form import Array
 from .scales import COLOURS, SMALLEST_EFFORT, SMALLEST_ERROR, SMALLEST_RANGE
 from .track import JointTrack, Track, number
@@ -83,6 +85,31 @@ def title(tracks: Sequence[Track]) -> str:
     """The robots, or where they are not known the bags."""
     robots = dict.fromkeys(t.motion.robot for t in tracks if t.motion and t.motion.robot)
     return ", ".join(robots or dict.fromkeys(track.name for track in tracks))
+
+
+def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
+    """The tracks with those joints alone, in that order.
+
+    Raises:
+        PlotError: no track has a joint of such a name.
+    """
+    known = dict.fromkeys(joint.name for track in tracks for joint in track.joints)
+    for name in names:
+        if name not in known:
+            raise PlotError(f"no joint '{name}'; there are: {', '.join(known)}")
+    order = list(dict.fromkeys(names))
+    return [
+        replace(
+            track,
+            joints=tuple(
+                sorted(
+                    (joint for joint in track.joints if joint.name in order),
+                    key=lambda joint: order.index(joint.name),
+                )
+            ),
+        )
+        for track in tracks
+    ]
 
 
 def duration(tracks: Sequence[Track]) -> float:

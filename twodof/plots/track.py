@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -157,31 +157,6 @@ def _lines(track: Track) -> list[Array]:
         found = (track.task.error, track.task.closed_form, track.task.off)
         lines += [line for line in found if line is not None]
     return lines
-
-
-def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
-    """The tracks with those joints alone, in that order.
-
-    Raises:
-        PlotError: no track has a joint of such a name.
-    """
-    known = dict.fromkeys(joint.name for track in tracks for joint in track.joints)
-    for name in names:
-        if name not in known:
-            raise PlotError(f"no joint '{name}'; there are: {', '.join(known)}")
-    order = list(dict.fromkeys(names))
-    return [
-        replace(
-            track,
-            joints=tuple(
-                sorted(
-                    (joint for joint in track.joints if joint.name in order),
-                    key=lambda joint: order.index(joint.name),
-                )
-            ),
-        )
-        for track in tracks
-    ]
 
 
 def _read_urdf(path: Path) -> str:
