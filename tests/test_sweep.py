@@ -44,7 +44,7 @@ Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
 STEP, STOP = 0.01, 5.0
 COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
 SMALL = {"Kp": (20.0, 60.0, 180.0), "Kd": (8.0, 30.0)}
-GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "5"]
+GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
 
 
 def table_of(path: Path) -> pandas.DataFrame:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from .pages.replay import view as view
     from .plots.runs import plot as plot
     from .ros.foxglove import Foxglove as Foxglove
+    from .ros.layouts import layouts as layouts
     from .ros.publisher import Publisher as Publisher
     from .ros.publisher import publish as publish
     from .ros.publisher import publish_together as publish_together
@@ -63,6 +64,7 @@ _HOMES = {
     "pages.replay": ("view",),
     "plots.runs": ("plot",),
     "ros.foxglove": ("Foxglove",),
+    "ros.layouts": ("layouts",),
     "ros.publisher": ("Publisher", "publish", "publish_together"),
     "sample": ("Sample", "Sink"),
     "sweeps.coordinator": ("sweep",),

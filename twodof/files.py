@@ -139,6 +139,8 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: it cannot be written.
     """
+    if not path.parent.is_dir():  # else it is the temporary file's name that is told
+        raise FileNotFoundError(errno.ENOENT, "there is no such folder", str(path.parent))
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".twodof-", delete=False) as file:
         partial = Path(file.name)
         try:

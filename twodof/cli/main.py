@@ -19,10 +19,10 @@ from typing import Any
 
 from ..errors import TwoDofError
 from ..version import __version__
-from . import build, info, linearise, live, page, plot, publish, recover, run, sweep, view
+from . import build, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
 from .common import INTERRUPTED, CommandLineError, in_options, plain
 
-VERBS = (build, run, publish, info, linearise, plot, view, live, page, sweep, recover)
+VERBS = (build, run, publish, layouts, info, linearise, plot, view, live, page, sweep, recover)
 LONGEST_LINE = 2000
 
 

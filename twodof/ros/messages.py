@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from itertools import chain
 from struct import Struct
@@ -19,7 +20,7 @@ from rosbags.interfaces import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ..errors import BagError
+from ..errors import BagError, InputError
 from ..experiments import Experiment, Value
 from ..fmu import read_resource
 from ..plant.urdf import Joint, RobotError
@@ -66,6 +67,16 @@ STORE = get_typestore(Stores.EMPTY)
 STORE.register(
     dict(chain(*(get_types_from_msg(text, name).items() for name, text in DEFINITIONS.items())))
 )
+
+
+def check_name(argument: str, name: str) -> None:
+    """Refuse what is no name of ROS 2.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    if name and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
+        raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
 
 
 class Topic(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +21,7 @@ from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic
 from .listener import Listener
-from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages
+from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name
 from .network import Network, OpenDomain, network, open_domain
 
 # isort: split
@@ -30,7 +29,6 @@ from cyclonedds import core, domain, pub  # where missing, dds says so
 
 LOG = logging.getLogger(__name__)
 JOINT_COMMANDS, TARGET_COMMAND, CLICKED_POINT = "joint_commands", "target_command", "clicked_point"
-NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 LOCKSTEP_TIMEOUT = 10.0  # s
 
 
@@ -82,8 +80,7 @@ class Publisher(Sink):
     ) -> None:
         names = {"namespace": namespace, "state_topic": state_topic, "command_topic": command_topic}
         for argument, name in names.items():
-            if name and not NAME.fullmatch(name):
-                raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
+            check_name(argument, name or "")
         if on_timeout not in (None, "hold", "ramp"):
             raise InputError(f"`on_timeout` '{on_timeout}' is not 'hold' or 'ramp'")
         if timeout is not None and not 0.0 < timeout < inf:

@@ -1,0 +1,158 @@
+"""Layouts in which other tools show a robot: RViz's, PlotJuggler's and Foxglove's files.
+
+Topics and their types are those that ``Messages`` has, in a namespace.
+"""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..experiments import experiment
+from ..files import write_file
+from ..fmu import Fmu, load_fmu
+from .messages import JOINT_STATES, POSE, Messages, check_name
+
+COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
+PARTS = {"position": "q", "velocity": "v", "effort": "tau"}
+DESCRIPTION = "/robot_description"
+
+
+def layouts(fmu: Fmu | str | Path, folder: str | Path = ".", *, namespace: str = "") -> list[Path]:
+    """Write the files in which RViz, PlotJuggler and Foxglove show an FMU's robot.
+
+    Args:
+        fmu: whose robot is published or recorded, with ``scene`` and ``effort``.
+        folder: where the files are written; they are called as the FMU is.
+        namespace: of its topics, as of ``Publisher``.
+
+    Returns:
+        The files: .rviz, .xml for PlotJuggler, .json for Foxglove.
+
+    Raises:
+        BagError: the FMU carries no robot.
+        FmuError: it cannot be read.
+        InputError: the namespace is none.
+        OSError: a file cannot be written.
+    """
+    check_name("namespace", namespace)
+    fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
+    effort = bool(fmu.vector("tau"))
+    own = Messages(experiment(fmu, stop_time=1.0, step=1.0), scene=True, effort=effort).topics
+    prefix = f"/{namespace.strip('/')}" if namespace else ""
+    types = {prefix + name: topic.type for name, topic in own.items()}
+    units = {
+        part: ", ".join(dict.fromkeys(str(fmu.variables[name].unit) for name in fmu.vector(group)))
+        for part, group in PARTS.items() if fmu.vector(group)
+    }  # fmt: skip
+    texts = {
+        ".rviz": _rviz(fmu, prefix, types),
+        ".plotjuggler.xml": _plotjuggler(fmu, prefix, units),
+        ".foxglove.json": _foxglove(fmu, prefix, units, types),
+    }
+    paths = []
+    for ending, text in texts.items():
+        path = Path(folder, Path(fmu.path).stem + ending)
+        write_file(path, text.encode())
+        paths.append(path)
+    return paths
+
+
+def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
+    """RViz reads YAML, which JSON is."""
+
+    def topic(name: str, *, latched: bool = False) -> dict[str, Any]:
+        durability = "Transient Local" if latched else "Volatile"
+        return {
+            "Value": name, "Depth": 5, "History Policy": "Keep Last",
+            "Reliability Policy": "Reliable", "Durability Policy": durability,
+        }  # fmt: skip
+
+    def display(kind: str, name: str, **more: Any) -> dict[str, Any]:
+        return {"Class": f"rviz_default_plugins/{kind}", "Name": name, "Enabled": True, **more}
+
+    displays = [
+        display("Grid", "Grid", **{"Cell Size": 0.1, "Plane Cell Count": 20}),
+        display(
+            "RobotModel", "RobotModel",
+            **{"Description Source": "Topic",
+               "Description Topic": topic(prefix + DESCRIPTION, latched=True)},
+        ),
+        display("TF", "TF", **{"Show Names": False, "Marker Scale": 0.2}),
+    ]  # fmt: skip
+    for name, kind in types.items():
+        if name.endswith(("/target", "/end_effector")):
+            shape = "Pose" if kind == POSE else "PointStamped"
+            displays.append(display(shape, name.rpartition("/")[2], Topic=topic(name)))
+    from_above = "".join(fmu.axes) == "xy"
+    view = {"Class": "rviz_default_plugins/Orbit", "Name": "Current View", "Distance": 2.0,
+            "Pitch": 1.57 if from_above else 0.5, "Yaw": 4.712 if from_above else 0.8}  # fmt: skip
+    clicked = topic(f"{prefix}/clicked_point")
+    tools = [
+        {"Class": "rviz_default_plugins/MoveCamera"},
+        {"Class": "rviz_default_plugins/PublishPoint", "Single click": True, "Topic": clicked},
+    ]
+    manager = {
+        "Class": "", "Displays": displays, "Enabled": True, "Name": "root", "Tools": tools,
+        "Global Options": {"Fixed Frame": fmu.root, "Frame Rate": 30}, "Views": {"Current": view},
+    }  # fmt: skip
+    panels = [{"Class": f"rviz_common/{name}", "Name": name} for name in ("Displays", "Views")]
+    return json.dumps({"Panels": panels, "Visualization Manager": manager}, indent=2) + "\n"
+
+
+def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
+    """A plot of each part of the joint states, under the names that PlotJuggler gives them."""
+    root = ET.Element("root")
+    window = ET.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
+    tab = ET.SubElement(window, "Tab", tab_name=fmu.name, containers="1")
+    size = ";".join([f"{1 / len(units):.6f}"] * len(units))
+    splitter = ET.SubElement(
+        ET.SubElement(tab, "Container"), "DockSplitter",
+        orientation="-", count=str(len(units)), sizes=size,
+    )  # fmt: skip
+    for part, unit in units.items():
+        plot = ET.SubElement(
+            ET.SubElement(splitter, "DockArea", name=f"{part} ({unit})"), "plot",
+            mode="TimeSeries", style="Lines", flip_x="false", flip_y="false",
+        )  # fmt: skip
+        ET.SubElement(plot, "limitY")
+        for i, joint in enumerate(fmu.joints):
+            name = f"{prefix}{JOINT_STATES}/{joint}/{part}"
+            ET.SubElement(plot, "curve", name=name, color=COLOURS[i % len(COLOURS)])
+    ET.SubElement(root, "use_relative_time_offset", enabled="1")
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[str, str]) -> str:
+    """The robot in 3D above its gains, beside a plot of each part of the joint states."""
+    shown = [prefix + DESCRIPTION, *(name for name, kind in types.items() if kind == POSE)]
+    panels: dict[str, Any] = {
+        "3D!robot": {
+            "followTf": fmu.root, "cameraState": {"distance": 1.5},
+            "topics": {name: {"visible": True} for name in shown},
+        },
+        "Parameters!gains": {"title": "Gains"},
+    }  # fmt: skip
+    for part, unit in units.items():
+        paths = [
+            {
+                "value": f"{prefix}{JOINT_STATES}.{part}[{i}]", "label": joint, "enabled": True,
+                "color": COLOURS[i % len(COLOURS)], "timestampMethod": "headerStamp",
+            }
+            for i, joint in enumerate(fmu.joints)
+        ]  # fmt: skip
+        panels[f"Plot!{part}"] = {
+            "foxglovePanelTitle": part, "paths": paths, "yAxisLabel": unit, "showLegend": True,
+        }  # fmt: skip
+    *upper, plots = [f"Plot!{part}" for part in units]
+    for plot in reversed(upper):
+        plots = {"direction": "column", "first": plot, "second": plots}  # type: ignore[assignment]
+    left = {"direction": "column", "first": "3D!robot", "second": "Parameters!gains",
+            "splitPercentage": 75}  # fmt: skip
+    mosaic = {"direction": "row", "first": left, "second": plots}
+    layout = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": mosaic}
+    return json.dumps(layout, indent=2) + "\n"
