@@ -57,8 +57,9 @@ MUJOCO = (
 
 
 @pytest.mark.parametrize("name", MUJOCO)
-def test_bare_plant_is_mujocos(name, length):
+def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
     """The forces that MuJoCo finds for our q̈, with damping, are those that made it."""
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its warnings
     root = ET.parse(urdf_path(name)).getroot()
     for link in root.iter("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
