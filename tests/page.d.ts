@@ -4,3 +4,9 @@ declare class DecompressionStream implements GenericTransformStream {
   readonly readable: ReadableStream;
   readonly writable: WritableStream;
 }
+
+/** Of plotly, what plots call. */
+declare const Plotly: {
+  newPlot(place: HTMLElement, data: object[], layout: object, config: object): Promise<unknown>;
+  restyle(place: HTMLElement, changed: object): Promise<unknown>;
+};

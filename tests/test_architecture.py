@@ -46,6 +46,7 @@ LIBRARIES = {
     "matplotlib": {"plots"},
     "pandas": {"sweeps", "bag", "plots", "cli"},  # tables: made, of a recording, drawn, printed
     "pinocchio": {"plant"},
+    "plotly": {"plots"},
     "pyarrow": {"sweeps"},
     "pythonfmu": {"export"},  # the slave in fmu_src is handed its base class
     "rosbags": {"ros", "bag"},
@@ -115,6 +116,7 @@ def test_a_foreign_library_is_in_its_room_alone() -> None:
 
 def test_nothing_is_longer_than_can_be_read() -> None:
     sources = [p for kind in ("*.[ch]", "*.js") for p in (ROOT / "fmu_src").rglob(kind)]
+    sources += (ROOT / "twodof").rglob("*.js")
     files = [*PYTHON, *(path.relative_to(ROOT) for path in sources)]
     lines = {str(path): (ROOT / path).read_text("utf-8").count("\n") for path in files}
     long = {name for name, count in lines.items() if count > MOST_LINES}

@@ -18,13 +18,14 @@ def add(verbs: Any) -> None:
     """Add the verb and its options."""
     plot = verbs.add_parser(
         "plot", help="draw bags, or the map of a sweep, into one figure",
-        description="Draw joint positions and velocities, the end effector's path and its error;"
-        " of a sweep, each metric over the variables.",
+        description="Draw joint positions, velocities and efforts, the end effector's path and its"
+        " error; of a sweep, each metric over the variables.",
     )  # fmt: skip
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
     plot.add_argument(
         "-o", dest="output", metavar="FILE", help=".png, .svg, .pdf or .html (a window)"
     )
+    plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     add_robot_options(plot)
     plot.set_defaults(call=call)
 
@@ -38,17 +39,22 @@ def call(options: argparse.Namespace) -> int:
     sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
     if not sweeps:
         return _plot_bags(options)
+    if options.joints is not None:
+        raise CommandLineError(f"'{sweeps[0]}' is a sweep; --joints is for bags")
     if len(options.bags) > 1:
         raise CommandLineError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
     return _plot_sweep(options, Path(sweeps[0]))
 
 
 def _plot_bags(options: argparse.Namespace) -> int:
+    from ..plots.panels import with_joints
     from ..plots.runs import drawing
     from ..plots.track import read_tracks
     from ..plots.words import difference, labels, outcome
 
     tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
+    if options.joints is not None:
+        tracks = with_joints(tracks, options.joints.split(","))
     results = []
     for label, track in zip(labels(tracks), tracks):
         apart = difference(tracks[0], track) if track is not tracks[0] else ""

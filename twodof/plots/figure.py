@@ -27,8 +27,6 @@ except ImportError as missing:
         f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
     ) from missing
 
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (7, 1.5, 1, 1.5)), (0, (1.5, 1)))
-"""With the colours, whose number this does not divide, 28 tracks look different."""
 STYLE = {
     "font.size": 8.0, "axes.titlesize": 8.5, "axes.labelsize": 8.0, "axes.titlelocation": "left",
     "text.color": INK, "text.parse_math": False, "axes.labelcolor": INK, "axes.edgecolor": GREY,
@@ -43,6 +41,23 @@ TICK_STYLE: dict[str, Any] = {
 }  # fmt: skip
 """Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
 
+STYLES = """h1 { font-size: 1.1em; margin: 0 0 .5em; overflow-wrap: anywhere; }
+#plots { display: grid; grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); gap: 1em; }
+#plots .plot { min-width: 0; }
+#side { overflow-x: auto; }
+#legend { width: 100%; margin: 0 0 1em; font-size: 12px; font-variant-numeric: tabular-nums; }
+#legend td, #legend th { padding: 1px 6px; text-align: right; white-space: nowrap; }
+#legend td:first-child, #legend th:first-child { text-align: left; min-width: 5em; }
+#legend label { display: flex; gap: .4em; align-items: center; cursor: pointer; }
+#legend .joint label { padding-left: 1em; }
+table.runs { table-layout: auto; overflow-wrap: anywhere; }
+@media (max-width: 1150px) { #plots { grid-template-columns: minmax(0, 1fr); } }
+@media (prefers-color-scheme: dark) {
+  html { background: #15191e; } body { filter: invert(.92) hue-rotate(180deg); }
+}
+"""
+"""Of pages. In the dark they are turned inside out, with the hues of their curves."""
+
 
 class Plot(Figure):
     """A figure that notebooks show without being asked."""
@@ -52,19 +67,21 @@ class Plot(Figure):
 
 
 class Drawing(NamedTuple):
-    """What can be drawn into a figure.
+    """What can be drawn into a figure, or stand on a page.
 
     Attributes:
         title: for people.
         name: of the file where the user gives none.
         draw: draws it into an empty figure, and sets the figure's size.
         columns: of the table that stands below it on a page.
+        body: makes the HTML that stands on a page in place of the figure; None: the figure does.
     """
 
     title: str
     name: str
     draw: Callable[[Figure], None]
     columns: Sequence[Mapping[str, str]]
+    body: Callable[[], str] | None = None
 
 
 def drawn(drawing: Drawing) -> Figure:
@@ -86,8 +103,7 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     """
     path = Path(output) if output is not None else _free_name(drawing.name)
     kind = file_kind(path)
-    figure = drawn(drawing)
-    content = _html(figure, drawing) if kind == "html" else _rendered(figure, kind)
+    content = _html(drawing) if kind == "html" else _rendered(drawn(drawing), kind)
     with refusing(PlotError, f"write '{path}'"):
         write_file(path, content)
     return path
@@ -142,9 +158,13 @@ def _rendered(figure: Figure, kind: str) -> bytes:
     return content.getvalue()
 
 
-def _html(figure: Figure, drawing: Drawing) -> bytes:
-    """A page that needs nothing else: the figure as SVG and a table."""
-    svg = _rendered(figure, "svg").decode()
+def _html(drawing: Drawing) -> bytes:
+    """A page that needs nothing else: its own body or the figure as SVG, and a table."""
+    if drawing.body:
+        body = drawing.body()
+    else:
+        svg = _rendered(drawn(drawing), "svg").decode()
+        body = svg[svg.index("<svg") :]
     title = html.escape(drawing.title)
     columns = drawing.columns
     rows = "\n".join(
@@ -157,10 +177,12 @@ def _html(figure: Figure, drawing: Drawing) -> bytes:
 <html lang="en">
 <head>
 <meta charset="utf-8"/>
+<meta name="viewport" content="width=device-width, initial-scale=1"/>
 <title>{title}</title>
 <style>
-body {{ font: 14px/1.5 sans-serif; color: {INK}; max-width: 1100px; margin: 2em auto; }}
-svg {{ width: 100%; height: auto; }}
+{STYLES}body {{ font: 14px/1.5 sans-serif; color: {INK}; background: white; max-width: 1500px;
+  margin: 0 auto; padding: 1em; }}
+body > svg {{ width: 100%; max-width: 1100px; height: auto; }}
 table {{ border-collapse: collapse; margin-top: 1em; }}
 th, td {{ text-align: left; vertical-align: top; padding: 0.2em 1.5em 0.2em 0; }}
 th {{ color: {GREY}; font-weight: normal; white-space: nowrap; }}
@@ -168,8 +190,9 @@ tr {{ border-top: 1px solid {HAIR}; }}
 </style>
 </head>
 <body>
-{svg[svg.index("<svg") :]}
-<table>
+<h1>{title}</h1>
+{body}
+<table class="runs">
 {rows}
 </table>
 </body>

@@ -1,7 +1,7 @@
 """One figure of one run or of several: joints, the arm in its workspace, and the error.
 
 Sizes are in inches of paper. Printed 17 cm wide, as the text of an A4 page is, the smallest letters
-are 5 pt high.
+are 5 pt high; more than ROWS joints take a wider page.
 """
 
 from __future__ import annotations
@@ -9,20 +9,32 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from functools import partial
-from itertools import chain, product
-from math import ceil, floor, log10
+from itertools import chain
+from math import ceil, log10
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from ..bag.recording import Recording
-from .closed_form import Array
-from .figure import DASHES, TICK_STYLE, Drawing, drawn
-from .lines import SIDE, Look, outline, set_ticks
-from .scales import COLOURS, GREY, INK, PALE, SMALLEST_ERROR, SMALLEST_RANGE
-from .track import JointTrack, Track, number, read_tracks
-from .words import common_settings, labels, outcome, summary
-from .workspace import draw_view, key, planes
+from .figure import TICK_STYLE, Drawing, drawn
+from .interactive import body
+from .panels import (
+    KINDS,
+    UNITS,
+    Curve,
+    Look,
+    Panel,
+    duration,
+    error_panel,
+    joint_panels,
+    outline,
+    title,
+    track_looks,
+)  # fmt: skip
+from .scales import GREY, INK, PALE
+from .strokes import draw_view, key, line, set_ticks
+from .track import Track, read_tracks
+from .words import common_settings, outcome, summary
+from .workspace import SIDE, views, workspace_title
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
@@ -30,8 +42,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-NAMES, TICKS, PANEL, GAP, MARGIN = 0.65, 0.5, 1.75, 0.6, 0.15
-"""Widths: joints' names, ticks' numbers, joints' panels and between them, margin."""
+ROWS = 16  # of joints; more stand in columns beside each other
+NAMES, TICKS, GAP, MARGIN = 0.65, 0.5, 0.55, 0.15
+"""Widths: joints' names, ticks' numbers, between joints' panels, margin."""
+PANEL = {1: 1.75, 2: 1.75, 3: 1.1}
+"""Width of joints' panels, by how many each joint has."""
 LINE, BETWEEN, BELOW, KEY = 0.17, 0.2, 0.4, 0.42
 """Heights: a line of text, between panels, the ticks and label below them, the workspace's key."""
 JOINTS, LOWEST, HIGHEST, ERROR = 3.6, 0.58, 1.6, 1.4
@@ -62,43 +77,46 @@ def drawing(tracks: Sequence[Track]) -> Drawing:
     first, *others = tracks
     table = [summary(first), *(summary(other, first) for other in others)]
     name = first.name + (f"-and-{len(tracks) - 1}-more" if len(tracks) > 1 else "")
-    return Drawing(_title(tracks), name, partial(_draw, tracks), table)
+    return Drawing(title(tracks), name, partial(_draw, tracks), table, partial(body, tracks))
 
 
 class _Page:
     """What goes where: sizes in inches from the upper left corner.
 
-    Joints are rows of position and velocity (a single joint has two rows), the error is below them,
-    the workspace is beside them, in one view for each of ``planes``.
+    Joints are rows of a panel for each kind (a single joint has a row for each), the error is below
+    them, the workspace is beside them, in one view above the other.
     """
 
     def __init__(self, figure: Figure, tracks: Sequence[Track], looks: Sequence[Look]) -> None:
-        joints = [joint for track in tracks for joint in track.joints]
         self.figure = figure
-        self.names = list(dict.fromkeys(joint.name for joint in joints))
-        self.kinds = "qv" if any(joint.v.size for joint in joints) else "q"
-        self.planes = planes(tracks)
-        self.error = any(track.task for track in tracks)
+        self.panels = joint_panels(tracks)
+        self.error = error_panel(tracks)
+        self.views = views(tracks, looks)
 
-        self.alone = len(self.names) == 1
-        self.columns = 1 if self.alone else len(self.kinds)
-        self.rows = len(self.kinds) if self.alone else len(self.names)
+        kinds = len({panel.kind for panel in self.panels})
+        joints = len(self.panels) // kinds
+        self.alone = joints == 1
+        self.columns = 1 if self.alone else kinds
+        self.rows = kinds if self.alone else ceil(joints / ceil(joints / ROWS))
         self.left = MARGIN + TICKS + NAMES * (not self.alone)
-        self.cell = 2 * PANEL + GAP if self.alone else PANEL
-        self.across = self.columns * (self.cell + GAP) - GAP
+        self.cell = 2 * PANEL[2] + GAP if self.alone else PANEL[kinds]
+        self.block = self.columns * (self.cell + GAP) + NAMES
+        self.across = self.block * ceil(joints / self.rows) - NAMES - GAP
+        if self.alone:
+            self.across = self.cell
         self.side = self.left + self.across + GAP + 0.1
-        self.width = (self.side + SIDE if self.planes else self.left + self.across) + MARGIN
+        self.width = (self.side + SIDE if self.views else self.left + self.across) + MARGIN
 
         self.gap = BETWEEN * (1 + self.alone)
         self.pitch = min(max(JOINTS / self.rows, LOWEST), HIGHEST)
         self.view = 0.0
         below = BELOW + BETWEEN + ERROR if self.error else 0.0
         body = self.rows * self.pitch - self.gap + below
-        if self.planes:
-            views = len(self.planes)
-            least, most = VIEWS[views]
-            body = max(body, views * (least + BELOW) - BELOW + KEY)
-            self.view = min(most, (body - KEY + BELOW) / views - BELOW)
+        if self.views:
+            count = len(self.views)
+            least, most = VIEWS[count]
+            body = max(body, count * (least + BELOW) - BELOW + KEY)
+            self.view = min(most, (body - KEY + BELOW) / count - BELOW)
             self.pitch = (body - below + self.gap) / self.rows
 
         self.letters = letters = int((self.width - 2 * MARGIN) / LETTER)
@@ -114,7 +132,7 @@ class _Page:
     def at(self, left: float, top: float) -> tuple[float, float]:
         return left / self.width, 1.0 - top / (self.bottom + BELOW)
 
-    def panel(self, left: float, top: float, width: float, height: float) -> Axes:
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
         x, y = self.at(left, top + height)
         box = (x, y, width / self.width, height / (self.bottom + BELOW))
         axes = self.figure.add_axes(box)
@@ -123,55 +141,45 @@ class _Page:
 
 
 def _draw(tracks: Sequence[Track], figure: Figure) -> None:
-    looks = _looks(tracks)
+    looks = track_looks(tracks)
     page = _Page(figure, tracks, looks)
     _draw_head(page, tracks, looks)
-    _draw_joints(page, tracks, looks)
+    end = duration(tracks)
+    _draw_joints(page, looks, end)
     if page.error:
-        height = page.bottom - ERROR
-        _draw_error(page.panel(page.left, height, page.across, ERROR), tracks, looks)
-    views = []
-    for i, plane in enumerate(page.planes):
-        axes = page.panel(page.side, page.top + i * (page.view + BELOW), SIDE, page.view)
-        draw_view(axes, plane, tracks, looks, aspect=page.view / SIDE)
-        views.append(axes)
-    if views:
-        views[0].set_title(_workspace(tracks), pad=ABOVE)
-        views[-1].legend(
-            handles=key(views), loc="upper left", ncols=3, handlelength=1.7,
+        axes = page.axes(page.left, page.bottom - ERROR, page.across, ERROR)
+        _draw_error(axes, page.error, looks)
+        _time_axis(axes, end)
+    below = []
+    for i, view in enumerate(page.views):
+        axes = page.axes(page.side, page.top + i * (page.view + BELOW), SIDE, page.view)
+        draw_view(axes, view, aspect=page.view / SIDE)
+        below.append(axes)
+    if below:
+        below[0].set_title(workspace_title(tracks), pad=ABOVE)
+        below[-1].legend(
+            handles=key(page.views), loc="upper left", ncols=3, handlelength=1.7,
             columnspacing=1.0, bbox_to_anchor=(0.0, -BELOW / page.view),
         )  # fmt: skip
 
 
 def _draw_head(page: _Page, tracks: Sequence[Track], looks: Sequence[Look]) -> None:
     """What was run, and where there are several bags the key that tells them apart."""
-    title = _end(_title(tracks), page.letters // 2)
-    page.figure.text(*page.at(MARGIN, 0.28), title, fontsize=11, fontweight="bold")
-    for i, line in enumerate(page.settings):
-        page.figure.text(*page.at(MARGIN, 0.48 + i * LINE), line, color=GREY)
+    name = _end(title(tracks), page.letters // 2)
+    page.figure.text(*page.at(MARGIN, 0.28), name, fontsize=11, fontweight="bold")
+    for i, words in enumerate(page.settings):
+        page.figure.text(*page.at(MARGIN, 0.48 + i * LINE), words, color=GREY)
     if len(looks) > 1:
-        told = [_end(look.label, int(0.8 * page.letters) - 10) for look in looks]
+        letters = int(0.8 * page.letters) - 10
+        handles = [
+            Line2D([], [], label=_end(look.label, letters), **line(look.colour, look.dashes))
+            for look in looks
+        ]
         page.figure.legend(
-            handles=[Line2D([], [], label=t, **look.line) for t, look in zip(told, looks)],
+            handles=handles,
             loc="upper left", bbox_to_anchor=page.at(MARGIN, 0.4 + LINE * len(page.settings)),
             ncols=page.keys, handlelength=3.5, fontsize=8.0,
         )  # fmt: skip
-
-
-def _looks(tracks: Sequence[Track]) -> list[Look]:
-    def arm(i: int) -> float:
-        return 3.5 if len(tracks) == 1 else 5.0 - 3.5 * i / (len(tracks) - 1)
-
-    return [
-        Look(label, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)], arm(i))
-        for i, label in enumerate(labels(tracks))
-    ]
-
-
-def _title(tracks: Sequence[Track]) -> str:
-    """The robots, or where they are not known the bags."""
-    robots = dict.fromkeys(t.motion.robot for t in tracks if t.motion and t.motion.robot)
-    return ", ".join(robots or dict.fromkeys(track.name for track in tracks))
 
 
 def _end(text: str, letters: int) -> str:
@@ -179,13 +187,8 @@ def _end(text: str, letters: int) -> str:
     return text if len(text) <= letters else f"…{text[1 - letters :]}"
 
 
-def _workspace(tracks: Sequence[Track]) -> str:
-    told = dict.fromkeys(f"{t.motion.frame} in {t.motion.root}" for t in tracks if t.motion)
-    return f"Path of {', '.join(told)}"
-
-
-def _time_axis(axes: Axes, tracks: Sequence[Track], *, labelled: bool = True) -> None:
-    axes.set_xlim(0.0, max(float(track.t[-1]) for track in tracks) or 1.0)
+def _time_axis(axes: Axes, end: float, *, labelled: bool = True) -> None:
+    axes.set_xlim(0.0, end)
     set_ticks(axes.xaxis, 5)
     if labelled:
         axes.set_xlabel("time in s")
@@ -193,37 +196,38 @@ def _time_axis(axes: Axes, tracks: Sequence[Track], *, labelled: bool = True) ->
         axes.tick_params(labelbottom=False)
 
 
+def _draw_curve(axes: Axes, curve: Curve, label: str, **look: Any) -> None:
+    kept = outline(curve.y)
+    axes.plot(curve.t[kept], curve.y[kept], label=label, **look)
+
+
 # --- joints ---
 
 
-def _draw_joints(page: _Page, tracks: Sequence[Track], looks: Sequence[Look]) -> None:
-    """Position with its limits and velocity of each joint."""
-    found = {joint.unit for track in tracks for joint in track.joints}
-    units = [unit for unit in ("rad", "m") if unit in found or "" in found]
-    for i, (name, kind) in enumerate(product(page.names, page.kinds)):
-        row, column = divmod(i, page.columns)
-        left, top = page.left + column * (page.cell + GAP), page.top + row * page.pitch
-        axes = page.panel(left, top, page.cell, page.pitch - page.gap)
-        lines = [
-            (track.t, joint, look)
-            for track, look in zip(tracks, looks)
-            for joint in track.joints
-            if joint.name == name
-        ]
-        _draw_joint(axes, lines, kind)
-        _time_axis(axes, tracks, labelled=row == page.rows - 1)
+def _draw_joints(page: _Page, looks: Sequence[Look], end: float) -> None:
+    units: dict[str, list[str]] = {}
+    for panel in page.panels:
+        units.setdefault(panel.kind, []).append(panel.unit)
+    for i, panel in enumerate(page.panels):
+        place, column = divmod(i, page.columns)
+        block, row = divmod(place, page.rows)
+        left = page.left + block * page.block + column * (page.cell + GAP)
+        top = page.top + row * page.pitch
+        axes = page.axes(left, top, page.cell, page.pitch - page.gap)
+        _draw_joint(axes, panel, looks)
+        last = row == page.rows - 1 or i + page.columns >= len(page.panels)
+        _time_axis(axes, end, labelled=last)
+        parts = {part for unit in units[panel.kind] for part in unit.split(" or ")}
+        several = [unit for unit in UNITS[panel.kind] if unit in parts]
         if row == 0 or page.alone:
-            what = {"q": "Position", "v": "Velocity"}[kind] + f" of {name}" * page.alone
-            unit = " or ".join(f"{u}/s" if kind == "v" else u for u in units)
-            axes.set_title(f"{what} in {unit}", pad=ABOVE)
+            what = KINDS[panel.kind] + f" of {panel.joint}" * page.alone
+            axes.set_title(f"{what} in {' or '.join(several)}", pad=ABOVE)
         if column == 0 and not page.alone:
-            label = _wrapped(name, page.pitch)
-            if len(units) > 1 and lines[0][1].unit == "m":
+            label = _wrapped(panel.joint, page.pitch)
+            if len(several) > 1 and panel.unit == "m":
                 label += "\n(m)"
-            middle = top + 0.5 * (page.pitch - page.gap)
-            page.figure.text(
-                *page.at(page.left - TICKS, middle), label, fontsize=7.5, ha="right", va="center"
-            )
+            middle = page.at(left - TICKS, top + 0.5 * (page.pitch - page.gap))
+            page.figure.text(*middle, label, fontsize=7.5, ha="right", va="center")
 
 
 def _wrapped(name: str, height: float) -> str:
@@ -241,89 +245,46 @@ def _wrapped(name: str, height: float) -> str:
     return "\n".join(lines)
 
 
-def _draw_joint(axes: Axes, lines: Sequence[tuple[Array, JointTrack, Look]], kind: str) -> None:
-    shown = [(t, getattr(joint, kind), look) for t, joint, look in lines]
-    shown = [(t, y, look) for t, y, look in shown if y.size]
-    for t, y, look in shown:
-        kept = outline(y)
-        marker = "o" if len(t) == 1 else ""
-        axes.plot(t[kept], y[kept], label=look.label, marker=marker, markersize=3, **look.line)
-    low, high = _range([y for _, y, _ in shown])
-    if kind == "q":
-        low, high = _draw_limits(axes, [joint for _, joint, _ in lines], low, high)
-    pad = 0.06 * (high - low)
-    axes.set_ylim(low - pad, high + pad)
-    set_ticks(axes.yaxis, 4)
-
-
-def _draw_limits(
-    axes: Axes, joints: Sequence[JointTrack], low: float, high: float
-) -> tuple[float, float]:
-    """Lines at the limits and their numbers; the range widened to the limits that are near."""
-    pairs = dict.fromkeys((joint.low, joint.high) for joint in joints)
-    limits = dict.fromkeys(limit for limit in chain(*pairs) if limit is not None)
-    near = [x for x in limits if abs(2 * x - low - high) < 1.8 * (high - low)]
-    low, high = min([low, *near]), max([high, *near])
-    for limit in limits:
+def _draw_joint(axes: Axes, panel: Panel, looks: Sequence[Look]) -> None:
+    for curve in panel.curves:
+        look = looks[curve.track]
+        marker = "o" if len(curve.t) == 1 else ""
+        _draw_curve(
+            axes, curve, look.label, marker=marker, markersize=3, **line(look.colour, look.dashes)
+        )
+    for limit in panel.limits:
         axes.axhline(
             limit, color=INK, linewidth=0.9, dashes=(7, 2, 1.5, 2), zorder=1.9, label="limit"
         )
-    text = "; ".join(filter(None, (_limits(*pair) for pair in pairs)))
-    axes.text(1.0, 1.01, text, transform=axes.transAxes, ha="right", va="bottom", fontsize=7.0,
-              color=GREY)  # fmt: skip
-    return low, high
-
-
-def _limits(low: float | None, high: float | None) -> str:
-    found = [number(float(f"{limit:.3g}")) for limit in (low, high) if limit is not None]
-    if low is not None and high == -low:
-        return f"limits ±{found[1]}"
-    return f"limit{'s' * (len(found) - 1)} {', '.join(found)}" if found else ""
-
-
-def _range(values: Sequence[Array]) -> tuple[float, float]:
-    """Smallest and largest value, at least SMALLEST_RANGE apart."""
-    found = [y[np.isfinite(y)] for y in values]
-    found = [y for y in found if y.size]
-    low = min((float(y.min()) for y in found), default=0.0)
-    high = max((float(y.max()) for y in found), default=0.0)
-    short = max(0.0, SMALLEST_RANGE - (high - low))
-    return low - 0.5 * short, high + 0.5 * short
+    axes.text(1.0, 1.01, panel.told, transform=axes.transAxes, ha="right", va="bottom",
+              fontsize=7.0, color=GREY)  # fmt: skip
+    axes.set_ylim(*panel.range)
+    set_ticks(axes.yaxis, 4)
 
 
 # --- the error ---
 
 
-def _draw_error(axes: Axes, tracks: Sequence[Track], looks: Sequence[Look]) -> None:
-    """Distance from the target over time, and what it is in closed form."""
-    tasks = [(track.t, track.task, look) for track, look in zip(tracks, looks) if track.task]
+def _draw_error(axes: Axes, panel: Panel, looks: Sequence[Look]) -> None:
     axes.set_yscale("log", nonpositive="mask")
-    _decades(axes, np.concatenate([task.error for _, task, _ in tasks]))
-    disturbances = dict.fromkeys(chain(*(task.disturbances for _, task, _ in tasks)))
-    name = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
-    name = "\n".join(textwrap.wrap(name, 36))
-    for t, task, look in tasks:
-        if task.closed_form is not None:
-            kept = outline(task.closed_form)
-            axes.plot(
-                t[kept], task.closed_form[kept], color=PALE, linewidth=4.0,
-                solid_capstyle="butt", zorder=1.5, label=name,
-            )  # fmt: skip
-        kept = outline(task.error)
-        axes.plot(t[kept], task.error[kept], label=look.label, **look.line)
-    axes.set_title("Distance from the target in m")
-    handles = [line for line in axes.get_lines() if line.get_label() == name][:1]
+    _decades(axes, *panel.range)
+    for curve in panel.closed_forms:
+        _draw_curve(
+            axes, curve, panel.told, color=PALE, linewidth=4.0, solid_capstyle="butt", zorder=1.5
+        )
+    handles = axes.get_lines()[:1]  # one tells of all closed forms
+    for curve in panel.curves:
+        look = looks[curve.track]
+        _draw_curve(axes, curve, look.label, **line(look.colour, look.dashes))
+    axes.set_title(f"Distance from the target in {panel.unit}")
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.02))
-    _time_axis(axes, tracks)
 
 
-def _decades(axes: Axes, error: Array) -> None:
-    """Whole decades that show the error where it is not rounding, and their ticks."""
-    low = floor(log10(max(float(error.min()), SMALLEST_ERROR)))
-    high = max(low + 1, ceil(log10(max(float(error.max()), SMALLEST_ERROR))))
-    axes.set_ylim(10.0**low, 10.0**high)
+def _decades(axes: Axes, low: float, high: float) -> None:
+    """Whole decades and their ticks."""
+    axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(LogLocator(numticks=6))
-    few = high - low <= 3
+    few = high < 5000.0 * low
     axes.yaxis.set_minor_locator(LogLocator(subs=range(2, 10)) if few else NullLocator())
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_formatter(FuncFormatter(_power_of_ten))

@@ -39,15 +39,19 @@ class JointTrack:
         unit: "rad" or "m"; "" where no robot tells which.
         low, high: limits of the run, or else of the URDF; None where there is none or it is not
             known.
-        q, v: positions and velocities, N values each; v is empty where the bag has none.
+        effort: limit of the URDF, N·m or N; None likewise.
+        q, v, tau: positions, velocities and efforts, N values each; v and tau are empty where they
+            are not known.
     """
 
     name: str
     unit: str
     low: float | None
     high: float | None
+    effort: float | None
     q: Array
     v: Array
+    tau: Array
 
     @property
     def at_limit(self) -> bool:
@@ -145,8 +149,10 @@ def read_tracks(
 
 
 def _lines(track: Track) -> list[Array]:
-    """What is drawn over time beside the joints, N values each."""
-    lines = [] if track.motion is None else [*track.motion.path.T]
+    """What is drawn over time beside positions and velocities, N values each."""
+    lines = [joint.tau for joint in track.joints if joint.tau.size]
+    if track.motion is not None:
+        lines += [*track.motion.path.T]
     if track.task is not None:
         found = (track.task.error, track.task.closed_form, track.task.off)
         lines += [line for line in found if line is not None]
@@ -201,19 +207,33 @@ def _with_robot(
 def _joints(bag: Recording, names: Sequence[str], robot: Robot | None) -> tuple[JointTrack, ...]:
     starts = bag.provenance.get("start_values", {})
     joints = []
+    efforts = _efforts(bag)
+    limited = bool(bag.provenance) and bool(bag.schedule[0][1].get("limit_effort"))
     for i, name in enumerate(names):
-        unit = ""
+        unit, effort = "", None
         low, high = starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]")
         if robot is not None and name in robot.urdf.joints:
             joint = robot.urdf.joints[name]
             unit = "m" if joint.prismatic else "rad"
             low = joint.low if low is None else low
             high = joint.high if high is None else high
+            effort = joint.effort if joint.effort < UNBOUNDED else None
         low = None if low is None or low <= -UNBOUNDED else low
         high = None if high is None or high >= UNBOUNDED else high
         v = bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0)
-        joints.append(JointTrack(name, unit, low, high, bag.q[:, i], v))
+        tau = efforts[:, i] if efforts.shape == bag.q.shape else np.empty(0)
+        if limited and effort is not None:  # of commands; efforts in a bag are within it
+            tau = np.clip(tau, -effort, effort)
+        joints.append(JointTrack(name, unit, low, high, effort, bag.q[:, i], v, tau))
     return tuple(joints)
+
+
+def _efforts(bag: Recording) -> Array:
+    """Those of the bag; of a bare plant, what it was told to apply, N × n; N × 0 where unknown."""
+    n = len(bag.joints)
+    if bag.tau.size or not bag.provenance or f"tau_cmd[{n}]" not in bag.schedule[0][1]:
+        return bag.tau
+    return bag.held("tau_cmd", n)
 
 
 def _in_robot_order(bag: Recording, robot: Robot, names: Sequence[str], values: Array) -> Array:

@@ -1,0 +1,105 @@
+// Unpacks the library and the figures, draws them, and joins them to a legend: its boxes switch
+// joints and bags in all figures, its columns have the values under the cursor.
+"use strict";
+
+/** @typedef {{bag: number, joint: string, label: string, colour: string, dashes: string}} Row */
+/** @typedef {{data: {meta: [number | null, string, string]}[], layout: object}} Chart */
+
+const UNITS_OF = { q: "position", v: "velocity", tau: "effort", error: "distance" };
+
+/** @param {string} id @returns {Promise<string>} what was packed into the page under that name */
+async function unpackedText(id) {
+  const packed = atob(/** @type {HTMLElement} */ (document.getElementById(id)).textContent || "");
+  const bytes = new Uint8Array(packed.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).text();
+}
+
+/** @param {Row} row @param {() => void} changed @returns {HTMLTableRowElement} a box, a look, a name */
+function legendRow(row, changed) {
+  const line = document.createElement("tr");
+  line.className = row.joint ? "joint" : "bag";
+  const label = document.createElement("label");
+  const box = document.createElement("input");
+  box.type = "checkbox";
+  box.checked = true;
+  box.onchange = changed;
+  const swatch = document.createElement("span");
+  swatch.innerHTML = '<svg width="26" height="8"><line x2="26" y1="4" y2="4" stroke-width="2"/></svg>';
+  const drawn = /** @type {SVGLineElement} */ (swatch.querySelector("line"));
+  drawn.setAttribute("stroke", row.colour);
+  drawn.setAttribute("stroke-dasharray", row.dashes);
+  label.append(box, swatch, row.label);
+  line.insertCell().append(label);
+  return line;
+}
+
+/** The legend: boxes and cells by bag, joint and quantity. */
+class Legend {
+  /** @param {Row[]} rows @param {string[]} kinds @param {() => void} changed */
+  constructor(rows, kinds, changed) {
+    this.table = document.createElement("table");
+    this.table.id = "legend";
+    const head = this.table.createTHead().insertRow();
+    for (const name of ["", ...kinds.map((kind) => UNITS_OF[/** @type {"q"} */ (kind)])]) {
+      head.appendChild(document.createElement("th")).textContent = name;
+    }
+    this.time = /** @type {HTMLElement} */ (head.firstElementChild);
+    /** @type {Map<string, HTMLInputElement>} */
+    this.boxes = new Map();
+    /** @type {Map<string, HTMLTableCellElement>} */
+    this.cells = new Map();
+    const body = this.table.createTBody();
+    for (const row of rows) {
+      const line = legendRow(row, changed);
+      body.append(line);
+      this.boxes.set(`${row.bag} ${row.joint}`, /** @type {HTMLInputElement} */ (line.querySelector("input")));
+      for (const kind of kinds) this.cells.set(`${row.bag} ${row.joint} ${kind}`, line.insertCell());
+    }
+  }
+
+  /** @param {[number | null, string, string]} meta whose a curve is @returns {boolean} */
+  shows([bag, joint]) {
+    const on = (/** @type {string} */ name) => this.boxes.get(name)?.checked ?? true;
+    return bag === null || (on(`${bag} `) && on(`${bag} ${joint}`));
+  }
+
+  /** @param {{data: {meta: [number, string, string]}, x: number, y: number}[]} points under the cursor */
+  tell(points) {
+    for (const cell of this.cells.values()) cell.textContent = "";
+    for (const { data, y } of points) {
+      const cell = this.cells.get(data.meta.join(" "));
+      if (cell) cell.textContent = Number(y).toPrecision(5).replace("-", "\u2212");
+    }
+    this.time.textContent = points.length ? `${Number(points[0].x.toPrecision(7))} s` : "";
+  }
+}
+
+async function drawPlots() {
+  const script = document.createElement("script");
+  script.textContent = await unpackedText("library");
+  document.head.append(script);
+  /** @type {{figures: Chart[], rows: Row[]}} */
+  const { figures, rows } = JSON.parse(await unpackedText("content"));
+  const place = /** @type {HTMLElement} */ (document.getElementById("plots"));
+  const told = new Set(figures[0].data.map((trace) => trace.meta[2]));
+  const kinds = Object.keys(UNITS_OF).filter((kind) => told.has(kind));
+  const drawn = figures.map(() => Object.assign(document.createElement("div"), { className: "plot" }));
+  const legend = new Legend(rows, kinds, () => {
+    figures.forEach(({ data }, i) => {
+      Plotly.restyle(drawn[i], { visible: data.map((trace) => legend.shows(trace.meta)) });
+    });
+  });
+  const side = Object.assign(document.createElement("div"), { id: "side" });
+  side.append(legend.table, ...drawn.slice(1));
+  place.append(drawn[0], side);
+  const config = { responsive: true, displaylogo: false, doubleClick: "reset", modeBarButtonsToRemove: ["select2d", "lasso2d"] };
+  await Promise.all(figures.map(({ data, layout }, i) => Plotly.newPlot(drawn[i], data, layout, config)));
+  const hearing = /** @type {any} */ (drawn[0]);
+  hearing.on("plotly_hover", (/** @type {any} */ event) => legend.tell(event.points));
+  hearing.on("plotly_unhover", () => legend.tell([]));
+  place.dataset.ready = "";
+}
+
+drawPlots();
