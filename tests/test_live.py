@@ -469,12 +469,12 @@ def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path)
         type_into(page, "z", round(place[2] - 0.1, 3))
         press(page, "Single step")
         press(page, "Single step")
-        found = until(page, lambda found: numbers(found["error"])[0] > 90.0)
+        found = until(page, lambda found: numbers(found["error"])[0] > 0.09)
         assert sum(name.startswith("panda_joint") for name in found) == 7
         begin = time_of(found)
         press(page, "Play")
         found = until(page, lambda found: time_of(found) > begin + 1.0)
-        assert numbers(found["error"])[0] < 50.0
+        assert numbers(found["error"])[0] < 0.05
         assert len(pixels(picture(page), LINKS[0])) > 200  # a joint's ball, as dark as link 1
 
 

@@ -947,6 +947,7 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(undisturbed: Pa
         f"{metric} over Kp and Kd" for metric in METRICS if metric != "time_at_limits"
     ]
     for label, axes in found.items():
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, 1/s2", "Kd, 1/s")
         metric = label.split()[0]
         (mesh,) = (c for c in axes.collections if hasattr(c, "get_coordinates"))
         cells = np.ma.filled(mesh.get_array(), np.nan).reshape(16, 20)

@@ -126,7 +126,7 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
         assert place == pytest.approx([*oracles.position(q), 0.0], abs=6e-6)
         target = TARGETS[time > CHANGE]
         assert numbers(found["target"])[:2] == pytest.approx(target)
-        error = 1e3 * np.linalg.norm(oracles.position(q) - target)
+        error = np.linalg.norm(oracles.position(q) - target)
         assert numbers(found["error"])[0] == pytest.approx(error, rel=1e-3)
         pictures.append(picture(page))
     assert all(colours(shot) > 100 for shot in pictures)

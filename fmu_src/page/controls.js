@@ -205,7 +205,7 @@ class Readout {
       this.cells[i][0].className = stopped.includes(joint) ? "limit" : "";
     });
     this.error.textContent = session.groups.has("x_des")
-      ? `${Number((1e3 * session.error(k)).toPrecision(4))} mm`
+      ? `${Number(session.error(k).toPrecision(4))} m`
       : `${Number(session.error(k).toPrecision(4))} ${unitsOf(session.facts.joints)[0]}`;
   }
 }

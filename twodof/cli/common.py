@@ -222,7 +222,7 @@ def print_summary(
         rows.append(("bag", f"{bag.path} ({messages})"))
     if summary.error is not None:
         target = ", ".join(f"{value:g}" for value in last.target or ())
-        rows.append(("end effector", f"{length(summary.error)} from its target ({target}) m"))
+        rows.append(("end effector", f"{summary.error:.3g} m from its target ({target}) m"))
     speed = simulated / summary.wall_time if summary.wall_time else 0.0
     rows.append(
         ("time", f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time")
@@ -235,14 +235,6 @@ def print_summary(
         complete = "" if bag is None else "; the bag is complete up to there"
         rows.append(("stopped", f"on request at {last.t:g} s{complete}"))
     print_table(*rows)
-
-
-def length(metres: float) -> str:
-    """A length with the unit that suits it."""
-    for factor, unit in ((1.0, "m"), (1e3, "mm"), (1e6, "µm")):
-        if metres * factor >= 1.0:
-            return f"{metres * factor:.3g} {unit}"
-    return f"{metres * 1e9:.3g} nm" if metres >= 1e-9 else "less than 1 nm"
 
 
 def controlled(fmu: Fmu) -> str:

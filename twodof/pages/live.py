@@ -162,7 +162,7 @@ class Controls:
         self._units = ["m" if joint.prismatic else "rad" for joint in joints]
         units = " or ".join(dict.fromkeys(self._units))
         age, rows = np.array([-self._step, 0.0]), np.repeat(self._rows, 2, axis=0)
-        position, error = f"position, {units}", "distance from the target, mm"
+        position, error = f"position, {units}", "distance from the target, m"
         self._plots = [Plot(page, position, fmu.joints, age, rows[:, :-1], marked=False)]
         if self._target is not None:
             self._plots.append(Plot(page, error, ["error"], age, rows[:, -1:], marked=False))
@@ -261,7 +261,7 @@ class Controls:
         }
         if sample.target:
             rows["target"] = f"({', '.join(f'{value:+.5f}' for value in sample.target)}) m"
-            rows["error"] = f"{1e3 * (sample.error or 0.0):.4g} mm"
+            rows["error"] = f"{sample.error or 0.0:.4g} m"
         if sample.turn_error is not None:
             rows["orientation error"] = f"{degrees(sample.turn_error):.4g}°"
         for name, q, unit in zip(self._fmu.joints, sample.q, self._units):

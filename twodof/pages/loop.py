@@ -56,7 +56,7 @@ class News(NamedTuple):
 
     Attributes:
         sample: the latest.
-        rows: joint positions and distance from the target, mm, of each sample since the last news.
+        rows: joint positions and distance from the target, m, of each sample since the last news.
         again: whether the run has begun again since.
         playing: whether it is to go on.
         missed, steps, worst: deadlines missed, of how many steps, and the largest delay, s.
@@ -187,7 +187,7 @@ class Loop:
 
     def _take(self, sample: Sample) -> None:
         self._sample = sample
-        self._rows.append((*sample.q, 1e3 * (sample.error or 0.0)))
+        self._rows.append((*sample.q, sample.error or 0.0))
         del self._rows[:-MOST_ROWS]  # while no page asks
         if self._recording is not None:
             try:

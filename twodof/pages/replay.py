@@ -213,7 +213,7 @@ class Replay:
         if track.task is not None:
             place = ", ".join(f"{value:+.4f}" for value in self._targets[k])
             rows["target"] = f"({place}) m"
-            rows["error"] = f"{track.task.error[k] * 1e3:.4g} mm"
+            rows["error"] = f"{track.task.error[k]:.4g} m"
         self._readout.show(rows)
 
     # --- what moves ---

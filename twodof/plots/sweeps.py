@@ -74,7 +74,7 @@ def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -
     best = ranked(table)
     if best.empty:
         raise PlotError(f"'{name}' has no run that was finished")
-    shown = {"run": "run", **{variable: variable for variable in varied}}
+    shown = {"run": "run", **{name: f"{name}{_in(table.attrs['units'][name])}" for name in varied}}
     shown |= {key: f"{metric.title}{_in(metric.unit)}" for key, metric in METRICS.items()}
     columns = [
         {title: f"{row[key]:.4g}" for key, title in shown.items()}
@@ -208,7 +208,8 @@ def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
         f"★ {best[panel.metric]:.3g} at {at}", (0, 1), (0, 4), xycoords="axes fraction",
         textcoords="offset points", fontsize=7.0, color=GREY,
     )  # fmt: skip
-    axes.set(xlabel=panel.x, ylabel=panel.y or "")
+    named = {name: f"{name}{_in(unit)}" for name, unit in table.attrs["units"].items()}
+    axes.set(xlabel=named[panel.x], ylabel=named[panel.y] if panel.y else "")
 
 
 def _draw_bar(figure: Figure, axes: Axes, shown: Any) -> None:

@@ -174,6 +174,8 @@ class Results:
 def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
     """A sweep's table in the order of the runs, and its provenance; it need not be finished.
 
+    The table's ``attrs["units"]`` holds its columns' units, "" for a number without one.
+
     Raises:
         SweepError: it cannot be read.
     """
@@ -182,7 +184,10 @@ def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
     if not files:
         raise SweepError(f"'{path}' is no sweep: it has no {WHOLE} and no parts")
     table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")
-    return table.to_pandas(), _provenance(files[0], table.schema)
+    rows = table.to_pandas()
+    said = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}
+    rows.attrs["units"] = {name: unit.decode("utf-8", "replace") for name, unit in said.items()}
+    return rows, _provenance(files[0], table.schema)
 
 
 def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
