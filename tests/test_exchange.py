@@ -304,6 +304,30 @@ def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, monkeypatch):
     assert theirs[-1].tolist() == [0.0, 0.5, 0.0, 0.0]
 
 
+@pytest.mark.parametrize("torques", [(0.0236, 0.9009), (0.8861, 0.0227), (0.2502, 0.7944)])
+def test_a_joint_that_is_thrown_off_its_stop_has_no_event_by_a_solvers_error(
+    fmus, monkeypatch, torques
+):
+    """CVode's own tolerance is far beyond what is past a limit."""
+    events = []
+    enter = FMU2Model.enterEventMode
+
+    def counted(model):
+        events.append(1)
+        assert len(events) <= 50
+        return enter(model)
+
+    monkeypatch.setattr(FMU2Model, "enterEventMode", counted)
+    starts = {f"{group}[{i}]": value for i in (1, 2)
+              for group, value in (("q_start", 0.0), ("q_min", -0.3), ("q_max", 0.3))}  # fmt: skip
+    starts |= {"tau_cmd[1]": torques[0], "tau_cmd[2]": torques[1]}
+    for tolerance, near in ((1e-5, 1e-2), (1e-10, 1e-7)):
+        events.clear()
+        theirs = run(fmus["effort"], "ModelExchange", starts, 1.0, relative_tolerance=tolerance)
+        ours = run(fmus["effort"], "CoSimulation", {**starts, "rtol": 1e-10, "atol": 1e-12}, 1.0)
+        assert np.abs(theirs - ours)[:, :2].max() <= near
+
+
 def test_events_are_at_the_times_of_the_closed_form(fmus, monkeypatch):
     """q = q_des (1 − cos ωt) under joint control without Kd is at 1 where cos ωt = 1 − 1/q_des."""
     time, events = [0.0], []

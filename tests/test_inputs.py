@@ -346,3 +346,34 @@ def test_number_of_steps_is_right_though_the_step_has_no_binary_form(
 ) -> None:
     run = twodof.experiment(fmu, stop_time=stop, step=step)
     assert (run.steps, run.time(n)) == (n, n * step)
+
+
+# --- changes over time, given in Python ---
+
+
+def test_changes_are_named_as_settings_are(fmu: Fmu) -> None:
+    run = twodof.experiment(fmu, changes=[(0.1, {"x_des": (0.1, 0.2)}), (0.1, {"Kp": 9})])
+    assert run.changes == [
+        (0.1, {"x_des[1]": 0.1, "x_des[2]": 0.2}), (0.1, {"Kp[1]": 9.0, "Kp[2]": 9.0}),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "culprit"),
+    [
+        ([(0.1, {"x_des": float("nan")})], r"x_des\[1\] = nan is not finite"),
+        ([(0.1, {"x_dse": 1.0})], "there is no variable 'x_dse'"),
+        ([(0.1, {"q": 1.0})], r"q\[1\] is of causality 'output'"),
+        ([(0.1, {"rtol": 1e-3})], "rtol is no input and cannot be changed at 0.1 s"),
+        ([(0.2, {"Kp": 1.0}), (0.1, {"Kp": 2.0})], "the times of `changes` are finite and ascend"),
+        ([(float("nan"), {"Kp": 1.0})], "the times of `changes` are finite and ascend"),
+    ],
+)
+def test_changes_that_cannot_be_are_refused_before_the_run(fmu: Fmu, changes, culprit) -> None:
+    with pytest.raises(InputError, match=culprit):
+        twodof.experiment(fmu, changes=changes)
+
+
+def test_an_element_beyond_a_vectors_end_is_told_as_such(fmu: Fmu) -> None:
+    with pytest.raises(InputError, match=r"no variable 'Kp\[3\]': Kp has 2 elements"):
+        twodof.experiment(fmu, settings={"Kp[3]": 1.0})

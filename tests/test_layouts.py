@@ -108,7 +108,7 @@ def test_names_are_text_and_topics_are_in_the_namespace(
     assert topics and all(topic.startswith("/left/") for topic in topics)
     for options, culprit in (
         (["--namespace", "a b"], "--namespace 'a b' is no name of ROS 2"),
-        (["-o", str(tmp_path / "none")], "none': there is no such folder"),
+        (["-o", str(tmp_path / "none")], "none/': No such file or directory"),
     ):
         assert main(["layouts", str(native_path), *options]) == 1
         assert culprit in capfd.readouterr().err

@@ -7,9 +7,10 @@ import difflib
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ def experiment(
     step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
     input_file: str | Path | None = None,
-    changes: Changes | None = None,
+    changes: Sequence[tuple[float, Mapping[str, Setting]]] | None = None,
     stamp_start: float | None = None,
 ) -> Experiment:
     """Check what a run is asked to do.
@@ -103,7 +104,7 @@ def experiment(
         settings: start values of inputs and parameters by name; a vector's name takes one value
             for all elements or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
-        changes: in its place, times and inputs that change there, as of ``read_commands``.
+        changes: in its place, times, s, and inputs that change there, named as in settings.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
 
     Raises:
@@ -114,15 +115,18 @@ def experiment(
     if stop_time is None:
         stop_time = start_time + _default(fmu, "stopTime", 5.0) - _default(fmu, "startTime", 0.0)
     given = resolve(fmu, settings or {})
+    due = [(t, _inputs_at(fmu, t, asked)) for t, asked in changes or []]
+    if not all(earlier <= t < inf for (earlier, _), (t, _) in pairwise([(-inf, {}), *due])):
+        raise InputError("the times of `changes` are finite and ascend")
     if input_file is not None:
         if changes is not None:
             raise InputError("`input_file` and `changes` are both inputs over time; give one")
-        changes = read_changes(fmu, input_file)
-        for name in changes[0][1]:
+        due = read_changes(fmu, input_file)
+        for name in due[0][1]:
             if name in given:
                 raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
-        while changes and changes[0][0] <= start_time + TIME_TOLERANCE * step:
-            given |= changes.pop(0)[1]
+        while due and due[0][0] <= start_time + TIME_TOLERANCE * step:
+            given |= due.pop(0)[1]
     if stamp_start is not None and not isfinite(stamp_start):
         raise InputError(f"stamp_start = {stamp_start} is not finite")
     run = Experiment(
@@ -132,11 +136,20 @@ def experiment(
         steps=_steps(start_time, stop_time, step),
         start_values={**_declared_starts(fmu), **given},
         given=given,
-        changes=changes or [],
+        changes=due,
         stamp_start=stamp_start,
     )
     run.first_stamp()  # which refuses what has none
     return run
+
+
+def _inputs_at(fmu: Fmu, t: float, asked: Mapping[str, Setting]) -> dict[str, Value]:
+    """What a change sets, each an input."""
+    values = resolve(fmu, asked)
+    for name in values:
+        if fmu.variables[name].causality != "input":
+            raise InputError(f"{name} is no input and cannot be changed at {t:g} s")
+    return values
 
 
 def _steps(start: float, stop: float, h: float) -> float:
@@ -213,9 +226,11 @@ def _checked(fmu: Fmu, name: str, value: object) -> Value:
 
 
 def _of_another(fmu: Fmu, name: str) -> str:
-    """Of which controls a variable is that this FMU has not; "" where of none."""
+    """How many elements a vector has, or of which controls it is; "" where there is none."""
     group = name.partition("[")[0]
     having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
+    if elements := fmu.vector(group):
+        return f": {group} has {len(elements)} elements"
     if not fmu.control or not having:
         return ""
     quoted = " or ".join(f"'{control}'" for control in having)

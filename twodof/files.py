@@ -139,8 +139,7 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    if not path.parent.is_dir():  # else it is the temporary file's name that is told
-        raise FileNotFoundError(errno.ENOENT, "there is no such folder", str(path.parent))
+    os.stat(f"{path.parent}/")  # else it is the temporary file's name that is told
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".twodof-", delete=False) as file:
         partial = Path(file.name)
         try:

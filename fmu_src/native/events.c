@@ -13,6 +13,8 @@
 /* How far past a limit an event is, as a part of max(1, |limit|): some hundred units in the last
    place. */
 static const double PAST = 1e-13;
+/* s: what a joint gains in room for its speed away from a limit. */
+static const double CLEARING = 1.0;
 /* rad/s2, m/s2, N·m or N: how a joint at rest is pulled off where its event is. */
 static const double PULL = 1e-9;
 /* rad/s or m/s: an impact slower than this drives no other joint off that rests. Two joints that in
@@ -34,25 +36,27 @@ void find_stops(const Plant *plant, Stops *stops)
     hold(plant, y, a, kept, stops);
 }
 
-/* Distance to a place past a limit; 1 where that is no limit. */
-static double room(double limit, double outwards)
+/* Distance to a place past a limit, and more where a joint moves away from it, at v: there a solver's
+   error is no event. 1 where that is no limit. */
+static double room(double limit, double distance, double v)
 {
     const double size = fabs(limit);
-    return size < DBL_MAX ? outwards + PAST * fmax(1.0, size) : 1.0;
+    return size < DBL_MAX ? distance + PAST * fmax(1.0, size) + CLEARING * fmax(0.0, v) : 1.0;
 }
 
 void event_indicators(const Plant *plant, const Stops *stops, double indicator[N_INDICATORS])
 {
-    const double *q = &plant->value[Q], *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
+    const double *q = &plant->value[Q], *v = &plant->value[V];
+    const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     double a[N_JOINTS], pressed[N_JOINTS];
     if (stops->any_watched) {
-        acceleration(plant, q, &plant->value[V], a);
+        acceleration(plant, q, v, a);
         restrain(plant, stops, q, a, pressed);
     }
     for (int i = 0; i < N_JOINTS; i++) {
         double *at[2] = {&indicator[i], &indicator[N_JOINTS + i]};
-        *at[0] = room(high[i], high[i] - q[i]);
-        *at[1] = room(low[i], q[i] - low[i]);
+        *at[0] = room(high[i], high[i] - q[i], -v[i]);
+        *at[1] = room(low[i], q[i] - low[i], v[i]);
         if (stops->held[i]) /* at rest where there is no range, for good */
             *at[0] = *at[1] = 1.0;
         if (stops->watched[i])

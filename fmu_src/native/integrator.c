@@ -38,10 +38,12 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
    step across that passes the error test. One of this size, whose stages had different ranks, is
    taken. */
 static const double JUMP_STEP = 1.0 / 256.0;
-/* As a part of the largest step: a joint that is back at its limit sooner than this after leaving
-   it is kept there for as long. Where its acceleration only grazes zero, as it may at a
-   singularity, it would else leave and return without end. */
-static const double PATIENCE = 0.25;
+/* As parts of the largest step, and of that: a joint that is back at its limit sooner than the one
+   after leaving it is kept there for the other, and each time that this is so again twice as long.
+   Where its acceleration only grazes zero, as it may at a singularity, or where joints drive each
+   other off, it would else leave and return without end; where it returns but once, nothing is
+   changed. */
+static const double PATIENCE = 0.25, FIRST_WAIT = 1.0 / 1073741824.0; /* 2⁻³⁰ */
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
@@ -316,12 +318,24 @@ static double until_event(Step *step, double t, double end, Obstacle *obstacle)
     return NAN;
 }
 
+/* How a joint is kept at its limit: until when, and for how long. */
+typedef struct {
+    double until, wait;
+} Keeping;
+
+static void keep_for_a_while(Keeping *keeping, double t, double patience)
+{
+    const int again = t - keeping->until < patience;
+    keeping->wait = again ? fmin(2.0 * keeping->wait, patience) : FIRST_WAIT * patience;
+    keeping->until = t + keeping->wait;
+}
+
 int advance_plant(Plant *plant, double h, Obstacle *obstacle)
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
     double left[N_JOINTS];       /* when each joint last left its limit */
-    double until[N_JOINTS] = {0}; /* until when each joint is kept at its limit */
+    Keeping keeping[N_JOINTS];
     int kept[N_JOINTS], let_go[N_JOINTS] = {0};
     Step step;
     double t = 0.0;
@@ -333,22 +347,24 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     step.evaluations = 0;
     memcpy(step.y, &plant->value[Q], N_JOINTS * sizeof *step.y);
     memcpy(step.y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *step.y);
-    for (int i = 0; i < N_JOINTS; i++)
+    for (int i = 0; i < N_JOINTS; i++) {
         left[i] = -HUGE_VAL;
+        keeping[i] = (Keeping){-HUGE_VAL, 0.0};
+    }
     while (t < h) {
         double end = h;
         int held_again = 0;
         for (int i = 0; i < N_JOINTS; i++) {
-            kept[i] = until[i] > t;
+            kept[i] = keeping[i].until > t;
             if (kept[i])
-                end = fmin(end, until[i]);
+                end = fmin(end, keeping[i].until);
         }
         set_out(&step, kept);
         for (int i = 0; i < N_JOINTS; i++) {
             if (!step.stops.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
                 left[i] = t;
             if (step.stops.watched[i] && let_go[i]) { /* it is pressed again, by rounding */
-                until[i] = t + patience;
+                keep_for_a_while(&keeping[i], t, patience);
                 held_again = 1;
             }
             let_go[i] = 0;
@@ -359,12 +375,12 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
         memcpy(let_go, step.let_go, sizeof let_go);
         for (int i = 0; i < N_JOINTS; i++)
             if (step.stopped[i] && t - left[i] < patience)
-                until[i] = t + patience;
+                keep_for_a_while(&keeping[i], t, patience);
     }
     if (isnan(t))
         return 0;
     for (int i = 0; i < N_JOINTS; i++)
-        kept[i] = until[i] > h;
+        kept[i] = keeping[i].until > h;
     impact(plant, step.y, kept);
     memcpy(&plant->value[Q], step.y, N_JOINTS * sizeof *step.y);
     memcpy(&plant->value[V], step.y + N_JOINTS, N_JOINTS * sizeof *step.y);

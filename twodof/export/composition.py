@@ -48,7 +48,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
     if options.control not in CONTROLS:
         raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
-    path = options.urdf or data_file("urdf", "2dof.urdf")
+    path = Path(options.urdf or data_file("urdf", "2dof.urdf"))
     mesh_dir = _mesh_dir(options)
     text = read_text(path, mesh_dir)
     try:

@@ -36,7 +36,7 @@ class FmuOptions:
             "x86_64-linux", "aarch64-linux"; empty: this machine's.
     """
 
-    urdf: Path | None = None
+    urdf: str | Path | None = None
     mesh_dir: Path | None = None
     frame: str | None = None
     lock: Mapping[str, float] = field(default_factory=dict)

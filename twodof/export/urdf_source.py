@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,9 +53,11 @@ def end_effector(urdf: Urdf) -> str:
         return DEFAULT_FRAME
     if len(leaves) == 1:
         return leaves[0]
+    if not leaves:
+        raise RobotError("there is no link that a joint moves; `lock` fewer joints")
     others = [link for link in urdf.links if link not in leaves]
     raise RobotError(
-        f"name the controlled link with `frame`; at the ends are: {', '.join(leaves) or 'none'};"
+        f"name the controlled link with `frame`; at the ends are: {', '.join(leaves)};"
         f" and there are: {', '.join(others)}"
     )
 
@@ -112,7 +115,9 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
             for child in element.findall(tag):
                 element.remove(child)
         element.set("type", "fixed")
-        rpy = turned.as_euler("xyz")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # where roll and yaw turn about one axis, any pair does
+            rpy = turned.as_euler("xyz")
         ET.SubElement(
             element, "origin", xyz=" ".join(map(repr, place.tolist())),
             rpy=" ".join(map(repr, rpy.tolist())),

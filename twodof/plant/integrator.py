@@ -58,10 +58,12 @@ BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
 STAGES = 6
 """Evaluations that an integration step costs."""
-PATIENCE = 0.25
-"""As a part of the largest step: a joint that is back at its limit sooner than this after leaving
-it is kept there for as long. Where its acceleration only grazes zero, as it may at a singularity,
-it would else leave and return without end."""
+PATIENCE, FIRST_WAIT = 0.25, 2.0**-30
+"""As parts of the largest step, and of that: a joint that is back at its limit sooner than the one
+after leaving it is kept there for the other, and each time that this is so again twice as long.
+Where its acceleration only grazes zero, as it may at a singularity, or where joints drive each
+other off, it would else leave and return without end; where it returns but once, nothing is
+changed."""
 TIME_RESOLUTION = 2.0**-52
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
 
@@ -131,8 +133,15 @@ def advance(
     t = 0.0
     patience = PATIENCE * min(max_step, h)
     left = [-inf] * len(limits)  # when each joint last left its limit
-    kept = [0.0] * len(limits)  # until when each joint is kept at its limit
+    kept = [-inf] * len(limits)  # until when each joint is kept at its limit,
+    wait = [0.0] * len(limits)  # and for how long
     let_go: list[int] = []
+
+    def keep_for_a_while(i: int) -> None:
+        again = t - kept[i] < patience
+        wait[i] = min(2.0 * wait[i], patience) if again else FIRST_WAIT * patience
+        kept[i] = t + wait[i]
+
     while t < h:
         end = min((until for until in kept if until > t), default=h)
         keep = [until > t for until in kept]
@@ -144,7 +153,7 @@ def advance(
                 left[i] = t
         again = [i for i in let_go if i in stops.watched]  # it is pressed again, by rounding
         for i in again:
-            kept[i] = t + patience
+            keep_for_a_while(i)
         let_go = []
         if again:
             continue
@@ -153,7 +162,7 @@ def advance(
         )
         for i in stopped:
             if t - left[i] < patience:
-                kept[i] = t + patience
+                keep_for_a_while(i)
     stops.impact(y, [until > h for until in kept])
     return y[: len(q)], y[len(q) :]
 

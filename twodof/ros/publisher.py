@@ -20,7 +20,7 @@ from ..sample import Sample, Sink
 from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic
-from .listener import Listener
+from .listener import ORDERS, Listener
 from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name
 from .network import Network, OpenDomain, network, open_domain
 
@@ -124,6 +124,12 @@ class Publisher(Sink):
         self.commands = tuple(self._heard)
         for both in {*self.commands} & {*self.topics}:
             raise InputError(f"`command_topic` is '{both}', which is published")
+        named = [*self.topics, *self.commands, *(ORDERS if self._clock else ())]
+        for name in named:
+            if named.count(name) > 1:
+                raise InputError(
+                    f"'{name}' would be two topics; name `state_topic` or `command_topic` otherwise"
+                )
         return self
 
     def _named(self, name: str) -> str:
@@ -302,6 +308,10 @@ def publish_together(
     """
     if pace is None and not options.get("lockstep"):
         pace = RealTime()
+    if not robots:
+        raise InputError("there are no robots to publish")
+    if len(robots) > 1 and str(options.get("state_topic", "")).startswith("/"):
+        raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
     shared, now, members = open_domain(place or network()), time.time(), list[Member]()
     for name, run in robots.items():
         wire = Publisher(
