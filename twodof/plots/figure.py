@@ -41,7 +41,8 @@ TICK_STYLE: dict[str, Any] = {
 }  # fmt: skip
 """Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
 
-STYLES = """h1 { font-size: 1.1em; margin: 0 0 .5em; overflow-wrap: anywhere; }
+STYLES = """html { overflow-y: scroll; }
+h1 { font-size: 1.1em; margin: 0 0 .5em; overflow-wrap: anywhere; }
 #plots { display: grid; grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); gap: 1em; }
 #plots .plot { min-width: 0; }
 #side { overflow-x: auto; }

@@ -212,7 +212,8 @@ def _trace(
     kept = outline(curve.y, chunks)
     return {
         "type": "scatter", "mode": "lines" if len(curve.t) > 1 else "markers",
-        "x": _numbers(curve.t[kept]), "y": _numbers(curve.y[kept]), "line": line,
+        "x": _numbers(curve.t[kept]), "y": _numbers(curve.y[kept]),
+        "line": {**line, "simplify": False},  # which bends curves visibly
         "marker": {"color": line["color"]}, "meta": [curve.track, joint, told],
         "hoverinfo": hoverinfo,
     }  # fmt: skip
