@@ -351,10 +351,10 @@ def test_the_clock_is_that_of_the_simulation(
         assert ended(process)[1] == ""
     told = [it for it in node.told if it[:2] == ["message", "/clock"]]
     stamps = [seconds * SECOND + rest for _, _, _, (seconds, rest) in told]
-    last = 100 * SECOND + round(simulated * 100) * SECOND // 100
-    assert stamps == [last - k * SECOND // 100 for k in range(len(stamps))][::-1]
+    points = [100 * SECOND + k * SECOND // 100 for k in range(round(simulated * 100) + 1)]
     states = [stamp_of(m[0]) for m in node.messages("/joint_states")]
-    assert stamps[-len(states) :] == states[-len(stamps) :]  # who was found first is heard longer
+    for heard in (stamps, states):  # at 1,000 a second a busy machine may lose some
+        assert heard == sorted({*heard} & {*points}) and len(heard) > len(points) / 2
     wall = (told[-1][2] - told[0][2]) / SECOND
     assert (stamps[-1] - stamps[0]) / SECOND / wall == pytest.approx(speed, rel=0.1)
 

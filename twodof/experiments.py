@@ -229,7 +229,8 @@ def _of_another(fmu: Fmu, name: str) -> str:
     """How many elements a vector has, or of which controls it is; "" where there is none."""
     group = name.partition("[")[0]
     having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
-    if elements := fmu.vector(group):
+    elements = fmu.vector(group)
+    if elements and fmu.variables[elements[0]].causality in ("input", "parameter"):
         return f": {group} has {len(elements)} elements"
     if not fmu.control or not having:
         return ""

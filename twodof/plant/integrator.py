@@ -129,19 +129,12 @@ def advance(
     """
     limits = stops.limits
     equations = _Equations(acceleration, len(limits))
-    y = [*q, *v]
-    t = 0.0
+    y, t = [*q, *v], 0.0
     patience = PATIENCE * min(max_step, h)
     left = [-inf] * len(limits)  # when each joint last left its limit
     kept = [-inf] * len(limits)  # until when each joint is kept at its limit,
     wait = [0.0] * len(limits)  # and for how long
     let_go: list[int] = []
-
-    def keep_for_a_while(i: int) -> None:
-        again = t - kept[i] < patience
-        wait[i] = min(2.0 * wait[i], patience) if again else FIRST_WAIT * patience
-        kept[i] = t + wait[i]
-
     while t < h:
         end = min((until for until in kept if until > t), default=h)
         keep = [until > t for until in kept]
@@ -153,7 +146,8 @@ def advance(
                 left[i] = t
         again = [i for i in let_go if i in stops.watched]  # it is pressed again, by rounding
         for i in again:
-            keep_for_a_while(i)
+            wait[i] = _wait(wait[i], t - kept[i], patience)
+            kept[i] = t + wait[i]
         let_go = []
         if again:
             continue
@@ -162,9 +156,15 @@ def advance(
         )
         for i in stopped:
             if t - left[i] < patience:
-                keep_for_a_while(i)
+                wait[i] = _wait(wait[i], t - kept[i], patience)
+                kept[i] = t + wait[i]
     stops.impact(y, [until > h for until in kept])
     return y[: len(q)], y[len(q) :]
+
+
+def _wait(last: float, since: float, patience: float) -> float:
+    """How long a joint is kept at its limit, s; last time it was so long, and ended so long ago."""
+    return min(2.0 * last, patience) if since < patience else FIRST_WAIT * patience
 
 
 def _until_event(
