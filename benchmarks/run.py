@@ -619,7 +619,7 @@ def print_in_c(rows: Sequence[RowInC], times: Sequence[float]) -> None:
         "\n  free: no controller. controlled: by the guide's equations, in each stage of RK4."
         "\n  path: where only an unlimited control torque acts, M cancels; with damping, tau_ext or"
         "\n  effort limits it does not. Panda: as in example-robot-data, but that its fingers are"
-        "\n  fixed, as mimic joints are not supported yet. chain: generated, without damping."
+        "\n  fixed, so that 7 joints move. chain: generated, without damping."
     )
 
 
