@@ -2,7 +2,7 @@
 
 import sys
 
-from twodof.cli.main import main
+from twodof.__main__ import main
 
 if __name__ == "__main__":
     sys.exit(main(["build", *sys.argv[1:]]))

@@ -38,7 +38,9 @@ TWODOF = [sys.executable, "-m", "twodof"]
 def floor(folder: Path) -> Callable[[int, bool], float]:
     """Processor time of a step in C, s, of a run of so many, logged or bare."""
     arm, path = shipped_arm(), folder / "logged"
-    flavour = native_flavour(arm.robot, "task", variable_table(arm.robot, arm.starts), "logged", ())
+    flavour = native_flavour(
+        arm.robot, "task", variable_table(arm.robot, arm.starts), "logged", (), 2, arrays=False
+    )
     sources = {Path(name).name: content for name, content in flavour.files.items()}
     sources["logged_step.c"] = (HERE / "logged_step.c").read_bytes()
     units = ("directional.c", "logged_step.c")

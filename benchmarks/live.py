@@ -5,8 +5,8 @@
 Steps the default arm every 10 ms behind a page that a browser of nice 19 has open, renders in
 software and sets the target of; a second process does nothing but sleep until each 10 ms. Prints
 what both missed. Then, for half that time and with a browser of nice 0: how long it takes there
-from a change of the target to the first change of the arm. Needs chromium and the packages 'viser'
-and 'playwright'.
+from a change of the target to the first change of the arm. Needs chromium and the packages
+'websockets' and 'playwright'.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def browse(url: str, seconds: float, nice: int) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             for x in (0.17, 0.2):
-                print(browser.latency(page, "x", x), flush=True)
+                print(browser.latency(page, "x_des[1], m", x), flush=True)
                 page.wait_for_timeout(800)
 
 
@@ -70,12 +70,12 @@ def main() -> None:
         fmu = build_fmu(Path(folder) / "TwoDof.fmu", FmuOptions(native=native))
         run = experiment(fmu, step=STEP, stop_time=math.inf)
         loop = Loop(run)
-        with page_of(loop, run, "127.0.0.1", 0) as (url, page):
+        with page_of(loop, run, "127.0.0.1", 0) as page:
             ended = threading.Event()
             bare, live, delays = [], [], []
 
             def begin_browser(seconds: float, nice: int) -> subprocess.Popen[str]:
-                command = [sys.executable, __file__, "--browse", url, f"{seconds}", f"{nice}"]
+                command = [sys.executable, __file__, "--browse", page.url, f"{seconds}", f"{nice}"]
                 viewer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 assert viewer.stdout is not None and viewer.stdout.readline() == "open\n"
                 time.sleep(2.0)
@@ -98,7 +98,7 @@ def main() -> None:
 
             thread = threading.Thread(target=watch)
             thread.start()
-            loop.play(page, ended.is_set)
+            loop.play(ended.is_set)
             thread.join()
     count = round(seconds / STEP)
     print(f"bare loop  {bare[0]:6.0f} of {count} missed, worst {1e3 * bare[1]:.1f} ms")

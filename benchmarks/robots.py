@@ -98,7 +98,7 @@ def measure(urdf: Path, folder: Path) -> list[str]:
     frame = frame_of(text)
     times = []
     for native in (False, True):
-        options = twodof.FmuOptions(urdf=urdf, frame=frame, native=native)
+        options = twodof.FmuOptions(urdf=urdf, frame=frame, native=native, live_documentation=False)
         fmu = twodof.build_fmu(folder / f"robot{native:d}.fmu", options)
         clock, bag = Clock(), twodof.Bag(folder / "bag", overwrite=True)
         summary = twodof.simulate(fmu, bag, clock, stop_time=1.0, stop=clock.late)

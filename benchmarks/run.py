@@ -37,6 +37,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+from unittest.mock import patch
 
 import fmpy
 import numpy as np
@@ -348,19 +349,33 @@ def without_shapes(urdf: str) -> ET.Element:
     return tree
 
 
-def native_cost(arm: Arm, folder: Path) -> Callable[[], float]:
-    """Times a run of the native engine in C, compiled as in its FMU."""
+def native_cost(
+    arm: Arm,
+    folder: Path,
+    change: Callable[[dict[str, bytes]], None] | None = None,
+    flags: Sequence[str] = (),
+) -> Callable[[], float]:
+    """Times a run of the native engine in C, compiled as in its FMU, or with changed sources."""
     name = f"step{len(list(folder.glob('step*')))}"
-    flavour = native_flavour(arm.robot, "task", variable_table(arm.robot, arm.starts), name, ())
+    flavour = native_flavour(
+        arm.robot, "task", variable_table(arm.robot, arm.starts), name, (), 2, arrays=False
+    )
     sources = {Path(path).name: content for path, content in flavour.files.items()}
     sources["native_step.c"] = (HERE / "native_step.c").read_bytes()
-    path = folder / name
-    path.write_bytes(
-        compile_library(sources, host_platform(), name, units=("directional.c", "native_step.c"))
-    )
+    if change is not None:
+        change(sources)
+    path, units = folder / name, ("directional.c", "native_step.c")
+    path.write_bytes(compile_library(sources, host_platform(), name, units=units, flags=flags))
     step_cost = ctypes.CDLL(str(path)).step_cost
     step_cost.argtypes, step_cost.restype = (ctypes.c_double, ctypes.c_int), ctypes.c_double
     return lambda: step_cost(STEP, STEPS)
+
+
+def by_own_compiler(*of: Any) -> Callable[[], float]:
+    """As native_cost, where ziglang is not installed."""
+    found = importlib.util.find_spec
+    with patch("importlib.util.find_spec", lambda name: None if name == "ziglang" else found(name)):
+        return native_cost(*of)
 
 
 def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]]]:

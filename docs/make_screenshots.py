@@ -4,11 +4,13 @@
 
 The first is the replay of a real run of the default arm, whose target changes; the second a live
 arm, whose target has just been dragged; the third the Panda on its way to a pose, and the fourth in
-a page of its own. Needs chromium and the packages 'viser', 'playwright' and 'example-robot-data'.
+a page of its own. Needs chromium and the packages 'websockets', 'playwright' and
+'example-robot-data'.
 """
 
 from __future__ import annotations
 
+import io
 import sys
 import sysconfig
 import tempfile
@@ -36,7 +38,7 @@ def main() -> None:
         fmu = twodof.build_fmu(folder / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
         (folder / "targets.csv").write_text(INPUTS)
         run = twodof.experiment(fmu, stop_time=6, input_file=folder / "targets.csv")
-        twodof.simulate(run, twodof.Bag(folder / "my_bag"))
+        twodof.simulate(run, twodof.Bag(folder / "my_bag", effort=True))
         view(chromium, folder)
         live(chromium, folder, fmu)
         panda(chromium, folder)
@@ -51,24 +53,22 @@ def page(chromium: Browser, folder: Path) -> None:
         name="Panda",
     )  # fmt: skip
     file = twodof.page(twodof.build_fmu(folder / "Panda.fmu", options), folder / "panda.html")
-    with browser.opened(chromium, file.as_uri(), ready="#arm-scene[data-ready]") as shown:
+    with browser.opened(chromium, file.as_uri(), scale=2) as shown:
         shown.locator("#arm-play").click()
         shown.evaluate(
             "() => { arm.startAgain(); arm.set('x_des', [0.5, 0.1, 0.4]);"
             " arm.set('quat_des', [1, 0, 0.3, 0.2]); arm.step(40); }"
         )
-        shown.wait_for_timeout(3000)
-        shown.screenshot(path=ROOT / "docs" / "page.png")
+        shoot(shown, "page.png")
 
 
 def view(chromium: Browser, folder: Path) -> None:
     """The replay, 0.6 s after the target has changed."""
     with (
         browser.served("view", "my_bag", cwd=folder) as command,
-        browser.opened(chromium, command.url) as page,
+        browser.opened(chromium, command.url, scale=2) as page,
     ):
-        browser.type_into(page, "time, s", 4.6)
-        browser.until(page, lambda found: found["time"] == "4.600 s")
+        page.evaluate("arm.seek(4.6)")
         shoot(page, "view.png")
 
 
@@ -76,13 +76,12 @@ def live(chromium: Browser, folder: Path, fmu: Path) -> None:
     """The live arm, paused on its way to a target that was moved."""
     with (
         browser.served("live", fmu, cwd=folder) as command,
-        browser.opened(chromium, command.url) as page,
+        browser.opened(chromium, command.url, scale=2) as page,
     ):
-        browser.until(page, lambda found: browser.numbers(found["error"])[0] < 2.0)
-        browser.type_into(page, "x", 0.14)
-        browser.type_into(page, "y", 0.19)
-        browser.until(page, lambda found: browser.numbers(found["error"])[0] > 80.0)
-        browser.until(page, lambda found: browser.numbers(found["error"])[0] < 60.0)
+        page.wait_for_function("() => arm.error() < 0.01")
+        page.evaluate("arm.set('x_des', [0.14, 0.19])")
+        page.wait_for_function("() => arm.error() > 0.08")
+        page.wait_for_function("() => arm.error() < 0.06")
         browser.press(page, "Pause")
         shoot(page, "live.png")
 
@@ -102,17 +101,17 @@ def panda(chromium: Browser, folder: Path) -> None:
         browser.served("view", "panda", cwd=folder) as command,
         browser.opened(chromium, command.url) as page,
     ):
-        browser.until(page, lambda found: found["time"] == "1.000 s")
+        page.evaluate("arm.seek(1)")
         page.wait_for_timeout(3000)
         picture = Image.fromarray(browser.still(page).astype("uint8"))
         picture.save(ROOT / "docs" / "panda.png", optimize=True)
 
 
 def shoot(page: Page, name: str) -> None:
-    """Save what is shown, without the notice that the browser renders in software."""
-    page.locator(".mantine-Notification-closeButton").first.click()
-    page.wait_for_timeout(1500)
-    page.screenshot(path=ROOT / "docs" / name)
+    """Save what is shown, with edges smoothed."""
+    page.wait_for_timeout(3000)
+    picture = Image.open(io.BytesIO(page.screenshot()))
+    picture.resize((SIZE["width"], SIZE["height"])).save(ROOT / "docs" / name, optimize=True)
 
 
 if __name__ == "__main__":

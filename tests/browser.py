@@ -16,16 +16,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import msgspec
 import numpy as np
-import viser
 import websockets.sync.client
 from harness import needs
-from PIL import Image
+from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page, sync_playwright
 from scipy import ndimage
-from viser import _messages
-from websockets import Subprotocol
+from scipy.spatial import ConvexHull
 
 LINKS = (
     lambda r, g, b: (r < 110) & (g < 120) & (b < 130) & (b >= r),
@@ -45,33 +42,31 @@ HOSTILE = (
     "[link](javascript:document.title='ran') &lt;"
 )
 """What a page must show as it is."""
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
-ROWS = """() => Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
-    cell => [cell.dataset.value, cell.textContent]))"""
-PLOTS = """() => Object.values(window.__viserTestpoints.uplots).map(({chart}) =>
-    [chart.root.querySelector(".u-title").textContent, chart.data.map(line => [...line].map(
-        value => Number.isFinite(value) ? value : null))])"""
+COMMAND = [sys.executable, "-m", "twodof"]
+READY = "#arm-scene[data-ready]"
+ROWS = """() => ({
+    time: document.getElementById("arm-time").textContent,
+    ...Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
+        cell => [cell.dataset.value, cell.textContent.replaceAll("\\u2212", "-")])),
+})"""
+SAMPLES = "() => [...arm.data.subarray(0, arm.count * arm.width)]"
 DRAWN = """async () => {
     for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
 }"""
-NOTES = ".mantine-Notifications-root { visibility: hidden }"
+NOTES = ".arm .bar, .arm .said { visibility: hidden }"
 LATENCY = """([label, text, row]) => new Promise(resolve => {
-    const cell = () => document.querySelector(`[data-value="${row}"]`);
-    const before = cell().textContent;
-    const input = [...document.querySelectorAll("label")].find(
-        e => e.textContent.trim() === label).closest("[class*=Group], div:has(input)");
-    const field = input.querySelector("input") || document.getElementById(input.htmlFor);
-    const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set;
-    set.call(field, text);
+    const cell = document.querySelector(`[data-value="${row}"]`), before = cell.textContent;
+    const field = document.querySelector(`input[aria-label="${label}"]`);
+    field.value = text;
     const start = performance.now();
-    field.dispatchEvent(new Event("input", {bubbles: true}));
+    field.dispatchEvent(new Event("change"));
     const observer = new MutationObserver(() => {
-        if (cell() && cell().textContent !== before) {
+        if (cell.textContent !== before) {
             observer.disconnect();
             resolve((performance.now() - start) / 1000);
         }
     });
-    observer.observe(document.body, {subtree: true, childList: true, characterData: true});
+    observer.observe(cell, {childList: true, characterData: true});
 })"""
 
 
@@ -86,9 +81,10 @@ def chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def opened(browser: Browser, url: str, *, ready: str = "[data-value]") -> Iterator[Page]:
-    """A page that is shown; at its end, no error is in its console."""
-    with browser.new_context(viewport=VIEWPORT) as context:
+def opened(browser: Browser, url: str, *, ready: str = READY, scale: int = 1) -> Iterator[Page]:
+    """A page that is shown, on a screen of so many pixels for one of the page's; at its end, no
+    error is in its console."""
+    with browser.new_context(viewport=VIEWPORT, device_scale_factor=scale) as context:
         context.set_default_timeout(1e3 * PATIENCE)
         page = context.new_page()
         errors: list[str] = []
@@ -147,16 +143,7 @@ def served(*arguments: str | Path, cwd: Path) -> Iterator[Served]:
 
 def connect(url: str) -> None:
     """Connect as a browser does that has the page open, and leave at once."""
-    camera = _messages.ViewerCameraMessage(
-        wxyz=(1.0, 0.0, 0.0, 0.0), position=(0.0, 0.0, 1.0), fov=0.6, near=0.01, far=10.0,
-        image_height=100, image_width=100, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 1.0, 0.0),
-    )  # fmt: skip
-    address = url.replace("http:", "ws:")
-    protocol = Subprotocol(f"viser-v{viser.__version__}")
-    with websockets.sync.client.connect(
-        address, subprotocols=[protocol], compression=None, max_size=None
-    ) as connection:
-        connection.send(msgspec.msgpack.encode(camera.as_serializable_dict()))
+    with websockets.sync.client.connect(url.replace("http:", "ws:") + "/socket") as connection:
         connection.recv()
         time.sleep(0.1)
 
@@ -167,10 +154,10 @@ UPGRADE = (
 )  # fmt: skip
 
 
-def answer(url: str, *headers: tuple[str, str]) -> int:
+def answer(url: str, *headers: tuple[str, str], path: str = "/") -> int:
     """The status of the answer to a request with these headers and no others."""
     with closing(HTTPConnection(*urlsplit(url).netloc.rsplit(":", 1), timeout=60)) as connection:
-        connection.putrequest("GET", "/", skip_host=True, skip_accept_encoding=True)
+        connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
         for header in headers:
             connection.putheader(*header)
         connection.endheaders()
@@ -185,6 +172,8 @@ def hostile_arm() -> ET.Element:
             element.set(key, HOSTILE + element.attrib[key])
     for mesh in robot.iter("mesh"):
         mesh.tag, mesh.attrib = "sphere", {"radius": "0.02"}
+    first = robot.find("joint")
+    first.set("name", f"1 {first.get('name')}")  # of names alike, pages show the rest
     return robot
 
 
@@ -198,7 +187,7 @@ def assert_shown_as_text(page: Page, *texts: str) -> None:
 
 
 def rows(page: Page) -> dict[str, str]:
-    """All of the readout at one moment."""
+    """All of the readout at one moment, and its time."""
     return page.evaluate(ROWS)
 
 
@@ -222,19 +211,11 @@ def press(page: Page, name: str) -> None:
 
 
 def type_into(page: Page, label: str, value: float) -> None:
-    """Type a number into the field or the slider's field of that label."""
-    field = field_of(page, label)
-    field.press("Control+a")
-    # as by pasting: what Playwright's fill does is lost by a field that was changed since it did so
-    page.keyboard.insert_text(f"{value:g}")  # "0.0" is taken for a number that is yet to be ended
+    """Type a number into the field of that label."""
+    field = page.get_by_label(label, exact=True)
+    field.evaluate("(field) => { field.closest('details').open = true; }")
+    field.fill(f"{value:g}")
     field.press("Enter")
-    page.wait_for_timeout(150)  # the page sends the latest of what changes faster than 50 ms
-
-
-def field_of(page: Page, label: str) -> Any:
-    """The input for a label's number."""
-    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]")
-    return row.locator("input[inputmode=decimal]").first
 
 
 def latency(page: Page, label: str, value: float) -> float:
@@ -254,11 +235,28 @@ def still(page: Page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
 
+def target_place(page: Page) -> tuple[float, float]:
+    """The middle of the target's ball in the window, on a page with an arm in it."""
+    ball = pixels(picture(page), lambda r, g, b: (r - b > 100) & (g < 105) & (r < 225))
+    box = page.locator("canvas").first.bounding_box()
+    x, y = np.median(ball, axis=0)
+    return float(box["x"] + x), float(box["y"] + y)
+
+
 def pixels(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
     """The largest patch of a picture whose red, green and blue are as asked; x and y, N × 2."""
     patches, count = ndimage.label(seen(*np.moveaxis(shown.astype(int), -1, 0)))
     assert count > 0
     return np.argwhere(patches == np.bincount(patches.flat)[1:].argmax() + 1)[:, ::-1]
+
+
+def area(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
+    """The convex hull of all such pixels but the loneliest: what is before them leaves no gap."""
+    points = np.argwhere(ndimage.binary_opening(seen(*np.moveaxis(shown.astype(int), -1, 0))))
+    hull = Image.new("1", shown.shape[1::-1])
+    corners = points[ConvexHull(points).vertices, ::-1]
+    ImageDraw.Draw(hull).polygon([(int(x), int(y)) for x, y in corners], fill=1)
+    return np.argwhere(np.asarray(hull))[:, ::-1]
 
 
 def direction(link: np.ndarray) -> float:

@@ -166,12 +166,16 @@ def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
     return Model(robot, variable_table(robot, starts, control), starts, control)
 
 
-@functools.cache
-def library(name: str) -> Path:
-    """The shared library of a model's FMU, as it is shipped."""
-    path = SCRATCH / name / "Arm.so"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(compile_library(model(name).sources(), host_platform(), "Arm"))
+def library(name: str, control: str = "task") -> Path:
+    """The shared library of a model's FMU, as it is shipped.
+
+    Written once: a library that is written anew while it is loaded crashes the next dlopen.
+    """
+    path = SCRATCH / name / control / "Arm.so"
+    if not path.exists():
+        content = compile_library(model(name, control).sources(), host_platform(), "Arm")
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content)
     return path
 
 
@@ -240,7 +244,8 @@ def engine(name: str, control: str = "task") -> Engine:
 
 
 def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2) -> Path:
-    """C files of the tests, which include the FMU's, compiled by the machine's own compiler."""
+    """C files of the tests, which include the FMU's, compiled by the machine's own compiler;
+    headers of the tests lie beside."""
     files = of.sources(*more, fmi=fmi)
     digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
     folder = SCRATCH / digest
@@ -253,7 +258,8 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
         subprocess.run(
             ["gcc", "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
              "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
-             "-o", output, "directional.c", *(path.name for path in more), "-lm"],
+             "-o", output, "directional.c",
+             *(path.name for path in more if path.suffix == ".c"), "-lm"],
             cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
     return output

@@ -6,16 +6,16 @@ reader. All stays on the loopback interface, or in network namespaces that lead 
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -27,11 +27,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 HERE = Path(__file__).resolve().parent
-TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
+TWODOF = [sys.executable, "-m", "twodof"]
 STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
 LATCHED = ("/robot_description", "/tf_static")
 COMMANDS = ("/target_command", "/clicked_point")
-DOMAINS = itertools.count(os.getpid())
 PATIENCE = 20.0  # s
 
 
@@ -63,9 +62,19 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def number() -> int:
-    """A DDS domain that no other test uses."""
-    return 1 + next(DOMAINS) % 100
+def number() -> Iterator[int]:
+    """A DDS domain that nothing else on this machine uses, claimed by a TCP port of its number."""
+    first = os.getpid()
+    for it in range(100):
+        domain = 1 + (first + it) % 100
+        with closing(socket.socket()) as claim:
+            try:
+                claim.bind(("127.0.0.1", 7400 + 250 * domain))
+            except OSError:
+                continue
+            yield domain
+            return
+    raise AssertionError("every DDS domain is in use")
 
 
 class Node:

@@ -845,7 +845,7 @@ def test_disk_too_small_to_begin_with_is_left_as_it_was(
 def test_reserve_is_room_to_close_a_run_that_was_never_flushed(
     run: Experiment, disk: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, storage: str
 ) -> None:
-    monkeypatch.setattr("twodof.bag.writer.FLUSH_PERIOD", 1e6)
+    monkeypatch.setattr("twodof.bag.store.FLUSH_PERIOD", 1e6)
     path = disk(2140) / "bag"  # 92 KiB beside the reserve; the messages take 140
     with twodof.Bag(path, storage=storage).begin(run) as bag:
         for k in range(1000):

@@ -77,6 +77,32 @@ def test_a_recorded_run_is_replayed_to_the_bit(native_path: Path, tmp_path: Path
     assert changes[0] == changes[1] and len(changes[0]) == 4
 
 
+def test_a_run_without_changes_is_replayed_from_its_start(
+    native_path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    settings = {"x_des": (0.1, 0.2), "Kp": 80.0}
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "first"), stop_time=1, settings=settings)
+    command = ["run", str(native_path), "--input", str(tmp_path / "first"), "--stop-time", "1"]
+    assert main([*command, "-o", str(tmp_path / "again")]) == 0
+    first, again = (twodof.read_bag(tmp_path / name) for name in ("first", "again"))
+    np.testing.assert_array_equal(first.q, again.q)
+    np.testing.assert_array_equal(first.target, again.target)
+    assert main([*command, "-o", str(tmp_path / "other"), "--set", "x_des=0.2,0.1"]) == 0
+    other = twodof.read_bag(tmp_path / "other")
+    np.testing.assert_array_equal(other.target[0], (0.2, 0.1))  # what is said has the last word
+    assert other.provenance["start_values"]["Kp[1]"] == 80.0
+
+
+def test_a_run_of_another_control_is_not_replayed(
+    native_path: Path, effort: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "first"), stop_time=0.1)
+    command = ["run", str(effort), "--input", str(tmp_path / "first"), "-o", str(tmp_path / "a")]
+    assert main(command) == 1
+    assert "no variable 'x_des[1]': it is of control 'task' or" in capfd.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: StoragePlugin) -> None:
     """Held from the first communication point at or after each, as a run on the network has it."""

@@ -58,7 +58,8 @@ MUJOCO = (
 
 @pytest.mark.parametrize("name", MUJOCO)
 def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
-    """The forces that MuJoCo finds for our q̈, with damping, are those that made it."""
+    """The forces that MuJoCo finds for our q̈, with damping, are those that made it; and where no
+    joint follows another, its q̈ is ours."""
     monkeypatch.chdir(tmp_path)  # where MuJoCo writes its warnings
     root = ET.parse(urdf_path(name)).getroot()
     for link in root.iter("link"):
@@ -84,9 +85,20 @@ def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
         mujoco.mj_inverse(theirs, data)
         effort = np.add(plant.tau_cmd, plant.tau_ext)[order]
         assert deviation(G.T @ data.qfrc_inverse, effort) <= 1e-9
+        if len(G) == len(ours):
+            data.qfrc_applied = effort
+            mujoco.mj_forward(theirs, data)
+            assert deviation(np.array(acceleration)[order], data.qacc) <= 1e-9
 
 
 # --- rigid stops ---
+
+
+def constrained(M, stopped, right):
+    """x of M x − E λ = b, Eᵀ x = 0, where E picks the joints that are stopped."""
+    E = np.eye(len(M))[:, stopped.astype(bool)]
+    matrix = np.block([[M, -E], [E.T, np.zeros((E.shape[1],) * 2)]])
+    return np.linalg.solve(matrix, right)[: len(M)]
 
 
 def conditions(reference, q, v, a_free, W, a, low, high, held):
@@ -138,10 +150,41 @@ def test_stops_satisfy_their_complementarity_conditions(name):
         effort = plant.tau_cmd - damping * after
         free = reference.forward_dynamics(q, after, effort)
         conditions(reference, q, after, free, np.linalg.inv(M), a, low, high, held)
+        kkt = constrained(M, held, np.r_[M @ free, np.zeros(int(held.sum()))])
+        assert deviation(M @ a, M @ kkt) <= 1e-11
+        struck = (at != 0) & (after == 0.0)
+        plastic = constrained(M, struck, np.r_[M @ v, np.zeros(struck.sum())])
+        assert deviation(M @ after, M @ plastic) <= 1e-11
         several += held.sum() > 1
         kinetic = 0.5 * after @ M @ after - 0.5 * v @ M @ v
         assert kinetic <= 1e-9 * max(1.0, 0.5 * v @ M @ v)
     assert several or native.n < 3
+
+
+@pytest.mark.parametrize(("name", "together"), [("twodof", 2), ("ur5", 4), ("panda", 5)])
+def test_joints_pressed_and_let_go_in_any_order_do_not_depend_on_the_step(name, together):
+    """Efforts that turn at random, in a narrow range; never beyond a limit, whatever the step."""
+    native, rng = engine(name, "effort"), np.random.default_rng(0)
+    plant = model(name, "effort").plant()
+    q = rng.uniform(-1, 1, native.n)
+    plant.q, plant.q_min, plant.q_max = q.tolist(), (q - 0.1).tolist(), (q + 0.1).tolist()
+    plant.rtol, plant.atol = 1e-10, 1e-12
+    inertia = np.diag(Reduced(plant.robot.model, name).mass_matrix(q))
+    turns = rng.choice([-1, 1], (8, native.n)) * rng.uniform(5, 20, (8, native.n)) * inertia
+    at = [i for i, variable in enumerate(native.model.table) if variable.group == "tau_cmd"]
+    runs, patterns = [], set()
+    for parts in (1, 4):
+        values, rows = native.values(plant), []
+        for values[at] in turns:
+            for k in range(1, 10 * parts + 1):
+                assert native.call("advance", values, 0.01 / parts) == 1
+                q, v = native.group(values, "q"), native.group(values, "v")
+                assert (q >= plant.q_min).all() and (q <= plant.q_max).all()
+                patterns.add(tuple((q == plant.q_min) | (q == plant.q_max)))
+                rows += [] if k % parts else [[*q, *v]]
+        runs.append(rows)
+    assert max(map(sum, patterns)) >= together and len(patterns) > native.n
+    np.testing.assert_allclose(*runs, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)

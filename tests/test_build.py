@@ -287,6 +287,26 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
         build_fmu(tmp_path / "nowhere" / "A.fmu")
 
 
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    """Which root could do to a device."""
+    pipe, link = tmp_path / "A.fmu", tmp_path / "B.fmu"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    for path in (pipe, link):
+        with pytest.raises(TwoDofError, match=rf"cannot write '{path}': Not a regular file"):
+            build_fmu(path)
+    assert pipe.is_fifo() and link.is_symlink()
+
+
+def test_what_a_native_one_cannot_draw_is_named(tmp_path):
+    urdf = tmp_path / "arm.urdf"
+    text = data_file("urdf", "2dof.urdf").read_text()
+    urdf.write_text(re.sub(r'rgba="[^"]*"', 'rgba="1 nan 1 1"', text))
+    options = FmuOptions(urdf=urdf, mesh_dir=data_file("meshes"), axes="xy", native=True)
+    with pytest.raises(TwoDofError, match=r"arm\.urdf: link 'link1' cannot be drawn: rgba='1 nan"):
+        build_fmu(tmp_path / "A.fmu", options)
+
+
 # --- dependencies, by moving one variable at a time ---
 
 PERTURBATION = {

@@ -11,6 +11,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ import twodof
 from twodof.cli.main import main
 
 ROOT = Path(__file__).parents[1]
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-m", "twodof"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
 
@@ -339,6 +340,37 @@ BAD: dict[str, Case] = {
     "stop no multiple": (nothing, [*RUN, "--step", "0.015"], "0.02 s is no whole .* of 0.015 s"),
     "stop 0": (nothing, [*RUN, "--stop-time", "0"], "stop time 0 s must be after"),
     "stop infinite": (nothing, [*RUN, "--stop-time", "inf"], "stop time inf s"),
+    # options that would do nothing
+    "live documentation": (
+        nothing, ["build", "-o", "a.fmu", "--no-live-documentation"], "without --native",
+    ),
+    "mesh folder of the arm": (nothing, ["build", "-o", "a.fmu", "--mesh-dir", "."], "without a U"),
+    "mesh folder and no meshes": (
+        text("arm.urdf", urdf()), [*BUILD, "--mesh-dir", ".", "--no-meshes"],
+        "--no-meshes does nothing beside --mesh-dir",
+    ),
+    "storage of no bag": (nothing, ["publish", "arm.fmu", "--storage", "mcap"], "without -o"),
+    "fsync of no bag": (nothing, ["publish", "arm.fmu", "--fsync"], "--fsync .* without -o"),
+    "port of no Foxglove": (
+        nothing, ["publish", "arm.fmu", "--foxglove-port", "0"], "without --foxglove$",
+    ),
+    "seed of no draws": (
+        nothing, ["sweep", "arm.fmu", "--grid", "Kp=1:2:2", "--seed", "0"], "without --random",
+    ),
+    "workers and a scheduler": (
+        nothing, ["sweep", "arm.fmu", "--workers", "1", "--scheduler", "tcp://a"],
+        "--workers does nothing beside --scheduler",
+    ),
+    "port of a file": (
+        nothing, ["view", "bag", "--export", "a.html", "--port", "0"], "beside --export",
+    ),
+    "two robots of one name": (
+        nothing, ["publish", "a=arm.fmu", "a=arm.fmu", "-o", "z"], "two robots are 'a'",
+    ),
+    "a robot without its name": (
+        nothing, ["publish", "=arm.fmu", "b=arm.fmu"], "'=arm.fmu' names no robot",
+    ),
+    "a robot's name alone": (nothing, ["publish", "left="], "'left=' names no FMU"),
     # the bag
     "bag exists": (a_bag, [*RUN, "-o", "bag"], "'bag' exists already.*--overwrite"),
     "bag is a file": (text("bag", "x"), [*RUN, "-o", "bag"], "'bag' exists already"),
@@ -425,8 +457,15 @@ def test_bad_input_in_a_process_of_its_own(folder: Path) -> None:
         (["run", "--storage", "db3"], "--storage.*db3"),
         (["build", "--gravity", "0", "1"], "--gravity"),
         (["info"], "FMU|BAG"),
+        *(
+            ([verb, option, ""], f"argument {option}: the name of a file is empty")
+            for verb, option in (
+                ("run", "-o"), ("publish", "-o"), ("sweep", "-o"), ("page", "-o"), ("live", "-o"),
+                ("view", "--export"),
+            )
+        ),
     ],
-)
+)  # fmt: skip
 def test_bad_command_line_is_refused_with_status_2(
     arguments: list[str], culprit: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -635,6 +674,36 @@ def test_bag_without_a_name_is_named_after_the_date(
     (bag,) = (path for path in folder.iterdir() if path.is_dir())
     assert re.fullmatch(r"rosbag2_\d{4}(_\d\d){2}-\d\d(_\d\d){2}", bag.name)
     assert bag.name in capfd.readouterr().out
+
+
+def test_a_second_bag_of_the_same_second_has_a_name_of_its_own(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "strftime", lambda form: form.partition("%")[0] + "now")
+    for _ in range(3):
+        assert main(["run", "arm.fmu", "--stop-time", "0.01"]) == 0
+    bags = {path.name for path in folder.iterdir() if path.is_dir()}
+    assert bags == {"rosbag2_now", "rosbag2_now-2", "rosbag2_now-3"}
+
+
+def test_a_start_outside_the_limits_is_told_when_it_is_built(folder: Path) -> None:
+    for control in ("task", "effort"):
+        command = ["build", "-o", "far.fmu", "--q-start", "9", "0", "--control", control]
+        done = twodof_command(*command, cwd=folder)
+        (line,) = done.stderr.splitlines()
+        assert re.match(r"WARNING: q_start\[1\] = 9 of joint 'joint1' is outside its lim", line)
+
+
+def test_controls_are_told_in_the_words_of_the_options(
+    folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*RUN, "--set", "quat_des=1"]) == 1
+    told = "it is of control 'task --orientation'; this FMU has control 'task'\n"
+    assert capfd.readouterr().err.endswith(told)
+    for command in (["build", "--orientation", "-o", "six.fmu"], ["info", "six.fmu"]):
+        assert main(command) == 0
+        of = rows(capfd.readouterr().out)["controlled"]
+        assert of == "EndEffector, axes x y of world; task control with --orientation"
 
 
 def test_bag_remembers_the_arguments_of_its_command(

@@ -50,7 +50,8 @@ def fmus(tmp_path_factory) -> dict[tuple[str, bool], Path]:
     folder = tmp_path_factory.mktemp("controls")
     return {
         (control, native): build_fmu(
-            folder / f"{control}{native}.fmu", FmuOptions(control=control, native=native)
+            folder / f"{control}{native}.fmu",
+            FmuOptions(control=control, native=native, live_documentation=False),
         )
         for control in CONTROLS
         for native in (False, True)
@@ -182,6 +183,28 @@ def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
     assert (np.abs(trajectories[0] - trajectories[2]) / size).max() <= 1e-9
 
 
+@pytest.mark.parametrize("control", CONTROLS)
+def test_flavours_are_equal_with_limits_of_all_kinds_and_a_force(fmus, control):
+    """Joints stopped, efforts saturated, pushed, with an unknown payload; stops as by default."""
+    settings = {
+        "q_min": (0.2, 0.1), "q_max": (0.7, 0.5), "limit_effort": True, "f_ext": (3.0, -2.0, 1.0),
+        "payload": 0.2, "payload_com": (0.01, 0.02, 0.0), "tau_ext": (0.1, -0.1), **TIGHT,
+    }  # fmt: skip
+    there, back = {
+        "task": ({"x_des": (0.1, 0.25), "Kp": 5000.0}, {"x_des": (0.28, 0.05)}),
+        "pose": ({"x_des": (0.1, 0.25), "Kp": 5000.0, "Kp_rot": 9.0}, {"x_des": (0.28, 0.05)}),
+        "joint": ({"q_des": (1.0, 1.0), "Kp": 5000.0}, {"q_des": 0.0}),
+        "effort": ({"tau_cmd": (11.0, 2.0)}, {"tau_cmd": -3.0}),
+    }[control]
+    options = {"stop_time": 0.2, "settings": settings | there, "changes": [(0.1, back)]}
+    runs = [list(twodof.samples(fmus[control, native], **options)) for native in (False, True)]
+    rows = [np.array([(*s.q, *s.v, *s.x, *s.tau) for s in run]) for run in runs]
+    assert (rows[0][:, :2] == [0.7, 0.5]).any() or (rows[0][:, :2] == [0.2, 0.1]).any()
+    assert (np.abs(rows[0][:, -2:]) == 10.0).any()
+    size = np.maximum(1.0, np.abs(rows[1]))
+    assert (np.abs(rows[0] - rows[1]) / size).max() <= 1e-9
+
+
 def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
     """Joint 2 is thrown off its stop for 11 µs, at 0.9481 s."""
     rng = np.random.default_rng(1)
@@ -309,8 +332,8 @@ def test_the_description_is_that_of_the_control(fmus, control):
 
 
 def test_a_variable_of_another_control_is_named_as_such(fmus):
-    message = r"no variable 'x_des': it is of control 'task' or 'pose'; this FMU has 'effort'"
-    with pytest.raises(twodof.TwoDofError, match=message):
+    message = "no variable 'x_des': it is of control 'task' or control 'pose'; this FMU has control"
+    with pytest.raises(twodof.TwoDofError, match=f"{message} 'effort'"):
         twodof.experiment(fmus["effort", True], settings={"x_des": 1.0})
     assert twodof.load_fmu(fmus["joint", False]).control == "joint"
 
@@ -358,6 +381,7 @@ def test_a_payload_that_is_none_is_refused(fmus, payload):
 def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, capsys):
     """Bag, figure, replay, sweep and what a page offers, with an FMU of each control."""
     from twodof.cli.main import main
+    from twodof.export.arm_page import RECORDED
     from twodof.pages.loop import Loop
 
     monkeypatch.chdir(tmp_path)
@@ -373,8 +397,12 @@ def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, ca
     assert ("final_error" in best) == follows
     bag = twodof.read_bag("bag")
     assert bag.tau.shape == bag.q.shape and bag.target.shape[1] == (2 if follows else 0)
-    loop = Loop(twodof.experiment(fmu, stop_time=np.inf))
-    assert (loop.news().sample.error is None) == (not follows)
+    live = twodof.experiment(fmu, stop_time=np.inf)
+    (row,) = Loop(live).news()["rows"]
+    values = {**live.start_values, **dict(zip(live.fmu.vector("q"), bag.q[0]))}
+    told = [values.get(name) for group in RECORDED for name in live.fmu.vector(group)]
+    assert len(row) == 1 + len(told)
+    assert all(a == b for a, b in zip(row[1:], told) if b is not None)
 
 
 @pytest.mark.parametrize("control", CONTROLS)

@@ -199,3 +199,5 @@ def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     api = (tmp_path / "api" / "index.html").read_text("utf-8")
     assert 'id="twodof.simulate"' in api
+    assert '<iframe src="arm.html"' in (tmp_path / "index.html").read_text("utf-8")
+    assert b'id="arm-engine"' in (tmp_path / "arm.html").read_bytes()

@@ -21,7 +21,7 @@ from twodof.bag.records import Allowance, DamageError
 from twodof.cli import info
 from twodof.cli.main import main
 
-TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
+TWODOF = [sys.executable, "-m", "twodof"]
 ENDLESS = ["--stop-time", "1e5", "--stamp-start", str(START)]
 
 
@@ -234,3 +234,41 @@ def test_interrupt_while_a_file_is_closed_is_an_interrupt(
     finally:
         signal.signal(signal.SIGINT, before)
     assert capsys.readouterr().err == "twodof: error: interrupted\n"
+
+
+INTERRUPTED_IMPORT = """
+import os, signal, sys
+
+class Interrupts:
+    def find_spec(name, *_):
+        if name == MODULE:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                if AS_C_DOES:
+                    raise ImportError("a module in C failed")
+                raise
+
+sys.meta_path.insert(0, Interrupts)
+from twodof.__main__ import main
+sys.exit(main(["info", FMU]))
+"""
+
+
+@pytest.mark.parametrize(
+    "module, as_c_does, said",
+    [
+        ("twodof.cli", False, ""),
+        ("argparse", False, ""),
+        ("twodof.cli.sweep", False, ""),
+        ("fmpy", False, "twodof: error: interrupted\n"),
+        ("fmpy", True, "twodof: error: interrupted\n"),
+    ],
+)
+def test_an_interrupted_import_is_quiet(
+    native_path: Path, module: str, as_c_does: bool, said: str
+) -> None:
+    given = f"MODULE, AS_C_DOES, FMU = {module!r}, {as_c_does}, {str(native_path)!r}"
+    command = [sys.executable, "-c", given + INTERRUPTED_IMPORT]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, said)

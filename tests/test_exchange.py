@@ -140,7 +140,7 @@ class FMU2Exchange(FMU2Model):
 Model = FMU2Exchange  # FMPy finds the standard's version in the class's name
 
 
-@pytest.mark.parametrize("name", ["task", "joint", "effort", "ur5"])
+@pytest.mark.parametrize("name", ["task", "pose", "joint", "effort", "ur5"])
 def test_the_description_is_valid(fmus, name):
     assert validate_fmu(str(fmus[name])) == []
     description = fmpy.read_model_description(str(fmus[name]))
@@ -149,7 +149,8 @@ def test_the_description_is_valid(fmus, name):
     reinit = [v.get("name") for v in xml.iter("ScalarVariable") if v[0].get("reinit") == "true"]
     assert reinit == states(fmus[name])
     n = description.numberOfContinuousStates // 2
-    assert description.numberOfEventIndicators == 2 * n + (name == "task")
+    ratios = {"task": 1, "pose": 4}.get(name, 0)  # of the singular values of 2 or 5 rows
+    assert description.numberOfEventIndicators == 2 * n + ratios
     variables = {v.name: v for v in description.modelVariables}
     for i in range(n):
         for state in ("q", "v"):
@@ -171,6 +172,8 @@ RUNS = {
                         "x_des[1]": 0.14, "x_des[2]": -0.03},
     ("task", "rigid"): {"q_max[1]": 0.52, "v_start[1]": 1.0, "rigid_stops": True},
     ("task", "forces"): {"tau_ext[1]": 0.2, "f_ext[2]": -0.5, "limit_effort": True},
+    ("pose", "stops"): {"q_max[1]": 0.7, "x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5,
+                        "quat_des[4]": 0.8},
     ("ur5", "falls into its stops"): {
         **{f"q_min[{i}]": -0.3 for i in (2, 3, 4)}, **{f"q_max[{i}]": 0.4 for i in (2, 3, 4)}},
     ("ur5 pose", "turns"): {"omega_des[3]": 0.3, "quat_des[1]": 0.1, "payload": 1.0},
@@ -286,44 +289,39 @@ def test_a_solvers_rounding_does_not_let_a_held_joint_go(fmus):
     assert model.event() and model.y == [1.0, 0.0, 0.0, 0.0] and model.rates()[2] == 0.0
 
 
-def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, monkeypatch):
-    """As the feet of a rocking block. Were each impact to free the other joint, there would be no
-    end of events."""
-    events = []
-    enter = FMU2Model.enterEventMode
+@pytest.fixture
+def events(monkeypatch):
+    """One element an event of a model that FMPy simulates; 1,000 are without end."""
+    entered, enter = [], FMU2Model.enterEventMode
 
     def counted(model):
-        events.append(1)
-        assert len(events) <= 1000
+        entered.append(model)
+        assert len(entered) <= 1000
         return enter(model)
 
     monkeypatch.setattr(FMU2Model, "enterEventMode", counted)
+    return entered
+
+
+def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, events):
+    """As the feet of a rocking block. Were each impact to free the other joint, there would be no
+    end of events."""
     starts = {"q_min[1]": 0.0, "q_max[2]": 0.5, "q_start[1]": 0.0, "q_start[2]": -0.457,
               "tau_cmd[1]": -1.451, "tau_cmd[2]": 1.308, "gravity[2]": 0.0}  # fmt: skip
     theirs = run(fmus["effort"], "ModelExchange", starts, 2.0, relative_tolerance=1e-10)
-    assert theirs[-1].tolist() == [0.0, 0.5, 0.0, 0.0]
+    assert events and theirs[-1].tolist() == [0.0, 0.5, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("torques", [(0.0236, 0.9009), (0.8861, 0.0227), (0.2502, 0.7944)])
-def test_a_joint_that_is_thrown_off_its_stop_has_no_event_by_a_solvers_error(
-    fmus, monkeypatch, torques
-):
+def test_a_joint_that_is_thrown_off_its_stop_has_no_event_by_a_solvers_error(fmus, events, torques):
     """CVode's own tolerance is far beyond what is past a limit."""
-    events = []
-    enter = FMU2Model.enterEventMode
-
-    def counted(model):
-        events.append(1)
-        assert len(events) <= 50
-        return enter(model)
-
-    monkeypatch.setattr(FMU2Model, "enterEventMode", counted)
     starts = {f"{group}[{i}]": value for i in (1, 2)
               for group, value in (("q_start", 0.0), ("q_min", -0.3), ("q_max", 0.3))}  # fmt: skip
     starts |= {"tau_cmd[1]": torques[0], "tau_cmd[2]": torques[1]}
     for tolerance, near in ((1e-5, 1e-2), (1e-10, 1e-7)):
         events.clear()
         theirs = run(fmus["effort"], "ModelExchange", starts, 1.0, relative_tolerance=tolerance)
+        assert 0 < len(events) <= 50
         ours = run(fmus["effort"], "CoSimulation", {**starts, "rtol": 1e-10, "atol": 1e-12}, 1.0)
         assert np.abs(theirs - ours)[:, :2].max() <= near
 

@@ -135,8 +135,8 @@ def test_nothing_but_building_needs_pinocchio(native_path: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("names", "code", "extra"),
     [
-        (["viser"], "twodof.view('bag')", "view"),
-        (["viser"], "twodof.live('x.fmu')", "view"),
+        (["websockets"], "twodof.view('bag')", "view"),
+        (["websockets"], "twodof.live('x.fmu')", "view"),
         (["matplotlib"], "twodof.plot('bag')", "view"),
         (["pyarrow"], "twodof.sweep('x.fmu', grid={'Kp': [1.0]})", "sweep"),
         (["cyclonedds"], "twodof.publish('x.fmu')", "ros"),

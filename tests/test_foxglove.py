@@ -6,6 +6,8 @@ import json
 import signal
 import socket
 import struct
+import subprocess
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -14,9 +16,10 @@ from typing import Any
 
 import pytest
 from bags import SECOND
+from harness import cannot_run, needs
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
-from nodes import LATCHED, STREAMS, ended, listed, published, recorded, stamp_of
+from nodes import LATCHED, PATIENCE, STREAMS, ended, listed, published, recorded, stamp_of
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -129,6 +132,54 @@ def test_a_gain_is_in_the_fmu_within_two_steps(native_path: Path, tmp_path: Path
     assert values == {"Kp[1]": 80.0, "Kp[2]": 90.5, "Kn": 3.0}
     first = twodof.read_bag(tmp_path / "bag").stamps[0]
     assert 0 <= t - (asked[0] - first) / SECOND <= 2 * step + 1e-9
+
+
+def test_foxgloves_own_client_decodes_every_topic_and_sets_a_gain(
+    native_path: Path, tmp_path: Path
+) -> None:
+    """The one of its viewer, in JavaScript; a gain is in the FMU within two steps there too."""
+    client = Path(__file__).with_name("foxglove_client.js")
+    node, packages = needs("node"), client.with_name("node_modules") / "@foxglove"
+    if not packages.is_dir():
+        cannot_run("Foxglove's packages are not in tests/node_modules")
+    told, clients, step = tmp_path / "told", [], 0.2
+
+    def opened(server: Foxglove) -> None:
+        with told.open("wb") as out:
+            clients.append(subprocess.Popen([node, str(client), server.url], stdout=out))
+        by = time.monotonic() + PATIENCE
+        while "advertised" not in told.read_text():
+            assert time.monotonic() < by, "the client does not come"
+            time.sleep(0.01)
+
+    viewer, bag = Foxglove(0, scene=True, effort=True, opened=opened), tmp_path / "bag"
+    twodof.simulate(
+        native_path, viewer, twodof.Bag(bag, scene=True, effort=True), stop_time=5, step=step,
+        pace=twodof.RealTime(), steer=viewer.command,
+    )  # fmt: skip
+    assert clients[0].wait(PATIENCE) == 0
+    heard: dict[str, list[Any]] = {}
+    for line in told.read_text().splitlines():
+        topic, *content = json.loads(line)
+        heard.setdefault(topic, []).extend(map(fields, content))
+    ((gains,),) = [heard.pop("parameters")]
+    assert [gain[::2] for gain in gains] == [["Kp", [80, 90.5]]]
+    assert heard.pop("advertised") == []
+    truth = recorded(bag)
+    assert {*heard} == {*truth} == {*STREAMS, *LATCHED}
+    for topic, messages in heard.items():
+        assert messages == truth[topic][-len(messages) :]
+        assert len(messages) >= 20 or topic in LATCHED
+    ((t, values),) = json.loads((bag / "run.json").read_text())["input_changes"]
+    assert values == {"Kp[1]": 80.0, "Kp[2]": 90.5}
+    asked, first = heard["/joint_states"][7], truth["/joint_states"][0]
+    assert 0 <= t - (stamp_of(asked[0]) - stamp_of(first[0])) / SECOND <= 2 * step + 1e-9
+
+
+def fields(value: Any) -> Any:
+    """What JSON has as ``listed`` gives it."""
+    parts = [*value.values()] if isinstance(value, dict) else value
+    return [*map(fields, parts)] if isinstance(parts, list) else parts
 
 
 def test_the_command_line_tells_where_it_listens(native_path: Path, number: int) -> None:

@@ -13,6 +13,8 @@ import pytest
 import twodof
 from twodof.cli.main import main
 from twodof.geometry.meshes import load_mesh, mesh_parts
+from twodof.geometry.shapes import link_shapes
+from twodof.plant.urdf import read_urdf
 
 ONE = np.ones(3)
 DAE = "{http://www.collada.org/2005/11/COLLADASchema}"
@@ -108,6 +110,19 @@ URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/>
 <material name="blue"/></visual></link><joint name="j" type="continuous"><parent link="base"/>
 <child link="tip"/><axis xyz="0 0 1"/></joint><link name="hand"/><joint name="k" type="fixed">
 <parent link="tip"/><child link="hand"/><origin xyz="1 0 0"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_mesh_that_is_not_finite_is_not_drawn(number: float) -> None:
+    """A page whose numbers are not JSON shows nothing at all."""
+    facet = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
+    robot = read_urdf(URDF.replace("cube.obj", "cube.stl"))
+    for value, missing in ((2.0, []), (number, ["cube.stl"])):
+        facet[6] = value
+        content = bytes(80) + b"\1\0\0\0" + facet.tobytes() + bytes(2)
+        shapes, absent = link_shapes(robot, lambda name, content=content: content)
+        assert absent == missing
+        assert all(np.isfinite(shape.vertices).all() for shape in shapes)
 
 
 def test_pages_and_exports_show_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -283,6 +283,18 @@ def test_rows_before_the_start_hold_at_the_start(fmu: Fmu, tmp_path: Path) -> No
     assert list(run) == list(plain)
 
 
+@pytest.mark.parametrize(("end", "late"), [(0.05, 3), (0.06, 0)])
+def test_rows_after_the_end_are_told(
+    fmu: Fmu, tmp_path: Path, caplog: pytest.LogCaptureFixture, end: float, late: int
+) -> None:
+    (tmp_path / "inputs.csv").write_text("time,x_des[1]\n0.06,0.3\n0.06,0.1\n0.06,0.1\n")
+    twodof.experiment(fmu, stop_time=end, input_file=tmp_path / "inputs.csv", stamp_start=0)
+    twodof.experiment(fmu, stop_time=end, changes=[(0.06, {"x_des": 0.1})], stamp_start=0)
+    told = f"inputs.csv': {late} of its times are after the run's end at 0.05 s"
+    assert [told in line for line in caplog.messages] == [True, False] * bool(late)
+    assert all("are never set" in line for line in caplog.messages)
+
+
 def test_changed_inputs_change_the_trajectory_only_afterwards(fmu: Fmu) -> None:
     changed = by_hand(fmu, {4: {"x_des[1]": 0.1}})
     plain = by_hand(fmu, {})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import RK45
 
-from twodof.plant import integrator
+from twodof.plant import dormand_prince, integrator
 from twodof.plant.integrator import StepError
 from twodof.plant.stops import Stops
 
@@ -22,10 +22,10 @@ def smooth(acceleration):
 
 
 def test_coefficients_are_those_of_scipy():
-    for row, expected in zip(integrator.A, [*RK45.A[1:6], RK45.B], strict=True):
+    for row, expected in zip(dormand_prince.A, [*RK45.A[1:6], RK45.B], strict=True):
         assert np.array_equal(row, expected[: len(row)]) and not any(expected[len(row) :])
-    assert np.array_equal(integrator.E, RK45.E)
-    assert np.array_equal(integrator.P, RK45.P)
+    assert np.array_equal(dormand_prince.E, RK45.E)
+    assert np.array_equal(dormand_prince.P, RK45.P)
 
 
 @pytest.mark.parametrize("rtol, atol", [(1e-3, 1e-6), (1e-8, 1e-10)])

@@ -22,7 +22,7 @@ from twodof.cli.main import main
 QOS = {"Reliability Policy": "reliability", "Durability Policy": "durability"}
 
 
-@pytest.fixture(scope="module", params=["task", "pose", "joint"])
+@pytest.fixture(scope="module", params=["task", "pose", "joint", "effort"])
 def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of an FMU beside it, with all that a layout shows."""
     folder = tmp_path_factory.mktemp("layouts")
@@ -89,6 +89,8 @@ def test_foxglove_draws_what_messages_hold(bag: Path) -> None:
         pending += [at["first"], at["second"]] if isinstance(at, dict) else []
         leaves += [at] if isinstance(at, str) else []
     assert sorted(leaves) == sorted(panels)
+    gains = {"Kp", "Kd", "Kn"} & {*twodof.load_fmu(bag.parent / "Arm 1.fmu").groups("input")}
+    assert ("Parameters!gains" in panels) == bool(gains)
 
 
 def test_names_are_text_and_topics_are_in_the_namespace(
@@ -108,8 +110,26 @@ def test_names_are_text_and_topics_are_in_the_namespace(
     assert topics and all(topic.startswith("/left/") for topic in topics)
     for options, culprit in (
         (["--namespace", "a b"], "--namespace 'a b' is no name of ROS 2"),
-        (["-o", str(tmp_path / "none")], "none/': No such file or directory"),
+        (["-o", str(fmu)], "Odd.fmu': File exists"),
     ):
         assert main(["layouts", str(native_path), *options]) == 1
         assert culprit in capfd.readouterr().err
-    assert not (tmp_path / "none").exists()
+    assert main(["layouts", str(native_path), "-o", str(tmp_path / "none" / "yet")]) == 0
+    assert len([*(tmp_path / "none" / "yet").iterdir()]) == 3
+
+
+def test_layouts_that_were_changed_stay(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["layouts", str(bag.parent / "Arm 1.fmu"), "-o", str(tmp_path)]
+    assert main(command) == main(command) == 0
+    rviz, juggler = tmp_path / "Arm 1.rviz", tmp_path / "Arm 1.plotjuggler.xml"
+    written = rviz.read_bytes()
+    rviz.write_text("{}")
+    juggler.unlink()
+    assert main(command) == 1
+    refusal = capsys.readouterr().err
+    assert f"'{rviz}' exists and differs" in refusal and "--overwrite" in refusal
+    assert rviz.read_text() == "{}" and not juggler.exists()
+    assert main([*command, "--overwrite"]) == 0
+    assert rviz.read_bytes() == written and juggler.exists()

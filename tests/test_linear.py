@@ -1,6 +1,7 @@
 """Linear models: of closed forms, at equilibria, and what has none."""
 
 import json
+import re
 
 import fmpy
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.linalg import expm
 import twodof
 from twodof import FmuOptions, build_fmu
 from twodof.cli.main import main
+from twodof.plant.variables import CONTROLS
 
 UPRIGHT = [np.pi / 2, 0.0]
 
@@ -82,6 +84,22 @@ def test_a_singular_pose_and_a_motion_are_remarked(native_path):
     assert [remark[:15] for remark in model.remarks] == ["a singular pose", "no equilibrium:"]
 
 
+def test_a_state_is_given_by_its_elements_too(bare):
+    """As settings are: what is not given is at its start, velocities at 0."""
+    model = twodof.linearise(bare, {"q[1]": 1.0, "v_start[2]": 0.2, "v[1]": 0.5, "tau_cmd[2]": 0.1})
+    point = [model.point[name] for name in ("q[1]", "q[2]", "v[1]", "v[2]", "tau_cmd[2]")]
+    assert point == [1.0, 0.35, 0.5, 0.2, 0.1]
+    model = twodof.linearise(bare, {"q": 0.2, "q[2]": 0.3})
+    assert [model.point[f"{name}[{i}]"] for name in "qv" for i in (1, 2)] == [0.2, 0.3, 0.0, 0.0]
+    for name, value, told in (
+        ("q[3]", 1.0, "there is no variable 'q[3]': q has 2 elements"),
+        ("v", [1.0, 2.0, 3.0], "v has 2 elements, 3 were given"),
+        ("q_start[3]", 1.0, "there is no variable 'q_start[3]': q_start has 2 elements"),
+    ):
+        with pytest.raises(twodof.TwoDofError, match=f"^{re.escape(told)}$"):
+            twodof.linearise(bare, {name: value})
+
+
 def test_groups_that_are_chosen(bare):
     model = twodof.linearise(bare, {"q": UPRIGHT}, inputs=["tau_cmd"], outputs=["x", "tau"])
     assert model.inputs == ("tau_cmd[1]", "tau_cmd[2]")
@@ -103,15 +121,14 @@ def test_the_command_prints_the_model(bare, capsys):
     assert "--at q: expected NAME=VALUE" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("control", ["task", "effort"])
-def test_casadi_takes_the_fmu_and_has_the_same_jacobian(control, bare, native_path, tmp_path):
+@pytest.mark.parametrize("control", CONTROLS)
+def test_casadi_takes_the_fmu_and_has_the_same_jacobian(control, tmp_path):
     """Its states by fmi2SetReal, from their start attributes, and derivatives by fmi2GetReal."""
     needs("casadi")
     import casadi
 
-    path = bare if control == "effort" else native_path
-    fmpy.extract(str(path), str(tmp_path))
-    dae = casadi.DaeBuilder("arm", str(tmp_path), {})
+    path = build_fmu(tmp_path / "Arm.fmu", FmuOptions(native=True, control=control))
+    dae = casadi.DaeBuilder("arm", str(fmpy.extract(str(path), str(tmp_path / "unzipped"))), {})
     assert [dae.start(name)[0] for name in dae.x()] == [0.5, 0.35, 0.0, 0.0]
     jacobian = dae.create("f", ["x", "u"], ["ode"]).factory("J", ["x", "u"], ["jac:ode:x"])
     state, inputs = [0.4, 0.3, 0.1, -0.2], [dae.start(name)[0] for name in dae.u()]

@@ -324,7 +324,7 @@ def test_several_robots_are_in_step_and_apart(
         _, err = ended(process)
     assert err.startswith("WARNING: no command for 0.5 s: the last one is held")
     assert err.count("WARNING") == 1
-    bags = [recorded(tmp_path / f"bag_{name}")["/joint_states"] for name in names]
+    bags = [recorded(bag)[topic] for topic in topics]
     stamps = [stamp_of(state[0]) for state in bags[0]]
     assert len(stamps) == 601 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
     for topic, states in zip(topics, bags):
@@ -408,3 +408,8 @@ def test_options_that_cannot_be(
     assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"twodof: error: {culprit}"), line
+
+
+def test_a_timeout_of_nothing(native_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["publish", str(native_path), "--stop-time", "0.1", "--timeout", "1"]) == 1
+    assert "--timeout is for commands of joints, and for --lockstep" in capfd.readouterr().err

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import struct
 import subprocess
 import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +27,7 @@ from native_models import GUID, HERE, executable, library, model
 from twodof.errors import BuildError
 from twodof.export.compiler import compile_library, universal
 from twodof.files import TEMPORARY
+from twodof.plant.variables import CONTROLS
 
 OK, WARNING, DISCARD, ERROR = range(4)
 
@@ -31,13 +35,13 @@ OK, WARNING, DISCARD, ERROR = range(4)
 class FMU2Arm(FMU2Slave):
     """An instance that keeps its messages; calls give their status instead of raising."""
 
-    def __init__(self, name="twodof", guid=GUID, logging=False, start=True):
-        self.of = model(name)
+    def __init__(self, name="twodof", guid=GUID, logging=False, start=True, control="task"):
+        self.of = model(name, control)
         super().__init__(
             guid=guid,
             modelIdentifier="Arm",
-            unzipDirectory=str(library(name).parent),
-            libraryPath=str(library(name)),
+            unzipDirectory=str(library(name, control).parent),
+            libraryPath=str(library(name, control)),
             instanceName=name,
         )
         self.messages: list[tuple[int, str]] = []
@@ -175,13 +179,13 @@ CALLS = {
     "reset": ("reset",),
     "get": ("getReal", [0]),
     "set input": ("setReal", [0], [0.1]),
-    "set parameter": ("setReal", [32], [0.02]),
+    "set parameter": ("set", "rtol", 0.02),
     "getStatus": ("getRealStatus", 2),
 }
 
 
-def arm_in(phase):
-    arm = Arm(start=False)
+def arm_in(phase, control="task"):
+    arm = Arm(start=False, control=control)
     if phase == "instantiated":
         return arm
     if phase == "initialization":
@@ -190,18 +194,19 @@ def arm_in(phase):
         return arm
     arm.start()
     if phase == "failed":
-        arm.set("Kp", [1e308, 1e308])
-        arm.set("x_des", [1e300, 1.0])
+        arm.set("tau_ext" if control == "effort" else "Kp", [1e308, 1e308])
+        arm.set(arm.of.table[0].group, [1e300, 1.0])
         assert arm.status("doStep", 0.0, 0.01) == DISCARD
     if phase == "terminated":
         arm.terminate()
     return arm
 
 
+@pytest.mark.parametrize("control", CONTROLS)
 @pytest.mark.parametrize("phase", LEGAL)
 @pytest.mark.parametrize("call", CALLS)
-def test_every_call_in_every_phase(phase, call):
-    arm = arm_in(phase)
+def test_every_call_in_every_phase(phase, call, control):
+    arm = arm_in(phase, control)
     if call in LEGAL[phase]:
         assert arm.status(*CALLS[call]) == OK
     else:
@@ -545,12 +550,23 @@ def test_random_calls_under_sanitizers(part, length):
     """Legal and illegal calls, with NaN, infinities and more; in full, 100,000 sequences."""
     count = length(25_000, 6_000)
     program = executable(
-        model("twodof"), HERE / "fuzz.c",
+        model("twodof"), HERE / "fuzz.h", HERE / "fuzz.c",
         flags=("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     )  # fmt: skip
     done = subprocess.run([program, str(count), str(part)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"{count} sequences")
+
+
+@pytest.mark.long
+def test_instances_in_threads_share_nothing(length):
+    """Random calls on instances of several threads at once, under ThreadSanitizer."""
+    count = length(25_000, 500)
+    flags = ("-g", "-O1", "-pthread", "-fsanitize=thread")
+    program = executable(model("twodof"), HERE / "fuzz.h", HERE / "fuzz.c", flags=flags)
+    done = subprocess.run([program, str(count), "2", "4"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(f"{count} sequences") == 4
 
 
 def test_run_under_valgrind():
@@ -569,9 +585,51 @@ def test_compiler_errors():
 
 
 def test_equal_sources_give_equal_libraries():
-    first = compile_library(model("twodof").sources(), "linux64", "Arm")
-    assert compile_library(model("twodof").sources(), "linux64", "Arm") == first
-    assert b"/tmp" not in first and TEMPORARY.encode() not in first
+    """In another folder too, where the compiler does not know them from before."""
+    sources = model("twodof").sources()
+    first = compile_library(sources, "linux64", "Arm")
+    assert compile_library({**sources, "elsewhere.h": b""}, "linux64", "Arm") == first
+    assert not any(name in first for name in (b"/tmp", b"/zig", TEMPORARY.encode()))
+
+
+def test_sources_that_are_kept_for_the_compiler_are_those_that_are_compiled(tmp_path, monkeypatch):
+    code = b'__attribute__((visibility("default"))) int answer(void) { return %d; }'
+
+    def compiled(number):
+        return compile_library({"a.c": code % number}, "linux64", "Arm", units=["a.c"])
+
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "cache").symlink_to(cache)  # what zig has built of the C library
+    first, other = compiled(1234), compiled(4321)
+    assert first != other
+    for kept in (tmp_path / "cache" / "twodof").glob("*/a.c"):
+        if kept.read_bytes() == code % 1234:
+            kept.write_bytes(code % 4321)
+    assert compiled(1234) == first
+
+
+def test_what_the_compiler_has_kept_may_be_damaged(tmp_path, monkeypatch):
+    code = b"int n = %d;" % (time.time_ns() % 2**31)  # that it does not know from before
+
+    def compiled():
+        return compile_library({"kept.c": code}, "linux64", "Arm", units=["kept.c"])
+
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "cache").symlink_to(cache)  # what zig has built of the C library
+    first = compiled()
+    kept = [*cache.glob("o/*/kept.o")]
+    assert kept
+    for file in kept:
+        os.truncate(file, 100)
+    assert compiled() == first
+
+
+def test_a_cache_that_cannot_be_is_named(monkeypatch):
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/proc/none")
+    with pytest.raises(BuildError, match=r"'/proc/none': .*ZIG_GLOBAL_CACHE_DIR"):
+        compile_library({"a.c": b""}, "linux64", "Arm", units=["a.c"])
 
 
 def test_universal_header():

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from harness import in_child_process, needs
 
+import twodof
 from twodof import FmuOptions, build_fmu
 from twodof.cli.main import main
 from twodof.errors import BuildError
@@ -322,7 +323,7 @@ def test_own_compiler_serves_without_zig(shipped, tmp_path, without_zig):
 def build_elsewhere(folder: Path, *platforms: str, **environment: str) -> bytes:
     """An FMU from a process of its own, in a folder of its own."""
     folder.mkdir()
-    command = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
+    command = [sys.executable, "-m", "twodof"]
     command += ["build", "-o", "arm.fmu", "--native"]
     for platform in platforms:
         command += ["--platform", platform]
@@ -346,6 +347,92 @@ def test_equal_bytes_from_an_empty_cache_without_a_home(unzipped, tmp_path):
     with zipfile.ZipFile(tmp_path / "fresh.fmu") as archive:
         library = archive.read(BINARIES["linux64"])
     assert library == (unzipped / BINARIES["linux64"]).read_bytes()
+
+
+# --- machines ---
+
+
+@pytest.fixture
+def raspberry(monkeypatch):
+    """This machine says that it is a Raspberry Pi or a Jetson."""
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("fmpy.platform_tuple", "aarch64-linux")  # as it says there
+
+
+@pytest.mark.parametrize(
+    "machine, system, names",
+    [
+        ("x86_64", "linux", ("linux64", "x86_64-linux")),
+        ("aarch64", "linux", ("", "aarch64-linux")),
+        ("armv7l", "linux", ("", "")),
+        ("AMD64", "win32", ("win64", "x86_64-windows")),
+        ("x86_64", "darwin", ("darwin64", "x86_64-darwin")),
+        ("arm64", "darwin", ("darwin64", "aarch64-darwin")),
+    ],
+)
+def test_names_of_machines(machine, system, names, monkeypatch):
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    monkeypatch.setattr("sys.platform", system)
+    assert (host_platform(2), host_platform(3)) == names
+
+
+def test_a_raspberry_builds_fmi_3_for_itself(raspberry, tmp_path, monkeypatch, capsys):
+    needs("ziglang")
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", "--native", "--control", "joint", "--no-live-documentation"]) == 0
+    assert "TwoDof-native.fmu" in capsys.readouterr().out
+    fmu = twodof.load_fmu("TwoDof-native.fmu")
+    assert (fmu.version, fmu.platforms, fmu.platform) == (3, ("aarch64-linux",), "aarch64-linux")
+    with zipfile.ZipFile(fmu.path) as archive:
+        library = archive.read("binaries/aarch64-linux/TwoDof.so")
+    assert library[:4] == b"\x7fELF" and library[18:20] == b"\xb7\x00"  # EM_AARCH64
+
+
+@pytest.mark.parametrize(
+    "options, expected",
+    [
+        (("--fmi", "2"), "FMI 2.0 has no name for this machine; choose one with --platform,"
+         " or --fmi 3, which has one"),
+        (("--platform", "aarch64-linux"), "FMI 2.0 has no platform 'aarch64-linux'; there are"
+         " linux64, win64, darwin64; --fmi 3 has it"),
+    ],
+)  # fmt: skip
+def test_fmi_2_on_a_raspberry_is_refused_at_the_build(
+    raspberry, tmp_path, monkeypatch, capsys, options, expected
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", "--native", *options]) == 1
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err.count("\n")) == ("", 1) and expected in captured.err
+
+
+def test_fmi_2_on_a_raspberry_is_refused_at_the_run(raspberry, fmu_path, tmp_path, capsys):
+    """linux64 means x86-64; FMPy takes it for the name of any Linux of 64 bits."""
+    assert fmpy.platform == "linux64"
+    assert main(["build", "-o", str(fmu_path)]) == 0
+    assert capsys.readouterr().out.split("next")[1].startswith("\n  twodof build --native\n")
+    assert main(["run", str(fmu_path), "-o", str(tmp_path / "bag")]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.strip().endswith(
+        f"'{fmu_path}' has no binary for this platform (aarch64-linux, which FMI 2.0 has no name"
+        " for), only for: linux64; one of FMI 3.0 can: 'twodof build --native --fmi 3'"
+    )
+    assert not (tmp_path / "bag").exists()
+
+
+def test_fmi_3_needs_none_of_fmpys_logger(tmp_path):
+    """FMPy has it for no aarch64-linux, and says so where it is imported, on standard output."""
+    code = """import sys
+sys.modules["fmpy.logging"] = None  # cannot be imported
+from twodof import FmuOptions, build_fmu, samples
+fmu = build_fmu("A.fmu", FmuOptions(native=True, fmi=3, live_documentation=False))
+print(len(list(samples(fmu, stop_time=0.1))))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout) == (0, "11\n"), done.stderr
 
 
 # --- bad input, missing and failing compilers ---

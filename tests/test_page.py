@@ -17,6 +17,8 @@ from browser import (
     HOSTILE,
     LINKS,
     PATIENCE,
+    READY,
+    SAMPLES,
     VIEWPORT,
     assert_shown_as_text,
     chromium,
@@ -25,6 +27,7 @@ from browser import (
     picture,
     pixels,
     press,
+    target_place,
     until,
 )
 from harness import needs
@@ -34,6 +37,7 @@ from playwright.sync_api import Browser, Page
 from rosbags.rosbag2 import Reader
 
 import twodof
+from twodof.cli.main import main
 from twodof.errors import BagError, PageError
 from twodof.experiments import resolve
 from twodof.export.arm_page import FUNCTIONS, SCRIPTS
@@ -43,8 +47,6 @@ from twodof.plots.track import read_tracks
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "fmu_src" / "page"
-READY = "#arm-scene[data-ready]"
-SAMPLES = "() => [...arm.data.subarray(0, arm.count * arm.width)]"
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +163,31 @@ def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
     expected = stepped(panda, {}, script, 1000)
     with shown(browser, path) as page:
         actual = played(page, {}, script, 1000)
+        joints, cut = page.evaluate(READOUT)
     np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-12)
+    told = ("finger_joint1", "end effector", "target", "error")
+    assert joints == [*(f"joint{i}" for i in range(1, 8)), *told]
+    assert cut == 0
+
+
+def test_a_speed_that_rounds_to_zero_has_no_sign(browser, arm) -> None:
+    with shown(browser, arm) as page:
+        press(page, "Pause")
+        page.evaluate("() => { arm.set('v_start', [-1e-6, -0.25]); arm.startAgain(); }")
+        until(page, ["0.0000", "\u22120.2500"].__eq__, speeds)
+
+
+def speeds(page: Page) -> list[str]:
+    cells = page.locator("#arm-readout td").all_text_contents()
+    return [cells[cells.index(joint) + 2] for joint in ("joint1", "joint2")]
+
+
+READOUT = """() => {
+    const cells = [...document.querySelectorAll("#arm-readout td")];
+    return [cells.filter(cell => !cell.previousElementSibling).map(cell => cell.textContent),
+        cells.filter(cell => cell.scrollWidth > cell.clientWidth).length];
+}"""
+"""Names in the readout, and how many of its cells do not show all that they hold."""
 
 
 def test_the_arm_runs_in_real_time_and_is_seen_where_it_is(browser, arm) -> None:
@@ -198,14 +224,38 @@ def test_what_the_buttons_and_keys_do(browser, arm) -> None:
         assert page.evaluate("[arm.k, ...arm.held('Kp')]") == [0, 77, 77]
         press(page, "Defaults")
         assert page.evaluate("[arm.k, ...arm.held('Kp')]") == [0, 50, 50]
-        page.evaluate("arm.set('x_des', [0.25, 0.5])")
+        page.evaluate("arm.set('x_des', [0.25, 1.2])")
         until(page, lambda text: "target out of reach" in text, said)
+        until(page, lambda count: count > 5, ball)  # which is followed
         page.evaluate("arm.set('x_des', [0.2, 0.05]); arm.set('q_max[1]', 0.5)")
         until(page, lambda text: "joint1 at limit" in text, said)
 
 
+def ball(page: Page) -> int:
+    """Pixels of the target at the upper edge, where nothing else is."""
+    red, green, blue = np.moveaxis(picture(page)[:80].astype(int), -1, 0)
+    return int(((red - blue > 100) & (green < 105) & (red < 225)).sum())
+
+
 def said(page: Page) -> str:
     return str(page.locator("#arm-said").text_content())
+
+
+def test_a_browser_without_3d_shows_the_rest(browser, arm) -> None:
+    with browser.new_context(viewport=VIEWPORT, offline=True) as context:
+        context.set_default_timeout(1e3 * PATIENCE)
+        page = context.new_page()
+        page.add_init_script(
+            """const given = HTMLCanvasElement.prototype.getContext;
+            HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+                return kind === "webgl2" ? null : given.call(this, kind, ...more);
+            }"""
+        )
+        page.goto(arm.as_uri())
+        page.wait_for_selector(READY)
+        until(page, lambda text: "no 3D" in text, said)
+        until(page, lambda k: k > 10, lambda page: page.evaluate("arm.k"))
+        assert page.locator("#arm-readout td").nth(1).text_content() != ""
 
 
 def test_the_target_is_dragged_in_the_plane(browser, arm) -> None:
@@ -213,7 +263,7 @@ def test_the_target_is_dragged_in_the_plane(browser, arm) -> None:
         press(page, "Pause")
         before = page.evaluate("arm.held('x_des')")
         box = page.locator("#arm-scene").bounding_box()
-        target = until(page, lambda found: found is not None, target_place)
+        target = target_place(page)
         page.mouse.move(*target)
         page.mouse.down()
         page.mouse.move(target[0] - 60, target[1] - 30, steps=3)
@@ -225,18 +275,6 @@ def test_the_target_is_dragged_in_the_plane(browser, arm) -> None:
         page.mouse.move(box["x"] + 90, box["y"] + 90, steps=3)  # beside it: the target stays
         page.mouse.up()
         assert page.evaluate("arm.held('x_des')") == [before[0] + x, before[1] + y]
-
-
-def target_place(page: Page) -> tuple[float, float] | None:
-    """The middle of the target's ball in the window."""
-    shown = picture(page).astype(int)
-    r, g, b = np.moveaxis(shown, -1, 0)
-    ball = np.argwhere((r - b > 100) & (g < 105) & (r < 225))
-    box = page.locator("#arm-scene").bounding_box()
-    if not len(ball):
-        return None
-    y, x = np.median(ball, axis=0)
-    return float(box["x"] + x), float(box["y"] + y)
 
 
 def download(page: Page, folder: Path) -> Path:
@@ -318,6 +356,25 @@ def test_what_an_fmu_refuses_is_said_and_changes_nothing(browser, arm) -> None:
                 [name, value],
             )
             assert message in text
+        for count in (-1, 0, 1.5, "3"):
+            told = page.evaluate(
+                "(n) => { try { arm.step(n); } catch (error) { return error.message; } }", count
+            )
+            assert told == f"step({count}): a number of steps is whole and at least 1"
+
+
+def test_a_page_without_a_name_replaces_a_page_alone(
+    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    own = Path(native_path.stem + ".html")
+    for written in ([own], [own]):
+        assert main(["page", str(native_path)]) == 0
+        assert [*Path().iterdir()] == written
+    own.write_text("of somebody")
+    assert main(["page", str(native_path)]) == 0
+    assert own.read_text() == "of somebody"
+    assert "arm-scene" in Path(native_path.stem + "-2.html").read_text()
 
 
 def test_the_policy_allows_its_own_script_alone(arm) -> None:

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from native_models import model
 from oracles import LINK, REST, TwoLinkArm, drift, jacobian, position, task_error
 
 from twodof.export.composition import DEFAULT_ARM
@@ -350,3 +351,12 @@ def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -
         warnings.simplefilter("error")
         plant.step(0.01)
     assert (plant.q, plant.v) == before
+
+
+def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
+    """Rounding would: TIAGo has a wrist that is light and much damped."""
+    plant = model("tiago").plant()
+    assert max(plant.robot.damping) > 0.0
+    q = list(plant.q)
+    plant.step(0.01)
+    assert plant.q == q and not any(plant.v)

@@ -483,6 +483,23 @@ def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: P
     assert error is not None
     low, high = error.get_ylim()
     assert 0.0 < low < high <= 1e-9
+    assert error.get_legend() is None  # of curves that are not seen
+    assert [text.get_text() for text in error.texts] == ["less than 1e-12 m throughout"]
+    (page,) = [a["text"] for a in over_time(read_tracks([recording.bag]))["layout"]["annotations"]
+               if "Distance" in a["text"]]  # fmt: skip
+    assert page == "Distance from the target in m: less than 1e-12 m throughout"
+
+
+@pytest.mark.parametrize("at", [0.5, 2.0 * math.pi, 4321.987, -1e-3])
+def test_ticks_of_what_does_not_move_differ(default: Recording, at: float) -> None:
+    run = long_run(default, np.full((200, 2), at))
+    figure = plot(replace(run, v=run.q, tau=run.q))
+    FigureCanvasAgg(figure).draw()
+    joints = [axes for axes in figure.axes if axes not in panels(figure).views][:6]
+    for axes in joints:
+        low, high = axes.get_ylim()
+        ticks = [t.get_text() for t in axes.get_yticklabels() if low <= t.get_position()[1] <= high]
+        assert len({*ticks}) == len(ticks) >= 2
 
 
 # --- several bags ---
@@ -967,7 +984,7 @@ def long_run(default: Recording, q: np.ndarray) -> twodof.Recording:
     run = twodof.read_bag(default.bag)
     stamps = START * 10**9 + np.arange(len(q)) * 10**6
     provenance = {**run.provenance, "step": 0.001}
-    return replace(run, stamps=stamps, q=q, v=q - q[0], provenance=provenance)
+    return replace(run, stamps=stamps, count=len(q), q=q, v=q - q[0], provenance=provenance)
 
 
 def test_noise_in_a_long_bag_keeps_its_extremes(default: Recording, tmp_path: Path) -> None:
@@ -1092,6 +1109,24 @@ def test_a_page_of_an_hour_is_small_and_keeps_its_extremes(
         kept = line[(at >= part[0]) & (at <= part[-1]), 1]
         assert (kept.min(), kept.max()) == (run.q[part, 0].min(), run.q[part, 0].max())
     assert save(drawing(tracks), tmp_path / "hour.html").stat().st_size <= 6e6
+
+
+def test_a_page_keeps_jumps_and_says_what_it_leaves_out(default: Recording, tmp_path: Path) -> None:
+    """Jumps that are no extremes, of one sample, in a curve that swings further."""
+    n, jumps = 60_000, np.array([11_113, 30_077, 47_042])
+    swing = np.sin(np.arange(n) / 20)
+    run = long_run(default, np.column_stack([swing, swing]))
+    for k in jumps:
+        run.v[k:, 0] += 0.2
+    tracks = read_tracks([run])
+    (line,) = traces(over_time(tracks), "joint1", "v")
+    at = np.rint(line[:, 0] * 1000).astype(int)
+    assert {*jumps, *jumps - 1} <= {*at}
+    text = save(drawing(tracks), tmp_path / "long.html").read_text("utf-8")
+    (told,) = re.findall(r"'Kp50' is drawn through at most (\d+) of 60000 samples", text)
+    assert len(line) <= int(told) <= 30_000
+    short = save(drawing(read_tracks([default.bag])), tmp_path / "short.html")
+    assert "is drawn through" not in short.read_text("utf-8")
 
 
 SEEN = """() => {
@@ -1458,7 +1493,7 @@ def test_figures_alone_import_matplotlib() -> None:
 
 # --- the command ---
 
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-m", "twodof"]
 
 
 def test_the_command_says_where_the_plot_is_and_what_came_out(

@@ -11,7 +11,6 @@ import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
-from multiprocessing import Pipe
 from pathlib import Path
 from threading import Thread
 
@@ -73,27 +72,23 @@ def by_a_thinned_loop(fmu: Path, bag: Path, samples: Collector) -> None:
 
 
 def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
-    """What the page's controls send, one order after each news; the recording begins midway."""
+    """What the page's controls send, one order after some news; the recording begins midway."""
     run = twodof.experiment(fmu, stop_time=math.inf)
     loop = Loop(run, bag=str(bag))
-    ours, theirs = Pipe()
+    loop.viewers = 1
     ended = False
-    thread = Thread(target=loop.play, args=(theirs, lambda: ended))
+    thread = Thread(target=loop.play, args=(lambda: ended,))
     thread.start()
 
     def more(until: Callable[[int], bool]) -> None:
-        while True:
-            ours.send(("more", True))
-            news = ours.recv()
-            if until(news.sample.k):
-                return
+        while not until(round(100 * loop.news()["t"])):
             time.sleep(0.02)
 
     more(lambda k: k > 5)
-    ours.send(("record", True))
+    loop.tell("record", True)
     for target in TARGETS.values():
         more(lambda k, begin=[]: bool(begin.append(k) or k > begin[0] + 15))
-        ours.send(("change", {"x_des": target}))
+        loop.tell("change", {"x_des": target})
     more(lambda k, begin=[]: bool(begin.append(k) or k > begin[0] + 15))
     ended = True
     thread.join()

@@ -42,8 +42,9 @@ from twodof.cli.main import main
 from twodof.errors import BagError
 from twodof.experiments import Experiment
 
-TWODOF = [sys.executable, "-c", "from twodof.cli.main import main; raise SystemExit(main())"]
+TWODOF = [sys.executable, "-m", "twodof"]
 BATCH = 40  # samples between two flushes
+PAGE = 4096  # bytes, of SQLite
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: b
         for k in range(n):
             bag.write(sample(run, k))
             if k % BATCH == 0:
-                bag._flush()
+                bag._store.flush()
         shutil.copytree(living, folder / "bag")
     shutil.rmtree(living.parent)
     return folder / "bag"
@@ -151,6 +152,11 @@ def test_mcap_cut_anywhere_keeps_what_came_before(
         shutil.copytree(bag, cut)
         (cut / "bag.mcap").write_bytes(whole[:size])
         there = streamed(cut / "bag.mcap")
+        if there == 0:
+            with pytest.raises(BagError, match="no message"):
+                twodof.recover(cut)
+            counts.add(0)
+            continue
         done = twodof.recover(cut)
         assert sum(done.counts.values()) == assert_consistent(cut, "mcap") == there
         kept = read_with_rosbags(cut)
@@ -169,6 +175,65 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(
     done = twodof.recover(bag)
     assert done.counts == {"/joint_states": there}
     assert assert_consistent(bag, "mcap") == there
+
+
+@pytest.mark.parametrize("part", [0.95, 0.5])
+def test_sqlite3_file_without_its_end_keeps_what_comes_before(
+    run: Experiment, tmp_path: Path, part: float
+) -> None:
+    """What SQLite itself reads once its header has the number of pages that there are."""
+    bag = tmp_path / "bag"
+    with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
+        for k in range(3000):
+            sink.write(sample(run, k))
+    file = bag / "bag.db3"
+    pages = int(part * file.stat().st_size / PAGE)
+    os.truncate(file, pages * PAGE)
+    mended = bytearray(file.read_bytes())
+    mended[28:32] = struct.pack(">I", pages)
+    (tmp_path / "mended.db3").write_bytes(mended)
+    there = []
+    with pytest.raises(sqlite3.DatabaseError):
+        for row in sqlite3.connect(tmp_path / "mended.db3").execute(
+            "SELECT timestamp, data FROM messages NOT INDEXED"
+        ):
+            there.append(row)
+    done = twodof.recover(bag)
+    assert "malformed" in done.damage and len(there) > 1000
+    with Reader(bag) as reader:
+        assert [(stamp, data) for _, stamp, data in reader.messages()] == there
+
+
+@pytest.mark.parametrize("table", ["messages", "topics", "message_definitions"])
+def test_a_table_whose_columns_are_damaged_is_not_an_empty_one(
+    run: Experiment, tmp_path: Path, table: str
+) -> None:
+    bag = tmp_path / "bag"
+    with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
+        sink.write(sample(run, 0))
+    with sqlite3.connect(bag / "bag.db3") as database:
+        database.execute("PRAGMA writable_schema = ON")
+        database.execute("UPDATE sqlite_master SET sql = 'CREATE TABLE x(' WHERE name = ?", [table])
+    database.close()
+    with pytest.raises(BagError, match="damaged"):
+        twodof.read_bag(bag)
+    with pytest.raises(BagError, match="no message"):
+        twodof.recover(bag)
+
+
+def test_a_bag_of_which_nothing_can_be_read_stays(
+    run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "bag"
+    with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
+        sink.write(sample(run, 0))
+    file = bag / "bag.db3"
+    os.truncate(file, 2 * PAGE)
+    before = file.read_bytes()
+    assert main(["recover", str(bag)]) == 1
+    told = capsys.readouterr()
+    assert "no message of the bag" in told.err and "next" not in told.out
+    assert file.read_bytes() == before and [*tmp_path.iterdir()] == [bag]
 
 
 @pytest.mark.parametrize("named", ["", "a file", "nothing"])

@@ -30,7 +30,7 @@ from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 import twodof
-from twodof.plant.urdf import Joint
+from twodof.plant.urdf import Joint, RobotError
 from twodof.ros.scene import Scene
 from twodof.sample import Sample
 
@@ -479,6 +479,12 @@ def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles: str) -> None:
     ((shape, _),) = geometries(description)
     size = sorted(float(word) for word in shape.get("size", "").split())
     assert size == pytest.approx([0.15, 0.2, 0.3], rel=1e-6)
+
+
+@pytest.mark.parametrize("attributes", [' scale="x"', ' scale="nan 1 1"'])
+def test_a_mesh_that_is_not_placed_by_numbers_is_refused(attributes: str) -> None:
+    with pytest.raises(RobotError, match="its meshes cannot be placed: "):
+        Scene(with_mesh(attributes), [], "thing", lambda _: None)
 
 
 @pytest.mark.parametrize("k", range(24))

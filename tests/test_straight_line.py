@@ -11,7 +11,7 @@ from native_models import model
 
 from twodof.export.bodies import mechanism
 from twodof.export.recursions import mass_matrix, solve_by_factors, solve_by_recursion
-from twodof.export.straight_line import Expression, c_function, cosine, operations, sine
+from twodof.export.straight_line import Expression, c_function, cosine, operations, sine, varied
 
 
 def test_what_constants_make_0_or_1_leaves_no_operation():
@@ -31,10 +31,11 @@ def test_text_computes_the_expression_and_how_it_varies():
     def f(x, y):
         return (np.cos(x) * 3 - y) / (np.sin(x) * y + 2) + x * y * 0.25 - x / y
 
-    text = c_function("void f(double x, double y, double *z)", {"z": value})
-    varied, plain = re.split(r"#else\n", text.split("#ifdef IS_COMPLEX\n")[1])
-    known = {"cos": np.cos, "sin": np.sin, "creal": np.real, "cimag": np.imag, "UNIT": 1j}
-    for body, arguments in ((plain, (0.7, -1.3)), (varied, (0.7 + 2e-20j, -1.3 + 1e-20j))):
+    text = c_function("void f(double x, double y, double *z)", {"z": value}, varied([value]))
+    complexes, plain = re.split(r"#else\n", text.split("#ifdef IS_COMPLEX\n")[1])
+    complexes = re.sub(r"assign\(&(\w+), (\w+), (\w+)\)", r"\1 = \2 + 1j * \3", complexes)
+    known = {"cos": np.cos, "sin": np.sin, "creal": np.real, "cimag": np.imag}
+    for body, arguments in ((plain, (0.7, -1.3)), (complexes, (0.7 + 2e-20j, -1.3 + 1e-20j))):
         scope = {**known, "x": arguments[0], "y": arguments[1]}
         for line in re.findall(r"(?:const \w+ )?(\w+ = [^;]*);", body):
             exec(line, scope)
@@ -48,7 +49,10 @@ def test_both_ways_to_an_acceleration_are_pinocchios(name):
     constants, rng, n = mechanism(robot), np.random.default_rng(5), len(robot.joints)
     q, tau = rng.normal(size=(2, n))
     joint = np.array(
-        [(x, 0.0) if slides else (np.cos(x), np.sin(x)) for x, slides in zip(q, robot.prismatic)]
+        [
+            (x, 0.0) if slides else (np.cos(x), np.sin(x))
+            for x, slides in zip(q + constants.c, constants.prismatic)
+        ]
     )
     M = mass_matrix(constants, constants.body, joint)
     expected = pin.crba(robot.model, robot.model.createData(), q)

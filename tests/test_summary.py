@@ -19,6 +19,7 @@ from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_ends
 from twodof.bag.records import Allowance
 from twodof.bag.summary import read_summary
+from twodof.cli.main import main
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FOOTER = 20 + 8  # its fields, and the magic behind it
@@ -34,6 +35,15 @@ def bag(native_path: Path, tmp_path: Path) -> Path:
 
 def file_of(bag: Path) -> Path:
     return bag / f"{bag.name}.mcap"
+
+
+def statistics_of(content: bytes | bytearray) -> tuple[int, int]:
+    """Where the summary begins, and the record of statistics in it."""
+    (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
+    place = start
+    while content[place] != 11:
+        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
+    return start, place
 
 
 def ends(bag: Path) -> list[object]:
@@ -104,14 +114,41 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag: Path, field: i
     """With a checksum that is right: messages and those by channel, chunks and their index."""
     file = file_of(bag)
     content = bytearray(file.read_bytes())
-    (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
-    place = start
-    while content[place] != 11:
-        place += 9 + struct.unpack_from("<Q", content, place + 1)[0]
+    start, place = statistics_of(content)
     content[place + 9 + field] ^= 1
     content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
     file.write_bytes(content)
     assert read_summary(file) is None
+
+
+@pytest.mark.parametrize("whose", ["metadata.yaml", "summary"])
+def test_a_summary_that_metadata_contradicts_is_told_and_mended(
+    bag: Path, whose: str, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whichever of them is wrong: 12,006 messages are in the file."""
+    if whose == "summary":
+        file = file_of(bag)
+        content = bytearray(file.read_bytes())
+        start, place = statistics_of(content)
+        for at in (place + 9, place + 9 + 46 + 2):  # of all messages, and of the first channel
+            struct.pack_into("<Q", content, at, struct.unpack_from("<Q", content, at)[0] - 1)
+        content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
+        file.write_bytes(content)
+        stated, held = 12_006, 12_005
+    else:
+        yaml = bag / whose
+        text = yaml.read_text("utf-8")
+        yaml.write_text(text.replace("message_count: 12006", "message_count: 12007"), "utf-8")
+        stated, held = 12_007, 12_006
+    assert main(["info", str(bag)]) == 0
+    (line,) = caplog.messages
+    assert f"should have {stated} messages by its metadata.yaml, and has {held} by" in line
+    assert f"'twodof recover {bag}'" in line
+    assert main(["recover", str(bag)]) == 0
+    caplog.clear()
+    assert main(["info", str(bag)]) == 0
+    assert not caplog.messages
+    assert "3001 joint states" in capsys.readouterr().out
 
 
 def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag: Path) -> None:

@@ -42,7 +42,7 @@ from twodof.sweeps.trace import trace
 
 Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
 STEP, STOP = 0.01, 5.0
-COMMAND = [sys.executable, "-c", "import sys; from twodof.cli.main import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-m", "twodof"]
 SMALL = {"Kp": (20.0, 60.0, 180.0), "Kd": (8.0, 30.0)}
 GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
 
@@ -199,9 +199,9 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kp=1:2:3", "--stop-time", "-1"], "stop time -1 s must be after"),
         (["--grid", "Kp=1:2:99999", "--grid", "Kd=1:2:99"], "runs; at most"),
         (["--grid", "limit_effort=0:1:2"], "limit_effort = 0.0: expected true or false"),
-        (["--grid", "Kp=1:2:3", "--resume"], "--resume needs the sweep to go on with: -o OUT"),
+        (["--grid", "Kp=1:2:3", "--resume"], "--resume does nothing without -o"),
         (["--grid", "Kp=1:2:3", "--resume", "-o", "none"], "there is no sweep 'none' to resume"),
-        (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists; resume it with --resume"),
+        (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists and is no sweep; choose another"),
         (["--grid", "Kp=1:2:3", "--workers", "0"], "0 workers; at least 1 is needed"),
         (["--grid", "Kp=1:2:3", "--scheduler", "tcp://127.0.0.1:9"],
          "the scheduler 'tcp://127.0.0.1:9' does not answer"),
@@ -235,7 +235,8 @@ MISSING = [
 def test_a_missing_extra_is_named(
     package: str, extra: str, options: list[str], native_path: Path, tmp_path: Path
 ) -> None:
-    code = f"import sys; sys.modules[{package!r}] = None; {COMMAND[2]}"
+    missing = f"import sys; sys.modules[{package!r}] = None; "
+    code = missing + "from twodof.__main__ import main; sys.exit(main())"
     done = subprocess.run(
         [sys.executable, "-c", code, "sweep", str(native_path), "--grid", "Kp=1:2:2", *options],
         cwd=tmp_path, capture_output=True, text=True, check=False,
@@ -314,7 +315,7 @@ def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: P
 BEGUN = b"""        import os, signal
         with open(os.environ['BEGUN'], 'a') as file:
             file.write(f'{self.Kp[0]:g} ')
-        if self.Kp[0] % 50 == 0:
+        if self.Kp[0] % 300 == 0:
             os.kill(os.getpid(), signal.SIGKILL)
         stops = self._stops()"""
 
@@ -322,16 +323,19 @@ BEGUN = b"""        import os, signal
 def test_a_run_that_kills_is_given_up_alone(
     fmu_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is begun three times; what was in its batch, twice at most; all else once."""
+    """It is begun three times; what was in its batch, twice at most; all else once.
+
+    Those that kill are further apart than a batch is long: in one, the second would not begin.
+    """
     fmu = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", BEGUN)
     monkeypatch.setenv("BEGUN", str(tmp_path / "begun"))
-    grid = {"Kp": np.arange(1.0, 151.0)}
+    grid = {"Kp": np.arange(1.0, 601.0)}
     table = sweep(fmu, grid=grid, stop_time=0.01, workers=2)
-    assert list(table["Kp"][table["outcome"] == "crashed"]) == [50.0, 100.0, 150.0]
-    assert (table["outcome"] == "finished").sum() == 147
+    assert list(table["Kp"][table["outcome"] == "crashed"]) == [300.0, 600.0]
+    assert (table["outcome"] == "finished").sum() == 598
     begun = Counter(map(float, (tmp_path / "begun").read_text().split()))
-    assert {kp for kp in begun if begun[kp] == 3} == {50.0, 100.0, 150.0}
-    assert max(begun[kp] for kp in begun if kp % 50) <= 2
+    assert {kp for kp in begun if begun[kp] == 3} == {300.0, 600.0}
+    assert max(begun[kp] for kp in begun if kp % 300) <= 2
 
 
 def test_flavours_agree(fmu_path: Path, native_path: Path) -> None:
@@ -465,13 +469,17 @@ def test_what_is_another_sweep_is_not_resumed(
     sweep(native_path, **{**options, "resume": False})
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     for change, said in (
-        ({"grid": {"Kp": [1.0, 3.0]}}, "other design"),
-        ({"stop_time": 0.06}, "other options"),
-        ({"bags": True}, "other bags"),
+        ({"grid": {"Kp": [1.0, 3.0]}}, r'was begun with grids {"Kp": \[1.0, 2.0\]};'),
+        (
+            {"stop_time": 0.06},
+            "was begun with stop time 0.05; begin this sweep in another `output`",
+        ),
+        ({"bags": True}, "was begun with `bags=False`;"),
+        ({"resume": False}, "exists; resume it with `resume=True`, or choose another `output`"),
     ):
         with pytest.raises(TwoDofError, match=said):
             sweep(native_path, **{**options, **change})
-    with pytest.raises(TwoDofError, match="of another FMU"):
+    with pytest.raises(TwoDofError, match=r"was begun with another FMU, TwoDof-native.fmu \("):
         sweep(fmu_path, **options)
     assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
@@ -809,21 +817,26 @@ def test_a_sweep_can_be_stopped_while_a_scheduler_does_not_answer(native_path: P
 def cluster(
     folder: Path, workers: int, options: Sequence[str] = (), **environment: str
 ) -> Iterator[tuple[str, int]]:
-    """Address and process of a scheduler, with workers of their own processes."""
-    file = folder / "scheduler.json"
+    """Address and process of a scheduler, with workers that have joined it."""
+    file, log = folder / "scheduler.json", folder / "cluster.log"
     programs = [["scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1"]]
     programs += [["worker", "--nthreads", "2", "--no-dashboard"]] * workers
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "dask", *program, "--scheduler-file", str(file), *options],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-            env={**os.environ, **environment},
-        )
-        for program in programs
-    ]  # fmt: skip
+    with log.open("a") as told:
+        processes = [
+            subprocess.Popen(
+                [sys.executable, "-m", "dask", *program, "--scheduler-file", str(file), *options],
+                stdout=told, stderr=told, start_new_session=True,
+                env={**os.environ, **environment},
+            )
+            for program in programs
+        ]  # fmt: skip
     try:
-        while not file.exists() or not file.read_text():
-            assert processes[0].poll() is None
+        while (
+            not file.exists()
+            or not file.read_text()
+            or log.read_text().count("Registered to:") < workers
+        ):
+            assert all(process.poll() is None for process in processes), log.read_text()
             time.sleep(0.05)
         yield json.loads(file.read_text())["address"], processes[0].pid
     finally:
@@ -901,10 +914,10 @@ def test_a_run_that_kills_is_given_up_by_a_cluster(fmu_path: Path, tmp_path: Pat
         "BEGUN": str(tmp_path / "begun"), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"
     }  # fmt: skip
     with cluster(tmp_path, 1, **variables) as (address, _):
-        grid = {"Kp": [48.0, 49.0, 50.0, 51.0]}
+        grid = {"Kp": [298.0, 299.0, 300.0, 301.0]}
         table = sweep(fmu, grid=grid, stop_time=0.01, scheduler=address)
     assert list(table["outcome"]) == ["finished", "finished", "crashed", "finished"]
-    assert (tmp_path / "begun").read_text().split().count("50") == 3
+    assert (tmp_path / "begun").read_text().split().count("300") == 3
 
 
 BLOCK = """

@@ -165,6 +165,24 @@ def test_a_urdf_is_run_by_one_command(
     assert (tmp_path / "xarm7-native.fmu").exists()
 
 
+def test_a_urdf_of_several_ends_is_run_by_one_command_too(
+    panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """The remedy of its refusal is an option that there is."""
+    monkeypatch.chdir(tmp_path)
+    command = ["run", str(panda_file), "--native", "-o", "bag", "--stop-time", "0.1"]
+    assert main(command) == 1
+    assert "name the controlled link with --frame" in capsys.readouterr().err
+    assert main([*command, "--frame", "panda_hand_tcp"]) == 0
+    assert twodof.load_fmu("panda-native.fmu").frame == "panda_hand_tcp"
+    page = ["page", str(panda_file), "--frame", "panda_hand_tcp", "-o", "panda.html"]
+    assert main(page) == 0
+    for fmu in (["panda-native.fmu"], []):
+        assert main(["run", *fmu, "--frame", "panda_hand_tcp", "-o", "none"]) != 0
+        assert "--frame is of a URDF; leave it out beside an FMU" in capsys.readouterr().err
+
+
 BALL = """<robot name="top"><link name="base"/><link name="a"/><link name="b"/><link name="top">
 <inertial><mass value="2"/><inertia ixx="0.2" ixy="0" ixz="0" iyy="0.3" iyz="0" izz="0.4"/>
 </inertial></link>{}</robot>""".format(

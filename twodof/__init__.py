@@ -6,12 +6,12 @@ summary = twodof.simulate(fmu, twodof.Bag("my_bag"), stop_time=5)
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
 from .version import __version__ as __version__
 
+TYPE_CHECKING = False  # that of typing, which would take as long as all else before Ctrl-C is heard
 if TYPE_CHECKING:
+    from typing import Any
+
     from .bag.commands import read_commands as read_commands
     from .bag.reader import read_bag as read_bag
     from .bag.recording import Recording as Recording
@@ -81,6 +81,8 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    import importlib
+
     from .errors import TwoDofError
 
     try:

@@ -55,7 +55,7 @@ class PlotError(TwoDofError):
 
 
 class PageError(TwoDofError):
-    """A page cannot be shown: viser, its port, the robot or the output file is at fault."""
+    """A page cannot be shown: its port, the robot or the output file is at fault."""
 
 
 class PublishError(TwoDofError):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import difflib
+import logging
 import math
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -31,6 +32,8 @@ MAX_CELLS = 1_000_000  # all of them go into the bag's run.json
 
 TIME_TOLERANCE = 1e-9  # of a communication step
 NANOSECONDS = 1_000_000_000
+LOG = logging.getLogger(__name__)
+
 LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 
 
@@ -104,29 +107,30 @@ def experiment(
         settings: start values of inputs and parameters by name; a vector's name takes one value
             for all elements or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
-        changes: in its place, times, s, and inputs that change there, named as in settings.
+        changes: in its place, times, s, and inputs that change there, named as in settings; what
+            comes before the start, or at −∞, holds at the start where the settings say nothing.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
 
     Raises:
         InputError, FmuError: naming what is wrong.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
-    step = _default(fmu, "stepSize", 0.01) if step is None else step
+    step = default(fmu, "stepSize", 0.01) if step is None else step
     if stop_time is None:
-        stop_time = start_time + _default(fmu, "stopTime", 5.0) - _default(fmu, "startTime", 0.0)
+        stop_time = start_time + default(fmu, "stopTime", 5.0) - default(fmu, "startTime", 0.0)
     given = resolve(fmu, settings or {})
-    due = [(t, _inputs_at(fmu, t, asked)) for t, asked in changes or []]
+    due = deque((t, _inputs_at(fmu, t, asked)) for t, asked in changes or [])
     if not all(earlier <= t < inf for (earlier, _), (t, _) in pairwise([(-inf, {}), *due])):
         raise InputError("the times of `changes` are finite and ascend")
+    given = {**pop_until(math.nextafter(start_time, -inf), due), **given}
     if input_file is not None:
         if changes is not None:
             raise InputError("`input_file` and `changes` are both inputs over time; give one")
-        due = read_changes(fmu, input_file)
+        due = deque(read_changes(fmu, input_file))
         for name in due[0][1]:
             if name in given:
                 raise InputError(f"{name} is both set and in '{input_file}'; leave one out")
-        while due and due[0][0] <= start_time + TIME_TOLERANCE * step:
-            given |= due.pop(0)[1]
+        given |= pop_until(start_time + TIME_TOLERANCE * step, due)
     if stamp_start is not None and not isfinite(stamp_start):
         raise InputError(f"stamp_start = {stamp_start} is not finite")
     run = Experiment(
@@ -136,11 +140,30 @@ def experiment(
         steps=_steps(start_time, stop_time, step),
         start_values={**_declared_starts(fmu), **given},
         given=given,
-        changes=due,
+        changes=[*due],
         stamp_start=stamp_start,
     )
     run.first_stamp()  # which refuses what has none
+    _tell_late(run, "`changes`" if input_file is None else f"'{input_file}'")
     return run
+
+
+def _tell_late(run: Experiment, source: str) -> None:
+    """Warn of inputs whose time never comes."""
+    end = run.time(run.steps)
+    if late := sum(t > end + TIME_TOLERANCE * run.step for t, _ in run.changes):
+        LOG.warning(
+            f"{source}: {late} of its times are after the run's end at {end:g} s, and their inputs"
+            " are never set"
+        )
+
+
+def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str, Value]:
+    """What the changes that are due by t set; they are due no more."""
+    values: dict[str, Value] = {}
+    while due and due[0][0] <= t:
+        values |= due.popleft()[1]
+    return values
 
 
 def _inputs_at(fmu: Fmu, t: float, asked: Mapping[str, Setting]) -> dict[str, Value]:
@@ -167,7 +190,7 @@ def _steps(start: float, stop: float, h: float) -> float:
     return steps
 
 
-def _default(fmu: Fmu, name: str, fallback: float) -> float:
+def default(fmu: Fmu, name: str, fallback: float) -> float:
     """A number of the FMU's default experiment."""
     number = getattr(fmu.description.defaultExperiment, name, None)
     return fallback if number is None else float(number)
@@ -234,8 +257,8 @@ def _of_another(fmu: Fmu, name: str) -> str:
         return f": {group} has {len(elements)} elements"
     if not fmu.control or not having:
         return ""
-    quoted = " or ".join(f"'{control}'" for control in having)
-    return f": it is of control {quoted}; this FMU has '{fmu.control}'"
+    quoted = " or ".join(f"control '{control}'" for control in having)
+    return f": it is of {quoted}; this FMU has control '{fmu.control}'"
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:

@@ -11,10 +11,12 @@ import os
 import re
 import shutil
 import stat
+import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 
 from .errors import TwoDofError
@@ -137,9 +139,11 @@ def write_file(path: Path, content: bytes) -> None:
     """Write a file whole or not at all.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: it cannot be written, or is there and no regular file: root would replace a device.
     """
     os.stat(f"{path.parent}/")  # else it is the temporary file's name that is told
+    if path.exists():
+        check_file(path, sys.maxsize)
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".twodof-", delete=False) as file:
         partial = Path(file.name)
         try:
@@ -228,6 +232,14 @@ def _locked(folder: int, how: int) -> bool:
     except OSError:  # a file system without locks
         pass
     return True
+
+
+def free_name(
+    name: str, ending: str = "", replaceable: Callable[[Path], bool] = lambda path: False
+) -> Path:
+    """The name, or that with the first number from 2 on, under which there is nothing to lose."""
+    names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
+    return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
 
 
 def sync(*paths: Path) -> None:

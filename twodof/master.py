@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from itertools import accumulate, chain, count
 from math import isfinite
 from pathlib import Path
@@ -27,6 +26,7 @@ from .experiments import (
     Setting,
     Value,
     experiment,
+    pop_until,
     resolve,
 )
 from .fmu import Fmu, Instance, instantiate
@@ -91,7 +91,8 @@ def samples(
                 return
             try:
                 if answer or due:
-                    asked = {**_changes_until(sample.t, due, run), **resolve(run.fmu, answer or {})}
+                    by = sample.t + TIME_TOLERANCE * run.step
+                    asked = {**pop_until(by, due), **resolve(run.fmu, answer or {})}
                     latest = {n: value for n, value in asked.items() if value != inputs.get(n)}
                     if latest:
                         instance.set(latest)
@@ -109,16 +110,6 @@ def samples(
 def _inputs(run: Experiment) -> dict[str, Value]:
     kinds = run.fmu.variables
     return {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
-
-
-def _changes_until(
-    t: float, due: deque[tuple[float, dict[str, Value]]], run: Experiment
-) -> dict[str, Value]:
-    """What the changes that are due by t set; they are due no more."""
-    latest: dict[str, Value] = {}
-    while due and due[0][0] <= t + TIME_TOLERANCE * run.step:
-        latest.update(due.popleft()[1])
-    return latest
 
 
 def _sampler(
@@ -241,13 +232,15 @@ def simulate_together(
         raise InputError("what runs together has one start time, step, stop time and first stamp")
     with ExitStack() as stack:
 
-        def begin(member: Member) -> None:
-            for sink in member.sinks:
-                stack.enter_context(sink.begin(member.run))
+        def begin() -> None:
+            """Called by the last one: where another fails before, no sink has been opened."""
+            for sink in [sink.begin(run) for run, sinks, *_ in members for sink in sinks]:
+                stack.enter_context(sink)
 
         sources = []
         for member in members:
-            run, _, _, resume, own, ready = *member, partial(begin, member)
+            run, _, _, resume, own = member
+            ready = begin if member is members[-1] else lambda: None
             source = samples(run, stop=lambda: ended, ready=ready, resume=resume, instance=own)
             sources.append(stack.enter_context(closing(source)))
         latest = [next(source) for source in sources]

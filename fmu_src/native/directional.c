@@ -19,7 +19,7 @@ static Real largest_of(const Real change[], int count)
 {
     Real largest = DBL_MIN;
     for (int i = 0; i < count; i++)
-        largest = fmax(largest, fabs(change[i]));
+        largest = fabs(change[i]) > largest ? fabs(change[i]) : largest;
     return largest;
 }
 
@@ -34,6 +34,13 @@ static Real largest_of(const Real change[], int count)
 
 static const Real STEP = 1e-100;
 static const double _Complex UNIT = (double _Complex)_Complex_I;
+
+/* x = a + i b; the expression multiplies out a product of i, 0 + 1 i. Source: C99, 6.2.5, paragraph 13. */
+static inline void assign(double _Complex *x, Real a, Real b)
+{
+    ((Real *)x)[0] = a;
+    ((Real *)x)[1] = b;
+}
 
 /* x + i y, where a function of x has such a value and derivative. */
 static inline double _Complex analytic(double _Complex x, Real value, Real derivative)

@@ -1,5 +1,6 @@
 /* All of the FMU but the derivatives: its files together, for their functions are static. */
 #include "engine.c"
+#include "dormand_prince.c"
 #include "integrator.c"
 #include "events.c"
 #include "instance.c"

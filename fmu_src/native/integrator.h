@@ -5,8 +5,7 @@
 #include "internal.h"
 #include "plant.h"
 
-enum { BUDGET = 1000000, /* evaluations of the equations of motion in one communication step */
-       STAGES = 6 };     /* evaluations that an integration step costs */
+enum { BUDGET = 1000000 }; /* evaluations of the equations of motion in one communication step */
 
 /* Why a communication step cannot be done. */
 typedef struct {

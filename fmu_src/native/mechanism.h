@@ -15,7 +15,8 @@ typedef struct {
    the turning about x, y and z. */
 typedef struct {
     double x[N_AXES];           /* position, m */
-    double J[N_ROWS][N_JOINTS]; /* Jacobian: the velocity is J v, m/s and rad/s */
+    double J[N_ROWS][N_JOINTS]; /* Jacobian */
+    double xd[N_ROWS];          /* velocity J v, m/s and rad/s */
     double drift[N_ROWS];       /* J̇ v, the acceleration where q̈ = 0, m/s2 and rad/s2 */
 #if N_ROWS > N_AXES
     double R[3][3];             /* orientation */

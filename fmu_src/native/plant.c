@@ -68,15 +68,17 @@ static void limit_effort(const double value[N_VARIABLES], double tau[N_JOINTS])
 
 /* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 where a was commanded and is what comes. */
 static void add_excess(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
-                       const Carrier *carrier, const double v[N_JOINTS],
-                       const double given[N_JOINTS], const double a[N_JOINTS],
-                       double sum[N_JOINTS])
+                       const double v[N_JOINTS], const double given[N_JOINTS],
+                       const double a[N_JOINTS], double sum[N_JOINTS])
 {
     double tau[N_JOINTS], needed[N_JOINTS];
     wanted_effort(value, joint, v, given, tau);
     memcpy(needed, tau, sizeof needed);
-    if (!knows_all(value))
-        inverse_dynamics(joint, carrier, v, a, &value[GRAVITY], needed);
+    if (!knows_all(value)) {
+        Carrier carrier;
+        body(value, 0, &carrier);
+        inverse_dynamics(joint, &carrier, v, a, &value[GRAVITY], needed);
+    }
     limit_effort(value, tau);
     for (int i = 0; i < N_JOINTS; i++)
         sum[i] += tau[i] - needed[i];
@@ -87,7 +89,6 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
 {
     const double *value = plant->value, *force = &value[F_EXT];
     JointPosition joint[N_BODIES];
-    Carrier carrier;
     double given[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
     int acts = 0;
     place_joints(q, joint);
@@ -101,12 +102,13 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
         for (int i = 0; i < N_JOINTS; i++)
             excess[i] += further[i];
     }
-    body(value, 0, &carrier);
     if (value[LIMIT_EFFORT] != 0.0 || !knows_all(value))
-        add_excess(value, joint, &carrier, v, given, a, excess);
+        add_excess(value, joint, v, given, a, excess);
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
+        Carrier carrier;
+        body(value, 0, &carrier);
         acceleration_of_effort(joint, &carrier, excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
@@ -136,17 +138,11 @@ void compute_position(Plant *plant)
     task_frame(joint, &plant->value[V], &task);
     for (int k = 0; k < N_AXES; k++) {
         plant->value[X + k] = task.x[k];
-        plant->value[XD + k] = 0.0;
-        for (int i = 0; i < N_JOINTS; i++)
-            plant->value[XD + k] += task.J[k][i] * plant->value[V + i];
+        plant->value[XD + k] = task.xd[k];
     }
 #if N_ROWS > N_AXES
     quaternion(task.R, &plant->value[QUAT]);
-    for (int k = 0; k < 3; k++) {
-        plant->value[OMEGA + k] = 0.0;
-        for (int i = 0; i < N_JOINTS; i++)
-            plant->value[OMEGA + k] += task.J[N_AXES + k][i] * plant->value[V + i];
-    }
+    memcpy(&plant->value[OMEGA], &task.xd[N_AXES], 3 * sizeof *task.xd);
 #endif
 }
 

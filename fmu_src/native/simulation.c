@@ -2,6 +2,7 @@
 #include <math.h>
 #include <stdio.h>
 
+#include "dormand_prince.h"
 #include "instance.h"
 #include "integrator.h"
 

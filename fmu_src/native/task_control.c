@@ -46,11 +46,8 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
     task_frame(joint, v, &task);
     law(value, &task, row);
     for (int k = 0; k < N_ROWS; k++) {
-        double xd = 0.0;
-        for (int i = 0; i < N_JOINTS; i++)
-            xd += task.J[k][i] * v[i];
-        wanted[k] = value[row[k].xdd_des] + value[row[k].Kd] * (value[row[k].xd_des] - xd)
-                    + value[row[k].Kp] * row[k].error - task.drift[k] + Kn * xd;
+        wanted[k] = value[row[k].xdd_des] + value[row[k].Kd] * (value[row[k].xd_des] - task.xd[k])
+                    + value[row[k].Kp] * row[k].error - task.drift[k] + Kn * task.xd[k];
     }
     const int rank = apply_pseudo_inverse(task.J, wanted, value[RCOND], given);
     for (int i = 0; i < N_JOINTS; i++)

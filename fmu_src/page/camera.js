@@ -1,7 +1,7 @@
 /** Where the scene is seen from. A robot that moves in a plane is seen from the front. */
 
 const FIELD_OF_VIEW = 0.6; // rad, vertical
-const ROOM = 1.45; // of the picture to what is in it
+const ROOM = 1.45, ROOM_ASKEW = 1.1; // of the picture to what is in it, which is less across than its diagonal
 
 class Camera {
   touched = false;
@@ -32,7 +32,7 @@ class Camera {
     const high = axes.map((i) => Math.max(...this.points.map((p) => p[i])));
     this.centre = axes.map((i) => (low[i] + high[i]) / 2);
     this.size = Math.max(Math.hypot(...axes.map((i) => high[i] - low[i])), 1e-3);
-    this.distance = (ROOM * this.size) / 2 / Math.tan(FIELD_OF_VIEW / 2);
+    this.distance = ((this.flat ? ROOM : ROOM_ASKEW) * this.size) / 2 / Math.tan(FIELD_OF_VIEW / 2);
   }
 
   /** @returns {number[]} */

@@ -35,7 +35,7 @@ function byId(id) {
 
 class Controls {
   /**
-   * @param {Session} session
+   * @param {Samples} session
    * @param {{centre: number[], radius: number}} reach
    * @param {(name: string, value: Value | number[]) => void} told
    */
@@ -167,45 +167,84 @@ function unitsOf(joints) {
   return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
 }
 
+/**
+ * How much of all names is the same at their beginning: whole words of it, which leave something of each.
+ * @param {string[]} names
+ */
+function prefix(names) {
+  if (names.length < 2) return 0;
+  let same = 0;
+  while (same < names[0].length && names.every((name) => name[same] === names[0][same])) same += 1;
+  return Math.max(names[0].lastIndexOf("_", same - 1), names[0].lastIndexOf("/", same - 1)) + 1;
+}
+
+/**
+ * A number to be read, no zero with a sign.
+ * @param {number} value
+ */
+function digits(value) {
+  if (!Number.isFinite(value)) return "\u2013";
+  const rounded = value.toFixed(Math.abs(value) < 10 ? 4 : 2);
+  return rounded.replace(/^-(?=[0.]+$)/, "").replace("-", "\u2212");
+}
+
 class Readout {
+  /** @type {Map<string, HTMLElement>} cells of what is told beside the joints, by its name */
+  more = new Map();
+
   /**
-   * @param {Session} session
+   * @param {Samples} session
    * @param {Curves} curves
    */
   constructor(session, curves) {
     this.session = session;
-    this.curves = curves;
-    const table = byId("readout"), units = unitsOf(session.facts.joints);
-    table.append(element("tr", "", ...["", ...units].map((unit) => element("th", unit))));
-    this.cells = session.facts.joints.map((joint, i) => {
+    const table = byId("readout"), { joints } = session.facts;
+    const shared = prefix(joints.map(({ name }) => name));
+    table.append(element("tr", "", ...["", ...unitsOf(joints)].map((unit) => element("th", unit))));
+    this.cells = joints.map((joint, i) => {
       const swatch = document.createElement("input");
       Object.assign(swatch, { type: "checkbox", checked: true, className: "swatch" });
       swatch.style.accentColor = COLOURS[i % COLOURS.length];
       swatch.setAttribute("aria-label", `curves of ${joint.name}`);
       swatch.addEventListener("change", () => curves.hidden[swatch.checked ? "delete" : "add"](i));
-      const name = element("td", "", element("label", "", swatch, document.createTextNode(joint.name)));
+      const name = element("td", "", element("label", "", swatch, document.createTextNode(joint.name.slice(shared))));
       name.title = joint.name;
       const cells = ["q", "v", "tau"].map(() => element("td", ""));
+      cells[0].dataset.value = joint.name;
       table.append(element("tr", "", name, ...cells));
       return cells;
     });
-    this.error = element("td", "");
-    /** @type {HTMLTableCellElement} */ (this.error).colSpan = 3;
-    if (!Number.isNaN(session.error())) table.append(element("tr", "", element("td", "error"), this.error));
   }
 
-  /** @param {number} k number of the sample @param {JointFacts[]} stopped joints at a limit */
-  show(k, stopped) {
-    const { session } = this;
-    session.facts.joints.forEach((joint, i) => {
-      ["q", "v", "tau"].forEach((group, c) => {
-        const value = session.at(group, k)[i];
-        this.cells[i][c].textContent = value.toFixed(4).replace("-", "\u2212");
-      });
+  /**
+   * @param {string} name
+   * @param {string} text
+   */
+  tell(name, text) {
+    let cell = this.more.get(name);
+    if (!cell) {
+      cell = element("td", "");
+      Object.assign(cell, { colSpan: 3 }).dataset.value = name;
+      this.more.set(name, cell);
+      byId("readout").append(element("tr", "", element("td", name), cell));
+    }
+    cell.textContent = text;
+  }
+
+  /**
+   * @param {number} k number of the sample
+   * @param {JointFacts[]} stopped joints at a limit
+   * @param {Record<string, number[]>} places by their names, m
+   */
+  show(k, stopped, places) {
+    const { session } = this, { joints } = session.facts;
+    joints.forEach((joint, i) => {
+      ["q", "v", "tau"].forEach((group, c) => (this.cells[i][c].textContent = digits(session.value(group, k, i))));
       this.cells[i][0].className = stopped.includes(joint) ? "limit" : "";
     });
-    this.error.textContent = session.groups.has("x_des")
-      ? `${Number(session.error(k).toPrecision(4))} m`
-      : `${Number(session.error(k).toPrecision(4))} ${unitsOf(session.facts.joints)[0]}`;
+    for (const [name, place] of Object.entries(places)) this.tell(name, `(${place.map(digits).join(", ")}) m`);
+    const error = session.error(k), unit = session.groups.has("x_des") ? "m" : unitsOf(joints)[0];
+    if (session.follows) this.tell("error", Number.isNaN(error) ? "\u2013" : `${Number(error.toPrecision(4))} ${unit}`);
+    for (const [name, text] of session.remarks()) this.tell(name, text);
   }
 }

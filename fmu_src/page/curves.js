@@ -7,16 +7,17 @@
  * @property {number[]} lines which of the names it has
  * @property {boolean} log whether its axis is logarithmic
  * @property {(line: number) => (number | null)[]} limits of a line
+ *
+ * @typedef {{line: number, points: number[][]}} Outline
  */
 
-const WINDOW = 10; // s that are shown of a run that goes on
 const MARGIN = { left: 58, right: 8, top: 20, bottom: 18 };
 const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c"];
 const SMALLEST = 1e-12; // what is below is rounding
 
 class Curves {
   /**
-   * @param {Session} session
+   * @param {Samples} session
    * @param {Panel[]} panels
    * @param {HTMLElement} parent
    */
@@ -24,7 +25,7 @@ class Curves {
     this.session = session;
     /** @type {Set<number>} */
     this.hidden = new Set();
-    /** @type {[number, number] | null} times that were chosen; null: the last few seconds */
+    /** @type {[number, number] | null} times that were chosen; null: those of interest */
     this.chosen = null;
     /** @type {number | null} */
     this.cursor = null;
@@ -33,7 +34,7 @@ class Curves {
       canvas.setAttribute("aria-label", panel.title);
       parent.append(canvas);
       this.listen(canvas);
-      return { ...panel, canvas };
+      return { ...panel, canvas, drawn: "", rows: /** @type {Outline[]} */ ([]) };
     });
   }
 
@@ -42,8 +43,7 @@ class Curves {
    * @returns {[number, number]}
    */
   get shown() {
-    const end = this.session.time(this.session.k);
-    return this.chosen ?? [Math.max(0, end - WINDOW), Math.max(end, WINDOW)];
+    return this.chosen ?? this.session.span;
   }
 
   /** @param {HTMLCanvasElement} canvas */
@@ -72,11 +72,9 @@ class Curves {
     canvas.addEventListener("dblclick", () => (this.chosen = null));
   }
 
-  /** The sample at the cursor, or the last. */
+  /** The sample at the cursor, or the one that is shown. */
   get sample() {
-    const { session } = this, last = session.count - 1;
-    if (this.cursor === null) return last;
-    return Math.min(Math.max(Math.round(this.cursor / session.facts.step), 0), last);
+    return this.cursor === null ? this.session.now : this.session.nearest(this.cursor);
   }
 
   /** @param {string[]} inks of the theme: text, grid */
@@ -85,7 +83,7 @@ class Curves {
   }
 
   /**
-   * @param {Panel & {canvas: HTMLCanvasElement}} panel
+   * @param {Curves["panels"][number]} panel
    * @param {string[]} inks
    */
   drawPanel(panel, [ink, hair]) {
@@ -93,7 +91,9 @@ class Curves {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio))
       Object.assign(canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
-    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    // which a browser then draws by itself: where graphics are emulated, that costs a tenth
+    const settings = { willReadFrequently: true };
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", settings));
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
     const rows = this.rows(panel, width - MARGIN.left - MARGIN.right);
@@ -120,7 +120,7 @@ class Curves {
       stroke(context, points.map(([t, v]) => [x(t), y(v)]));
       context.lineWidth = 1;
     }
-    if (this.cursor !== null) {
+    if (this.cursor !== null || !this.session.steered) {
       context.strokeStyle = ink;
       const t = x(this.session.time(this.sample));
       stroke(context, [[t, 0], [t, height]]);
@@ -130,14 +130,17 @@ class Curves {
 
   /**
    * Points of the lines that are shown: of each pixel's samples the least and the largest.
-   * @param {Panel} panel
+   * @param {Curves["panels"][number]} panel
    * @param {number} pixels
    */
   rows(panel, pixels) {
-    const { session } = this, [from, to] = this.shown, h = session.facts.step;
-    const first = Math.max(0, Math.floor(from / h)), last = Math.min(session.count - 1, Math.ceil(to / h));
+    const { session } = this, [from, to] = this.shown;
+    const first = Math.max(0, session.nearest(from) - 1), last = Math.min(session.count - 1, session.nearest(to) + 1);
     const stride = Math.max(1, Math.ceil((last - first + 1) / Math.max(pixels, 50)));
-    return panel.lines.filter((line) => !this.hidden.has(line)).map((line) => {
+    const drawn = [first, last, stride, session.time(last), ...this.hidden].join();
+    if (drawn === panel.drawn) return panel.rows;
+    panel.drawn = drawn;
+    panel.rows = panel.lines.filter((line) => !this.hidden.has(line)).map((line) => {
       /** @type {number[][]} */
       const points = [];
       for (let k = first; k <= last; k += stride) {
@@ -148,16 +151,18 @@ class Curves {
         }
         for (const i of new Set([Math.min(least, largest), Math.max(least, largest)])) {
           const value = panel.value(i, line);
-          points.push([session.time(i), panel.log ? Math.log10(Math.max(value, SMALLEST)) : value]);
+          if (Number.isFinite(value))
+            points.push([session.time(i), panel.log ? Math.log10(Math.max(value, SMALLEST)) : value]);
         }
       }
       return { line, points };
     });
+    return panel.rows;
   }
 }
 
 /**
- * @param {{points: number[][]}[]} rows
+ * @param {Outline[]} rows
  * @param {boolean} log
  * @returns {[number, number]}
  */

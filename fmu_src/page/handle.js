@@ -9,7 +9,7 @@ class Handle {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {Camera} camera
-   * @param {Session} session
+   * @param {Samples} session
    * @param {() => number[]} place where the target is, in the root frame
    * @param {(name: string, values: number[]) => void} told what the target is to be
    */
@@ -19,8 +19,8 @@ class Handle {
     this.session = session;
     this.place = place;
     this.told = told;
-    this.axes = session.groups.has("x_des") ? session.facts.axes : "";
-    this.turns = session.groups.has("quat_des");
+    this.axes = session.steered && session.groups.has("x_des") ? session.facts.axes : "";
+    this.turns = session.steered && session.groups.has("quat_des");
     /** @type {Map<number, number[]>} where pointers are, in parts of the picture */
     this.pointers = new Map();
     /** @type {((x: number, y: number) => void) | null} */

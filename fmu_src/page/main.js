@@ -1,56 +1,62 @@
 /** The page: what is stepped, drawn and told, and when. */
 
 const TRAIL = 1.5; // s
-const LATE = 0.25; // s behind the clock from which on time is let go
-const BUSY = 0.012, SHARE = 0.5; // s of a frame, or its share, in which the plant is stepped
-const CURVES = 0.1; // s between pictures of the curves, where no cursor asks for more
+const MOMENTS = 30, PATH_POINTS = 600; // of a replay, that are in the picture at first, and of its path
+const PANEL = 0.1; // s between pictures of curves and numbers, where no cursor asks for more
 
 /**
  * @param {string} id
  * @returns {Promise<ArrayBuffer>}
  */
 async function unpacked(id) {
-  const bytes = Uint8Array.from(atob(byId(id).textContent), (c) => c.charCodeAt(0));
+  const text = atob(byId(id).textContent), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
 }
+
+const SLOW = 0.04, PATIENCE = 10; // s of a frame, and so many in a row, from which on edges are not smoothed
 
 class App {
   /**
    * @param {Facts} facts
-   * @param {Engine} engine
+   * @param {Session | Replay | Remote} session
    * @param {ArrayBuffer} meshes
    */
-  constructor(facts, engine, meshes) {
-    this.session = new Session(facts, engine);
+  constructor(facts, session, meshes) {
+    this.session = session;
+    for (const id of session.without) byId(id).hidden = true;
     this.robot = new Robot(facts);
-    this.scene = new Scene(byId("scene"), facts, meshes);
-    const links = this.robot.links(this.session.at("q"));
+    const gl = byId("scene").getContext("webgl2", { antialias: false, alpha: false });
+    this.scene = gl && new Scene(byId("scene"), gl, facts, meshes);
+    const links = this.robot.links(session.at("q"));
+    this.path = session.steered ? [] : spread(session.count, PATH_POINTS).map((k) => this.end(k));
     this.reach = this.robot.reach(links) ?? { centre: [0, 0, 0], radius: 1 };
-    this.camera = this.makeCamera(links);
+    this.camera = this.makeCamera();
     const tell = this.tell.bind(this);
     this.handle = new Handle(byId("scene"), this.camera, this.session, () => this.target(), tell);
     this.curves = new Curves(this.session, this.panels(), byId("curves"));
     this.readout = new Readout(this.session, this.curves);
-    this.controls = new Controls(this.session, this.reach, tell);
-    this.playing = true;
-    this.due = 0; // time of the robot that the clock asks for, s
-    this.drawn = -Infinity; // when the curves were, ms
-    this.said = "";
+    this.controls = session.steered ? new Controls(session, this.reach, tell) : null;
+    byId("controls").append(...facts.remarks.map((remark) => element("p", remark)));
+    this.drawn = -Infinity; // when the panel was, ms
+    this.slow = 0; // frames, until now
     this.listen();
     this.before = performance.now();
     this.frame(this.before);
   }
 
-  /** @param {Float64Array[]} links */
-  makeCamera(links) {
-    const { facts } = this.session, points = links.map((link) => transform(link, [0, 0, 0]));
+  makeCamera() {
+    const { session, robot } = this, { facts } = session, points = [...this.path];
+    for (const k of session.steered ? [session.now] : spread(session.count, MOMENTS)) {
+      points.push(...robot.links(session.at("q", k)).map((link) => transform(link, [0, 0, 0])));
+      if (session.groups.has("x_des")) points.push(this.target(k));
+    }
     const flat = facts.axes.length === 2;
-    const gravity = [1, 2, 3].map((i) => -Number(this.session.values.get(`gravity[${i}]`) ?? 0));
+    const gravity = [1, 2, 3].map((i) => -Number(session.values.get(`gravity[${i}]`) ?? 0));
     const vertical = base(gravity.map(Math.abs).indexOf(Math.max(...gravity.map(Math.abs), 1e-9)));
     const up = Math.hypot(...gravity) ? vertical.map((n) => n * Math.sign(gravity[vertical.indexOf(1)])) : base(2);
-    if (this.session.groups.has("x_des")) points.push(this.target());
     const { centre, radius } = this.reach;
-    if (Number.isFinite(radius))
+    if (facts.links.length > 1 && Number.isFinite(radius))
       for (const sign of [-0.5, 0.5])
         for (const i of flat ? ["x", "y", "z"].filter((c) => facts.axes.includes(c)).map((c) => "xyz".indexOf(c)) : [0, 1])
           points.push(plus(centre, sign * radius, base(i)));
@@ -63,15 +69,21 @@ class App {
       const right = cross(upright, normal);
       view = { front: normal.map((n) => n * (right[0] + right[1] + right[2] > 0 ? 1 : -1)), vertical: upright };
     }
-    return new Camera(view, flat, points);
+    return new Camera(view, flat, points.filter((point) => point.every(Number.isFinite)));
+  }
+
+  /**
+   * Where the end effector is.
+   * @param {number} k number of the sample
+   */
+  end(k) {
+    return transform(this.robot.frame(this.robot.links(this.session.at("q", k))), [0, 0, 0]);
   }
 
   /** Where the target is: on an axis that is not controlled, where the end effector is. */
-  target() {
-    const { session, robot } = this, place = transform(robot.frame(robot.links(session.at("q"))), [0, 0, 0]);
-    session.facts.axes.split("").forEach((axis, i) => {
-      place["xyz".indexOf(axis)] = Number(session.values.get(`x_des[${i + 1}]`) ?? place["xyz".indexOf(axis)]);
-    });
+  target(k = this.session.now) {
+    const { session } = this, place = this.end(k), given = session.target("x_des", k);
+    if (given.length) session.facts.axes.split("").forEach((axis, i) => (place["xyz".indexOf(axis)] = given[i]));
     return place;
   }
 
@@ -81,46 +93,55 @@ class App {
    * @param {Value | number[]} value
    */
   tell(name, value) {
-    this.attempt(() => this.session.set(name, value));
-    if (this.session.variable((this.session.groups.get(name) ?? [name])[0]).causality === "parameter") this.due = 0;
+    this.order(() => this.session.set(name, value));
+  }
+
+  /**
+   * Do what the user asks for.
+   * @param {() => void} action
+   */
+  order(action) {
+    this.session.said = "";
+    this.attempt(action);
+    this.label();
   }
 
   /** @param {() => void} action */
   attempt(action) {
     try {
       action();
-      this.said = "";
     } catch (refused) {
-      this.said = refused instanceof Error ? refused.message : String(refused);
-      this.play(false);
+      this.session.said = refused instanceof Error ? refused.message : String(refused);
+      this.session.play(false);
     }
   }
 
-  /** @param {boolean} on */
-  play(on) {
-    this.playing = on;
-    byId("play").textContent = on ? "Pause" : "Play";
-    this.due = this.session.time(this.session.k);
+  /** Say on buttons what they do now. */
+  label() {
+    const { playing, recorded } = this.session;
+    const texts = { play: playing ? "Pause" : "Play", record: recorded ? `Stop recording (${recorded} samples)` : "Record" };
+    for (const [id, text] of Object.entries(texts)) if (byId(id).textContent !== text) byId(id).textContent = text;
   }
 
   panels() {
-    const { session } = this, { facts } = session, all = facts.joints.map((_, i) => i);
-    const units = unitsOf(facts.joints);
-    const none = () => [];
+    const { session } = this, { facts } = session, units = unitsOf(facts.joints);
+    /** @type {Record<string, (line: number) => (number | null)[]>} */
+    const limits = {
+      q: (line) => ["q_min", "q_max"].map((side) => Number(session.values.get(`${side}[${line + 1}]`))),
+      v: () => [],
+      tau: (line) => [-(facts.joints[line].effort ?? NaN), facts.joints[line].effort ?? NaN],
+    };
     /** @type {Panel[]} */
-    const panels = ["q", "v", "tau"].map((group, i) => ({
+    const panels = Object.keys(limits).map((group, i) => ({
       title: `${["position", "velocity", "torque"][i]}, ${units[i]}`,
-      value: (k, line) => session.at(group, k)[line],
-      lines: all,
+      value: (k, line) => session.value(group, k, line),
+      lines: session.at(group).length ? facts.joints.map((_, line) => line) : [],
       log: false,
-      limits: none,
+      limits: limits[group],
     }));
-    panels[0].limits = (line) => ["q_min", "q_max"].map((side) => Number(session.values.get(`${side}[${line + 1}]`)));
-    panels[2].limits = (line) => [-(facts.joints[line].effort ?? NaN), facts.joints[line].effort ?? NaN];
-    const unit = session.groups.has("x_des") ? "m" : units[0];
-    if (!Number.isNaN(session.error()))
-      panels.push({ title: `distance from the target, ${unit}`, value: (k) => session.error(k), lines: [0], log: true, limits: none });
-    return panels;
+    const unit = session.groups.has("x_des") ? "m" : units[0], title = `distance from the target, ${unit}`;
+    if (session.follows) panels.push({ title, value: (k) => session.error(k), lines: [0], log: true, limits: limits.v });
+    return panels.filter(({ lines }) => lines.length);
   }
 
   listen() {
@@ -129,20 +150,28 @@ class App {
      * @param {() => void} action
      */
     const on = (id, action) => byId(id).addEventListener("click", action);
-    on("play", () => this.play(!this.playing));
-    on("step", () => {
-      this.play(false);
-      this.attempt(() => this.session.step());
-    });
+    const { session } = this, play = () => this.order(() => session.play(!session.playing));
+    on("play", play);
+    on("step", () => this.order(() => {
+      if (session.playing) session.play(false);
+      session.step();
+    }));
     on("reset", () => this.restart(false));
     on("defaults", () => this.restart(true));
     on("home", () => this.camera.reset());
     on("download", () => this.download());
+    if (session instanceof Remote) on("record", () => this.order(() => session.record()));
+    if (session instanceof Replay) {
+      byId("scrub").max = String(session.duration);
+      byId("scrub").addEventListener("input", () => this.order(() => session.seek(Number(byId("scrub").value))));
+      byId("loop").addEventListener("change", () => (session.loops = byId("loop").checked));
+    }
     addEventListener("keydown", (event) => {
       const outside = !document.body.matches(".whole") && !document.activeElement?.closest(".arm");
-      const typing = event.target instanceof HTMLElement && event.target.matches("input, select, button, summary");
+      const fields = `input${event.key === " " ? ":not([type=range])" : ""}, select, button, summary`;
+      const typing = event.target instanceof HTMLElement && event.target.matches(fields);
       if (outside || typing || event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.key === " ") this.play(!this.playing);
+      if (event.key === " ") play();
       else if (event.key === "Home") this.camera.reset();
       else return;
       event.preventDefault();
@@ -151,12 +180,12 @@ class App {
 
   /** @param {boolean} all */
   restart(all) {
-    this.attempt(() => this.session.startAgain(all));
-    this.due = 0;
+    this.order(() => this.session.startAgain(all));
     this.curves.chosen = null;
   }
 
   download() {
+    if (!(this.session instanceof Session)) return;
     const link = document.createElement("a"), content = mcap(this.session, this.robot);
     link.href = URL.createObjectURL(new Blob([content]));
     link.download = `${this.session.facts.name}.mcap`;
@@ -168,14 +197,9 @@ class App {
   frame(now) {
     const { session } = this, passed = (now - this.before) / 1000;
     this.before = now;
-    if (this.playing) {
-      this.due += passed * Number(byId("speed").value);
-      const end = performance.now() + 1000 * Math.max(BUSY, SHARE * passed);
-      this.attempt(() => {
-        while (session.time(session.k + 1) <= this.due && performance.now() < end) session.step();
-      });
-      if (this.due - session.time(session.k) > LATE) this.due = session.time(session.k);
-    }
+    if (session.playing) this.attempt(() => session.advance(passed, Number(byId("speed").value)));
+    this.slow = passed > SLOW ? this.slow + 1 : 0;
+    if (this.slow === PATIENCE && this.scene) this.scene.fineness = 1;
     this.show();
     requestAnimationFrame((next) => this.frame(next));
   }
@@ -184,52 +208,75 @@ class App {
     const { session, robot, scene, camera } = this, k = this.curves.sample, q = session.at("q", k);
     const links = robot.links(q), style = getComputedStyle(byId("scene").parentElement);
     const colour = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
-    this.addRobot(links);
-    this.addTrail(k, links);
     camera.follow(transform(robot.frame(links), [0, 0, 0]));
-    scene.draw(camera, fractions(colour("--scene")));
-    if (this.curves.cursor !== null || this.before - this.drawn > 1000 * CURVES) {
-      this.curves.draw([colour("--ink"), colour("--hair")]);
-      this.drawn = this.before;
+    const target = this.target(k);
+    if (!this.handle.drag && target.every(Number.isFinite)) camera.follow(target);
+    if (scene) {
+      this.addRobot(scene, links);
+      this.addTrail(scene, k, links);
+      scene.draw(camera, fractions(colour("--scene")));
     }
     const stopped = robot.atLimit(q, session.values);
-    this.readout.show(k, stopped);
-    this.controls.show();
-    byId("time").textContent = `${session.time(k).toFixed(2)} s`;
-    const far = session.groups.has("x_des") && Math.hypot(...plus(this.target(), -1, this.reach.centre)) > this.reach.radius;
-    const notes = [this.said, far ? "target out of reach" : "", ...stopped.map((joint) => `${joint.name} at limit`)];
+    if (this.curves.cursor !== null || this.before - this.drawn > 1000 * PANEL) {
+      this.curves.draw([colour("--ink"), colour("--hair")]);
+      this.readout.show(k, stopped, this.places(k));
+      this.controls?.show();
+      this.label();
+      byId("time").textContent = `${session.time(k).toFixed(3)} s`;
+      if (session instanceof Replay) byId("scrub").value = String(session.moment);
+      this.drawn = this.before;
+    }
+    const far = session.groups.has("x_des") && Math.hypot(...plus(target, -1, this.reach.centre)) > this.reach.radius;
+    const blind = scene ? "" : "this browser shows no 3D: it has no WebGL 2";
+    const notes = [blind, session.said, session.notice, far ? "target out of reach" : "", ...stopped.map((joint) => `${joint.name} at limit`)];
     const text = notes.filter(Boolean).join("\n");
     if (byId("said").textContent !== text) byId("said").textContent = text;
   }
 
-  /** @param {Float64Array[]} links */
-  addRobot(links) {
+  /**
+   * What the readout tells beside the joints, m.
+   * @param {number} k number of the sample
+   * @returns {Record<string, number[]>}
+   */
+  places(k) {
+    const { groups, facts } = this.session;
+    if (facts.links.length === 1) return {};
+    return { "end effector": this.end(k), ...(groups.has("x_des") && { target: this.target(k) }) };
+  }
+
+  /**
+   * @param {Scene} scene
+   * @param {Float64Array[]} links
+   */
+  addRobot(scene, links) {
     this.session.facts.shapes.forEach(({ link, place, colour }, i) => {
-      this.scene.addSolid(i + 1, multiply(links[link], place), [...colour, 1]);
+      scene.addSolid(i + 1, multiply(links[link], place), [...colour, 1]);
     });
   }
 
   /**
    * What is drawn beside the robot.
+   * @param {Scene} scene
    * @param {number} k
    * @param {Float64Array[]} links
    */
-  addTrail(k, links) {
-    const { session, robot, scene, camera } = this, { facts } = session, size = camera.size;
-    const first = Math.max(0, k - Math.round(TRAIL / facts.step)), stride = Math.max(1, Math.ceil((k - first) / 60));
+  addTrail(scene, k, links) {
+    const { session, robot, camera } = this, { facts } = session, size = camera.size;
+    const first = session.nearest(session.time(k) - TRAIL), stride = Math.max(1, Math.ceil((k - first) / 60));
     const trail = [];
-    for (let i = first; i <= k; i += stride) trail.push(transform(robot.frame(robot.links(session.at("q", i))), [0, 0, 0]));
+    for (let i = first; i <= k; i += stride) trail.push(this.end(i));
+    scene.addLine(this.path, [0.5, 0.55, 0.6, 0.7], 1);
     scene.addLine([...trail, transform(robot.frame(links), [0, 0, 0])], [0, 0.447, 0.698, 1], 2);
-    if (Number.isFinite(this.reach.radius)) {
+    if (facts.links.length > 1 && Number.isFinite(this.reach.radius)) {
       const planes = facts.axes.length === 2 ? [base([0, 1, 2].find((i) => !facts.axes.includes("xyz"[i])) ?? 2)] : [0, 1, 2].map(base);
-      for (const normal of planes) scene.addLine(circle(this.reach.centre, this.reach.radius, normal), [0.5, 0.55, 0.6, 0.6], 0.6);
+      for (const normal of planes) scene.addLine(circle(this.reach.centre, this.reach.radius, normal), [0.5, 0.55, 0.6, 0.4], 1);
     }
     if (!session.groups.has("x_des")) return;
-    scene.addSolid(0, placed(this.target(), 0.018 * size), [0.835, 0.369, 0, 0.8]);
-    if (!this.handle.turns) return;
-    const ends = [robot.frame(links), multiply(placed(this.target()), rotation(session.held("quat_des")))];
+    scene.addSolid(0, placed(this.target(k), 0.018 * size), [0.835, 0.369, 0, 0.92]);
+    if (!session.groups.has("quat_des")) return;
+    const ends = [robot.frame(links), multiply(placed(this.target(k)), rotation(session.target("quat_des", k)))];
     AXIS_COLOURS.forEach((axisColour, axis) => {
-      scene.addLine(this.handle.ring(axis), [...axisColour, 0.8], 1.2);
+      if (this.handle.turns) scene.addLine(this.handle.ring(axis), [...axisColour, 0.8], 1.2);
       for (const end of ends) {
         const from = transform(end, [0, 0, 0]);
         scene.addLine([from, plus(from, 0.09 * size, transform(end, base(axis), 0))], [...axisColour, 1], 1.8);
@@ -256,10 +303,30 @@ function fractions(colour) {
   return [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16) / 255);
 }
 
+/**
+ * Numbers of samples, some so many of them, from the first to the last.
+ * @param {number} count
+ * @param {number} some
+ */
+function spread(count, some) {
+  const most = Math.min(count, some);
+  return Array.from({ length: most }, (_, i) => Math.round((i * (count - 1)) / Math.max(most - 1, 1)));
+}
+
+/**
+ * What moves the robot: an engine or samples in this page, or else its server.
+ * @param {Facts} facts
+ */
+async function makeSession(facts) {
+  if (byId("engine")) return new Session(facts, await Engine.load(new Uint8Array(await unpacked("engine"))));
+  if (byId("samples")) return new Replay(facts, await unpacked("samples"));
+  return Remote.connect(facts);
+}
+
 async function main() {
   const facts = /** @type {Facts} */ (JSON.parse(byId("facts").textContent));
-  const [module, meshes] = await Promise.all([unpacked("engine"), unpacked("meshes")]);
-  const app = new App(facts, await Engine.load(new Uint8Array(module)), meshes);
+  const [session, meshes] = await Promise.all([makeSession(facts), unpacked("meshes")]);
+  const app = new App(facts, session, meshes);
   Object.assign(globalThis, { arm: app.session });
   byId("scene").dataset.ready = "";
 }

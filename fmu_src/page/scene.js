@@ -45,15 +45,15 @@ class Scene {
   lines = [];
   /** @type {{mesh: number, model: Float64Array, colour: number[]}[]} */
   solids = [];
+  fineness = 2; // pixels that are computed for one that is shown, along each side
 
   /**
    * @param {HTMLCanvasElement} canvas
+   * @param {WebGL2RenderingContext} gl
    * @param {Facts} facts
    * @param {ArrayBuffer} meshes vertices and triangles, one mesh after the other
    */
-  constructor(canvas, facts, meshes) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
-    if (!gl) throw new Error("this browser shows no 3D: it has no WebGL 2");
+  constructor(canvas, gl, facts, meshes) {
     this.gl = gl;
     this.canvas = canvas;
     this.solid = this.program(SOLID);
@@ -106,20 +106,16 @@ class Scene {
   upload(places, triangles) {
     const { gl } = this, array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    const corners = new Uint16Array(4 * triangles.length);
-    triangles.forEach((vertex, i) => {
-      for (let k = 0; k < 3; k++) corners[4 * i + k] = places[3 * vertex + k];
-    });
-    const buffers = [
-      [corners, gl.UNSIGNED_SHORT, 8], [cornerNormals(places, triangles), gl.BYTE, 4],
-    ];
-    for (const [i, [content, type, stride]] of buffers.entries()) {
+    const { corners, normals, indices } = smoothed(places, triangles);
+    for (const [i, [content, type]] of /** @type {const} */ ([[corners, gl.UNSIGNED_SHORT], [normals, gl.BYTE]]).entries()) {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, /** @type {Uint16Array} */ (content), gl.STATIC_DRAW);
+      gl.bufferData(gl.ARRAY_BUFFER, content, gl.STATIC_DRAW);
       gl.enableVertexAttribArray(i);
-      gl.vertexAttribPointer(i, 3, Number(type), true, Number(stride), 0);
+      gl.vertexAttribPointer(i, 3, type, true, 4 * content.BYTES_PER_ELEMENT, 0);
     }
-    return { array, count: triangles.length };
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    return { array, count: indices.length };
   }
 
   /** Forget what was to be drawn. */
@@ -155,7 +151,7 @@ class Scene {
    */
   draw(camera, background) {
     const { gl, canvas } = this;
-    const ratio = Math.min(devicePixelRatio, 2);
+    const ratio = Math.max(Math.min(devicePixelRatio, 2), this.fineness);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((n) => Math.max(1, Math.round(n * ratio)));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     camera.aspect = width / height;
@@ -167,7 +163,9 @@ class Scene {
     this.drawSolids(this.solids.filter(({ colour }) => colour[3] === 1), view, light);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.BLEND);
+    gl.enable(gl.CULL_FACE); // a far side would be seen in part
     this.drawSolids(this.solids.filter(({ colour }) => colour[3] < 1), view, light);
+    gl.disable(gl.CULL_FACE);
     gl.useProgram(this.line);
     gl.bindVertexArray(this.linesArray);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.linesBuffer);
@@ -198,38 +196,71 @@ class Scene {
       gl.uniform4fv(at("colour"), colour);
       gl.uniform3fv(at("low"), low);
       gl.uniform1f(at("size"), size);
-      gl.drawArrays(gl.TRIANGLES, 0, count);
+      gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
     }
   }
 }
 
 /**
- * The normals of a mesh at each corner of its triangles, four bytes each: the mean of the faces about
- * the vertex that are not at a sharp edge to the corner's own.
+ * What is drawn of a mesh: places, each with its normal and padded to four numbers, and the corners of
+ * triangles among them. A vertex is there once for each normal that it has, which is the mean of the faces
+ * about it that are not at a sharp edge to the corner's own.
  * @param {Uint16Array} places
  * @param {Uint32Array} triangles
  */
-function cornerNormals(places, triangles) {
-  const faces = new Float64Array(triangles.length); // of an area's length
-  const [begins, around] = facesAround(places.length / 3, triangles);
-  for (let t = 0; t < triangles.length; t += 3) {
-    const [a, b, c] = [0, 1, 2].map((k) => places.subarray(3 * triangles[t + k], 3 * triangles[t + k] + 3));
-    faces.set(cross(plus([b[0], b[1], b[2]], -1, a), plus([c[0], c[1], c[2]], -1, a)), t);
-  }
-  const normals = new Int8Array(4 * triangles.length);
-  for (let corner = 0; corner < triangles.length; corner++) {
-    const own = corner - (corner % 3), vertex = triangles[corner];
-    const [x, y, z] = [faces[own], faces[own + 1], faces[own + 2]], length = Math.hypot(x, y, z);
-    let sum = [0, 0, 0];
+function smoothed(places, triangles) {
+  const { length } = triangles, count = places.length / 3;
+  const faces = facesOf(places, triangles), [begins, around] = facesAround(count, triangles);
+  const corners = new Uint16Array(4 * length), normals = new Int8Array(4 * length), indices = new Uint32Array(length);
+  const newest = new Int32Array(count).fill(-1), older = new Int32Array(length); // of those of a vertex
+  let made = 0;
+  for (let corner = 0; corner < length; corner++) {
+    const vertex = triangles[corner], own = corner - (corner % 3);
+    let x = 0, y = 0, z = 0;
     for (let i = begins[vertex]; i < begins[vertex + 1]; i++) {
-      const f = around[i], other = [faces[f], faces[f + 1], faces[f + 2]];
-      const smooth = x * other[0] + y * other[1] + z * other[2] > CREASE * length * Math.hypot(...other);
-      if (f === own || smooth) sum = plus(sum, 1, other);
+      const f = around[i];
+      if (f !== own && !(cosine(faces, own, f) > CREASE)) continue;
+      [x, y, z] = [x + faces[f], y + faces[f + 1], z + faces[f + 2]];
     }
-    const scale = 127 / (Math.hypot(...sum) || 1);
-    normals.set(sum.map((value) => value * scale), 4 * corner);
+    const scale = 127 / (Math.hypot(x, y, z) || 1);
+    normals.set([x * scale, y * scale, z * scale], 4 * made);
+    let same = newest[vertex];
+    while (same >= 0 && [0, 1, 2].some((i) => normals[4 * same + i] !== normals[4 * made + i])) same = older[same];
+    if (same < 0) {
+      corners.set(places.subarray(3 * vertex, 3 * vertex + 3), 4 * made);
+      [older[made], newest[vertex], same] = [newest[vertex], made, made];
+      made += 1;
+    }
+    indices[corner] = same;
   }
-  return normals;
+  return { corners: corners.subarray(0, 4 * made), normals: normals.subarray(0, 4 * made), indices };
+}
+
+/**
+ * Normals of triangles, of their areas' length: that of a triangle begins at its first corner.
+ * @param {Uint16Array} places
+ * @param {Uint32Array} triangles
+ */
+function facesOf(places, triangles) {
+  const faces = new Float64Array(triangles.length);
+  for (let t = 0; t < triangles.length; t += 3) {
+    const [a, b, c] = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
+    const [ux, uy, uz] = [places[b] - places[a], places[b + 1] - places[a + 1], places[b + 2] - places[a + 2]];
+    const [vx, vy, vz] = [places[c] - places[a], places[c + 1] - places[a + 1], places[c + 2] - places[a + 2]];
+    [faces[t], faces[t + 1], faces[t + 2]] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
+  }
+  return faces;
+}
+
+/**
+ * Of the angle between two faces; NaN where one has no area.
+ * @param {Float64Array} faces
+ * @param {number} f
+ * @param {number} g
+ */
+function cosine(faces, f, g) {
+  const [x, y, z] = [faces[f], faces[f + 1], faces[f + 2]], [u, v, w] = [faces[g], faces[g + 1], faces[g + 2]];
+  return (x * u + y * v + z * w) / Math.sqrt((x * x + y * y + z * z) * (u * u + v * v + w * w));
 }
 
 /**

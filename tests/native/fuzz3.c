@@ -1,40 +1,9 @@
 /* Random legal and illegal calls of FMI 3.0, with NaN, infinities, wrong value references and wrong sizes
-   of arrays. What is common to the versions fuzz.c has: here it is the functions and their arrays.
-   Compiled with AddressSanitizer and UndefinedBehaviorSanitizer. Every call that is illegal in an
-   instance's phase is refused and leaves the instance's state as it was.
+   of arrays. What both versions do fuzz.c has: here it is the functions of 3.0 and their arrays. Every
+   call that is illegal in an instance's phase is refused and leaves the instance's state as it was. */
+#include "fuzz.h"
 
-       fuzz3 SEQUENCES SEED [THREADS]    as many sequences in each thread, at the same time */
-#include <math.h>
-#include <pthread.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "fmu.c"
-
-#define CHECK(condition)                                                                     \
-    do {                                                                                     \
-        if (!(condition)) {                                                                  \
-            fprintf(stderr, "line %d: not %s\n", __LINE__, #condition);                      \
-            exit(1);                                                                         \
-        }                                                                                    \
-    } while (0)
-
-enum { LONGEST = 40, MANY = 4, ROOM = N_VARIABLES };
-static __thread uint64_t seed;
-static __thread long logged, refused, done;
-
-static unsigned pick(unsigned below) /* xorshift64* */
-{
-    seed ^= seed >> 12, seed ^= seed << 25, seed ^= seed >> 27;
-    return (unsigned)((seed * UINT64_C(2685821657736338717)) >> 33) % below;
-}
-
-static double number(void)
-{
-    static const double odd[] = {0.0, NAN, INFINITY, -INFINITY, 1e-320, 1e300, -1e6};
-    return pick(12) ? (pick(2001) - 1000.0) * 1e-3 : odd[pick(7)];
-}
+enum { MANY = 4, ROOM = N_VARIABLES };
 
 static void log_message(fmi3InstanceEnvironment environment, fmi3Status status,
                         fmi3String category, fmi3String message)
@@ -253,42 +222,12 @@ static void sequence(void)
     fmi3FreeInstance(c);
 }
 
-typedef struct {
-    long sequences;
-    uint64_t seed;
-} Share;
-
-static void *run(void *given)
+static void refuse_to_instantiate(void)
 {
-    const Share *share = given;
-    seed = share->seed;
-    for (long i = 0; i < share->sequences; i++)
-        sequence();
-    printf("%ld sequences, %ld calls done, %ld refused, %ld messages\n", share->sequences, done,
-           refused, logged);
-    return NULL;
-}
-
-int main(int count, char *argument[])
-{
-    enum { MOST = 16 };
-    const long sequences = count > 1 ? atol(argument[1]) : 1000;
-    const uint64_t first = count > 2 ? strtoull(argument[2], NULL, 10) : 0;
-    const int threads = count > 3 ? atoi(argument[3]) : 1;
-    pthread_t thread[MOST];
-    Share share[MOST];
-    CHECK(threads > 0 && threads <= MOST);
     CHECK(!fmi3InstantiateModelExchange("x", "wrong", NULL, 0, 0, NULL, log_message));
     CHECK(!fmi3InstantiateModelExchange(NULL, MODEL_GUID, NULL, 0, 0, NULL, NULL));
     CHECK(!fmi3InstantiateScheduledExecution("x", MODEL_GUID, "", 0, 0, NULL, log_message, NULL,
                                              NULL, NULL));
     CHECK(fmi3Reset(NULL) == fmi3Error);
     fmi3FreeInstance(NULL);
-    for (int i = 0; i < threads; i++) {
-        share[i] = (Share){sequences, (first + (uint64_t)i) * UINT64_C(0x9e3779b97f4a7c15) + 1};
-        CHECK(!pthread_create(&thread[i], NULL, run, &share[i]));
-    }
-    for (int i = 0; i < threads; i++)
-        CHECK(!pthread_join(thread[i], NULL));
-    return 0;
 }

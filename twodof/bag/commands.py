@@ -2,93 +2,176 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import chain, repeat
+from math import floor, inf
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import BagError, InputError
-from ..experiments import NANOSECONDS, Changes, resolve
+from ..experiments import NANOSECONDS, Changes, Setting, Value, default, resolve
 from ..files import shown
 from ..fmu import Fmu, load_fmu
+from ..plant.variables import CONTROLS
 from ..ros.cdr import Rows
-from ..ros.commands import CommandError, Commands
-from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES
+from ..ros.commands import LONGEST_NAME, CommandError, Commands
+from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY
+from ..ros.trajectories import follow, read_trajectory
 from .contents import read_messages
-from .provenance import KNOWN_UNTIL, read_provenance
+from .provenance import KNOWN_UNTIL, read_provenance, robot_in
 from .reader import whole_bag
 from .records import Allowance, DamageError
 
+LOG = logging.getLogger(__name__)
 MAX_COMMANDS = 1_000_000
 SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of what a robot did
+FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs with which trajectories are followed
+Stored = list[tuple[int, str, bytes]]
+"""Messages: time when they were recorded, ns since the epoch, type and content."""
 
 
-def read_commands(fmu: Fmu | str | Path, path: str | Path, topic: str | None = None) -> Changes:
+def read_commands(
+    fmu: Fmu | str | Path, path: str | Path, topic: str | None = None, *,
+    step: float | None = None, settings: Mapping[str, Setting] | None = None,
+) -> Changes:  # fmt: skip
     """Commands of a bag, of this or another writer: times, s, and the inputs that change there.
 
     JointStates, points or poses, as the FMU's control follows them (``ros.commands``), each at the
-    time when it was recorded, after the bag's first joint state that is no command.
+    time when it was recorded, after the bag's first joint state that is no command; or for control
+    'joint' JointTrajectories, as values of the inputs at whole steps (``ros.trajectories``).
 
     Args:
         fmu: that is commanded, or its path.
-        path: the bag's folder.
-        topic: of the commands; None: the changes of inputs that the bag's run.json has, or else the
-            only topic that can be commands.
+        path: the bag's folder; of one robot of several, with a colon and its namespace.
+        topic: of the commands; None: the inputs that the bag's run.json has, those of the start at
+            −∞; or where there is none, the only topic that can be commands.
+        step: of the run, in which trajectories are followed; None: the FMU's, s.
+        settings: of the run: trajectories begin at rest at its q_des, or else at its q_start.
 
     Raises:
         BagError: it is no bag, or is unfinished or damaged.
         InputError: it has no such commands, or one that is none.
     """
     fmu, path = fmu if isinstance(fmu, Fmu) else load_fmu(fmu), Path(path)
-    run = read_provenance(path) if topic is None else {}
-    if run.get("input_changes"):
+    run = read_provenance(*robot_in(path)) if topic is None else {}
+    if run:
         if KNOWN_UNTIL in run:
             raise InputError(f"'{path}' knows its inputs until {run[KNOWN_UNTIL]:g} s only")
         start = run["start_time"]
-        return [(t - start, resolve(fmu, values)) for t, values in run["input_changes"]]
+        changes = [(t - start, resolve(fmu, values)) for t, values in run["input_changes"]]
+        return [(-inf, resolve(fmu, _inputs(fmu, run["start_values"]))), *changes]
     follows = Commands(fmu)
+    types = (*follows.types, *[JOINT_TRAJECTORY] * all(map(fmu.vector, (*FOLLOWING, "q_start"))))
+    found, begins = _messages(path, types, topic)
+    chosen = _only(found, path, topic, types)
+    commands = sorted(found[chosen], key=lambda command: command[0])
+    begin = min((t for name, t in begins.items() if name != chosen), default=commands[0][0])
+    if len(commands) > MAX_COMMANDS:
+        raise InputError(f"'{path}' has more than {MAX_COMMANDS} messages on {shown(chosen)}")
+    if len({kind == JOINT_TRAJECTORY for _, kind, _ in commands}) > 1:
+        raise InputError(f"'{path}' has trajectories and other commands on {shown(chosen)}")
+    if commands[0][1] == JOINT_TRAJECTORY:
+        step = default(fmu, "stepSize", 0.01) if step is None else step
+        return _followed(commands, begin, fmu, resolve(fmu, settings or {}), step, f"'{path}'")
+    return _changes(commands, begin, follows, f"'{path}'")
+
+
+def _messages(
+    path: Path, types: Sequence[str], topic: str | None
+) -> tuple[dict[str, Stored], dict[str, int]]:
+    """What may be commands, by topic; and of each topic of joint states the time of the first."""
+    found: dict[str, Stored] = {}
+    begins: dict[str, int] = {}
     try:
         files, allowance = whole_bag(path), Allowance()
         messages = chain.from_iterable(read_messages(file, allowance) for file in files)
-        found: dict[str, list[tuple[int, str, bytes]]] = {}
-        begins: dict[str, int] = {}
         for channel, stamps, data in messages:
             if channel.type == JOINT_STATE:
                 first = int(stamps.min())
                 begins[channel.topic] = min(first, begins.get(channel.topic, first))
             wanted = channel.topic not in SAMPLES if topic is None else channel.topic == topic
-            if channel.type in follows.types and wanted:
+            if channel.type in types and wanted:
                 told = zip(stamps.tolist(), repeat(channel.type), map(Rows.tobytes, data))
                 found.setdefault(channel.topic, []).extend(told)
     except (OSError, DamageError) as error:
         raise BagError(f"cannot read the bag '{path}': {error}") from error
-    chosen = _only(found, path, topic, follows)
-    states = [begin for name, begin in begins.items() if name != chosen]
-    commands = sorted(found[chosen], key=lambda command: command[0])
-    if len(commands) > MAX_COMMANDS:
-        raise InputError(f"'{path}' has more than {MAX_COMMANDS} messages on {shown(chosen)}")
-    return _changes(commands, min(states, default=commands[0][0]), follows, f"'{path}'")
+    return found, begins
 
 
-def _only(found: Mapping[str, object], path: Path, topic: str | None, follows: Commands) -> str:
+def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
+    """Of a bag's start values those that command, its FMU or this one."""
+    commands = {group for law in CONTROLS.values() for group in law.inputs}
+
+    def commands_it(name: str) -> bool:
+        known = fmu.variables.get(name)
+        return known.causality == "input" if known else name.partition("[")[0] in commands
+
+    return {name: value for name, value in values.items() if commands_it(name)}
+
+
+def _only(found: Mapping[str, object], path: Path, topic: str | None, types: Sequence[str]) -> str:
     """The topic of the commands."""
     if len(found) == 1:
         return next(iter(found))
     there = ", ".join(sorted(map(shown, found)))
     if there:
         raise InputError(f"'{path}' has several topics that can be commands: {there}; choose one")
-    kinds = " or ".join(follows.types) or "nothing: it has no inputs for them"
+    kinds = " or ".join(types) or "nothing: it has no inputs for them"
     where = f" on {topic}" if topic else ""
     raise InputError(f"'{path}' has no commands{where} for this FMU, which follows {kinds}")
 
 
-def _changes(
-    commands: list[tuple[int, str, bytes]], begin: int, follows: Commands, bag: str
-) -> Changes:
-    changes: Changes = []
-    for stamp, kind, data in commands:
-        t = (stamp - begin) / NANOSECONDS
-        try:
-            changes.append((t, dict(follows.read(kind, data).inputs)))
-        except CommandError as error:
-            raise InputError(f"{bag}: the command at {t:g} s {error}") from error
+def _changes(commands: Stored, begin: int, follows: Commands, bag: str) -> Changes:
+    changes, strangers = list[tuple[float, dict[str, Value]]](), set[str]()
+    for came, kind, data in commands:
+        with _refusing(bag, came - begin):
+            command = follows.read(kind, data)
+        changes.append(((came - begin) / NANOSECONDS, dict(command.inputs)))
+        strangers.update(command.strangers)
+    _tell_strangers(bag, strangers)
     return changes
+
+
+def _tell_strangers(bag: str, names: set[str]) -> None:
+    if names:
+        told = ", ".join(sorted(names))[:LONGEST_NAME]
+        LOG.warning(f"{bag}: joints that this robot has not are left out: {told!r}")
+
+
+def _followed(
+    commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str
+) -> Changes:
+    """Inputs with which joints go along trajectories, where they change from step to step."""
+    trajectories, joints = [], {name: i for i, name in enumerate(fmu.joints)}
+    for came, _, data in commands:
+        with _refusing(bag, came - begin):
+            trajectories.append(read_trajectory(data, joints, came, begin))
+    _tell_strangers(bag, {name for it in trajectories for name in it.strangers})
+    begun, ended = min(it.start for it in trajectories), max(it.times[-1] for it in trajectories)
+    if not ended - begun <= MAX_COMMANDS * step < inf:
+        told = f"take {ended - begun:g} s, more than {MAX_COMMANDS} steps of {step:g} s"
+        raise InputError(f"{bag}: its trajectories {told}")
+    grid = step * np.arange(floor(begun / step) - 1.0, floor(ended / step) + 3.0)
+    groups = [fmu.vector(group) for group in FOLLOWING]
+    starts = fmu.vector("q_start")
+    known = {**{name: float(fmu.variables[name].start or 0.0) for name in starts}, **given}
+    rest = [float(known.get(q_des, known[q_start])) for q_des, q_start in zip(groups[0], starts)]
+    means = follow(trajectories, rest, grid)
+    names = [group[i] for i in means for group in groups]
+    table = np.hstack([*means.values()])
+    changes = [(-inf, dict(zip(chain(*groups), chain(rest, repeat(0.0)))))]
+    for k in 1 + np.flatnonzero((np.diff(table, axis=0) != 0.0).any(axis=1)):
+        changes.append((float(grid[k]), dict(zip(names, table[k].tolist()))))
+    return changes
+
+
+@contextmanager
+def _refusing(bag: str, t: int) -> Iterator[None]:
+    """Name the bag, and the time, ns, of a command that is none."""
+    try:
+        yield
+    except CommandError as error:
+        raise InputError(f"{bag}: the command at {t / NANOSECONDS:g} s {error}") from error

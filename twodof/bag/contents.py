@@ -6,9 +6,12 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from ..files import read_file
 from .mcap import mcap_messages
 from .records import Allowance, Batch, refusing_damage
 from .sqlite import sqlite3_messages
+
+MAX_METADATA = 64 * 1024**2  # bytes
 
 
 def storage_files(folder: Path) -> list[Path]:
@@ -20,6 +23,17 @@ def storage_files(folder: Path) -> list[Path]:
         return [folder]
     files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
     return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
+
+
+def stated_count(folder: Path) -> int | None:
+    """How many messages a bag's metadata.yaml says that it has; None where it does not.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    text = read_file(folder / "metadata.yaml", MAX_METADATA).decode("utf-8", "replace")
+    stated = re.search(r"^  message_count: (\d{1,18})$", text, re.MULTILINE)
+    return int(stated[1]) if stated else None
 
 
 def read_messages(file: Path, allowance: Allowance) -> Iterator[Batch]:

@@ -1,11 +1,16 @@
-"""Where a run came from: run.json, written beside the messages, and never behind them."""
+"""Where a run came from: run.json, written beside the messages, and never behind them.
+
+Of several robots in one bag each has its own, run.NAME.json, with its namespace in the name.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 from ..errors import BagError
 from ..experiments import Changes, Experiment
@@ -48,6 +53,7 @@ class ProvenanceFile:
 
     Args:
         folder: of the bag.
+        namespace: of the robot in it, or "".
         run: the experiment.
         command_line: that made the bag; "" where none did.
 
@@ -55,8 +61,8 @@ class ProvenanceFile:
         OSError: it cannot be written; so does ``add``, which can be called again then.
     """
 
-    def __init__(self, folder: Path, run: Experiment, command_line: str) -> None:
-        self.path = folder / FILE
+    def __init__(self, folder: Path, namespace: str, run: Experiment, command_line: str) -> None:
+        self.path, self.key = folder / file_of(namespace), key_of(namespace)
         self._head = _as_json(_provenance(run, command_line))[:-1] + b',"input_changes":['
         self.path.write_bytes(self._head + TAIL)
         self._start, self._end = run.start_time, len(self._head)
@@ -107,13 +113,57 @@ def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
     }
 
 
+def file_of(namespace: str) -> str:
+    """Of a robot's provenance in its bag's folder."""
+    return f"run.{quote(namespace, safe='')}.json" if namespace else FILE
+
+
+def key_of(namespace: str) -> str:
+    """Of a robot's provenance in its bag's own metadata."""
+    return f"{KEY}/{namespace}" if namespace else KEY
+
+
+def robots_of(folder: Path) -> list[str]:
+    """Namespaces of the robots whose provenance a bag has, [""] where it is of one or of none."""
+    if (folder / FILE).exists():
+        return [""]
+    found = (re.fullmatch(r"run\.(.+)\.json", file.name) for file in folder.glob("run.*.json"))
+    return sorted(unquote(match[1]) for match in found if match) or [""]
+
+
+def robot_in(path: Path) -> tuple[Path, str]:
+    """A bag's folder and the namespace of its robot that is meant: "pair:left" is one of "pair".
+
+    Raises:
+        BagError: the bag has no such robot, or several and none is chosen.
+    """
+    text, _, name = str(path).rpartition(":")
+    if path.exists() or not text or not Path(text).is_dir():
+        text, name = str(path), ""
+    folder = Path(text)
+    robots = robots_of(folder)
+    if name in robots or (not name and len(robots) == 1):
+        return folder, name or robots[0]
+    if robots == [""]:
+        raise BagError(f"the bag '{folder}' is of one robot; leave ':{name}' out")
+    choice = ", ".join(f"'{folder}:{robot}'" for robot in robots)
+    reason = f"has no robot '{name}'; there are" if name else "is of several robots; give one,"
+    raise BagError(f"the bag '{folder}' {reason} {choice}")
+
+
+def each_robot(path: Path) -> list[Path]:
+    """The addresses of a bag's robots, as ``robot_in`` takes them; of one robot the bag itself."""
+    robots = robots_of(path) if path.is_dir() else [""]
+    return [path] if len(robots) == 1 else [Path(f"{path}:{robot}") for robot in robots]
+
+
 def _as_json(content: Any) -> bytes:
     """Without a single space: writers of YAML, which holds it too, fold there, not all rightly."""
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
 
 
-def read_provenance(path: Path) -> dict[str, Any]:
-    """The provenance of a bag; {} where there is none, or that of another tool.
+def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
+    """The provenance of a bag's robot; {} where there is none, or that of another tool.
 
     It is in the bag's folder, or in the metadata of a bag that is a single file.
 
@@ -121,7 +171,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
         BagError: it cannot be read, or is not what was written.
     """
     single = path.suffix == ".mcap" and path.is_file()
-    file = path if single else path / FILE
+    file = path if single else path / file_of(namespace)
     try:
         text = read_metadata(path, KEY, FILE).encode() if single else read_file(file, MAX_SIZE)
         if single and not text:

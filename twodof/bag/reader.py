@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 from array import array
 from collections import Counter
@@ -13,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import BagError
-from ..files import is_being_written
+from ..files import is_being_written, shown
 from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, STORE, TARGET
-from .contents import read_messages, storage_files
+from .contents import read_messages, stated_count, storage_files
 from .outline import Indices, Outline
-from .provenance import read_provenance
+from .provenance import read_provenance, robot_in, robots_of
 from .recording import Array, Heard, Recording, Stamps, TopicCount
 from .records import Allowance, DamageError
 from .summary import read_summary
@@ -26,9 +27,14 @@ from .summary import read_summary
 MAX_JOINT_STATE = 1024**2  # bytes; some ten thousand joints
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
+LOG = logging.getLogger(__name__)
+
 
 def read_bag(path: str | Path) -> Recording:
     """Joint states and targets of a bag, of this or another writer.
+
+    Args:
+        path: the bag's folder; of one robot of several, with a colon and its namespace.
 
     Raises:
         BagError: it is no bag, is unfinished or damaged, or has no joint states.
@@ -61,24 +67,41 @@ def read_ends(path: str | Path) -> Recording:
         BagError: as ``read_bag``.
     """
     path = Path(path)
-    with _refusing(path):
-        summaries = [read_summary(file) for file in whole_bag(path)]
+    folder, prefix, others = _place(path)
+    with _refusing(folder):
+        summaries = [read_summary(file) for file in whole_bag(folder)]
         if None in summaries:
             return _read(path, _Ends, None)
         counts: Counter[tuple[str, str]] = Counter()
+        total = 0
         for summary in filter(None, summaries):
             for number, count in summary.counts.items():
                 channel = summary.channels[number]
-                counts[channel.topic, channel.type] += count
+                if _is_within(channel.topic, prefix, others):
+                    counts[channel.topic, channel.type] += count
+                total += count
         stating = [topic for topic, kind in counts if kind == JOINT_STATE]
-        if len(stating) > 1 and JOINT_STATES not in stating:  # that which begins first in the file
+        usual = prefix + JOINT_STATES
+        if len(stating) > 1 and usual not in stating:  # that which begins first in the file
             return _read(path, _Ends, None)
-        chosen = JOINT_STATES if JOINT_STATES in stating else "".join(stating)
+        chosen = usual if usual in stating else "".join(stating)
         ends, allowance = _Ends(path), Allowance()
         for summary in filter(None, summaries):
             for batch in summary.ends(chosen, allowance):
                 ends.add(batch.stamps, batch.messages)
+        _check_count(folder, total)
         return _recording(path, counts, chosen, ends, None)
+
+
+def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
+    """A bag's folder, what topics of the robot that is meant begin with, and others' of those."""
+    folder, namespace = robot_in(path)
+    inside = (name for name in robots_of(folder) if name.startswith(f"{namespace}/"))
+    return folder, f"/{namespace}" if namespace else "", tuple(f"/{name}/" for name in inside)
+
+
+def _is_within(topic: str, prefix: str, others: tuple[str, ...]) -> bool:
+    return not prefix or (topic.startswith(f"{prefix}/") and not topic.startswith(others))
 
 
 @contextmanager
@@ -103,29 +126,51 @@ def _read(
 ) -> Recording:
     """What a kind of reader keeps of a bag's joint states, and of these an outline."""
     counts: Counter[tuple[str, str]] = Counter()
-    chosen, states = "", kind(path)
+    chosen, states, total = "", kind(path), 0
     allowance, thinned = Allowance(), False
 
     def thin(outline: Outline) -> None:
         states.keep(outline.choose(_recording(path, counts, chosen, states, targets)))
 
-    with _refusing(path):
-        for file in whole_bag(path):
+    folder, prefix, others = _place(path)
+    with _refusing(folder):
+        for file in whole_bag(folder):
             for channel, stamps, messages in read_messages(file, allowance):
+                total += len(stamps)
+                if not _is_within(channel.topic, prefix, others):
+                    continue
                 counts[channel.topic, channel.type] += len(stamps)
                 if channel.type == JOINT_STATE:
-                    if channel.topic != chosen and (not chosen or channel.topic == JOINT_STATES):
+                    usual = channel.topic == prefix + JOINT_STATES
+                    if channel.topic != chosen and (not chosen or usual):
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamps, messages)
                         if outline is not None and len(states) > outline.most:
                             thin(outline)
                             thinned = True
-                elif targets and channel.topic == TARGET and channel.type in (POINT, POSE):
+                elif targets and channel.topic == prefix + TARGET and channel.type in (POINT, POSE):
                     targets.add(stamps, messages)
+        _check_count(folder, total)
+    stating = [topic for topic, kind in counts if kind == JOINT_STATE]
+    if len(stating) > 1 and chosen != prefix + JOINT_STATES:
+        LOG.warning(
+            f"'{path}' has several topics of joint states, {', '.join(map(shown, stating))};"
+            f" what is read is {shown(chosen)}"
+        )
     if outline is not None and thinned:
         thin(outline)  # the end alike
     return _recording(path, counts, chosen, states, targets)
+
+
+def _check_count(path: Path, count: int) -> None:
+    """Warn where a bag's files have not as many messages as its metadata.yaml says."""
+    stated = stated_count(path) if path.is_dir() else count
+    if stated not in (None, count):
+        LOG.warning(
+            f"'{path}' should have {stated} messages by its metadata.yaml, and has {count} by its"
+            f" files; 'twodof recover {path}' counts them"
+        )
 
 
 def _recording(
@@ -148,7 +193,7 @@ def _recording(
         v=v,
         tau=tau,
         heard=targets.heard(stamps) if targets is not None else None,
-        provenance=read_provenance(path),
+        provenance=read_provenance(*robot_in(path)),
     )
 
 

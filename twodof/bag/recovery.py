@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import sqlite3
 from collections import Counter
@@ -19,11 +18,12 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..errors import BagError
-from ..files import lock, read_file, sync
+from ..files import lock, sync
 from . import provenance
-from .contents import read_messages, storage_files
+from .contents import read_messages, stated_count, storage_files
 from .records import Allowance, Channel, DamageError
-from .storage import KINDS, MAX_METADATA, BagWriter, check_path
+from .storage import KINDS, BagWriter, check_path
+from .summary import read_summary
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
 MAX_DEFINITION = 64 * 1024  # bytes
@@ -75,6 +75,8 @@ def recover(path: str | Path) -> Recovered:
                 raise BagError(f"'{original}', where the old bag would go, exists; move it away")
             work.mkdir()
             counts, damage = _copy(folder, files, work / folder.name)
+            if damage and not any(counts.values()):
+                raise BagError(f"no message of the bag '{bag}' can be read: {damage}")
             folder.rename(original)
             (work / folder.name).rename(folder)
             sync(folder.parent)
@@ -112,30 +114,34 @@ def _undo(folder: Path, original: Path, work: Path) -> None:
 
 
 def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:
-    """Messages by topic of a bag that lacks nothing, else None."""
+    """Messages by topic of a bag that lacks nothing and says so alike, else None."""
+    counts: Counter[str] = Counter()
     try:
-        metadata = read_file(folder / "metadata.yaml", MAX_METADATA).decode("utf-8", "replace")
-        counts: Counter[str] = Counter()
+        stated = stated_count(folder)
+        summaries = [read_summary(file) for file in files]
         allowance = Allowance()
         for file in files:
             for channel, stamps, _ in read_messages(file, allowance):
                 counts[channel.topic] += len(stamps)
     except (OSError, DamageError):
         return None
-    stated = re.search(r"^  message_count: (\d{1,18})$", metadata, re.MULTILINE)
-    return dict(counts) if stated and int(stated[1]) == counts.total() else None
+    summed = sum(sum(summary.counts.values()) for summary in summaries if summary)
+    told = {stated, *([] if None in summaries else [summed])}
+    return dict(counts) if told == {counts.total()} else None
 
 
 def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
     """Write what can be read into a new bag; messages by topic, and what ended the reading."""
     damage = []
     allowance = Allowance()
-    run_file = folder / provenance.FILE
+    robots = provenance.robots_of(folder)
     others = set()
     writer = BagWriter(new, KINDS[files[0].suffix])
-    with suppress(BagError):  # damaged: the messages are worth saving without it
-        if provenance.read_provenance(folder):
-            writer.set_custom_data(provenance.KEY, run_file.read_text("utf-8").strip())
+    for robot in robots:
+        with suppress(BagError):  # damaged: the messages are worth saving without it
+            if provenance.read_provenance(folder, robot):
+                text = (folder / provenance.file_of(robot)).read_text("utf-8").strip()
+                writer.set_custom_data(provenance.key_of(robot), text)
     with writer:
         topics = _Topics(writer)
         for file in files:
@@ -151,8 +157,9 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
                 damage.append(str(error))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
-    if run_file.is_file():
-        shutil.copyfile(run_file, new / run_file.name)
+    for name in map(provenance.file_of, robots):
+        if (folder / name).is_file():
+            shutil.copyfile(folder / name, new / name)
     with Reader(new) as reader:  # whole is what another reader opens
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     sync(*new.iterdir(), new)

@@ -31,15 +31,21 @@ def sqlite3_messages(path: Path) -> Iterator[Batch]:
     try:
         with _database(path) as database:
             channels = _sqlite3_channels(path, database)
-            rows = _rows(path, database, "messages")
-            while some := [*islice(rows, SOME)]:
+            rows, failure = _rows(path, database, "messages"), None
+            while failure is None:
                 waiting: dict[int, list[tuple[int, bytes]]] = {}
-                for _, topic, stamp, data in some:
-                    if not isinstance(stamp, int) or stamp < 0 or not isinstance(data, bytes):
-                        raise DamageError(f"'{path.name}' is damaged")
-                    waiting.setdefault(topic, []).append((stamp, data))
+                try:
+                    for _, topic, stamp, data in islice(rows, SOME):
+                        if not isinstance(stamp, int) or stamp < 0 or not isinstance(data, bytes):
+                            raise DamageError(f"'{path.name}' is damaged")
+                        waiting.setdefault(topic, []).append((stamp, data))
+                except (sqlite3.Error, DamageError) as error:
+                    failure = error  # after what was read before it
                 for topic, messages in waiting.items():
                     yield from _batches(channels[topic], messages)
+                if not waiting and failure is None:
+                    return
+            raise failure
     except sqlite3.Error as error:
         raise DamageError(f"'{path.name}': {error}") from error
 
@@ -62,6 +68,7 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
                         journal.write(bytes(8))
             uri = (folder / path.name).as_uri()
         with closing(sqlite3.connect(uri, uri=True)) as database:
+            database.execute("PRAGMA writable_schema = ON")  # reads files that lack their end
             database.set_progress_handler(lambda: 1, SCHEMA_STEPS)
             tables = "SELECT name, sql FROM sqlite_master WHERE sql NOT NULL"
             schema = dict(database.execute(tables))
@@ -103,6 +110,9 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
     columns = TABLES[table].split()
     infos = database.execute(f"PRAGMA table_xinfo({table})")
     stored = ["" if computed else name for _, name, *_, computed in infos]
+    listed = database.execute("SELECT 1 FROM sqlite_master WHERE name = ?", [table])
+    if not stored and listed.fetchone():
+        raise DamageError(f"'{path.name}' is damaged")  # its columns cannot be read
     known = [name for name in columns if name in stored]
     if stored[: len(known)] != known:
         raise DamageError(f"'{path.name}' has {table} that are not those of ROS 2")

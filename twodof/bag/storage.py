@@ -31,7 +31,6 @@ from .mcap import HEAD, MAGIC, MESSAGE
 Stamps = NDArray[np.int64]
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
-MAX_METADATA = 64 * 1024**2  # bytes
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
 REMOVED = "it was removed while it was being written"

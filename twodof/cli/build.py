@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import CommandLineError, controlled, print_next, print_table, quote
+from .options import check_company
 
 
 def add(verbs: Any) -> None:
@@ -53,6 +54,11 @@ def add(verbs: Any) -> None:
         "--link-environment", action="store_true",
         help="remember in the FMU where this Python's packages are",
     )  # fmt: skip
+    _add_native_options(build)
+    build.set_defaults(call=call)
+
+
+def _add_native_options(build: argparse.ArgumentParser) -> None:
     build.add_argument(
         "--native", action="store_true", help="compiled C, which needs no Python where it runs"
     )
@@ -69,15 +75,25 @@ def add(verbs: Any) -> None:
         "--fmi", type=int, choices=(2, 3),
         help="version of a native FMU (2; 3 on machines that 2 has no name for)",
     )  # fmt: skip
-    build.set_defaults(call=call)
+    build.add_argument(
+        "--scalars", action="store_true",
+        help="in FMI 3 each element of a vector is a variable, for tools that know no arrays",
+    )  # fmt: skip
 
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     if options.urdf and options.robot:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
+    check_company(
+        options,
+        needs={"--no-live-documentation": "--native", "--mesh-dir": "a URDF"},
+        excludes={"--no-meshes": "--mesh-dir"},
+    )
     if options.orientation and options.control != "task":
         raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
+    if options.scalars and options.fmi != 3:
+        raise CommandLineError("--scalars goes with --native --fmi 3")
     from ..export.options import FmuOptions
     from ..export.package import build_fmu
 
@@ -96,6 +112,7 @@ def call(options: argparse.Namespace) -> int:
         link_environment=options.link_environment,
         native=options.native,
         fmi=options.fmi,
+        arrays=not options.scalars,
         live_documentation=not options.no_live_documentation,
         platforms=_platforms(options.platforms, options.fmi or 2),
     )
@@ -109,7 +126,11 @@ def call(options: argparse.Namespace) -> int:
         ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
         ("controlled", controlled(fmu)),
     )
-    print_next(f"twodof run {quote(path)}", f"twodof info {quote(path)}")
+    here = fmu.platform in fmu.platforms
+    print_next(
+        f"twodof run {quote(path)}" if here else "twodof build --native",
+        f"twodof info {quote(path)}",
+    )
     return 0
 
 

@@ -10,6 +10,7 @@ import re
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,8 +34,10 @@ PATIENCE = 5.0  # s for what is under way to end when it was asked to
 
 
 ARGUMENT = re.compile(r"`(\w+)(?:=True)?`")
-OPTIONS = {"path": "-o", "output": "-o", "platforms": "--platform"}
+OPTIONS = {"path": "-o", "output": "-o", "platforms": "--platform", "changes": "--input"}
 """Options that are not called as the argument of the library which they give."""
+POSE = "control 'pose'"
+"""Which is two options."""
 
 
 class CommandLineError(InputError):
@@ -43,6 +46,7 @@ class CommandLineError(InputError):
 
 def in_options(text: str) -> str:
     """A message of the library, which has its arguments in backticks, for the command line."""
+    text = text.replace(POSE, "control 'task --orientation'")
     return plain(ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text))
 
 
@@ -112,19 +116,24 @@ def experiment_of(
     from ..fmu import load_fmu
 
     fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
+    settings = parse_settings(options.settings)
     if table is not None:
         folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
         if Path(folder).is_dir() and folder:
             from ..bag.commands import read_commands
+            from ..bag.provenance import robots_of
 
-            table, changes = None, read_commands(fmu, folder, topic)
+            if topic in robots_of(Path(folder)):  # of one of several robots, as it was driven
+                folder, topic = table, None
+            table = None
+            changes = read_commands(fmu, folder, topic, step=step, settings=settings)
     return experiment(
-        fmu, stop_time=stop_time, step=step, settings=parse_settings(options.settings),
+        fmu, stop_time=stop_time, step=step, settings=settings,
         input_file=table, changes=changes, stamp_start=options.stamp_start,
     )  # fmt: skip
 
 
-def bag_of(options: argparse.Namespace, path: str) -> Bag:
+def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
     """The bag that the options ask for."""
     from ..bag.writer import Bag
 
@@ -137,6 +146,13 @@ def bag_of(options: argparse.Namespace, path: str) -> Bag:
         fsync=options.fsync,
         command_line=options.command_line,
     )
+
+
+def dated(stem: str) -> Path:
+    """The default name of what a run leaves."""
+    from ..files import free_name
+
+    return free_name(time.strftime(f"{stem}_%Y_%m_%d-%H_%M_%S"))
 
 
 def fast_fmu(options: argparse.Namespace) -> Path:
@@ -155,7 +171,10 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else that of the URDF or of the default arm, built if need be."""
-    if options.fmu and Path(options.fmu).suffix not in (".urdf", ".xacro"):
+    of_urdf = bool(options.fmu) and Path(options.fmu).suffix in (".urdf", ".xacro")
+    if options.frame is not None and not of_urdf:
+        raise CommandLineError("--frame is of a URDF; leave it out beside an FMU")
+    if options.fmu and not of_urdf:
         if options.native:
             raise CommandLineError(
                 "--native builds the default arm's FMU; leave it out beside an FMU"
@@ -166,12 +185,13 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
     from ..export.package import build_fmu
 
     native = options.native or host_platform() != "linux64"
-    robot = Path(options.fmu) if options.fmu else None
     if native and not options.native:
         print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
-    if robot is None:
+    if not of_urdf:
         return build_fmu(None, FmuOptions(native=native))
-    return build_fmu(None, FmuOptions(urdf=robot, name=identifier(robot), native=native))
+    robot, frame = Path(options.fmu), options.frame
+    name = identifier(robot)
+    return build_fmu(None, FmuOptions(urdf=robot, name=name, frame=frame, native=native))
 
 
 def identifier(robot: Path) -> str:
@@ -188,7 +208,7 @@ def facts_of(
     last = summary.last
     return dict(
         fmu=str(run.fmu.path),
-        bag=None if bag is None else str(bag.path),
+        bag=None if bag is None else bag.address,
         joint_states=last.k + 1,
         end_time=last.t,
         stopped=summary.stopped,
@@ -218,8 +238,8 @@ def print_summary(
         if len(elements) > 1 and isinstance(value, int | float):
             rows.append((f"{name}", f"{value:g}, all {len(elements)} elements"))
     if bag is not None:
-        messages = f"{last.k + 1} messages on /joint_states, {options.storage}"
-        rows.append(("bag", f"{bag.path} ({messages})"))
+        messages = f"{last.k + 1} messages on {bag.topic}, {options.storage}"
+        rows.append(("bag", f"{bag.address} ({messages})"))
     if summary.error is not None:
         target = ", ".join(f"{value:g}" for value in last.target or ())
         rows.append(("end effector", f"{summary.error:.3g} m from its target ({target}) m"))
@@ -242,7 +262,8 @@ def controlled(fmu: Fmu) -> str:
     if not fmu.frame:
         return "unknown"
     of = f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}"
-    return f"{of}; {fmu.control} control" if fmu.control else of
+    law = "task control with --orientation" if fmu.control == "pose" else f"{fmu.control} control"
+    return f"{of}; {law}" if fmu.control else of
 
 
 def open_page(

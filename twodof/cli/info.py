@@ -29,14 +29,13 @@ def add(verbs: Any) -> None:
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     path = options.path
+    folder = Path(str(path).rpartition(":")[0] or path)
     if path.is_dir() and any(path.glob("*.parquet")):
         from ..sweeps.results import read_sweep
 
         (_print_sweep_json if options.json else _print_sweep)(path, *read_sweep(path))
-    elif path.is_dir():
-        from ..bag.reader import read_ends
-
-        (_print_bag_json if options.json else _print_bag)(read_ends(path))
+    elif path.is_dir() or (folder.is_dir() and not path.exists()):
+        _show_bags(path, options.json)
     elif path.suffix in (".mcap", ".db3", ".parquet") and path.is_file():
         what = "sweep" if path.suffix == ".parquet" else "bag"
         raise InputError(f"'{path}' is a {what}'s file; give the {what}'s folder, '{path.parent}'")
@@ -47,6 +46,22 @@ def call(options: argparse.Namespace) -> int:
 
         (_print_fmu_json if options.json else _print_fmu)(load_fmu(path))
     return 0
+
+
+def _show_bags(path: Path, as_json: bool) -> None:
+    """Of each robot that the bag has."""
+    from ..bag.provenance import each_robot
+    from ..bag.reader import read_ends
+
+    bags = [read_ends(robot) for robot in each_robot(path)]
+    if as_json:
+        facts = [_bag_facts(bag) for bag in bags]
+        several = dict(kind="bag", path=str(path), robots=facts)
+        print_json(**facts[0] if len(facts) == 1 else several)
+        return
+    for i, bag in enumerate(bags):
+        print("\n" * (i > 0), end="")
+        _print_bag(bag)
 
 
 def _print_fmu_json(fmu: Fmu) -> None:
@@ -70,8 +85,8 @@ def _print_fmu_json(fmu: Fmu) -> None:
     )  # fmt: skip
 
 
-def _print_bag_json(bag: Recording) -> None:
-    print_json(
+def _bag_facts(bag: Recording) -> dict[str, Any]:
+    return dict(
         kind="bag",
         path=str(bag.path),
         joints=bag.joints,

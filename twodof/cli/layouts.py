@@ -19,6 +19,7 @@ def add(verbs: Any) -> None:
     add_fmu(layouts)
     layouts.add_argument("-o", dest="folder", default=".", metavar="FOLDER", help="(%(default)s)")
     layouts.add_argument("--namespace", default="", metavar="NS", help="of the topics")
+    layouts.add_argument("--overwrite", action="store_true", help="replace files that differ")
     layouts.set_defaults(call=call, native=False)
 
 
@@ -27,7 +28,9 @@ def call(options: argparse.Namespace) -> int:
     from ..ros.layouts import layouts
 
     chosen = chosen_fmu(options)
-    rviz, juggler, foxglove = layouts(chosen, options.folder, namespace=options.namespace)
+    rviz, juggler, foxglove = layouts(
+        chosen, options.folder, namespace=options.namespace, overwrite=options.overwrite
+    )
     print_table(
         ("RViz", str(rviz)),
         ("PlotJuggler", f"{juggler}: File, Load Layout"),

@@ -20,8 +20,8 @@ def add(verbs: Any) -> None:
     linearise.add_argument("fmu", metavar="FMU")
     linearise.add_argument(
         "--at", action="append", default=[], metavar="NAME=VALUE",
-        help="of the point: q=0.5,0.35, v=0, and inputs and parameters, as tau_cmd=0.1,0; without q"
-        " and v it is the equilibrium near q_start",
+        help="of the point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
+        " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
     )  # fmt: skip
     add_json_option(linearise)
     linearise.set_defaults(call=call)

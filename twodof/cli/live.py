@@ -14,7 +14,7 @@ from .common import (
     print_next,
     quote,
 )  # fmt: skip
-from .options import add_page_options, add_set_option, add_step_option
+from .options import add_page_options, add_set_option, add_step_option, file_name, page_place
 
 
 def add(verbs: Any) -> None:
@@ -23,8 +23,10 @@ def add(verbs: Any) -> None:
         "live", help="drive an FMU in the browser",
         description="Step an FMU in real time behind a page in the browser: drag the target.",
     )  # fmt: skip
-    live.add_argument("fmu", nargs="?", metavar="FMU", help="default: the default arm's")
-    live.add_argument("-o", dest="output", metavar="BAG", help="name of recordings")
+    live.add_argument(
+        "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
+    )
+    live.add_argument("-o", dest="output", type=file_name, metavar="BAG", help="name of recordings")
     add_step_option(live)
     add_set_option(live)
     add_page_options(live)
@@ -39,7 +41,7 @@ def call(options: argparse.Namespace) -> int:
     with asked_to_stop() as asked:
         bags = live(
             fmu, asked, lambda url: open_page(options, url, fmu=fmu),
-            host=options.host, port=options.port, step=options.step,
+            **page_place(options), step=options.step,
             settings=parse_settings(options.settings), bag=options.output,
             command_line=options.command_line,
         )  # fmt: skip

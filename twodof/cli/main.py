@@ -1,4 +1,3 @@
-# PYTHON_ARGCOMPLETE_OK
 """The command line: calls the function behind each verb, and prints.
 
 Imports are inside the verbs, so that ``twodof --help`` is instant.
@@ -12,7 +11,6 @@ import io
 import logging
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -24,6 +22,7 @@ from .common import INTERRUPTED, CommandLineError, in_options, plain
 
 VERBS = (build, run, publish, layouts, info, linearise, plot, view, live, page, sweep, recover)
 LONGEST_LINE = 2000
+_interrupts: list[int] = []
 
 
 class _Parser(argparse.ArgumentParser):
@@ -69,6 +68,44 @@ class _Words(logging.Formatter):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost a tenth of a short run
+    try:
+        options = _options(arguments)
+        status: int = options.call(options)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        return _fail("interrupted", INTERRUPTED)
+    except CommandLineError as error:
+        return _fail(str(error), 2)
+    except TwoDofError as error:
+        return _fail(in_options(str(error)))
+    except BrokenPipeError:  # the reader of our output has left: nothing more to say
+        _silence()
+        return 1
+    except MemoryError:
+        return _fail("there is not enough memory")
+    except ImportError as error:  # of a broken environment, or where memory does not do
+        if _interrupts:
+            return _fail("interrupted", INTERRUPTED)
+        return _fail(f"cannot load what it needs: {error}")
+    except OSError as error:
+        if _is_interrupt(error):
+            return _fail("interrupted", INTERRUPTED)
+        _silence()
+        culprit = "" if error.filename is None else f"'{error.filename}': "
+        return _fail(f"{culprit}{error.strerror or error}")
+
+
+def interrupt(number: int, _frame: object) -> None:
+    """Ctrl-C; noted, as a module in C that is being imported makes an ImportError of it."""
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    """What the arguments say, and output and messages as the command line has them."""
     program = parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
@@ -83,34 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(handlers=[log], level=logging.WARNING)
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
-    try:
-        status: int = options.call(options)
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        if status == INTERRUPTED:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process is at its end
-        return status
-    except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        return _fail("interrupted", INTERRUPTED)
-    except CommandLineError as error:
-        return _fail(str(error), 2)
-    except TwoDofError as error:
-        return _fail(in_options(str(error)))
-    except BrokenPipeError:  # the reader of our output has left: nothing more to say
-        _silence()
-        return 1
-    except MemoryError:
-        return _fail("there is not enough memory")
-    except ImportError as error:  # of a broken environment, or where memory does not do
-        return _fail(f"cannot load what it needs: {error}")
-    except OSError as error:
-        if _is_interrupt(error):
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            return _fail("interrupted", INTERRUPTED)
-        _silence()
-        culprit = "" if error.filename is None else f"'{error.filename}': "
-        return _fail(f"{culprit}{error.strerror or error}")
+    return options
 
 
 def _is_interrupt(error: OSError) -> bool:

@@ -3,6 +3,49 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
+
+from .common import CommandLineError
+
+SAME = {
+    "-o": ("output",),
+    "--platform": ("platforms",),
+    "a URDF": ("robot", "urdf"),
+    "--range": ("ranges",),
+}
+"""What options are called in the namespace, where that is not their own name."""
+
+
+def check_company(
+    options: argparse.Namespace,
+    needs: dict[str, str] | None = None,
+    excludes: dict[str, str] | None = None,
+) -> None:
+    """Refuse options that would do nothing: without another, or beside another.
+
+    Raises:
+        CommandLineError: naming both.
+    """
+    for option, other in (needs or {}).items():
+        if _given(options, option) and not _given(options, other):
+            raise CommandLineError(f"{option} does nothing without {other}")
+    for option, other in (excludes or {}).items():
+        if _given(options, option) and _given(options, other):
+            raise CommandLineError(f"{option} does nothing beside {other}; leave one out")
+
+
+def _given(options: argparse.Namespace, option: str) -> bool:
+    """Whether an option is on the command line; such ones have no defaults of their own."""
+    names = SAME.get(option, (option.lstrip("-").replace("-", "_"),))
+    values = [getattr(options, name) for name in names]
+    return any(value is not None and value is not False and value != [] for value in values)
+
+
+def file_name(text: str) -> str:
+    """A name that is not empty, as one of a variable that a shell does not know is."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name of a file is empty")
+    return text
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
@@ -34,8 +77,15 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 def add_fmu(parser: argparse.ArgumentParser) -> None:
     """What is run."""
     parser.add_argument(
-        "fmu", nargs="?", metavar="FMU|URDF", help="default: TwoDof.fmu, built if need be"
-    )
+        "fmu", nargs="?", type=file_name, metavar="FMU|URDF",
+        help="default: TwoDof.fmu, built if need be",
+    )  # fmt: skip
+    add_frame_option(parser)
+
+
+def add_frame_option(parser: argparse.ArgumentParser) -> None:
+    """Of a URDF that is run, for `chosen_fmu`."""
+    parser.add_argument("--frame", metavar="LINK", help="of a URDF, the controlled link (its end)")
 
 
 def add_time_options(parser: argparse.ArgumentParser) -> None:
@@ -72,8 +122,12 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:
     """Where a page is served."""
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on (%(default)s, this machine alone)"
-    )
-    parser.add_argument("--port", type=int, default=8080, help="(%(default)s); 0: any that is free")
+    parser.add_argument("--host", help="address to listen on (127.0.0.1, this machine alone)")
+    parser.add_argument("--port", type=int, help="(8080); 0: any that is free")
     parser.add_argument("--no-browser", action="store_true", help="open no browser")
+
+
+def page_place(options: argparse.Namespace) -> dict[str, Any]:
+    """Where a page is served, as far as the options say it."""
+    given = {name: getattr(options, name) for name in ("host", "port")}
+    return {name: value for name, value in given.items() if value is not None}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import chosen_fmu, parse_settings, print_table
-from .options import add_set_option, add_step_option
+from .options import add_frame_option, add_set_option, add_step_option, file_name
 
 
 def add(verbs: Any) -> None:
@@ -18,9 +18,16 @@ def add(verbs: Any) -> None:
         " browser, a target to drag. It needs no network and no server.",
     )  # fmt: skip
     page.add_argument(
-        "fmu", nargs="?", metavar="FMU|URDF", help="default: the default arm's native FMU"
+        "fmu",
+        nargs="?",
+        type=file_name,
+        metavar="FMU|URDF",
+        help="default: the default arm's native FMU",
     )
-    page.add_argument("-o", dest="output", metavar="FILE.html", help="default: <name>.html")
+    page.add_argument(
+        "-o", dest="output", type=file_name, metavar="FILE.html", help="default: <name>.html"
+    )
+    add_frame_option(page)
     add_step_option(page)
     add_set_option(page)
     page.set_defaults(call=call)
@@ -28,11 +35,12 @@ def add(verbs: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
-    from ..pages.arm import page
+    from ..files import free_name
+    from ..pages.arm import is_page, page
 
     options.native = not options.fmu or Path(options.fmu).suffix in (".urdf", ".xacro")
     fmu = chosen_fmu(options)
-    output = options.output or fmu.with_suffix(".html").name
+    output = options.output or free_name(fmu.stem, ".html", is_page)
     path = page(fmu, output, step=options.step, settings=parse_settings(options.settings))
     size = path.stat().st_size / 1024
     print_table(("FMU", str(fmu)), ("page", f"{path} ({size:.0f} KB); it needs no network"))

@@ -39,8 +39,9 @@ def call(options: argparse.Namespace) -> int:
     sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
     if not sweeps:
         return _plot_bags(options)
-    if options.joints is not None:
-        raise CommandLineError(f"'{sweeps[0]}' is a sweep; --joints is for bags")
+    for option in ("joints", "urdf", "frame"):
+        if getattr(options, option) is not None:
+            raise CommandLineError(f"'{sweeps[0]}' is a sweep; --{option} is for bags")
     if len(options.bags) > 1:
         raise CommandLineError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
     return _plot_sweep(options, Path(sweeps[0]))
@@ -48,11 +49,11 @@ def call(options: argparse.Namespace) -> int:
 
 def _plot_bags(options: argparse.Namespace) -> int:
     from ..plots.panels import with_joints
-    from ..plots.runs import drawing
+    from ..plots.runs import drawing, each_of
     from ..plots.track import read_tracks
     from ..plots.words import difference, labels, outcome
 
-    tracks = read_tracks(options.bags, urdf=options.urdf, frame=options.frame)
+    tracks = read_tracks(each_of(options.bags), urdf=options.urdf, frame=options.frame)
     if options.joints is not None:
         tracks = with_joints(tracks, options.joints.split(","))
     results = []

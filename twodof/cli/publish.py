@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,9 +25,10 @@ from .common import (
     print_table,
     quote,
 )
-from .options import add_run_options
+from .options import add_frame_option, add_run_options, check_company, file_name
 
 if TYPE_CHECKING:
+    from ..bag.writer import Bag
     from ..experiments import Experiment
     from ..ros.foxglove import Foxglove
     from ..ros.publisher import Publisher
@@ -47,8 +50,13 @@ def add(verbs: Any) -> None:
         " or its file's",
     )  # fmt: skip
     publish.add_argument(
-        "-o", dest="output", metavar="BAG", help="record a bag too; of several, BAG_NAME of each"
+        "-o",
+        dest="output",
+        type=file_name,
+        metavar="BAG",
+        help="record a bag too, one of all robots",
     )
+    add_frame_option(publish)
     publish.add_argument("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
     publish.add_argument(
         "--rate", type=float, default=100.0, metavar="HZ", help="steps a second (%(default)g)"
@@ -59,12 +67,10 @@ def add(verbs: Any) -> None:
     publish.add_argument(
         "--foxglove", action="store_true", help="serve Foxglove too, on this machine alone"
     )
-    publish.add_argument(
-        "--foxglove-port", dest="port", type=int, default=8765, metavar="PORT", help="(%(default)s)"
-    )
+    publish.add_argument("--foxglove-port", type=int, metavar="PORT", help="(8765)")
     _add_loop_options(publish)
     add_run_options(publish)
-    publish.set_defaults(call=call)
+    publish.set_defaults(call=call, storage=None)
 
 
 def _add_loop_options(publish: argparse.ArgumentParser) -> None:
@@ -104,19 +110,18 @@ def call(options: argparse.Namespace) -> int:
 
     if not 0.0 < options.rate < math.inf:
         raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")
-    if options.output is None and (options.overwrite or options.fsync):
-        raise CommandLineError("--overwrite and --fsync are for a bag; name it with -o")
+    of_a_bag = ("--overwrite", "--fsync", "--storage")
+    check_company(options, needs={**dict.fromkeys(of_a_bag, "-o"), "--foxglove-port": "--foxglove"})
+    options.storage = options.storage or "mcap"
     robots = _robots(options)
-    bags = {
-        name: bag_of(options, f"{options.output}_{name}" if name else options.output)
-        for name in robots if options.output
-    }  # fmt: skip
+    bag = bag_of(options, options.output) if options.output else None
+    bags = {} if bag is None else _bags(bag, options.namespace, robots)
     wire: dict[str, Any] = dict(
         place=network(subnet=options.subnet), scene=options.scene, effort=options.effort,
         clock=options.clock, namespace=options.namespace, state_topic=options.state_topic,
         command_topic=options.command_topic, lockstep=options.lockstep, timeout=options.timeout,
         on_timeout=options.on_timeout,
-        opened=_print_network if not options.json else lambda wire: None,
+        opened=(lambda _: None) if options.json else partial(_print_network, options.stop_time),
     )  # fmt: skip
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
@@ -140,9 +145,8 @@ def call(options: argparse.Namespace) -> int:
     else:
         for name, summary in summaries.items():
             print_summary(options, robots[name], bags.get(name), summary, pace)
-    if bags and not options.json:
-        paths = [quote(bag.path) for bag in bags.values()]
-        print_next(f"twodof plot {' '.join(paths)}", f"ros2 bag play {paths[0]}")
+    if bag is not None and not options.json:
+        print_next(f"twodof plot {quote(bag.path)}", f"ros2 bag play {quote(bag.path)}")
     return INTERRUPTED if any(summary.stopped for summary in summaries.values()) else 0
 
 
@@ -155,6 +159,10 @@ def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
         if not equals or Path(given).exists():
             options.fmu = given
             name = identifier(Path(given)) if len(options.robots) > 1 else ""
+        elif not name:
+            raise CommandLineError(f"'{given}' names no robot")
+        if not options.fmu and options.robots:
+            raise CommandLineError(f"'{given}' names no FMU")
         if name in robots:
             raise CommandLineError(f"two robots are '{name}'; call them NAME={options.fmu}")
         robots[name] = experiment_of(options, stop_time, 1.0 / options.rate)
@@ -163,22 +171,28 @@ def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
     return robots
 
 
+def _bags(bag: Bag, namespace: str, robots: Iterable[str]) -> dict[str, Bag]:
+    """The robots' parts of one bag, by name, in their namespaces."""
+    return {name: bag.of(f"{namespace}/{name}") if name else bag for name in robots}
+
+
 def _foxglove(options: argparse.Namespace) -> Foxglove:
     from ..ros.foxglove import Foxglove
 
     def tell(server: Foxglove) -> None:
         print(f"open  Foxglove, Open connection, Foxglove WebSocket: {server.url}", flush=True)
 
-    return Foxglove(options.port, scene=options.scene, effort=options.effort, opened=tell)
+    port = {} if options.foxglove_port is None else {"port": options.foxglove_port}
+    return Foxglove(**port, scene=options.scene, effort=options.effort, opened=tell)
 
 
-def _print_network(wire: Publisher) -> None:
+def _print_network(stop_time: float | None, wire: Publisher) -> None:
     place = wire.place
     print_table(
         ("topics", ", ".join(wire.topics)),
         ("network", f"DDS domain {place.domain} on {wire.interface}, {in_options(place.reach)}"),
         ("commands", f"from {', '.join(wire.commands)}" if wire.commands else "none"),
-        ("end", "Ctrl-C"),
+        ("end", "Ctrl-C" if stop_time is None else f"after {stop_time:g} s, or Ctrl-C"),
     )
     print_next(f"ros2 topic echo {wire.topics[0]}")
     sys.stdout.flush()

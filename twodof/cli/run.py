@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import time
 from typing import TYPE_CHECKING, Any
 
 from .common import (
@@ -13,12 +12,13 @@ from .common import (
     CommandLineError,
     asked_to_stop,
     bag_of,
+    dated,
     experiment_of,
     print_next,
     print_summary,
     quote,
 )
-from .options import add_fmu, add_run_options, add_time_options
+from .options import add_fmu, add_run_options, add_time_options, file_name
 
 if TYPE_CHECKING:
     from ..experiments import Experiment
@@ -31,7 +31,9 @@ def add(verbs: Any) -> None:
         "run", help="simulate an FMU and write a bag",
         description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
     )  # fmt: skip
-    run.add_argument("-o", dest="output", metavar="BAG", help="default: rosbag2_<date and time>")
+    run.add_argument(
+        "-o", dest="output", type=file_name, metavar="BAG", help="default: rosbag2_<date and time>"
+    )
     add_time_options(run)
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run)
@@ -49,7 +51,7 @@ def call(options: argparse.Namespace) -> int:
             "stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C"
         )
     run = experiment_of(options, options.stop_time, options.step)
-    bag = bag_of(options, options.output or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
+    bag = bag_of(options, options.output or dated("rosbag2"))
     pace = RealTime() if options.realtime else None
     with asked_to_stop() as asked:
         summary = simulate(run, bag, *progress(), pace=pace, stop=asked)

@@ -14,6 +14,7 @@ from .common import (
     CommandLineError,
     asked_to_stop,
     best_runs,
+    dated,
     fast_fmu,
     parse_settings,
     print_best,
@@ -22,7 +23,13 @@ from .common import (
     print_table,
     quote,
 )  # fmt: skip
-from .options import add_json_option, add_set_option, add_time_options
+from .options import (
+    add_json_option,
+    add_set_option,
+    add_time_options,
+    check_company,
+    file_name,
+)
 
 
 def add(verbs: Any) -> None:
@@ -32,22 +39,24 @@ def add(verbs: Any) -> None:
         description="Run an FMU over a grid or random values of any of its inputs and parameters."
         " The native default FMU is built where none is named.",
     )  # fmt: skip
-    sweep.add_argument("fmu", nargs="?", metavar="FMU", help="default: the default arm's")
+    sweep.add_argument(
+        "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
+    )
     sweep.add_argument(
         "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",
         help="values evenly spaced; all combinations of several",
     )  # fmt: skip
-    sweep.add_argument("--random", type=int, default=0, metavar="N", help="draws of each --range")
-    sweep.add_argument(
-        "--seed", type=int, default=0, metavar="S", help="of the draws (%(default)s)"
-    )
+    sweep.add_argument("--random", type=int, metavar="N", help="draws of each --range")
+    sweep.add_argument("--seed", type=int, metavar="S", help="of the draws (0)")
     sweep.add_argument(
         "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH",
         help="values drawn uniformly",
     )  # fmt: skip
     add_time_options(sweep)
     add_set_option(sweep)
-    sweep.add_argument("-o", dest="output", metavar="OUT", help="default: sweep_<date and time>")
+    sweep.add_argument(
+        "-o", dest="output", type=file_name, metavar="OUT", help="default: sweep_<date and time>"
+    )
     sweep.add_argument(
         "--resume", action="store_true", help="go on with OUT; what is done is not repeated"
     )
@@ -64,12 +73,15 @@ def call(options: argparse.Namespace) -> int:
 
     from ..sweeps.coordinator import sweep
 
-    if options.resume and not options.output:
-        raise CommandLineError("--resume needs the sweep to go on with: -o OUT")
+    check_company(
+        options,
+        needs={"--resume": "-o", "--seed": "--random"},
+        excludes={"--workers": "--scheduler"},
+    )
     grid, ranges = parse_grids(options.grids), parse_ranges(options.ranges)
     settings = parse_settings(options.settings)
     fmu = fast_fmu(options)
-    output = Path(options.output or time.strftime("sweep_%Y_%m_%d-%H_%M_%S"))
+    output = Path(options.output or dated("sweep"))
     begin = time.perf_counter()
     total = 0
     with (
@@ -85,7 +97,7 @@ def call(options: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         table = sweep(
-            fmu, grid=grid, ranges=ranges, random=options.random, seed=options.seed,
+            fmu, grid=grid, ranges=ranges, random=options.random or 0, seed=options.seed or 0,
             stop_time=options.stop_time, step=options.step, settings=settings, output=output,
             resume=options.resume, bags=options.bags, workers=options.workers,
             scheduler=options.scheduler, progress=progress, stop=asked,

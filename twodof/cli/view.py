@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import asked_to_stop, in_options, open_page
-from .options import add_page_options, add_robot_options
+from .options import add_page_options, add_robot_options, check_company, file_name, page_place
 
 
 def add(verbs: Any) -> None:
@@ -18,7 +18,12 @@ def add(verbs: Any) -> None:
         description="Replay a bag in the browser, or write a page that replays it offline.",
     )  # fmt: skip
     view.add_argument("bag", metavar="BAG", type=Path)
-    view.add_argument("--export", metavar="FILE.html", help="write one self-contained file instead")
+    view.add_argument(
+        "--export",
+        type=file_name,
+        metavar="FILE.html",
+        help="write one self-contained file instead",
+    )
     add_robot_options(view)
     view.add_argument(
         "--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes"
@@ -30,6 +35,7 @@ def add(verbs: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
+    check_company(options, excludes={"--host": "--export", "--port": "--export"})
     from ..pages.replay import export, view
 
     robot = {name: getattr(options, name) for name in ("urdf", "mesh_dir", "frame", "fmu")}
@@ -41,6 +47,6 @@ def call(options: argparse.Namespace) -> int:
     with asked_to_stop() as asked:
         view(
             options.bag, asked, lambda url, remarks: open_page(options, url, remarks),
-            host=options.host, port=options.port, **robot,
+            **page_place(options), **robot,
         )  # fmt: skip
     return 0

@@ -1,4 +1,4 @@
-"""A native FMU alive in a page: its engine as WebAssembly, its robot, and what drives them.
+"""An arm in a page: its robot, and what moves it: its engine, samples of a run, or a server.
 
 All is in the page itself: it asks no network for anything, and its Content-Security-Policy allows
 its own script alone. Text from the URDF is in it as JSON, and shown as text.
@@ -12,23 +12,22 @@ import html
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..files import data_file
-from ..geometry.kinematics import Kinematics, Placement
-from ..geometry.meshes import ReadMesh
-from ..geometry.shapes import Shape, link_shapes, sphere
+from ..geometry.kinematics import Array, Kinematics, Placement
+from ..geometry.shapes import Shape, sphere
 from ..plant.urdf import UNBOUNDED, Joint, Urdf, read_urdf
 from ..version import versions
 from .compiler import UNITS, compile_web_module
 
 SCRIPTS = (
-    "engine.js", "session.js", "matrices.js", "robot.js", "camera.js", "scene.js", "handle.js",
-    "curves.js", "recording.js", "controls.js", "main.js",
+    "engine.js", "samples.js", "session.js", "replay.js", "remote.js", "matrices.js", "robot.js",
+    "camera.js", "scene.js", "handle.js", "curves.js", "recording.js", "controls.js", "main.js",
 )  # fmt: skip
 """In the order in which they are read."""
 FUNCTIONS = (
@@ -37,9 +36,11 @@ FUNCTIONS = (
     "engine_step",
 )  # fmt: skip
 """Of page.c, which the page calls."""
+RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
+"""Groups of variables that a sample holds, in its order."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
 POLICY = (
-    "default-src 'none'; script-src 'sha256-{script}' 'wasm-unsafe-eval';"
+    "default-src 'none'; script-src 'sha256-{script}'{more};"
     " style-src 'unsafe-inline'; img-src data:"
 )
 CONTAINER = b'<div class="arm" id="arm"'
@@ -48,7 +49,7 @@ CONTAINER = b'<div class="arm" id="arm"'
 
 @dataclass(frozen=True)
 class Arm:
-    """What a page of an FMU is made of.
+    """What a page of a robot is made of.
 
     Attributes:
         name, guid, file: of the FMU.
@@ -57,8 +58,9 @@ class Arm:
             reference, causality, unit, start and description.
         step: communication step, s.
         urdf: text of resources/robot.urdf.
-        read: gives its meshes.
+        shapes: of its links.
         sources: contents of sources/.
+        remarks: what is not as it should be.
     """
 
     name: str
@@ -73,8 +75,9 @@ class Arm:
     variables: Sequence[Mapping[str, Any]]
     step: float
     urdf: str
-    read: ReadMesh
-    sources: Mapping[str, bytes]
+    shapes: Sequence[Shape]
+    sources: Mapping[str, bytes] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
 
 
 class LivePart(NamedTuple):
@@ -85,41 +88,63 @@ class LivePart(NamedTuple):
 
 
 def live_part(arm: Arm) -> LivePart:
-    """The arm, alive.
+    """The arm, with its engine.
 
     Raises:
         BuildError: the engine cannot be compiled.
-        RobotError: the robot cannot be drawn.
     """
     around = data_file("fmu_src", "page", "page.c").read_bytes()
     module = compile_web_module({**arm.sources, "page.c": around}, (*UNITS, "page.c"), FUNCTIONS)
+    provenance = {
+        "fmu": {"name": arm.name, "guid": arm.guid, "file": arm.file},
+        **{key: getattr(arm, key) for key in ("robot", "frame", "root", "axes", "step")},
+        "joints": list(arm.joints),
+        "versions": versions(),
+        "urdf": arm.urdf,
+    }
+    source = {"engine": _packed(module)}
+    return _part(arm, source, " 'wasm-unsafe-eval'", provenance=provenance)
+
+
+def replayed_part(arm: Arm, samples: Array) -> LivePart:
+    """The arm, with samples: N × (time in s, groups in ``RECORDED``)."""
+    return _part(arm, {"samples": _packed(samples.astype("<f8").tobytes())})
+
+
+def served_part(arm: Arm) -> LivePart:
+    """The arm, moved by the server of the page, at /socket."""
+    return _part(arm, {}, "; connect-src 'self'")
+
+
+def _part(arm: Arm, source: Mapping[str, str], more: str = "", **others: Any) -> LivePart:
     facts, meshes = _facts(arm)
-    data = json.dumps(facts, sort_keys=True).replace("<", "\\u003c")
+    data = json.dumps({**facts, **others}, sort_keys=True).replace("<", "\\u003c")
     script = "".join(_asset(name) for name in SCRIPTS)
     script = f'(() => {{ "use strict";\n{script}}})();\n'
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    policy = POLICY.format(script=digest)
+    policy = POLICY.format(script=digest, more=more)
     head = (
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<link rel="icon" href="data:,">\n'
         f"<style>\n{_asset('arm.css')}</style>\n"
     )
-    parts = (("facts", data), ("engine", _packed(module)), ("meshes", _packed(meshes)))
+    parts = {"facts": data, "meshes": _packed(meshes), **source}.items()
     blocks = "\n".join(
         f'<script type="application/json" id="arm-{name}">{text}</script>' for name, text in parts
     )
     return LivePart(head, f"{_asset('arm.html')}{blocks}\n<script>{script}</script>\n")
 
 
-def arm_page(arm: Arm) -> bytes:
-    """The arm as a page of its own; raises as ``live_part``."""
-    head, body = live_part(arm)
-    return (
+def arm_page(title: str, part: LivePart) -> bytes:
+    """An arm as a page of its own."""
+    head, body = part
+    page = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(arm.robot or arm.name)} - twodof</title>\n{head}</head>\n"
+        f"<title>{html.escape(title)} - twodof</title>\n{head}</head>\n"
         f'<body class="whole">\n{body}</body>\n</html>\n'
-    ).encode()
+    )
+    return page.encode("utf-8", "replace")  # names of files need not be text
 
 
 def _asset(name: str) -> str:
@@ -134,36 +159,33 @@ def _packed(content: bytes) -> str:
 def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
     """What the page knows of its FMU, and the content of its meshes."""
     urdf = read_urdf(arm.urdf)
-    shapes, _ = link_shapes(urdf, arm.read)
     ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
-    packed = [_mesh(shape) for shape in [ball, *shapes]]
+    packed = [_mesh(shape) for shape in [ball, *arm.shapes]]
     links, number = _links(urdf, arm.joints)
     facts = {
         **{key: getattr(arm, key) for key in ("name", "robot", "frame", "axes", "control", "step")},
-        "joints": [_joint(urdf.joints[name]) for name in arm.joints],
+        "joints": [_joint(name, urdf.joints.get(name)) for name in arm.joints],
+        "recorded": RECORDED,
+        "remarks": list(arm.remarks),
         "variables": list(arm.variables),
         "links": links,
         "frameLink": number[arm.frame],
         "shapes": [
-            {"link": number[s.link], "place": _matrix(s.place), "colour": s.colour} for s in shapes
+            {"link": number[s.link], "place": _matrix(s.place), "colour": s.colour}
+            for s in arm.shapes
         ],
         "meshes": [facts for facts, _ in packed],
-        "provenance": {
-            "fmu": {"name": arm.name, "guid": arm.guid, "file": arm.file},
-            **{key: getattr(arm, key) for key in ("robot", "frame", "root", "axes", "step")},
-            "joints": list(arm.joints),
-            "versions": versions(),
-            "urdf": arm.urdf,
-        },
     }
     return facts, b"".join(content for _, content in packed)
 
 
-def _joint(joint: Joint) -> dict[str, Any]:
-    """Of a joint that moves on its own; null where it has no limit."""
+def _joint(name: str, joint: Joint | None) -> dict[str, Any]:
+    """Of a joint that moves on its own; null where it has no limit, or none is known."""
+    if joint is None:
+        return {"name": name, "prismatic": False, "low": None, "high": None, "effort": None}
     limits = {"low": joint.low, "high": joint.high, "effort": joint.effort}
     finite = {key: value if abs(value) < UNBOUNDED else None for key, value in limits.items()}
-    return {"name": joint.name, "prismatic": joint.prismatic, **finite}
+    return {"name": name, "prismatic": joint.prismatic, **finite}
 
 
 def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dict[str, int]]:

@@ -6,7 +6,8 @@ here, once, so that all else knows one kind of axis. Pinocchio has read the URDF
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from ..plant.robot import Robot
 
 Array = NDArray[Any]
 """Of numbers, or of numbers and expressions."""
+Placement = tuple[Array, Array]
+"""R and p of a frame: a = R b + p."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,27 @@ class Body:
         """Together with a point mass."""
         points = place * mass
         tensor = np.eye(3) * place.dot(points) - np.outer(place, points)
-        return Body(self.mass + mass, self.moment + points, self.inertia + tensor)
+        return self + Body(mass, points, tensor)
+
+    def __add__(self, other: Body) -> Body:
+        """Both as one, in the same frame."""
+        return Body(
+            self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia
+        )
+
+    def moved(self, R: Array, p: Array) -> Body:
+        """The same in the frame in which its own is placed at (R, p)."""
+        d = R.dot(self.moment)
+        T = R.dot(self.inertia)
+        # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
+        half = d + p * (0.5 * self.mass)
+        spread = 2.0 * half.dot(p)
+        inertia = np.zeros((3, 3), dtype=object)
+        for r in range(3):
+            for k in range(r + 1):
+                entry = T[r].dot(R[k]) - half[r] * p[k] - p[r] * half[k]
+                inertia[r, k] = inertia[k, r] = entry + spread if r == k else entry
+        return Body(self.mass, d + p * self.mass, inertia)
 
 
 @dataclass(frozen=True)
@@ -66,31 +89,114 @@ class Mechanism:
 
 
 def mechanism(robot: Robot) -> Mechanism:
-    """The constants of a robot, read by Pinocchio, with frames turned so that axes are z."""
+    """The constants of a robot, read by Pinocchio, in frames and bodies that leave few of them."""
     model = robot.model
     subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
-    to_z = [_rotation_to_z(axis[:3] + axis[3:]) for axis in subspaces]
-    turned = [np.eye(3), *to_z]  # by Pinocchio's joint index, 0 the root
-    parents = [int(parent) for parent in list(model.parents)[1:]]
-    placements = list(model.jointPlacements)[1:]
-    frame = model.frames[robot.frame_id]
-    to_frame = turned[frame.parentJoint].T
-    bodies = []
-    for R, inertia in zip(to_z, list(model.inertias)[1:]):
-        centred = Body(0.0, np.zeros(3), R.T @ inertia.inertia @ R)
-        bodies.append(centred.with_point(inertia.mass, R.T @ inertia.lever))
-    return Mechanism(
-        parent=tuple(parent - 1 for parent in parents),
-        prismatic=tuple(bool(axis[:3].any()) for axis in subspaces),
-        R=np.array([turned[p].T @ M.rotation @ R for p, M, R in zip(parents, placements, to_z)]),
-        p=np.array([turned[p].T @ M.translation for p, M in zip(parents, placements)]),
+    slides = tuple(bool(axis[:3].any()) for axis in subspaces)
+    parents = tuple(int(parent) - 1 for parent in list(model.parents)[1:])
+    placed = [(M.rotation, M.translation) for M in list(model.jointPlacements)[1:]]
+    end = model.frames[robot.frame_id]
+    path = tuple(int(i) - 1 for i in model.supports[end.parentJoint])[1:]
+    frames = _frames([axis[:3] + axis[3:] for axis in subspaces], parents, placed, path)
+    rotations, origins, bodies, turns = [], [], [], np.zeros(len(parents))
+    for i, ((R, p), inertia) in enumerate(zip(placed, list(model.inertias)[1:])):
+        (base, zero), (own, origin) = frames[parents[i]], frames[i]
+        rotation = base.T @ R @ own
+        if not slides[i]:
+            rotation, turns[i] = _without_turn(rotation)
+        rotations.append(_without_rounding(rotation))
+        origins.append(_without_rounding(base.T @ (p + R @ origin - zero)))
+        centred = Body(0.0, np.zeros(3), own.T @ inertia.inertia @ own)
+        bodies.append(centred.with_point(inertia.mass, own.T @ (inertia.lever - origin)))
+    base, zero = frames[path[-1]]
+    constants = Mechanism(
+        parent=parents,
+        prismatic=slides,
+        R=np.array(rotations),
+        p=np.array(origins),
         body=tuple(bodies),
-        path=tuple(int(i) - 1 for i in model.supports[frame.parentJoint])[1:],
-        frame_R=to_frame @ frame.placement.rotation,
-        frame_p=to_frame @ frame.placement.translation,
+        path=path,
+        frame_R=base.T @ end.placement.rotation,
+        frame_p=base.T @ (end.placement.translation - zero),
         G=np.eye(len(robot.joints)) if robot.coupling is None else robot.coupling,
-        c=robot.offset,
+        c=robot.offset + turns,
     )
+    return replace(constants, body=_regrouped(constants))
+
+
+SKEW = 0.1
+"""Sine of the angle of two axes above which the place where they come nearest is worth knowing."""
+
+
+def _frames(
+    axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Placement], path: Sequence[int]
+) -> list[Placement]:
+    """A frame for each joint, in that of Pinocchio, and at last the root's.
+
+    z is the joint's axis, x its common normal with the next one's, from which the origin is taken;
+    so rotations to the next frame are about x, and the place of that has a component less. Source:
+    Khalil & Kleinfinger, "A new geometric notation for open and closed-loop robots", ICRA 1986.
+    """
+    frames = []
+    for i, axis in enumerate(axes):
+        following = [k for k, parent in enumerate(parents) if parent == i]
+        chosen = [k for k in following if k in path] or following
+        x, origin = np.zeros(3), np.zeros(3)
+        if chosen:
+            R, p = placed[chosen[0]]
+            other = R @ axes[chosen[0]]
+            normal = np.cross(axis, other)
+            square = normal.dot(normal)
+            if square > SKEW**2:
+                x, origin = normal, axis * (np.cross(p, other).dot(normal) / square)
+            else:
+                x = p - axis * axis.dot(p)
+        frames.append((_rotation_to(axis, x), origin))
+    return [*frames, (np.eye(3), np.zeros(3))]
+
+
+def _rotation_to(z: Array, x: Array) -> Array:
+    """A rotation to axes z and, where that has a length, x."""
+    length = np.linalg.norm(x)
+    if length < 1e-9:
+        x = np.roll(np.eye(3)[0], int(np.argmax(np.abs(z))) + 1)  # after the largest component
+        x -= z * z.dot(x)
+        length = np.linalg.norm(x)
+    x = x / length
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _without_turn(R: Array) -> tuple[Array, float]:
+    """A and φ with R = A R_z(φ), in which A has a zero."""
+    tilted = np.hypot(R[2, 0], R[2, 1]) > 1e-6
+    angle = np.arctan2(R[2, 0], R[2, 1]) if tilted else np.arctan2(R[1, 0], R[0, 0])
+    c, s = np.cos(angle), np.sin(angle)
+    return R @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), angle
+
+
+def _without_rounding(values: Array) -> Array:
+    """What is a whole number but for rounding made one."""
+    whole = values.round()
+    return np.where(np.abs(values - whole) < 1e-15, whole, values)
+
+
+def _regrouped(robot: Mechanism) -> tuple[Body, ...]:
+    """The bodies without what a joint cannot tell from a part of its parent's.
+
+    That is a rod along the axis of a joint that turns: m, z and I_yy of its body, which become 0.
+    The task frame's body, whose payload varies, is left whole. Source: Gautier & Khalil, "Direct
+    calculation of minimum set of inertial parameters of serial robots", IEEE T-RA 6(3), 1990.
+    """
+    bodies = list(robot.body)
+    for i in reversed(range(len(bodies))):
+        if robot.prismatic[i] or i == robot.path[-1]:
+            continue
+        b, parent = bodies[i], robot.parent[i]
+        rod = Body(b.mass, b.moment * [0, 0, 1], np.diag([1.0, 1.0, 0.0]) * b.inertia[1, 1])
+        bodies[i] = Body(0.0, b.moment - rod.moment, b.inertia - rod.inertia)
+        if parent >= 0:
+            bodies[parent] = bodies[parent] + rod.moved(robot.R[i], robot.p[i])
+    return tuple(bodies)
 
 
 def _subspace(joint: object) -> Array:
@@ -98,12 +204,3 @@ def _subspace(joint: object) -> Array:
     data = joint.createData()  # type: ignore[attr-defined]
     joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
     return np.asarray(data.S).reshape(6)
-
-
-def _rotation_to_z(axis: Array) -> Array:
-    """A rotation R with R e_z = axis; a permutation, so exact, where the axis is x, y or z."""
-    k = int(np.argmax(np.abs(axis)))
-    x = np.roll(np.eye(3)[0], k + 1)  # the coordinate axis after the largest component
-    x -= axis * axis.dot(x)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 import platform as host
@@ -13,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..errors import BuildError
-from ..files import temporary_folder
+from ..files import temporary_folder, write_file
 
 TARGETS: dict[str, tuple[str, ...]] = {
     "linux64": ("x86_64-linux-gnu.2.17",),
@@ -68,14 +69,11 @@ def compile_library(
     """
     if platform not in TARGETS:
         raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")
-    with temporary_folder() as folder:
-        for file, content in sources.items():
-            (folder / file).write_bytes(content)
-        output = name + EXTENSIONS[platform]
-        built = []
-        for compiler in _compilers(platform):
-            _run([*compiler, *FLAGS, *flags, *_link_flags(output), *units], folder)
-            built.append((folder / output).read_bytes())
+    output = name + EXTENSIONS[platform]
+    built = [
+        _compile(sources, [*compiler, *FLAGS, *flags, *_link_flags(output), *units], output)
+        for compiler in _compilers(platform)
+    ]
     return built[0] if len(built) == 1 else universal(built)
 
 
@@ -94,12 +92,8 @@ def compile_web_module(
             "cannot compile for the browser: install the package 'ziglang' (the extra 'native')"
         )
     exports = [f"-Wl,--export={function}" for function in functions]
-    with temporary_folder() as folder:
-        for file, content in sources.items():
-            (folder / file).write_bytes(content)
-        link = ["-mexec-model=reactor", "-s", "-o", "module.wasm", *exports]
-        _run([*ZIG, "wasm32-wasi", *FLAGS, *link, *units], folder)
-        return (folder / "module.wasm").read_bytes()
+    command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *exports, *units]
+    return _compile(sources, command, "module.wasm")
 
 
 def compiles_for_the_web() -> bool:
@@ -158,7 +152,7 @@ def _compilers(platform: str) -> list[list[str]]:
 
 def _link_flags(output: str) -> list[str]:
     """Flags that leave nothing of this machine and this moment in the library."""
-    flags = ["-shared", "-s", "-o", output]
+    flags = ["-shared", "-s"]
     if output.endswith(".so"):
         return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
     if output.endswith(".dylib"):
@@ -166,10 +160,40 @@ def _link_flags(output: str) -> list[str]:
     return flags
 
 
-def _run(command: Sequence[str], folder: Path) -> None:
+def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) -> bytes:
+    """What a command makes of C files. zig finds what it has compiled before by its place too."""
+    with temporary_folder() as folder:
+        environment, place = _environment(folder), folder
+        cache = environment.get("ZIG_GLOBAL_CACHE_DIR")
+        if cache and command[: len(ZIG)] == [*ZIG]:
+            digest = hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()[:32]
+            place = Path(cache, "twodof", digest)
+            try:
+                place.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise BuildError(
+                    f"zig's cache cannot be '{cache}': {error.strerror}; ZIG_GLOBAL_CACHE_DIR"
+                    " names its folder"
+                ) from error
+        for file, content in sources.items():
+            if not (place / file).exists() or (place / file).read_bytes() != content:
+                write_file(place / file, content)
+        try:
+            _run([*command, "-o", str(folder / output)], place, environment)
+        except BuildError:
+            if place == folder:
+                raise
+            # what zig has kept may be damaged: it knows nothing of sources in another place
+            for file, content in sources.items():
+                write_file(folder / file, content)
+            _run([*command, "-o", str(folder / output)], folder, environment)
+        return (folder / output).read_bytes()
+
+
+def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
     try:
         done = subprocess.run(
-            command, cwd=folder, env=_environment(folder),
+            command, cwd=folder, env=environment,
             capture_output=True, text=True, errors="replace", check=False,
         )  # fmt: skip
     except OSError as error:

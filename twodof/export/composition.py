@@ -6,6 +6,7 @@ import hashlib
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,13 +14,14 @@ from typing import Any
 
 from ..errors import BuildError
 from ..files import data_file
+from ..geometry.shapes import link_shapes
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import RobotError, read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
 from ..version import __version__
 from .arm_page import Arm, LivePart, live_part
-from .compiler import PLATFORMS, compiles_for_the_web, host_platform
+from .compiler import PLATFORMS, TARGETS, compiles_for_the_web, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
@@ -78,7 +80,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
             exchanges=flavour.exchanges,
             source_files=flavour.source_files,
         )
-        return model_description3(description) if flavour.fmi == 3 else description
+        return model_description3(description, flavour.arrays) if flavour.fmi == 3 else description
 
     digest = hashlib.sha256(describe(""))
     for name in sorted(files):
@@ -98,22 +100,24 @@ def _finish(
     files: Files,
 ) -> Files:
     """What the GUID is not of: binaries and documentation."""
-    binaries = flavour.finish(guid)
-    live = LivePart("", "")
-    if is_live(options):
-        variables = engine_variables(robot, table, options.control, flavour.fmi)
-        live = _live_part(options, robot, variables, guid, {**files, **binaries})
-    return binaries | documentation(
-        robot,
-        table,
-        options.control,
-        flavour,
-        name=options.name,
-        guid=guid,
-        version=__version__,
-        urdf=files["resources/robot.urdf"].decode(),
-        live=live,
-    )
+    with ThreadPoolExecutor(1) as compiling:  # the page is compiled meanwhile
+        binaries = compiling.submit(flavour.binaries, guid)
+        signed, live = flavour.signed(guid), LivePart("", "")
+        if is_live(options):
+            variables = engine_variables(robot, table, options.control, flavour.fmi)
+            live = _live_part(options, robot, variables, guid, {**files, **signed})
+        described = documentation(
+            robot,
+            table,
+            options.control,
+            flavour,
+            name=options.name,
+            guid=guid,
+            version=__version__,
+            urdf=files["resources/robot.urdf"].decode(),
+            live=live,
+        )
+        return {**signed, **binaries.result(), **described}
 
 
 def _live_part(
@@ -128,14 +132,17 @@ def _live_part(
         for reference, variable in enumerate(table)
         if variable.causality != "local"
     ]  # fmt: skip
-    folder = "sources/"
+    folder, urdf = "sources/", files["resources/robot.urdf"].decode()
+    try:
+        shapes, _ = link_shapes(read_urdf(urdf), lambda name: files.get(f"resources/{name}"))
+    except RobotError as error:
+        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     return live_part(
         Arm(
             name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
             joints=robot.joints, frame=robot.frame, root=robot.root, axes="".join(robot.axes),
-            control=options.control, variables=variables, step=DEFAULT_STEP,
-            urdf=files["resources/robot.urdf"].decode(),
-            read=lambda name: files.get(f"resources/{name}"),
+            control=options.control, variables=variables, step=DEFAULT_STEP, urdf=urdf,
+            shapes=shapes,
             sources={p[len(folder) :]: c for p, c in files.items() if p.startswith(folder)},
         )
     )  # fmt: skip
@@ -149,10 +156,10 @@ def _flavour(
     starts: Mapping[str, Any],
 ) -> Flavour:
     if not options.native:
-        if options.platforms or options.fmi:
+        if options.platforms or options.fmi or not options.arrays:
             raise BuildError(
-                "the platforms and the version of FMI can be chosen for the native flavour only,"
-                " `native=True`"
+                "the platforms, the version of FMI and its arrays can be chosen for the native"
+                " flavour only, `native=True`"
             )
         return python_flavour(
             robot, options.control, urdf, starts, options.name, options.link_environment
@@ -164,12 +171,19 @@ def _flavour(
         raise BuildError(f"there is no FMI {fmi} here, `fmi` is 2 or 3")
     platforms = options.platforms or (host_platform(fmi),)
     if platforms == ("",):
-        raise BuildError("this machine is none of the FMI platforms; choose one with `platforms`")
+        other = ", or `fmi` 3, which has one" if host_platform(3) else ""
+        raise BuildError(
+            f"FMI {fmi}.0 has no name for this machine; choose one with `platforms`{other}"
+        )
     for platform in platforms:
         if platform not in PLATFORMS[fmi]:
             names = ", ".join(PLATFORMS[fmi])
-            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}")
-    return native_flavour(robot, options.control, table, options.name, platforms, fmi)
+            other = f"; `fmi` {5 - fmi} has it" if platform in TARGETS else ""
+            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}{other}")
+    if fmi == 2 and not options.arrays:
+        raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` goes with `fmi=3`")
+    arrays = fmi == 3 and options.arrays
+    return native_flavour(robot, options.control, table, options.name, platforms, fmi, arrays)
 
 
 def _mesh_dir(options: FmuOptions) -> Path | None:
@@ -208,12 +222,13 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         )
     if shipped and axes != "xy":
         raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
+    at_rest = {"x_des": (0.0,) * len(axes), "quat_des": (0.0, 0.0, 0.0, 1.0), **starts}
+    plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
+    for warning in plant.initialise():
+        logger.warning("%s", warning)
     if "x_des" not in CONTROLS[options.control].inputs:
         starts.pop("x_des", None)
     else:
-        at_rest = {"x_des": (0.0,) * len(axes), "quat_des": (0.0, 0.0, 0.0, 1.0), **starts}
-        plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
-        plant.initialise()
         starts.setdefault("x_des", tuple(plant.x))
         if options.control == "pose":
             starts["quat_des"] = tuple(plant.quat)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import site
 import sysconfig
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -46,10 +48,12 @@ class Flavour:
         attributes: of <CoSimulation> in the model description, and of <ModelExchange>.
         exchanges: whether it has Model Exchange too.
         fmi: version of FMI, 2 or 3.
+        arrays: whether its vectors are arrays of FMI 3.
         files: resources and sources; the GUID is a digest of them.
         source_files: names under sources/ that a tool compiles.
         platforms: FMI platforms of the binaries.
-        finish: given the GUID, the files that contain it and the binaries.
+        signed: given the GUID, the sources that contain it.
+        binaries: given the GUID, the compiled libraries.
         dependencies: text of documentation/externalDependencies.txt.
         limitations: what it cannot do, a section of documentation/index.html; "" where nothing.
         licences: of others' code that the FMU contains, by name of the distribution.
@@ -58,10 +62,12 @@ class Flavour:
     attributes: Mapping[str, str]
     exchanges: bool
     fmi: int
+    arrays: bool
     files: Files
     source_files: Sequence[str]
     platforms: Sequence[str]
-    finish: Callable[[str], Files]
+    signed: Callable[[str], Files]
+    binaries: Callable[[str], Files]
     dependencies: bytes
     limitations: str
     licences: Sequence[str]
@@ -95,10 +101,12 @@ def python_flavour(
         attributes={"needsExecutionTool": "true"},
         exchanges=False,
         fmi=2,
+        arrays=False,
         files={f"resources/{path}": content for path, content in resources.items()},
         source_files=(),
         platforms=("linux64",),
-        finish=lambda guid: {f"binaries/linux64/{name}.so": wrapper.read_bytes()},
+        signed=lambda guid: {},
+        binaries=lambda guid: {f"binaries/linux64/{name}.so": wrapper.read_bytes()},
         dependencies=data_file("fmu_src", "externalDependencies.txt").read_bytes(),
         limitations=data_file("fmu_src", "limitations.html").read_text("utf-8"),
         licences=("pythonfmu",),
@@ -125,7 +133,8 @@ def native_flavour(
     table: Sequence[Variable],
     name: str,
     platforms: Sequence[str],
-    fmi: int = 2,
+    fmi: int,
+    arrays: bool,
 ) -> Flavour:
     """The plant as C99 sources, compiled for the platforms."""
     fmpy = find_spec("fmpy")  # it comes with the headers of the standard
@@ -137,30 +146,39 @@ def native_flavour(
     described = {}
     if fmi == 3:
         described["sources/buildDescription.xml"] = build_description(name, UNITS)
-        described["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table)
+        described["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table, arrays)
 
-    def header(guid: str) -> Files:
-        return {"model.h": model_header(robot, table, control, guid, fmi).encode()}
+    def header(guid: str) -> bytes:
+        return model_header(robot, table, control, guid, fmi, arrays).encode()
 
-    def finish(guid: str) -> Files:
-        files = {f"sources/{path}": content for path, content in header(guid).items()}
-        for platform in platforms:
+    def binaries(guid: str) -> Files:
+        all_sources = {**sources, "model.h": header(guid)}
+
+        def library(platform: str) -> bytes:
             LOG.info("compiling for %s", platform)
-            library = compile_library({**sources, **header(guid)}, platform, name)
-            files[f"binaries/{platform}/{name}{EXTENSIONS[platform]}"] = library
-        return files
+            return compile_library(all_sources, platform, name)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            libraries = pool.map(library, platforms)
+            return {
+                f"binaries/{platform}/{name}{EXTENSIONS[platform]}": content
+                for platform, content in zip(platforms, libraries)
+            }
 
     return Flavour(
         attributes={"needsExecutionTool": "false", "providesDirectionalDerivative": "true"},
         exchanges=True,
         fmi=fmi,
+        arrays=arrays,
         files={
-            **{f"sources/{path}": content for path, content in {**sources, **header("")}.items()},
+            **{f"sources/{path}": content for path, content in sources.items()},
+            "sources/model.h": header(""),
             **described,
         },
         source_files=UNITS,
         platforms=platforms,
-        finish=finish,
+        signed=lambda guid: {"sources/model.h": header(guid)},
+        binaries=binaries,
         dependencies=b"None: the binaries need the C library and its mathematics only.\n",
         limitations="",
         licences=(),

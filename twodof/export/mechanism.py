@@ -16,7 +16,7 @@ from .recursions import (
     solve_by_recursion,
     task_frame,
 )
-from .straight_line import Expression, Value, c_function, cosine, operations, sine
+from .straight_line import Expression, Value, Varied, c_function, cosine, operations, sine, varied
 
 
 def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
@@ -29,17 +29,17 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         ]
     )
     a, tau, force = _variables("a", n), _variables("tau", n), _variables("force", 3)
-    x, R, J, drift = task_frame(constants, joint, _variables("v", n))
+    v = _variables("v", n)
+    x, R, J, drift = task_frame(constants, joint, v)
     rows = ["xyz".index(axis) for axis in robot.axes]
     frame = _elements("task->x", x[rows])
     if any(variable.group == "quat_des" for variable in table):
         rows += [3, 4, 5]
         frame |= _elements("task->R", R)
     frame |= _elements("task->J", J[rows]) | _elements("task->drift", drift[rows])
+    frame |= _elements("task->xd", J[rows].dot(v))
     bodies, load = _loaded(constants)
-    effort = inverse_dynamics(
-        constants, bodies, joint, _variables("v", n), a, _variables("gravity", 3)
-    )
+    effort = inverse_dynamics(constants, bodies, joint, v, a, _variables("gravity", 3))
     ways = [solve_by_factors(mass_matrix(constants, bodies, joint), tau)]
     if robot.coupling is None:
         ways.append(solve_by_recursion(constants, bodies, joint, tau))
@@ -55,12 +55,21 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         " const double a[N_JOINTS], const double gravity[3], double tau[N_JOINTS])": _elements(
             "tau", effort
         ),
-        f"acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
-        " double a[N_JOINTS])": _elements("a", min(ways, key=operations)),
     }
-    return MECHANISM + "".join(
-        "\n" + c_function(f"void {head}", results, HELD) for head, results in functions.items()
+    solution = min(ways, key=operations)
+    inertial = inverse_dynamics(constants, bodies, joint, np.zeros(n), a, np.zeros(3))
+    solve = (
+        f"acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
+        " double a[N_JOINTS])"
     )
+    texts = [
+        c_function(f"void {head}", results, varied(results.values(), held=HELD))
+        for head, results in functions.items()
+    ]
+    texts.append(
+        c_function(f"void {solve}", _elements("a", solution), _solution(solution, inertial))
+    )
+    return "\n".join([MECHANISM, *texts])
 
 
 MECHANISM = """\
@@ -73,6 +82,24 @@ MECHANISM = """\
 HELD = ("carrier->", "gravity[", "payload", "place[")
 """Parameters, along which there are no derivatives."""
 LOWER = np.tril_indices(3)
+
+
+def _solution(solution: Array, inertial: Array) -> list[Varied]:
+    """a = M⁻¹τ and how it varies: M δa = δτ − δM a, with the factors that there are.
+
+    Args:
+        solution: a, of the variables τ.
+        inertial: M a, of the variables a.
+    """
+    n = len(solution)
+    names = [(f"a[{i}]", f"tau[{i}]") for i in range(n)]
+    value = [a for a, _ in varied(solution, held=HELD)]
+    along = {name: (a, 0.0) for (name, _), a in zip(names, value)}
+    rest = {
+        name: (Expression(f"cimag({name})") - force, 0.0)
+        for (_, name), (_, force) in zip(names, varied(inertial, along, HELD))
+    }
+    return [(a, change) for a, (change, _) in zip(value, varied(solution, rest, HELD))]
 
 
 def _places(robot: Mechanism) -> dict[str, Value]:

@@ -61,6 +61,11 @@ DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
 VENDOR = "twodof"
 AUTHOR = "the twodof developers"
 
+CAPABILITIES = {
+    "canGetAndSetFMUstate": "true",
+    "canSerializeFMUstate": "true",
+    "canNotUseMemoryManagementFunctions": "true",
+}
 STATES = ("q", "v")
 SMALL = ("rtol", "atol", "max_step")
 """Whose start is their size."""
@@ -108,19 +113,10 @@ def model_description(
         generationTool=f"{VENDOR} {version}",
         variableNamingConvention="structured",
     )
-    capabilities = {
-        "modelIdentifier": name,
-        "canGetAndSetFMUstate": "true",
-        "canSerializeFMUstate": "true",
-        "canNotUseMemoryManagementFunctions": "true",
-        **flavour,
-    }
-    if exchanges:
-        root.set("numberOfEventIndicators", str(count_event_indicators(robot, control)))
-        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
-        _source_files(ET.SubElement(root, "ModelExchange", exchange), source_files)
-    capabilities["canHandleVariableCommunicationStepSize"] = "true"
-    _source_files(ET.SubElement(root, "CoSimulation", capabilities), source_files)
+    indicators = count_event_indicators(robot, control) if exchanges else None
+    _interfaces(
+        root, {"modelIdentifier": name, **CAPABILITIES, **flavour}, indicators, source_files
+    )
     used = {variable.unit for variable in table}
     _units(root, used)
     _types(root, used)
@@ -140,6 +136,21 @@ def model_description(
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
+
+
+def _interfaces(
+    root: ET.Element,
+    capabilities: Mapping[str, str],
+    indicators: int | None,
+    source_files: Sequence[str],
+) -> None:
+    """Co-simulation, and Model Exchange where there are event indicators to tell of."""
+    if indicators is not None:
+        root.set("numberOfEventIndicators", str(indicators))
+        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
+        _source_files(ET.SubElement(root, "ModelExchange", exchange), source_files)
+    stepping = {**capabilities, "canHandleVariableCommunicationStepSize": "true"}
+    _source_files(ET.SubElement(root, "CoSimulation", stepping), source_files)
 
 
 def _source_files(interface: ET.Element, names: Sequence[str]) -> None:

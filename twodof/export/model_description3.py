@@ -1,5 +1,5 @@
 """The XML files of FMI 3.0. modelDescription.xml is made of that of FMI 2.0: elements of vectors
-become arrays.
+become arrays, or stay scalars for tools that know no arrays.
 
 Source: FMI 3.0.2, sections 2.4 to 2.6.
 """
@@ -29,7 +29,7 @@ TERMINALS = {
 TYPES = {"Real": "Float64", "Boolean": "Boolean"}
 
 
-def model_description3(description: bytes) -> bytes:
+def model_description3(description: bytes, arrays: bool) -> bytes:
     """The XML text, of that of FMI 2.0; with event indicators and the time, variables in 3.0."""
     root = ET.fromstring(description)
     indicators = int(root.get("numberOfEventIndicators", ""))
@@ -47,10 +47,23 @@ def model_description3(description: bytes) -> bytes:
         simple.attrib.update(simple[0].attrib)
         simple.remove(simple[0])
     scalars = list(root.iter("ScalarVariable"))
-    vectors = _vectors(scalars)
-    references = _references(vectors, indicators)
-    _variables(root, scalars, vectors, references, indicators)
-    _structure(root, vectors, references)
+    names = [_name(scalar, arrays) for scalar in scalars]
+    first = next(i for i, scalar in enumerate(scalars) if scalar.get("causality") == "parameter")
+    references: dict[str, int] = {}  # of the first element; what 3.0 adds is before the parameters
+    for i, name in enumerate(names):
+        references.setdefault(name, i + (indicators + 1 if i >= first else 0))
+    added = _added(first, indicators, arrays)
+    variables = root.find("ModelVariables")
+    structure = root.find("ModelStructure")
+    assert variables is not None and structure is not None
+    own = _variables(scalars, names, references)
+    variables[:] = sorted([*own, *added], key=lambda v: int(v.get("valueReference", "")))
+    structure[:] = _unknowns(structure, names, references)
+    structure.extend(
+        ET.Element("EventIndicator", valueReference=variable.get("valueReference", ""))
+        for variable in added
+        if variable.get("causality") == "local"
+    )
     _annotations(root)
     return _text(root)
 
@@ -61,41 +74,42 @@ def _text(root: ET.Element) -> bytes:
     return text + b"\n"
 
 
-def _name(scalar: ET.Element) -> str:
-    """Of the vector: "x" of "x[1]", "der(q)" of "der(q[1])"."""
+def _name(scalar: ET.Element, arrays: bool) -> str:
+    """Its own, or that of its vector: "x" of "x[1]", "der(q)" of "der(q[1])"."""
     name = scalar.get("name", "")
     before, bracket, after = name.partition("[")
-    return before + after.partition("]")[2] if bracket else name
+    return before + after.partition("]")[2] if bracket and arrays else name
 
 
-def _vectors(scalars: Sequence[ET.Element]) -> dict[str, list[int]]:
-    """Places of the elements of each vector and of each scalar, in order, by its name."""
-    vectors: dict[str, list[int]] = {}
-    for i, scalar in enumerate(scalars):
-        vectors.setdefault(_name(scalar), []).append(i)
-    return vectors
-
-
-def _references(vectors: dict[str, list[int]], indicators: int) -> dict[str, int]:
-    """Value references, of the first element; what 3.0 adds is before the parameters."""
-    first = vectors["q_start"][0]
-    shift = indicators + 1
-    references = {
-        name: places[0] + (shift if places[0] >= first else 0) for name, places in vectors.items()
-    }
-    return {**references, INDICATORS: first, TIME: first + indicators}
+def _added(first: int, indicators: int, arrays: bool) -> list[ET.Element]:
+    """Variables that 2.0 has calls for, from a value reference on."""
+    local = {
+        "causality": "local", "variability": "continuous", "initial": "calculated",
+        "description": "change their sign where a joint meets or leaves a stop, or J⁺ its rank",
+    }  # fmt: skip
+    places = [(f"{INDICATORS}[{i + 1}]", first + i) for i in range(indicators)]
+    if arrays:
+        places = [(INDICATORS, first)]
+    added = [
+        ET.Element("Float64", {"name": name, "valueReference": str(place), **local})
+        for name, place in places
+    ]
+    if arrays:
+        ET.SubElement(added[0], "Dimension", start=str(indicators))
+    time = ET.Element(
+        "Float64", name=TIME, valueReference=str(first + indicators), causality="independent",
+        variability="continuous", description="time", unit="s",
+    )  # fmt: skip
+    return [*added, time]
 
 
 def _variables(
-    root: ET.Element,
-    scalars: Sequence[ET.Element],
-    vectors: dict[str, list[int]],
-    references: dict[str, int],
-    indicators: int,
-) -> None:
-    variables = root.find("ModelVariables")
-    assert variables is not None
-    variables.clear()
+    scalars: Sequence[ET.Element], names: Sequence[str], references: dict[str, int]
+) -> list[ET.Element]:
+    vectors: dict[str, list[int]] = {}  # places of the elements, in order
+    for i, name in enumerate(names):
+        vectors.setdefault(name, []).append(i)
+    variables = []
     for name, places in vectors.items():
         elements = [{**scalars[i].attrib, **scalars[i][0].attrib} for i in places]
         attributes = {"name": name}
@@ -106,26 +120,15 @@ def _variables(
         }
         attributes["valueReference"] = str(references[name])
         attributes["description"] = _description(elements)
-        if "derivative" in attributes or "derivative" in elements[0]:
-            state = _name(scalars[int(elements[0]["derivative"]) - 1])
-            attributes["derivative"] = str(references[state])
+        if "derivative" in elements[0]:
+            attributes["derivative"] = str(references[names[int(elements[0]["derivative"]) - 1]])
         if "start" in elements[0]:
             attributes["start"] = " ".join(element["start"] for element in elements)
-        variable = ET.SubElement(variables, TYPES[scalars[places[0]][0].tag], attributes)
-        if "[" in scalars[places[0]].get("name", ""):
+        variable = ET.Element(TYPES[scalars[places[0]][0].tag], attributes)
+        if name != scalars[places[0]].get("name"):
             ET.SubElement(variable, "Dimension", start=str(len(places)))
-    time = {"causality": "independent", "variability": "continuous", "description": "time"}
-    ET.SubElement(
-        variables, "Float64",
-        {"name": TIME, "valueReference": str(references[TIME]), **time, "unit": "s"},
-    )  # fmt: skip
-    indicator = ET.SubElement(
-        variables, "Float64", name=INDICATORS, valueReference=str(references[INDICATORS]),
-        causality="local", variability="continuous", initial="calculated",
-        description="change their sign where a joint meets or leaves a stop, or J⁺ its rank",
-    )  # fmt: skip
-    ET.SubElement(indicator, "Dimension", start=str(indicators))
-    variables[:] = sorted(variables, key=lambda variable: int(variable.get("valueReference", "")))
+        variables.append(variable)
+    return variables
 
 
 def _description(elements: Sequence[dict[str, str]]) -> str:
@@ -142,10 +145,9 @@ def _description(elements: Sequence[dict[str, str]]) -> str:
     return f"{common}: {'; '.join(owners)}"
 
 
-def _structure(root: ET.Element, vectors: dict[str, list[int]], references: dict[str, int]) -> None:
-    structure = root.find("ModelStructure")
-    assert structure is not None
-    name_of = {str(i + 1): name for name, places in vectors.items() for i in places}
+def _unknowns(
+    structure: ET.Element, names: Sequence[str], references: dict[str, int]
+) -> list[ET.Element]:
     unknowns: list[ET.Element] = []
     for tag, group in (
         ("Output", "Outputs"),
@@ -154,15 +156,14 @@ def _structure(root: ET.Element, vectors: dict[str, list[int]], references: dict
     ):
         dependencies: dict[str, dict[str, None]] = {}
         for unknown in structure.iterfind(f"{group}/Unknown"):
-            known = dependencies.setdefault(name_of[unknown.get("index", "")], {})
+            known = dependencies.setdefault(names[int(unknown.get("index", "")) - 1], {})
             places = unknown.get("dependencies", "").split()
-            known.update(dict.fromkeys(name_of[place] for place in places))
+            known.update(dict.fromkeys(names[int(place) - 1] for place in places))
         for name, known in dependencies.items():
             text = " ".join(str(references[k]) for k in known)
             attributes = {"valueReference": str(references[name]), "dependencies": text}
             unknowns.append(ET.Element(tag, attributes))
-    unknowns.append(ET.Element("EventIndicator", valueReference=str(references[INDICATORS])))
-    structure[:] = unknowns
+    return unknowns
 
 
 def _annotations(root: ET.Element) -> None:
@@ -187,14 +188,10 @@ def build_description(identifier: str, units: Sequence[str]) -> bytes:
     return _text(root)
 
 
-def terminals_and_icons(table: Sequence[Variable]) -> bytes:
+def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
     """The text of terminalsAndIcons.xml: how the icon lies, and what belongs together in a plug."""
-    groups = dict.fromkeys(variable.group for variable in table)
-    terminals = {
-        "targets": [group for group in groups if group.endswith(("_des", "_cmd"))],
-        "joints": ["q", "v", "tau"],
-        "forces": list(DISTURBANCES),
-    }
+    targets = {v.group for v in table if v.group.endswith(("_des", "_cmd"))}
+    terminals = {"targets": targets, "joints": {"q", "v", "tau"}, "forces": set(DISTURBANCES)}
     root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
     graphic = ET.SubElement(root, "GraphicalRepresentation")
     place = {"x1": "-15", "y1": "-10", "x2": "15", "y2": "10"}  # as wide as high as the icon is
@@ -205,9 +202,10 @@ def terminals_and_icons(table: Sequence[Variable]) -> bytes:
         terminal = ET.SubElement(
             parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name]
         )
-        for group in members:
+        names = (v.group if arrays else v.name for v in table if v.group in members)
+        for member in dict.fromkeys(names):
             ET.SubElement(
-                terminal, "TerminalMemberVariable", variableName=group, memberName=group,
+                terminal, "TerminalMemberVariable", variableName=member, memberName=member,
                 variableKind="signal",
             )  # fmt: skip
     return _text(root)

@@ -22,7 +22,12 @@ FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "li
 
 
 def model_header(
-    robot: Robot, table: Sequence[Variable], control: str, guid: str, fmi: int = 2
+    robot: Robot,
+    table: Sequence[Variable],
+    control: str,
+    guid: str,
+    fmi: int = 2,
+    arrays: bool = True,
 ) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
 
@@ -33,7 +38,8 @@ def model_header(
         table: its variables; a variable's place is its value reference.
         control: what drives it, a key of ``CONTROLS``.
         guid: as the modelDescription has it.
-        fmi: version of FMI; 3 has vectors where 2 has their elements.
+        fmi: version of FMI.
+        arrays: whether 3 has vectors where 2 has their elements.
 
     Raises:
         BuildError: more joints than the engine's working memory has room for.
@@ -55,7 +61,7 @@ def model_header(
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
         _value_references(groups),
         "/* How many values each value reference stands for. */\n"
-        + _table("int EXTENT", _extents(table, fmi)),
+        + _table("int EXTENT", _extents(table, fmi == 3 and arrays)),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
         _ranges(groups),
@@ -103,9 +109,9 @@ def _ranges(groups: Sequence[str]) -> str:
     )
 
 
-def _extents(table: Sequence[Variable], fmi: int) -> list[int]:
+def _extents(table: Sequence[Variable], arrays: bool) -> list[int]:
     """Of each variable 1, or of each vector's first element its length and of the others 0."""
-    if fmi == 2:
+    if not arrays:
         return [1] * len(table)
     sizes = Counter(variable.group for variable in table)
     return [0 if variable.index else sizes[variable.group] for variable in table]

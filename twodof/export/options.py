@@ -32,6 +32,8 @@ class FmuOptions:
         live_documentation: put the arm, alive, into the documentation of a native FMU, where
             there is a compiler for it; its meshes are then in the FMU twice.
         fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
+        arrays: whether vectors are arrays in FMI 3; without, each element is a variable of its own,
+            as it is in FMI 2, for tools that know no arrays.
         platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or of FMI 3.0
             "x86_64-linux", "aarch64-linux"; empty: this machine's.
     """
@@ -49,5 +51,6 @@ class FmuOptions:
     link_environment: bool = False
     native: bool = False
     fmi: int | None = None
+    arrays: bool = True
     live_documentation: bool = True
     platforms: tuple[str, ...] = ()

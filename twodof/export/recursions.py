@@ -36,11 +36,11 @@ def placements(robot: Mechanism, joint: Array) -> tuple[list[Array], list[Array]
 def task_frame(robot: Mechanism, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
     """The task frame in the root's axes: position, rotation, Jacobian and drift.
 
-        ω_i = ω_p + z_i v_i,   α_i = α_p + ω_p × z_i v_i,   with q̈ = 0
-        a_i = a_p + α_p × r + ω_p × (ω_p × r), and 2 ω_p × z_i v_i of a sliding joint
-        J_i = z_i × (x − o_i), or z_i of a sliding joint
+        J_i = z_i × (x − o_i), or z_i of a sliding joint;   ω_i = ω_p + z_i v_i of one that turns
+        J̇ v = Σ (ω_p + ω_i) × J_i v_i,   and of the turning Σ ω_p × z_i v_i
 
-    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 3.1 and 7.3.
+    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 3.1 and 7.3; the
+    sum is that of the accelerations there, for q̈ = 0, by joints.
 
     Returns:
         x (3), R (3 × 3), J (6 × n: linear, angular), J̇ v (6).
@@ -50,25 +50,21 @@ def task_frame(robot: Mechanism, joint: Array, v: Array) -> tuple[Array, Array, 
     R: Array = np.eye(3)
     x = omega = alpha = a = np.zeros(3)
     axes, places = [], []
-    for i in (*robot.path, None):
-        r = R.dot(robot.frame_p if i is None else origins[i])
-        x = x + r
-        a = a + cross(alpha, r) + cross(omega, cross(omega, r))
-        if i is None:
-            break
+    for i in robot.path:
+        x = x + R.dot(origins[i])
         R = R.dot(rotations[i])
-        motion = R[:, 2] * rates[i]
-        coriolis = cross(omega, motion)
-        if robot.prismatic[i]:
-            a = a + 2.0 * coriolis
-        else:
-            alpha, omega = alpha + coriolis, omega + motion
         axes.append(R[:, 2])
         places.append(x)
+    x = x + R.dot(robot.frame_p)
     columns = np.zeros((len(robot.parent), 6), dtype=object)
     for i, z, o in zip(robot.path, axes, places):
-        still = np.zeros(3)
-        columns[i] = [*z, *still] if robot.prismatic[i] else [*cross(z, x - o), *z]
+        before, turning = omega, z * rates[i]
+        if robot.prismatic[i]:
+            columns[i, :3] = z
+        else:
+            columns[i] = [*cross(z, x - o), *z]
+            alpha, omega = alpha + cross(omega, turning), omega + turning
+        a = a + cross(before + omega, columns[i, :3] * rates[i])
     return x, R.dot(robot.frame_R), columns.T.dot(robot.G), np.array([*a, *alpha])
 
 
@@ -138,13 +134,7 @@ def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:
             t = t + cross(origins[k], f)
             k = robot.parent[k]
         if robot.parent[i] >= 0:
-            moved = _moved(b, rotations[i], origins[i])
-            whole = composite[robot.parent[i]]
-            composite[robot.parent[i]] = Body(
-                whole.mass + moved.mass,
-                whole.moment + moved.moment,
-                whole.inertia + moved.inertia,
-            )
+            composite[robot.parent[i]] += b.moved(rotations[i], origins[i])
     reduced: Array = robot.G.T.dot(M).dot(robot.G)
     return reduced
 
@@ -232,21 +222,6 @@ def cross(a: Array, b: Array) -> Array:
     return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
-
-
-def _moved(b: Body, R: Array, p: Array) -> Body:
-    """A body in the frame in which its own is placed at (R, p)."""
-    d = R.dot(b.moment)
-    T = R.dot(b.inertia)
-    # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
-    half = d + p * (0.5 * b.mass)
-    spread = 2.0 * half.dot(p)
-    inertia = np.zeros((3, 3), dtype=object)
-    for r in range(3):
-        for k in range(r + 1):
-            entry = T[r].dot(R[k]) - half[r] * p[k] - p[r] * half[k]
-            inertia[r, k] = inertia[k, r] = entry + spread if r == k else entry
-    return Body(b.mass, d + p * b.mass, inertia)
 
 
 def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -> list[Array]:

@@ -86,26 +86,70 @@ def operations(results: Iterable[Value]) -> int:
     return sum(1 for _, operands in nodes if operands)
 
 
-def c_function(head: str, results: Mapping[str, Value], held: Sequence[str] = ()) -> str:
-    """A function that assigns each result to the variable of its name, real or complex.
+Varied = tuple[Value, Value]
+"""A value, and how it varies."""
+
+
+def varied(
+    results: Iterable[Value], parts: Mapping[str, Varied] | None = None, held: Sequence[str] = ()
+) -> list[Varied]:
+    """Real parts of values, and how these vary, by the rules of differentiation.
 
     Complex numbers are x + i h dx with an h whose square vanishes, so that real parts are computed
-    as such, and imaginary ones by the rules of differentiation.
+    as such.
+
+    Args:
+        results: the values.
+        parts: those of variables, by name; of others they are the real and the imaginary part.
+        held: what names of variables begin with that have no imaginary part.
+    """
+    nodes, places = _ordered(results)
+    pairs: list[Varied] = []
+    for operation, operands in nodes:
+        (a, da), (b, db) = ([pairs[operand] for operand in operands] + [(0.0, 0.0)] * 2)[:2]
+        if operation == "+":
+            pair = a + b, da + db
+        elif operation == "-":
+            pair = a - b, da - db
+        elif operation == "*":
+            pair = a * b, a * db + da * b
+        elif operation == "/":
+            quotient = a / b
+            pair = quotient, (da - quotient * db) / b
+        elif operation == "neg":
+            pair = -a, -da
+        elif operation == "cos":
+            pair = cosine(a), -(sine(a) * da)
+        elif operation == "sin":
+            pair = sine(a), cosine(a) * da
+        elif _is_number(operation):
+            pair = float(operation), 0.0
+        elif parts and operation in parts:
+            pair = parts[operation]
+        elif operation.startswith(tuple(held)):
+            pair = Expression(f"creal({operation})"), 0.0
+        else:
+            pair = Expression(f"creal({operation})"), Expression(f"cimag({operation})")
+        pairs.append(pair)
+    return [pairs[place] for place in places]
+
+
+def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Varied]) -> str:
+    """A function that assigns each result to the variable of its name, real or complex.
 
     Args:
         head: of the function.
         results: values by lvalue; no lvalue may be a variable of one of the values.
-        held: what names of variables begin with that have no imaginary part.
+        complexes: of each result, if numbers are complex, the real part and how it varies.
     """
-    varied: dict[str, Value] = {}
-    with_variations = _with_variations(results.values(), tuple(held))
-    for value, variation in with_variations:
-        varied[f"const Real re{len(varied)}"] = value
-        varied[f"const Real im{len(varied)}"] = variation
+    separate: dict[str, Value] = {}
+    for value, variation in complexes:
+        separate[f"const Real re{len(separate)}"] = value
+        separate[f"const Real im{len(separate)}"] = variation
     combined = "".join(
-        f"\n    {target} = re{2 * i} + UNIT * im{2 * i + 1};" for i, target in enumerate(results)
+        f"\n    assign(&{target}, re{2 * i}, im{2 * i + 1});" for i, target in enumerate(results)
     )
-    body = f"#ifdef IS_COMPLEX\n{_statements(varied, 'Real')}{combined}\n#else\n"
+    body = f"#ifdef IS_COMPLEX\n{_statements(separate, 'Real')}{combined}\n#else\n"
     body += f"{_statements(results, 'double')}\n#endif"
     parameters = re.findall(r"(\w+)(?:\[\w+\])?[,)]", head)
     unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
@@ -130,37 +174,6 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
         for target, place in zip(results, places, strict=True)
     ]
     return "\n".join(lines)
-
-
-def _with_variations(results: Iterable[Value], held: tuple[str, ...]) -> list[tuple[Value, Value]]:
-    """The real parts of values, and how these vary with the imaginary parts of variables."""
-    nodes, places = _ordered(results)
-    pairs: list[tuple[Value, Value]] = []
-    for operation, operands in nodes:
-        (a, da), (b, db) = ([pairs[operand] for operand in operands] + [(0.0, 0.0)] * 2)[:2]
-        if operation == "+":
-            pair = a + b, da + db
-        elif operation == "-":
-            pair = a - b, da - db
-        elif operation == "*":
-            pair = a * b, a * db + da * b
-        elif operation == "/":
-            quotient = a / b
-            pair = quotient, (da - quotient * db) / b
-        elif operation == "neg":
-            pair = -a, -da
-        elif operation == "cos":
-            pair = cosine(a), -(sine(a) * da)
-        elif operation == "sin":
-            pair = sine(a), cosine(a) * da
-        elif _is_number(operation):
-            pair = float(operation), 0.0
-        elif operation.startswith(held):
-            pair = Expression(f"creal({operation})"), 0.0
-        else:
-            pair = Expression(f"creal({operation})"), Expression(f"cimag({operation})")
-        pairs.append(pair)
-    return [pairs[place] for place in places]
 
 
 def _is_number(operation: str) -> bool:

@@ -1,5 +1,10 @@
 """An FMU's file and an instance of it, whoever made it. All of FMPy is here."""
 
+from contextlib import redirect_stdout
+
+with redirect_stdout(None):  # where FMPy says that for aarch64-linux it has no logger of FMI 2.0
+    import fmpy  # noqa: F401
+
 from .description import Fmu, load_fmu, read_resource
 from .instance import Instance, instantiate
 

@@ -15,6 +15,7 @@ import fmpy
 from fmpy.model_description import ModelDescription, ModelVariable
 
 from ..errors import ZIP_ERRORS, FmuError
+from ..export.compiler import host_platform
 from ..files import UnsafeArchiveError, check_archive, is_plain_xml, read_member
 
 MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
@@ -87,8 +88,8 @@ class Fmu:
 
     @property
     def platform(self) -> str:
-        """Name of this machine in the FMU's version of FMI."""
-        return str(fmpy.platform if self.version == 2 else fmpy.platform_tuple)
+        """Name of this machine in the FMU's version of FMI; "" where it has none."""
+        return host_platform() if self.version == 2 else str(fmpy.platform_tuple)
 
     @property
     def guid(self) -> str:

@@ -18,7 +18,6 @@ import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
 from fmpy.fmi1 import FMICallException
-from fmpy.logging import addLoggerProxy
 from numpy.typing import NDArray
 
 from ..errors import ZIP_ERRORS, FmuError, SimulationError
@@ -65,6 +64,8 @@ class Instance:
             os.chdir(working_folder)  # FMPy leaves it where a library cannot be loaded
 
     def _instantiate(self, **what: str) -> Any:
+        from fmpy.logging import addLoggerProxy  # none for aarch64-linux, which 2.0 has no name for
+
         slave = fmi2.FMU2Slave(**what)
         self._callbacks = fmi2.fmi2CallbackFunctions(
             logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
@@ -277,8 +278,10 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
         FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
     """
     if fmu.platform not in fmu.platforms:
+        here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
         there = ", ".join(fmu.platforms) or "none"
-        reason = f"has no binary for this platform ({fmu.platform}), only for: {there}"
+        remedy = "" if fmu.platform else "; one of FMI 3.0 can: 'twodof build --native --fmi 3'"
+        reason = f"has no binary for this platform ({here}), only for: {there}{remedy}"
         raise FmuError(f"'{fmu.path}' {reason}")
     with temporary_folder() as folder:
         try:

@@ -64,14 +64,16 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
 
 
 def _parts(element: ET.Element, read: ReadMesh) -> list[Part]:
-    """Of a URDF's geometry; none where it is of an unknown kind or its mesh is not at hand."""
+    """Of a URDF's geometry; none where it is of an unknown kind or its mesh is of no use."""
 
     def number(key: str) -> float:
-        return float(element.get(key, 1))
+        (value,) = floats(element, key, "1")
+        return float(value)
 
     if element.tag == "mesh":
         name = element.get("filename", "").removeprefix("package://")
-        return mesh_parts(name, read, floats(element, "scale", "1 1 1"))
+        parts = mesh_parts(name, read, floats(element, "scale", "1 1 1"))
+        return [part for part in parts if np.isfinite(part.vertices).all()]
     if element.tag == "box":
         corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
         return [Part(corners * floats(element, "size", "1 1 1"), BOX, None)]
@@ -143,9 +145,16 @@ def _colour(tree: ET.Element, visual: ET.Element) -> Colour:
 
 
 def floats(element: ET.Element | None, key: str, default: str) -> Array:
-    """The numbers of an attribute."""
+    """The numbers of an attribute.
+
+    Raises:
+        ValueError: it has others.
+    """
     text = default if element is None else element.get(key, default)
-    return np.array([float(word) for word in text.split()])
+    numbers = np.array([float(word) for word in text.split()])
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{key}='{text}' is not finite")
+    return numbers
 
 
 def origin(element: ET.Element | None) -> Placement:

@@ -99,11 +99,9 @@ def linearise(
             f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`"
         )
     given = dict(at or {})
-    fixed = "q" in given or "v" in given
-    if fixed:
-        given.setdefault("v", 0.0)
-    settings = {{"q": "q_start", "v": "v_start"}.get(k, k): value for k, value in given.items()}
-    values = resolve(fmu, settings)
+    fixed = bool({name.partition("[")[0] for name in given} & {"q", "v"})
+    starts = {"v_start": 0.0} if fixed else {}
+    values = resolve(fmu, starts) | _values(fmu, given)
     with instantiate(fmu) as instance:
         point = _Point(fmu, instance, values)
         if not fixed:
@@ -111,6 +109,21 @@ def linearise(
         return point.model(
             _chosen(fmu, "input", inputs, "inputs"), _chosen(fmu, "output", outputs, "outputs")
         )
+
+
+def _values(fmu: Fmu, given: Mapping[str, Setting]) -> dict[str, Value]:
+    """Of inputs and parameters; a state, or one of its elements, is set by its parameter."""
+    values: dict[str, Value] = {}
+    for name, value in given.items():
+        group, bracket, index = name.partition("[")
+        if group not in ("q", "v"):
+            values |= resolve(fmu, {name: value})
+            continue
+        try:
+            values |= resolve(fmu, {f"{group}_start{bracket}{index}": value})
+        except InputError as error:
+            raise InputError(str(error).replace(f"{group}_start", group)) from None
+    return values
 
 
 def _chosen(fmu: Fmu, causality: str, wanted: Sequence[str] | None, argument: str) -> list[str]:

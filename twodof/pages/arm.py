@@ -10,12 +10,15 @@ from pathlib import Path
 
 from ..errors import ZIP_ERRORS, FmuError, PageError
 from ..experiments import Experiment, Setting, experiment
-from ..export.arm_page import Arm, arm_page
+from ..export.arm_page import CONTAINER, Arm, arm_page, live_part
 from ..files import read_member, refusing, write_file
 from ..fmu import Fmu, read_resource
-from ..plant.urdf import RobotError
+from ..geometry.shapes import link_shapes
+from ..plant.urdf import RobotError, read_urdf
 
 MAX_SOURCE = 16 * 1024**2  # bytes of a file
+NO_SOURCES: Mapping[str, bytes] = {}
+MAX_HEAD = 64 * 1024  # bytes in which a page says that it is one
 
 
 def page(
@@ -44,24 +47,40 @@ def page(
         BuildError: there is no compiler.
     """
     run = experiment(fmu, stop_time=inf, step=step, settings=settings)
-    path = Path(output)
-    try:
-        content = arm_page(_arm(run))
-    except RobotError as error:
-        raise PageError(f"'{run.fmu.path}': its robot cannot be shown: {error}") from error
+    path, sources = Path(output), _sources(run.fmu)
+    if not run.fmu.control or not sources:
+        raise PageError(
+            f"'{run.fmu.path}' has no plant in C, as native FMUs of this package have;"
+            " build one with 'twodof build --native'"
+        )
+    arm = arm_of(run, sources)
+    content = arm_page(arm.robot or arm.name, live_part(arm))
     with refusing(PageError, f"write '{path}'"):
         write_file(path, content)
     return path
 
 
-def _arm(run: Experiment) -> Arm:
+def is_page(path: Path) -> bool:
+    """Whether a file is such a page."""
+    try:
+        with path.open("rb") as file:
+            return CONTAINER in file.read(MAX_HEAD)
+    except OSError:
+        return False
+
+
+def arm_of(run: Experiment, sources: Mapping[str, bytes] = NO_SOURCES) -> Arm:
+    """What a page of a run's FMU is made of.
+
+    Raises:
+        PageError: its robot cannot be shown.
+    """
     fmu = run.fmu
-    sources = _sources(fmu)
-    if not fmu.control or not sources:
-        raise PageError(
-            f"'{fmu.path}' has no plant in C, as native FMUs of this package have;"
-            " build one with 'twodof build --native'"
-        )
+    urdf = fmu.urdf or ""
+    try:
+        shapes, _ = link_shapes(read_urdf(urdf), partial(read_resource, fmu))
+    except RobotError as error:
+        raise PageError(f"'{fmu.path}': its robot cannot be shown: {error}") from error
     variables = [
         {
             "name": name, "reference": variable.reference + variable.element,
@@ -75,7 +94,7 @@ def _arm(run: Experiment) -> Arm:
     return Arm(
         name=fmu.name, guid=fmu.guid, file=fmu.path.name, robot=fmu.robot, joints=fmu.joints,
         frame=fmu.frame, root=fmu.root, axes=fmu.axes, control=fmu.control, variables=variables,
-        step=run.step, urdf=fmu.urdf or "", read=partial(read_resource, fmu), sources=sources,
+        step=run.step, urdf=urdf, shapes=shapes, sources=sources,
     )  # fmt: skip
 
 

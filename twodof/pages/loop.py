@@ -1,29 +1,35 @@
-"""The loop that steps an FMU in real time as a page asks; it knows the page by a connection alone.
+"""The loop that steps an FMU in real time as pages ask; it knows them by what they tell alone.
 
-The two talk through a pipe: the page tells what its controls ask for, which is done between two
-steps, and thirty times a second that it is ready for more, whereupon the loop tells what has
-happened.
+They are served by a thread of its own, which tells what their controls ask for, to be done between
+two steps, and asks for the news. Neither waits for the other.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from itertools import chain, count
-from multiprocessing.connection import Connection
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from queue import Empty, SimpleQueue
+from threading import Lock
+from typing import Any
 
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
-from ..experiments import Experiment, Setting, resolve
+from ..experiments import Experiment, Setting, Value, resolve
+from ..files import free_name
 from ..master import at_rest, samples
 from ..pace import RealTime
 from ..sample import Sample
 
-MOST_ROWS = 10_000  # that wait for a page to ask
+MOST_ROWS = 1000  # that are kept for pages that have not asked yet,
+MOST_AT_ONCE = 200  # and are told at a time
+MOST_NOTES = 4
 IDLE = 0.05  # s between two looks at whether to go on
+TOLD = ("x_des", "quat_des", "q_des")
+"""Inputs that are told with a sample."""
 
 
 class Excerpt(Bag):
@@ -51,30 +57,6 @@ class Excerpt(Bag):
         super().write(sample._replace(stamp=sample.stamp + self._later))
 
 
-class News(NamedTuple):
-    """What the loop tells the page.
-
-    Attributes:
-        sample: the latest.
-        rows: joint positions and distance from the target, m, of each sample since the last news.
-        again: whether the run has begun again since.
-        playing: whether it is to go on.
-        missed, steps, worst: deadlines missed, of how many steps, and the largest delay, s.
-        recorded: number of samples in the bag that is being recorded, 0 where there is none.
-        notes: what to tell the user, titles and texts.
-    """
-
-    sample: Sample
-    rows: list[tuple[float, ...]]
-    again: bool
-    playing: bool
-    missed: int
-    steps: int
-    worst: float
-    recorded: int
-    notes: list[tuple[str, str]]
-
-
 class Loop:
     """Steps an FMU as a page asks.
 
@@ -87,6 +69,7 @@ class Loop:
         recorded: the bags that were written.
         pace: keeps the time.
         steps: number of steps in real time.
+        viewers: number of pages that are open; without one, nothing moves.
 
     Raises:
         PageError: the FMU carries no robot, or no target.
@@ -99,122 +82,194 @@ class Loop:
         if fmu.urdf is None or not fmu.axes or not drives:
             raise PageError(f"'{fmu.path}' carries no robot, or no inputs that drive it")
         self._run, self._bag, self._command_line = run, bag, command_line
+        self._first = run
         self.recorded: list[Path] = []
         self.pace = RealTime()
         self.steps = 0
+        self.viewers = 0
         self._recording: Excerpt | None = None
-        self._changes: dict[str, Setting] = {}
-        self._notes: list[tuple[str, str]] = []
-        self._playing, self._watched, self._singles = True, False, 0
+        self._changes: dict[str, Value] = {}
+        self._playing, self._singles = True, 0
+        self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
+        self._groups = [name for group in TOLD for name in fmu.vector(group)]
+        self._lock = Lock()  # of what news are made of
+        self._rows: deque[list[float]] = deque(maxlen=MOST_ROWS)
+        self._notes: deque[str] = deque(maxlen=MOST_NOTES)
+        self._number = self._count = self._noted = 0
+        self._values: dict[str, Value] = {}
         self._begin()
 
     def _begin(self) -> None:
         """Instantiate the FMU and take its first sample."""
         self._source = samples(self._run, pace=self.pace, resume=self._resume)
         self.pace.restart()
-        self._rows: list[tuple[float, ...]] = []
-        self._again, self._broken = True, False
-        self._take(next(self._source))
+        sample = next(self._source)
+        self._broken = False
+        with self._lock:
+            self._rows.clear()
+            self._count, self._number = 0, self._number + 1
+            self._values = {**self._run.start_values, **self._changes}
+        self._take(sample)
 
-    def play(self, page: Connection, stop: Callable[[], bool]) -> None:
-        """Step the FMU as the page asks, until ``stop`` is true.
-
-        Raises:
-            PageError: the page's process has ended.
-        """
+    def play(self, stop: Callable[[], bool]) -> None:
+        """Step the FMU as pages ask, until ``stop`` is true."""
         try:
             while not stop():
                 if self._singles and not self._broken:
                     self._singles -= 1
                     self.pace.restart()
                     self._step()
-                elif self._playing and self._watched and not self._broken:
-                    self._step()
-                    self.steps += 1
+                elif self._playing and self.viewers and not self._broken:
+                    self._step(paced=True)
                 else:
                     self.pace.restart()
-                    page.poll(IDLE)
-                while page.poll():
-                    self._obey(page, *page.recv())
-        except (EOFError, OSError) as error:
-            raise PageError("the process of the page has ended") from error
+                    self._obey(IDLE)
+                while not (self._orders.empty() or stop()):
+                    self._obey()
         finally:
             self._end_recording()
             self._source.close()
 
-    def news(self) -> News:
-        """What has happened since it was asked before."""
-        rows, self._rows = self._rows, []
-        notes, self._notes = self._notes, []
-        again, self._again = self._again, False
-        return News(
-            self._sample, rows, again, self._playing, self.pace.missed, self.steps, self.pace.worst,
-            0 if self._recording is None else self._recording.count, notes,
-        )  # fmt: skip
+    def tell(self, order: str, value: Any = None) -> None:
+        """Ask for something to be done between two steps; from any thread.
 
-    def _obey(self, page: Connection, order: str, value: Any) -> None:
-        if order == "more":
-            self._watched = value
-            page.send(self.news())
-        elif order == "change":
-            self._changes.update(value)
-        elif order == "play":
-            self._playing = value
+        Args:
+            order: "change" of inputs and parameters, the latter begin the run anew; "play";
+                "step"; "reset"; "record".
+            value: settings by name; whether to go on; -; whether inputs and parameters are reset
+                too; whether to record.
+
+        Raises:
+            InputError: a setting is at fault.
+            ValueError: there is no such order.
+        """
+        if order not in ("change", "play", "step", "reset", "record"):
+            raise ValueError(order)
+        with self._lock:
+            if order == "change":
+                value = resolve(self._run.fmu, value)
+                self._values |= value
+                inputs = self._sample.inputs
+                self._changes |= {name: value[name] for name in value if name in inputs}
+                value = {name: value[name] for name in value if name not in inputs}
+            elif order in ("play", "step"):
+                self._playing = order == "play" and bool(value)
+        self._orders.put((order, value))
+
+    def note(self, text: str) -> None:
+        """Tell a text on all pages; from any thread."""
+        with self._lock:
+            self._notes.append(text)
+            self._noted += 1
+
+    def news(self, run: int = 0, seen: int = 0) -> dict[str, Any]:
+        """What has happened since somebody was told before; from any thread.
+
+        Args:
+            run, seen: as of the news before.
+
+        Returns:
+            run: number of the run; it has begun again where that is another.
+            t: time of the latest sample, s.
+            seen: number of the last of the rows.
+            rows: time, s, and the groups of ``TOLD`` of each sample since.
+            values: inputs and parameters as they are told by now.
+            playing: whether it is to go on.
+            missed, steps, worst: deadlines missed, of how many steps, and the largest delay, s.
+            recorded: number of samples in the bag that is being recorded, 0 where there is none.
+            notes, noted: the latest of what to tell the user, and how many there were.
+        """
+        recording = self._recording
+        with self._lock:
+            known = len(self._rows)
+            new = min(known, self._count - (seen if run == self._number else 0))
+            rows = [*islice(self._rows, known - new, known - new + MOST_AT_ONCE)]
+            return {
+                "run": self._number, "t": self._sample.t,
+                "seen": self._count - new + len(rows), "rows": rows,
+                "values": dict(self._values), "playing": self._playing,
+                "missed": self.pace.missed, "steps": self.steps, "worst": self.pace.worst,
+                "recorded": 0 if recording is None else recording.count,
+                "notes": [*self._notes], "noted": self._noted,
+            }  # fmt: skip
+
+    def _obey(self, patience: float = 0.0) -> None:
+        try:
+            order, value = self._orders.get(timeout=patience)
+        except Empty:
+            return
+        if order == "change" and value:
+            self._restart(value)
         elif order == "step":
-            self._playing = False
             self._singles += 1
         elif order == "reset":
-            self._reset()
-        elif not value:
+            self._restart({}, self._first if value else None)
+        elif order == "record" and not value:
             self._end_recording()
-        elif self._recording is None:
+        elif order == "record" and self._recording is None:
             self._record()
 
-    def _step(self) -> None:
-        changes, self._changes = self._changes, {}
+    def _take_changes(self) -> dict[str, Value]:
+        with self._lock:
+            changes, self._changes = self._changes, {}
+        return changes
+
+    def _step(self, *, paced: bool = False) -> None:
+        changes = self._take_changes()
         try:
-            self._take(self._source.send(changes or None))
+            self._take(self._source.send(changes or None), paced)
         except (SimulationError, StopIteration) as error:
             self._broken = True
-            self._notes.append(("The simulation has ended", f"{error or 'its time is over'}"))
+            self.note(f"The simulation has ended: {error or 'its time is over'}")
             self._end_recording()
 
     def _resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
         rest = at_rest(self._run.fmu, sample)
         if rest is not None:
-            self._notes.append(("The robot is stopped where it is", str(error)))
+            self.note(f"The robot is stopped where it is: {error}")
+            with self._lock:
+                self._values |= resolve(self._run.fmu, rest)
         return rest
 
-    def _take(self, sample: Sample) -> None:
+    def _take(self, sample: Sample, paced: bool = False) -> None:
         self._sample = sample
-        self._rows.append((*sample.q, sample.error or 0.0))
-        del self._rows[:-MOST_ROWS]  # while no page asks
+        inputs = (float(sample.inputs[name]) for name in self._groups)
+        row = [sample.t, *sample.q, *sample.v, *sample.x, *sample.quat, *sample.tau, *inputs]
+        with self._lock:
+            self._rows.append(row)
+            self._count += 1
+            self.steps += paced
         if self._recording is not None:
             try:
                 self._recording.write(sample)
             except BagError as error:
-                self._notes.append(("The recording has ended", str(error)))
+                self.note(f"The recording has ended: {error}")
                 self._recording = None
 
-    def _reset(self) -> None:
-        """The arm back to its start; the inputs stay."""
+    def _restart(self, values: Mapping[str, Value], first: Experiment | None = None) -> None:
+        """The arm back to its start; inputs and parameters stay, but for values, or as at first."""
         self._end_recording()
         self._source.close()
-        inputs = {**self._sample.inputs, **resolve(self._run.fmu, self._changes)}
-        self._changes = {}
-        self._run = replace(
-            self._run,
-            start_values={**self._run.start_values, **inputs},
-            given={**self._run.given, **inputs},
-        )
-        self._begin()
+        now = {**self._sample.inputs, **self._take_changes()}
+        runs = [first or self._starting({**now, **values}), self._starting(now), self._run]
+        self._singles = 0
+        for self._run in runs:
+            try:
+                return self._begin()
+            except SimulationError as error:
+                self.note(str(error))
+
+    def _starting(self, told: Mapping[str, Value]) -> Experiment:
+        """The run, but for what is told, from the start."""
+        run = self._run
+        return replace(run, start_values={**run.start_values, **told}, given={**run.given, **told})
 
     def _record(self) -> None:
-        path = self._free_name()
+        path = free_name(self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
         try:
             self._recording = Excerpt(path, self._run, self._sample, self._command_line)
         except BagError as error:
-            self._notes.append(("There is no recording", str(error)))
+            self.note(f"There is no recording: {error}")
         self.pace.restart()  # opening a bag may wait for the disk: time has stood still
 
     def _end_recording(self) -> None:
@@ -224,12 +279,7 @@ class Loop:
         try:
             recording.__exit__(None, None, None)
             self.recorded.append(recording.path)
-            self._notes.append(("Recorded", f"{recording.path}, {recording.count} samples"))
+            self.note(f"Recorded: {recording.path}, {recording.count} samples")
         except BagError as error:
-            self._notes.append(("The recording has ended", str(error)))
+            self.note(f"The recording has ended: {error}")
         self.pace.restart()
-
-    def _free_name(self) -> Path:
-        name = self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
-        names = chain([name], (f"{name}-{i}" for i in count(2)))
-        return next(path for path in map(Path, names) if not path.exists())

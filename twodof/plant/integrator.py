@@ -1,9 +1,8 @@
 """Dormand–Prince 5(4) over one communication step, with located joint-limit stops.
 
-The method is that of SciPy's ``RK45``: its coefficients, error norm, step-size control and
-dense output (Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986;
-Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every communication step begins afresh with
-the step min(max_step, h), so that no integrator state outlives it.
+The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I",
+II.4). Every communication step begins afresh with the step min(max_step, h), so that no integrator
+state outlives it.
 
 A joint that reaches a limit is set onto it and stays there until it is released (``stops``).
 """
@@ -11,44 +10,22 @@ A joint that reaches a limit is set onto it and stays there until it is released
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import partial
 from itertools import chain, product
-from math import inf, isfinite, sqrt, ulp
+from math import inf, isfinite, ulp
 from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .dormand_prince import State, dormand_prince, error_norm, interpolant
 from .stops import Limits, Stops
 
 Array = NDArray[np.float64]
-State = list[float]
-"""(q, v), 2n values. Plain floats: at this size a call of numpy costs more than the arithmetic."""
 Response = Callable[[Array, Array], tuple[Sequence[float], int]]
 """At (q, v), joint limits left out: q̈ of the equations of motion, or what a control law gives, n
 values, and the rank of the law's J⁺, the number of its singular values that were not dropped."""
 
-A = (
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-)
-"""Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution."""
-E = (-71 / 57600, 0.0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40)
-P = np.array(
-    [
-        [1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
-        [0, 0, 0, 0],
-        [0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
-        [0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
-        [0, 127303824393 / 49829197408, -318862633887 / 49829197408, 701980252875 / 199316789632],
-        [0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
-        [0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
-    ]
-)
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 JUMP_STEP = 2.0**-8
 """As a part of the first step: where J⁺ drops a singular value the right-hand side jumps, and no
@@ -56,8 +33,6 @@ step across that passes the error test. One of this size, whose stages had diffe
 taken."""
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-STAGES = 6
-"""Evaluations that an integration step costs."""
 PATIENCE, FIRST_WAIT = 0.25, 2.0**-30
 """As parts of the largest step, and of that: a joint that is back at its limit sooner than the one
 after leaving it is kept there for the other, and each time that this is so again twice as long.
@@ -98,6 +73,14 @@ class _Equations:
         self._write(self._buffer, 0, *y)
         a, rank = self._acceleration(self._q, self._v)
         return list(a), rank
+
+    def rates(self, stops: Stops, ranks: list[int], y: State) -> State:
+        """ẏ at y with the joints held that are; the rank is added to ranks."""
+        a, rank = self.acceleration(y)
+        if stops.held:
+            stops.restrain(y, a)
+        ranks.append(rank)
+        return y[self.n :] + a
 
 
 def advance(
@@ -193,8 +176,9 @@ def _until_event(
         small = step <= jump_step  # also where it is stretched to the end
         if last:
             step = end - t
-        y_new, K, ranks = _dormand_prince(equations, y, step, stops, rates, rank)
-        norm = _error_norm(K, y, y_new, step, rtol, atol)
+        ranks = [rank]
+        y_new, K = dormand_prince(partial(equations.rates, stops, ranks), y, step, rates)
+        norm = error_norm(K, y, y_new, step, rtol, atol)
         factor = MIN_FACTOR
         if isfinite(norm):
             factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
@@ -221,64 +205,6 @@ def _until_event(
                 raise _too_fast(equations, y, too_fine=True)
         if equations.evaluations > BUDGET:
             raise _too_fast(equations, y, too_fine=False)
-
-
-@lru_cache(maxsize=8)  # most steps are of one size
-def _weights(step: float) -> list[list[float]]:
-    """The rows of A, and E, times the step."""
-    return [[step * weight for weight in row] for row in (*A, E)]
-
-
-def _dormand_prince(
-    equations: _Equations, y: State, step: float, stops: Stops, k1: State, rank: int
-) -> tuple[State, list[State], list[int]]:
-    """One step from y, where the derivative is k1: y_new, the stages' derivatives and ranks."""
-    n, ranks = equations.n, [rank]
-
-    def rates(y: State) -> State:
-        a, rank = equations.acceleration(y)
-        if stops.held:
-            stops.restrain(y, a)
-        ranks.append(rank)
-        return y[n:] + a
-
-    s2, s3, s4, s5, s6, s7, _ = _weights(step)
-    (a,) = s2
-    k2 = rates([u + a * p for u, p in zip(y, k1)])
-    a, b = s3
-    k3 = rates([u + (a * p + b * q) for u, p, q in zip(y, k1, k2)])
-    a, b, c = s4
-    k4 = rates([u + (a * p + b * q + c * r) for u, p, q, r in zip(y, k1, k2, k3)])
-    a, b, c, d = s5
-    k5 = rates([u + (a * p + b * q + c * r + d * s) for u, p, q, r, s in zip(y, k1, k2, k3, k4)])
-    a, b, c, d, e = s6
-    k6 = rates(
-        [
-            u + (a * p + b * q + c * r + d * s + e * t)
-            for u, p, q, r, s, t in zip(y, k1, k2, k3, k4, k5)
-        ]
-    )
-    a, _, b, c, d, e = s7
-    y_new = [
-        u + (a * p + b * q + c * r + d * s + e * t)
-        for u, p, q, r, s, t in zip(y, k1, k3, k4, k5, k6)
-    ]
-    return y_new, [k1, k2, k3, k4, k5, k6, rates(y_new)], ranks
-
-
-def _error_norm(
-    K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float
-) -> float:
-    """Root mean square of the error over its tolerance; the step passes below 1."""
-    a, _, b, c, d, e, f = _weights(step)[-1]
-    k1, _, k3, k4, k5, k6, k7 = K
-    total = 0.0
-    for old, new, p, q, r, s, t, u in zip(y, y_new, k1, k3, k4, k5, k6, k7):
-        size = max(abs(old), abs(new))
-        error = a * p + b * q + c * r + d * s + e * t + f * u
-        ratio = error / (atol + rtol * size)
-        total += ratio * ratio
-    return sqrt(total / len(y))
 
 
 def _too_fast(equations: _Equations, y: State, *, too_fine: bool) -> StepError:
@@ -311,12 +237,7 @@ def _first_event(
         else:  # all are inside, and none has turned
             return None
     at_the_end = _events(equations, y_new, stops)
-    start, Q = np.array(y), np.array(K).T.dot(P)
-
-    def state(passed: float) -> State:
-        return y_new if passed == step else _dense_output(start, Q, passed / step, step).tolist()
-
-    latest = step
+    state, latest = interpolant(y, y_new, K, step), step
     if not at_the_end:
         excursion = _excursion(y, y_new, state, step, stops.limits)
         if excursion is None:
@@ -362,12 +283,6 @@ def _excursion(
 
 def _turn(state: Callable[[float], State], component: int, v: float, step: float) -> float:
     return _bisect(lambda passed: state(passed)[component] * v <= 0.0, step, step)
-
-
-def _dense_output(y: Array, Q: Array, x: float, step: float) -> Array:
-    """State at the part x of a step, by the fourth-order interpolant."""
-    state: Array = y + step * x * Q.dot((1.0, x, x * x, x * x * x))
-    return state
 
 
 def _bisect(happened: Callable[[float], bool], latest: float, step: float) -> float:

@@ -98,7 +98,7 @@ class Mechanism:
         M = np.triu(M) + np.triu(M, 1).T
         return M if G is None else np.asarray(G.T @ M @ G)
 
-    def inverse_mass(self, q: Sequence[float]) -> Array:
+    def inverse_mass(self, q: Sequence[float] | Array) -> Array:
         """M(q)⁻¹, n × n."""
         if self._G is not None:
             return np.asarray(np.linalg.inv(self.mass_matrix(np.array(q))))

@@ -17,7 +17,8 @@ from operator import mul
 import numpy as np
 
 from . import effort_control, joint_control, task_control
-from .integrator import BUDGET, STAGES, Array, Response, StepError, advance
+from .dormand_prince import STAGES
+from .integrator import BUDGET, Array, Response, StepError, advance
 from .mechanism import Mechanism
 from .orientation import quaternion
 from .robot import Robot
@@ -245,17 +246,21 @@ class Plant:
         command: Response = self._law(self)
         damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
         force = np.array(self.f_ext)
-        # where none of these is there, q̈ = M⁻¹(M q̈_cmd + h − h)
-        acts = damping.any() or external.any() or force.any() or self.limit_effort
-        if self._commands == "acceleration" and self.known is self._real and not acts:
+        # q̈ = q̈_cmd + M⁻¹(…): rounding of M q̈_cmd + h − h would move joints that are at rest
+        cancels = self._commands == "acceleration" and self.known is self._real
+        cancels = cancels and not self.limit_effort
+        if cancels and not (damping.any() or external.any() or force.any()):
             return command
 
         def acceleration(q: Array, v: Array) -> tuple[list[float], int]:
-            tau, rank = self._control_effort(command, q, v)
-            effort = tau + external - damping * v
+            effort = external - damping * v
             if force.any():
                 effort += force @ np.array(self._real.observe(q, v)[1][:3])
-            return self._real.forward_dynamics(q, v, effort).tolist(), rank
+            if cancels:
+                given, rank = command(q, v)
+                return np.add(given, self._real.inverse_mass(q) @ effort).tolist(), rank
+            tau, rank = self._control_effort(command, q, v)
+            return self._real.forward_dynamics(q, v, tau + effort).tolist(), rank
 
         return acceleration
 

@@ -127,7 +127,7 @@ CONTROLS = {
 "pose" is "task" with three more rows."""
 
 DISTURBANCES = ("tau_ext", "f_ext")
-OF_A_LAW = {group for law in CONTROLS.values() for group in law.outputs}
+OF_A_LAW = {group for law in CONTROLS.values() for group in (*law.outputs, *law.parameters)}
 
 Row = tuple[str, str, list[str], list[str], str]
 Starts = Mapping[str, Value | tuple[float, ...]]
@@ -149,7 +149,7 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
         default.setdefault("q_des", default["q_start"])
     table: list[Variable] = []
     for group, causality, size, units, text in _rows(robot, control):
-        own = group in (*law.inputs, *law.outputs)
+        own = group in (*law.inputs, *law.outputs, *law.parameters)
         if own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES:
             start = default.get(group) if causality in ("input", "parameter") else None
             for i, (unit, owner) in enumerate(zip(units, size)):
@@ -193,11 +193,8 @@ def _rows(robot: Robot, control: str) -> list[Row]:
 
     position, velocity = units("m", "rad"), units("m/s", "rad/s")
     acceleration, effort = units("m/s2", "rad/s2"), units("N", "N.m")
-    known: Row = ("payload_known", "parameter", [], [""], "the controller knows the payload")
-    rcond: Row = (
-        "rcond", "parameter", [], [""], "singular values up to rcond times the largest are dropped",
-    )  # fmt: skip
-    parameters = CONTROLS[control].parameters
+    dropped = "singular values up to rcond times the largest are dropped"
+    limited = "limit the control effort to the URDF's effort limits"
     return [
         ("x_des", "input", axis, ["m"] * 3, "target position"),
         ("xd_des", "input", axis, ["m/s"] * 3, "target velocity"),
@@ -232,16 +229,13 @@ def _rows(robot: Robot, control: str) -> list[Row]:
         ("gravity", "parameter", root, ["m/s2"] * 3, "gravity"),
         ("payload", "parameter", [], ["kg"], f"point mass at {robot.frame}"),
         ("payload_com", "parameter", frame, ["m"] * 3, "where the payload is"),
-        *([rcond] if "rcond" in parameters else []),
+        ("rcond", "parameter", [], [""], dropped),
         ("rtol", "parameter", [], [""], "relative tolerance of the integrator"),
         ("atol", "parameter", [], [""], "absolute tolerance of the integrator"),
         ("max_step", "parameter", [], ["s"], "largest step of the integrator"),
-        (
-            "limit_effort", "parameter", [], [""],
-            "limit the control effort to the URDF's effort limits",
-        ),
+        ("limit_effort", "parameter", [], [""], limited),
         ("rigid_stops", "parameter", [], [""], "joint stops act on the other joints too"),
-        *([known] if "payload_known" in parameters else []),
+        ("payload_known", "parameter", [], [""], "the controller knows the payload"),
     ]  # fmt: skip
 
 

@@ -10,12 +10,12 @@ import io
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import PlotError
-from ..files import refusing, write_file
+from ..files import free_name, refusing, write_file
 from ..version import __version__
 from .scales import GREY, HAIR, INK
 
@@ -102,7 +102,7 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     Raises:
         PlotError: another kind of file, or it cannot be written.
     """
-    path = Path(output) if output is not None else _free_name(drawing.name)
+    path = Path(output) if output is not None else free_name(drawing.name, ".png", _is_ours)
     kind = file_kind(path)
     content = _html(drawing) if kind == "html" else _rendered(drawn(drawing), kind)
     with refusing(PlotError, f"write '{path}'"):
@@ -199,12 +199,6 @@ tr {{ border-top: 1px solid {HAIR}; }}
 </body>
 </html>
 """.encode()
-
-
-def _free_name(name: str) -> Path:
-    """The first of NAME.png, NAME-2.png, … that does not exist or is a plot of ours."""
-    candidates = (Path(f"{name}.png" if i == 1 else f"{name}-{i}.png") for i in count(1))
-    return next(path for path in candidates if not os.path.lexists(path) or _is_ours(path))
 
 
 def _is_ours(path: Path) -> bool:

@@ -23,11 +23,11 @@ from .panels import (
     Curve,
     Look,
     Panel,
+    close_outline,
     duration,
     error_panel,
     joint_panels,
     looks,
-    outline,
     track_looks,
 )  # fmt: skip
 from .scales import GREY, HAIR, INK, PALE
@@ -65,10 +65,11 @@ def body(tracks: Sequence[Track]) -> str:
         raise PlotError(
             f"cannot plot into a page: {missing}; install the package 'plotly' (the extra 'view')"
         ) from missing
-    content = {"figures": [over_time(tracks), *in_workspace(tracks)], "rows": _rows(tracks)}
+    over = over_time(tracks)
+    content = {"figures": [over, *in_workspace(tracks)], "rows": _rows(tracks)}
     script = data_file("plots", "interactive.js").read_text("utf-8")
     return (
-        '<div id="plots"></div>\n'
+        f'<div id="plots"></div>\n{_thinned(tracks, over)}'
         f'<script type="text/plain" id="library">{_packed(get_plotlyjs())}</script>\n'
         f'<script type="text/plain" id="content">{_packed(json.dumps(content))}</script>\n'
         f"<script>\n{script}</script>"
@@ -94,6 +95,21 @@ def _numbers(values: Array) -> dict[str, str]:
 def _line(colour: str, dashes: Sequence[float] = (), width: float = 1.4) -> dict[str, Any]:
     told = ",".join(f"{width * part:g}px" for part in dashes)
     return {"color": colour, "width": width, "dash": told or "solid"}
+
+
+def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
+    """Which samples are drawn, where they are not all: a line for each track."""
+    lines = []
+    for i, track in enumerate(tracks):
+        own = [t["x"]["bdata"] for t in figure["data"] if t["meta"][0] == i and "bdata" in t["x"]]
+        drawn = max((len(base64.b64decode(x)) // 8 for x in own), default=0)
+        if drawn < track.recording.count:
+            lines.append(
+                f"<p>A curve of '{_text(track.name)}' is drawn through at most {drawn} of"
+                f" {track.recording.count} samples: of each part of it the ends, extremes, and both"
+                " sides of the greatest steps. Fewer joints are drawn through more.</p>\n"
+            )
+    return "".join(lines)
 
 
 # --- what is switched ---
@@ -160,9 +176,12 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         top = 1.0 - (row - 1) * (ROW + GAP) / height
         layout[f"yaxis{row}"] = _value_axis(panels, top, top - ROW / height)
         name = KINDS.get(kind, "Distance from the target")
-        layout["annotations"].append(_heading(f"{name} in {unit}", top))
+        heading = f"{name} in {unit}"
+        if kind == "error" and not panels[0].closed_forms:  # of which nobody asks here what it is
+            heading = ": ".join(filter(None, (heading, panels[0].told)))
+        layout["annotations"].append(_heading(heading, top))
         for panel in panels:
-            for trace in _traces(panel, look, end, POINTS // (4 * curves)):
+            for trace in _traces(panel, look, end, POINTS // curves):
                 data.append({**trace, "xaxis": "x", "yaxis": f"y{row}"})
     return {"data": data, "layout": layout}
 
@@ -176,7 +195,8 @@ def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str,
         if high > 1e6 * low:
             logarithmic["dtick"] = 3
         return {**axis, **logarithmic, "range": np.log10([low, high]).tolist()}
-    return {**axis, "nticks": 6}
+    pad = 0.04 * (high - low)  # off the edges, whatever another joint's range is
+    return {**axis, "range": [low - pad, high + pad], "nticks": 6}
 
 
 def _heading(text: str, top: float) -> dict[str, Any]:
@@ -187,11 +207,11 @@ def _heading(text: str, top: float) -> dict[str, Any]:
 
 
 def _traces(
-    panel: Panel, look: dict[tuple[int, str], Look], end: float, chunks: int
+    panel: Panel, look: dict[tuple[int, str], Look], end: float, most: int
 ) -> Iterator[dict[str, Any]]:
     """Closed forms, limits and curves, which belong to a track's joint and are told of it."""
     for curve in panel.closed_forms:
-        yield _trace(curve, "", _line(PALE, width=4.0), chunks, told="", hoverinfo="skip")
+        yield _trace(curve, "", _line(PALE, width=4.0), most, told="", hoverinfo="skip")
     for curve in panel.curves:
         own = look[curve.track, panel.joint]
         for limit in panel.limits:
@@ -203,13 +223,13 @@ def _traces(
     for curve in panel.curves:
         own = look[curve.track, panel.joint]
         line = _line(own.colour, own.dashes)
-        yield _trace(curve, panel.joint, line, chunks, told=panel.kind, hoverinfo="none")
+        yield _trace(curve, panel.joint, line, most, told=panel.kind, hoverinfo="none")
 
 
 def _trace(
-    curve: Curve, joint: str, line: dict[str, Any], chunks: int, *, told: str, hoverinfo: str
+    curve: Curve, joint: str, line: dict[str, Any], most: int, *, told: str, hoverinfo: str
 ) -> dict[str, Any]:
-    kept = outline(curve.y, chunks)
+    kept = close_outline(curve.y, most)
     return {
         "type": "scatter", "mode": "lines" if len(curve.t) > 1 else "markers",
         "x": _numbers(curve.t[kept]), "y": _numbers(curve.y[kept]),

@@ -14,7 +14,7 @@ import numpy as np
 from ..bag.outline import extremes
 from ..errors import PlotError
 from .closed_form import Array
-from .scales import COLOURS, SMALLEST_EFFORT, SMALLEST_ERROR, SMALLEST_RANGE
+from .scales import COLOURS, SMALLEST_EFFORT, SMALLEST_ERROR, SMALLEST_PART, SMALLEST_RANGE
 from .track import JointTrack, Track, number
 from .words import labels
 
@@ -53,9 +53,10 @@ class Panel(NamedTuple):
         unit: "rad or m" where no robot tells which.
         curves: of each track that has it.
         limits: values that it is held between, ascending.
-        told: limits, or what ``closed_forms`` leave out, in words.
+        told: limits, or what ``closed_forms`` leave out, in words; of an error that is below the
+            range, that it is.
         range: that shows the curves, and the limits that are near.
-        closed_forms: what the error is in closed form.
+        closed_forms: what the error is in closed form, where it is in the range.
     """
 
     kind: str
@@ -170,6 +171,7 @@ def _range(values: Sequence[Array], smallest: float) -> tuple[float, float]:
     found = [y for y in found if y.size]
     low = min((float(y.min()) for y in found), default=0.0)
     high = max((float(y.max()) for y in found), default=0.0)
+    smallest = max(smallest, SMALLEST_PART * max(abs(low), abs(high)))
     short = max(0.0, smallest - (high - low))
     return low - 0.5 * short, high + 0.5 * short
 
@@ -185,20 +187,39 @@ def error_panel(tracks: Sequence[Track]) -> Panel | None:
     low = floor(log10(max(float(error.min()), SMALLEST_ERROR)))
     high = max(low + 1, ceil(log10(max(float(error.max()), SMALLEST_ERROR))))
     disturbances = dict.fromkeys(chain(*(task.disturbances for _, _, task in tasks)))
-    name = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
+    exact = [Curve(i, t, k.closed_form) for i, t, k in tasks if k.closed_form is not None]
+    shown = tuple(curve for curve in exact if curve.y.max() >= 10.0**low)
+    told = "" if error.max() >= 10.0**low else f"less than {10.0**low:g} m throughout"
+    if shown:
+        told = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
     return Panel(
         "error", "", "m", tuple(Curve(i, t, task.error) for i, t, task in tasks), (),
-        "\n".join(textwrap.wrap(name, 36)), (10.0**low, 10.0**high),
-        tuple(Curve(i, t, k.closed_form) for i, t, k in tasks if k.closed_form is not None),
+        "\n".join(textwrap.wrap(told, 36)), (10.0**low, 10.0**high), shown,
     )  # fmt: skip
 
 
-def outline(values: Array, chunks: int = CHUNKS) -> Any:
+def outline(values: Array) -> Any:
     """Indices of the samples with which a line over time looks as it does with all of them.
 
-    Of each of the chunks the first, last, smallest and largest.
+    Of each of CHUNKS parts the first, last, smallest and largest.
     """
     n = len(values)
-    if n <= 4 * chunks:
+    if n <= 4 * CHUNKS:
         return slice(None)
-    return extremes(np.arange(n) // ceil(n / chunks), [values])
+    return extremes(np.arange(n) // ceil(n / CHUNKS), [values])
+
+
+def close_outline(values: Array, most: int) -> Any:
+    """So many at most, with which it does so from near by too, so that a jump is one.
+
+    Of parts as short as may be the same four, and both sides of the greatest rise and fall.
+    """
+    n, rise = len(values), np.diff(values)
+    kept: Any = slice(None)
+    size = 1
+    while n > most:
+        size = max(2 * size, 2 * n // most)
+        lines = [values, np.append(rise, np.nan), np.append(np.nan, rise)]
+        kept = extremes(np.arange(len(values)) // size, lines)
+        n = len(kept)
+    return kept

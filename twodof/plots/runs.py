@@ -14,6 +14,7 @@ from math import ceil, log10
 from pathlib import Path
 from typing import Any
 
+from ..bag.provenance import each_robot
 from ..bag.recording import Recording
 from .figure import TICK_STYLE, Drawing, drawn
 from .interactive import body
@@ -63,13 +64,19 @@ def plot(
     """A figure of one bag, or of several for comparison.
 
     Args:
-        bags: bags, or their folders.
+        bags: bags, or their folders; all robots of one that has several.
         urdf, frame: the robot and its end effector, as in ``track.read_tracks``.
 
     Raises:
         BagError, PlotError: naming what is wrong.
     """
-    return drawn(drawing(read_tracks(bags, urdf=urdf, frame=frame)))
+    return drawn(drawing(read_tracks(each_of(bags), urdf=urdf, frame=frame)))
+
+
+def each_of(bags: Sequence[Recording | str | Path]) -> list[Recording | Path]:
+    """Bags, and of those that have several robots each robot's."""
+    parts = ([bag] if isinstance(bag, Recording) else each_robot(Path(bag)) for bag in bags)
+    return [part for several in parts for part in several]
 
 
 def drawing(tracks: Sequence[Track]) -> Drawing:
@@ -256,10 +263,14 @@ def _draw_joint(axes: Axes, panel: Panel, looks: Sequence[Look]) -> None:
         axes.axhline(
             limit, color=INK, linewidth=0.9, dashes=(7, 2, 1.5, 2), zorder=1.9, label="limit"
         )
-    axes.text(1.0, 1.01, panel.told, transform=axes.transAxes, ha="right", va="bottom",
-              fontsize=7.0, color=GREY)  # fmt: skip
+    _tell(axes, panel.told)
     axes.set_ylim(*panel.range)
     set_ticks(axes.yaxis, 4)
+
+
+def _tell(axes: Axes, text: str) -> None:
+    axes.text(1.0, 1.01, text, transform=axes.transAxes, ha="right", va="bottom",
+              fontsize=7.0, color=GREY)  # fmt: skip
 
 
 # --- the error ---
@@ -277,7 +288,10 @@ def _draw_error(axes: Axes, panel: Panel, looks: Sequence[Look]) -> None:
         look = looks[curve.track]
         _draw_curve(axes, curve, look.label, **line(look.colour, look.dashes))
     axes.set_title(f"Distance from the target in {panel.unit}")
-    axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.02))
+    if handles:
+        axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.02))
+    else:
+        _tell(axes, panel.told)
 
 
 def _decades(axes: Axes, low: float, high: float) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bag.provenance import KNOWN_UNTIL
+from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_outline
 from ..bag.recording import Recording, Schedule
 from ..errors import PlotError
@@ -111,8 +111,9 @@ class Track:
 
     @property
     def name(self) -> str:
-        """The bag's name."""
-        return shown(self.recording.path.resolve().name)
+        """The bag's name, with that of one of its robots."""
+        folder, robot = robot_in(self.recording.path)
+        return shown("-".join([folder.resolve().name, *filter(None, robot.split("/"))]))
 
 
 def read_tracks(

@@ -7,7 +7,7 @@ frame, or JointStates, whose joints are matched by name.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -62,18 +62,44 @@ class Command(NamedTuple):
     strangers: tuple[str, ...] = ()
 
 
-def deserialise(kind: str, cdr: bytes) -> Any:
-    """A message of a type.
+def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
+    """A message of a type, of so many bytes at most.
 
     Raises:
         CommandError: the bytes, which are anybody's, are none.
     """
     try:
-        if len(cdr) > MAX_COMMAND:
+        if len(cdr) > most:
             raise ValueError(f"it has {len(cdr)} bytes")
         return STORE.deserialize_cdr(cdr, kind)
     except Exception as error:  # rosbags raises anything
         raise CommandError("bytes", f"cannot be read ({error})") from error
+
+
+def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[int, int]]:
+    """Of joints that a message names those of the robot: index there, index in the message.
+
+    Raises:
+        CommandError: there are none, or it names one twice.
+    """
+    known = [(joints[name], k) for k, name in enumerate(names) if name in joints]
+    told = f"{', '.join(names)[:LONGEST_NAME]!r}"
+    if not known:
+        raise CommandError("names", f"is of no joint of this robot: {told}")
+    if len(dict(known)) < len(known):
+        raise CommandError("names", f"names a joint twice: {told}")
+    return known
+
+
+def sized(part: Sequence[float], what: str, names: Sequence[str]) -> Sequence[float]:
+    """Numbers of a message, one for each joint that it names.
+
+    Raises:
+        CommandError: there are not as many.
+    """
+    if len(part) != len(names):
+        raise CommandError("sizes", f"has {len(part)} {what} for {len(names)} joints")
+    return part
 
 
 class Commands:
@@ -138,23 +164,14 @@ class Commands:
     def _of_joints(self, message: Any) -> Inputs:
         """Efforts, or positions and velocities, which are 0 where there are none."""
         names = message.name
-        known = [(self._joints[name], k) for k, name in enumerate(names) if name in self._joints]
-        if not known:
-            told = ", ".join(names)[:LONGEST_NAME]
-            raise CommandError("names", f"is of no joint of this robot: {told!r}")
-
-        def numbers(part: Sequence[float], what: str) -> Sequence[float]:
-            if len(part) != len(names):
-                told = f"has {len(part)} {what} for {len(names)} joints"
-                raise CommandError("sizes", told)
-            return part
-
+        known = known_joints(names, self._joints)
         if effort := self._groups["tau_cmd"]:
-            tau = numbers(message.effort, "efforts")
+            tau = sized(message.effort, "efforts", names)
             return {effort[i]: float(tau[k]) for i, k in known}
-        q = numbers(message.position, "positions")
+        q = sized(message.position, "positions", names)
         given = {self._groups["q_des"][i]: float(q[k]) for i, k in known}
-        v = numbers(message.velocity, "velocities") if len(message.velocity) else [0.0] * len(q)
+        v = message.velocity
+        v = sized(v, "velocities", names) if len(v) else [0.0] * len(q)
         return given | {self._groups["v_des"][i]: float(v[k]) for i, k in known}
 
 

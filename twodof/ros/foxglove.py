@@ -11,7 +11,7 @@ from ..errors import InputError, PublishError
 from ..experiments import Experiment, Value, resolve
 from ..sample import Sample, Sink
 from .cdr import Rows
-from .messages import STORE, Messages
+from .messages import GAINS, STORE, Messages
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -24,7 +24,6 @@ except ImportError as missing:
 
 LOG = logging.getLogger(__name__)
 HOST, PORT = "127.0.0.1", 8765
-GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 
 
 class Foxglove(Sink):

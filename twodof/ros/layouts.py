@@ -11,23 +11,31 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..errors import InputError
 from ..experiments import experiment
 from ..files import write_file
 from ..fmu import Fmu, load_fmu
-from .messages import JOINT_STATES, POSE, Messages, check_name
+from .messages import GAINS, JOINT_STATES, POSE, Messages, check_name
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
 PARTS = {"position": "q", "velocity": "v", "effort": "tau"}
 DESCRIPTION = "/robot_description"
 
 
-def layouts(fmu: Fmu | str | Path, folder: str | Path = ".", *, namespace: str = "") -> list[Path]:
+def layouts(
+    fmu: Fmu | str | Path,
+    folder: str | Path = ".",
+    *,
+    namespace: str = "",
+    overwrite: bool = False,
+) -> list[Path]:
     """Write the files in which RViz, PlotJuggler and Foxglove show an FMU's robot.
 
     Args:
         fmu: whose robot is published or recorded, with ``scene`` and ``effort``.
-        folder: where the files are written; they are called as the FMU is.
+        folder: where the files are written, made if need be; they are called as the FMU is.
         namespace: of its topics, as of ``Publisher``.
+        overwrite: replace files that differ.
 
     Returns:
         The files: .rviz, .xml for PlotJuggler, .json for Foxglove.
@@ -35,7 +43,7 @@ def layouts(fmu: Fmu | str | Path, folder: str | Path = ".", *, namespace: str =
     Raises:
         BagError: the FMU carries no robot.
         FmuError: it cannot be read.
-        InputError: the namespace is none.
+        InputError: the namespace is none, or a file exists and holds something else.
         OSError: a file cannot be written.
     """
     check_name("namespace", namespace)
@@ -53,12 +61,16 @@ def layouts(fmu: Fmu | str | Path, folder: str | Path = ".", *, namespace: str =
         ".plotjuggler.xml": _plotjuggler(fmu, prefix, units),
         ".foxglove.json": _foxglove(fmu, prefix, units, types),
     }
-    paths = []
-    for ending, text in texts.items():
-        path = Path(folder, Path(fmu.path).stem + ending)
-        write_file(path, text.encode())
-        paths.append(path)
-    return paths
+    stem = Path(folder, Path(fmu.path).stem)
+    contents = {Path(f"{stem}{ending}"): text.encode() for ending, text in texts.items()}
+    for path, content in contents.items():
+        if not overwrite and path.exists() and path.read_bytes() != content:
+            reason = "exists and differs; choose another folder or give `overwrite=True`"
+            raise InputError(f"'{path}' {reason}")
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    for path, content in contents.items():
+        write_file(path, content)
+    return [*contents]
 
 
 def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
@@ -128,14 +140,13 @@ def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
 
 
 def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[str, str]) -> str:
-    """The robot in 3D above its gains, beside a plot of each part of the joint states."""
+    """The robot in 3D above its gains, if any, beside a plot of each part of the joint states."""
     shown = [prefix + DESCRIPTION, *(name for name, kind in types.items() if kind == POSE)]
     panels: dict[str, Any] = {
         "3D!robot": {
             "followTf": fmu.root, "cameraState": {"distance": 1.5},
             "topics": {name: {"visible": True} for name in shown},
         },
-        "Parameters!gains": {"title": "Gains"},
     }  # fmt: skip
     for part, unit in units.items():
         paths = [
@@ -151,8 +162,11 @@ def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[st
     *upper, plots = [f"Plot!{part}" for part in units]
     for plot in reversed(upper):
         plots = {"direction": "column", "first": plot, "second": plots}  # type: ignore[assignment]
-    left = {"direction": "column", "first": "3D!robot", "second": "Parameters!gains",
-            "splitPercentage": 75}  # fmt: skip
+    left: Any = "3D!robot"
+    if any(group in GAINS for group in fmu.groups("input")):
+        panels["Parameters!gains"] = {"title": "Gains"}
+        left = {"direction": "column", "first": left, "second": "Parameters!gains",
+                "splitPercentage": 75}  # fmt: skip
     mosaic = {"direction": "row", "first": left, "second": plots}
     layout = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": mosaic}
     return json.dumps(layout, indent=2) + "\n"

@@ -38,11 +38,15 @@ END_EFFECTOR = "/end_effector"
 CLOCK = "/clock"
 POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
+"""Inputs that are shown and set as parameters."""
 FOREVER = QosTime(9223372036, 854775807)
 
 XYZ = "float64 x\nfloat64 y\nfloat64 z"
 DEFINITIONS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id",
     "rosgraph_msgs/msg/Clock": "builtin_interfaces/Time clock",
     "std_msgs/msg/Bool": "bool data",
@@ -56,6 +60,10 @@ DEFINITIONS = {
     "geometry_msgs/msg/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
     POINT: "std_msgs/Header header\ngeometry_msgs/Point point",
     POSE: "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    "trajectory_msgs/msg/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\n"
+    "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start",
+    JOINT_TRAJECTORY: "std_msgs/Header header\nstring[] joint_names\n"
+    "trajectory_msgs/JointTrajectoryPoint[] points",
     "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\n"
     "geometry_msgs/Quaternion rotation",
     "geometry_msgs/msg/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"

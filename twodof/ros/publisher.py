@@ -111,6 +111,8 @@ class Publisher(Sink):
         if of_joints and not self.lockstep:
             ramp = None if self._on_timeout is None else self._on_timeout == "ramp"
             self._watchdog = Watchdog(run.fmu, self._timeout or TIMEOUT, ramp)
+        elif not of_joints and self._timeout is not None and not self.lockstep:
+            raise InputError("`timeout` is for commands of joints, and for `lockstep`")
         elif self._on_timeout is not None:
             raise InputError("`on_timeout` is for commands of joints that are not in `lockstep`")
         self._heard = {}
@@ -310,6 +312,8 @@ def publish_together(
         pace = RealTime()
     if not robots:
         raise InputError("there are no robots to publish")
+    for name in sinks.keys() - robots.keys():
+        raise InputError(f"`sinks` has '{name}', and there are the robots {', '.join(robots)}")
     if len(robots) > 1 and str(options.get("state_topic", "")).startswith("/"):
         raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
     shared, now, members = open_domain(place or network()), time.time(), list[Member]()

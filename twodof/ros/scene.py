@@ -53,7 +53,10 @@ class Scene:
         every = robot.joints.values()
         self.moving = [joint for joint in every if self._kinematics.moves(joint)]
         self.fixed = [joint for joint in every if not self._kinematics.moves(joint)]
-        _replace_meshes(robot.tree, read)
+        try:
+            _replace_meshes(robot.tree, read)
+        except ValueError as error:
+            raise RobotError(f"its meshes cannot be placed: {error}") from error
         self.description = ET.tostring(robot.tree, encoding="unicode")
 
     def transforms(self, joints: Iterable[Joint], q: Array) -> list[Array]:

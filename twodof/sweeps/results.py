@@ -119,9 +119,9 @@ class Results:
         self._write_part([])
 
     def _taken(self) -> SweepError:
-        return SweepError(
-            f"'{self.path}' exists; resume it with `resume=True`, or choose another `output`"
-        )
+        known = self.path.is_dir() and _files(self.path)
+        what = "exists; resume it with `resume=True`, or" if known else "exists and is no sweep;"
+        return SweepError(f"'{self.path}' {what} choose another `output`")
 
     def _resume(self, provenance: dict[str, Any]) -> None:
         if not self.path.is_dir():
@@ -298,15 +298,27 @@ def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
 def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
     for key in COMPARED:
         if there[key] != wanted[key]:
-            other = {"fmu": f"of another FMU ({there['fmu']['file']}, {there['fmu']['guid']})"}
+            other = {
+                "fmu": f"another FMU, {there['fmu']['file']} ({there['fmu']['guid']})",
+                "bags": f"`bags={there['bags']}`",
+            }
             raise SweepError(
-                f"'{path}' is {other.get(key, f'of other {key}: {json.dumps(there[key]):.300}')};"
-                " resume it with those, or choose another `output`"
+                f"'{path}' was begun with {other.get(key) or _differing(there[key], wanted[key])};"
+                " begin this sweep in another `output`, or resume that one as it was begun"
             )
     if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
         raise SweepError(
             f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version"
         )
+
+
+def _differing(there: dict[str, Any], wanted: dict[str, Any]) -> str:
+    """Of a design or options: what was asked for then, where it is not what is now."""
+    return ", ".join(
+        f"{key.replace('_', ' ')} {json.dumps(value):.200}"
+        for key, value in there.items()
+        if value != wanted.get(key)
+    )
 
 
 def _write(path: Path, table: pa.Table) -> None:

@@ -1,0 +1,177 @@
+"""What pages cost a browser: until they are ready, a frame, and a drag.
+
+    python benchmarks/page.py [ARM.html|PLOT.html ...]
+
+Opens each in headless Chromium from its file, without a network, rendering in software in a window
+of 900 × 560; without arguments the pages of the default arm and of a Panda to a pose, and the plot
+of one hour of that Panda at 100 Hz (some minutes). Prints
+
+- size; beside an empty page, the time from navigation until it is ready, and the processor time
+  of that in all of the browser's processes;
+- of an arm that runs: frames a second and processor time a frame; how far the plant fell behind the
+  clock at most, and the longest frame, by which it may;
+- of a target that is dragged: from the event until the frame after the one that shows it begins.
+
+A machine that does something else lengthens the times, hardly the processor times. Needs chromium
+and the packages 'playwright' and 'example-robot-data'.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import browser  # noqa: E402
+import numpy as np  # noqa: E402
+from native_models import robots_folder  # noqa: E402
+from playwright.sync_api import Browser, Page  # noqa: E402
+
+import twodof  # noqa: E402
+
+SECONDS = 10.0  # of frames
+DRAGS = 30
+HOUR = 3600.0  # s
+READY = """() => new Promise(resolve => {
+    const look = () => document.querySelector("[data-ready]")
+        ? requestAnimationFrame(() => resolve(performance.now())) : setTimeout(look, 5);
+    look();
+})"""
+FRAMES = """seconds => new Promise(resolve => {
+    const frames = [];
+    const frame = now => {
+        frames.push([now / 1000, arm.time(arm.k)]);
+        if (now / 1000 - frames[0][0] < seconds) requestAnimationFrame(frame);
+        else resolve(frames);
+    };
+    requestAnimationFrame(frame);
+})"""
+DELAYS = """() => {
+    globalThis.delays = [];
+    document.querySelector("canvas").addEventListener("pointermove", event => {
+        requestAnimationFrame(() => requestAnimationFrame(now => {
+            delays.push(now - event.timeStamp);
+        }));
+    });
+}"""
+
+
+def main() -> None:
+    """Measure and print."""
+    print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f} before it")
+    with tempfile.TemporaryDirectory() as name, browser.chromium() as chromium:
+        empty = Path(name) / "empty.html"
+        empty.write_text("<canvas data-ready></canvas>")
+        measure(chromium, empty)
+        for path in map(Path, sys.argv[1:]) if sys.argv[1:] else pages(Path(name)):
+            measure(chromium, path)
+
+
+def pages(folder: Path) -> Iterator[Path]:
+    """Those that are measured by default."""
+    arm = twodof.build_fmu(folder / "arm.fmu", twodof.FmuOptions(native=True))
+    yield twodof.page(arm, folder / "arm.html")
+    robot = {
+        "urdf": robots_folder() / "panda_description/urdf/panda.urdf",
+        "mesh_dir": robots_folder().parent, "frame": "panda_hand_tcp", "native": True,
+    }  # fmt: skip
+    options = twodof.FmuOptions(**robot, control="pose")
+    panda = twodof.build_fmu(folder / "panda.fmu", options)
+    yield twodof.page(panda, folder / "panda.html")
+    random = np.random.default_rng(0)
+    changes = [
+        (t, {"x_des": random.uniform((0.3, -0.2, 0.3), (0.6, 0.2, 0.6))})
+        for t in np.arange(0.0, HOUR, 5.0)
+    ]
+    run = twodof.experiment(panda, stop_time=HOUR, changes=changes)
+    twodof.simulate(run, twodof.Bag(folder / "hour", effort=True))
+    plot = [sys.executable, "-m", "twodof", "plot", "hour", "-o", "hour.html"]
+    subprocess.run(plot, cwd=folder, check=True, capture_output=True)
+    yield folder / "hour.html"
+
+
+def measure(chromium: Browser, path: Path) -> None:
+    """Open a page, and print what it costs."""
+    with chromium.new_context(viewport=browser.VIEWPORT, offline=True) as context:
+        context.set_default_timeout(1e3 * browser.PATIENCE)
+        page = context.new_page()
+        with spent() as processor:
+            page.goto(path.absolute().as_uri(), wait_until="commit")
+            ready = page.evaluate(READY) / 1000
+        print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB, ready after {ready:.2f} s"
+              f" ({processor[0]:.2f} s of processor time)")  # fmt: skip
+        if page.locator("#arm-scene").count():
+            frames(page)
+            if page.evaluate("arm.groups.has('x_des')"):
+                drag(page)
+
+
+def frames(page: Page) -> None:
+    """Of an arm that runs."""
+    page.wait_for_timeout(1000)
+    with spent() as processor:
+        found = np.array(page.evaluate(FRAMES, SECONDS))
+    between = np.diff(found[:, 0])
+    late = found[:, 0] - found[0, 0] - (found[:, 1] - found[0, 1])
+    print(
+        f"  {1 / between.mean():.0f} frames a second, {1e3 * processor[0] / len(found):.0f} ms of"
+        f" processor time each; the plant late by at most {1e3 * late.max():.0f} ms, longest frame"
+        f" {1e3 * between.max():.0f} ms"
+    )
+
+
+def drag(page: Page) -> None:
+    """Of a target."""
+    page.locator("#arm-reset").click()
+    place = browser.target_place(page)
+    before = page.evaluate("arm.held('x_des')")
+    page.evaluate(DELAYS)
+    page.mouse.move(*place)
+    page.mouse.down()
+    for i in range(DRAGS):
+        page.mouse.move(place[0] - i, place[1])
+        page.wait_for_timeout(100)
+    page.mouse.up()
+    page.wait_for_timeout(200)
+    assert page.evaluate("arm.held('x_des')") != before
+    delays = page.evaluate("delays")
+    print(
+        f"  a drag is seen after {statistics.median(delays):.0f} ms, at most {max(delays):.0f} ms"
+    )
+
+
+@contextmanager
+def spent() -> Iterator[list[float]]:
+    """The processor time of the browser meanwhile, s, in all of its processes."""
+    before, found = processor_time(), [0.0]
+    yield found
+    found[0] = processor_time() - before
+
+
+def processor_time() -> float:
+    """Of all processes that descend from this one, s."""
+    tick = os.sysconf("SC_CLK_TCK")
+    children: dict[int, list[tuple[int, float]]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended since
+            words = stat.read_text().rpartition(")")[2].split()
+            times = sum(map(int, words[11:15])) / tick
+            children.setdefault(int(words[1]), []).append((int(stat.parent.name), times))
+    waiting, total = [os.getpid()], 0.0
+    while waiting:
+        for pid, times in children.get(waiting.pop(), []):
+            waiting.append(pid)
+            total += times
+    return total
+
+
+if __name__ == "__main__":
+    main()

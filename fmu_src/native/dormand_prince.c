@@ -1,0 +1,88 @@
+/* Coefficients, error norm and dense output are those of SciPy's RK45 and plant/dormand_prince.py.
+
+   Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986. */
+#include "dormand_prince.h"
+
+#include <math.h>
+#include <string.h>
+
+/* Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution. */
+static const double A[STAGES][STAGES] = {
+    {1.0 / 5, 0, 0, 0, 0, 0},
+    {3.0 / 40, 9.0 / 40, 0, 0, 0, 0},
+    {44.0 / 45, -56.0 / 15, 32.0 / 9, 0, 0, 0},
+    {19372.0 / 6561, -25360.0 / 2187, 64448.0 / 6561, -212.0 / 729, 0, 0},
+    {9017.0 / 3168, -355.0 / 33, 46732.0 / 5247, 49.0 / 176, -5103.0 / 18656, 0},
+    {35.0 / 384, 0, 500.0 / 1113, 125.0 / 192, -2187.0 / 6784, 11.0 / 84},
+};
+static const double E[STAGES + 1] = {
+    -71.0 / 57600, 0, 71.0 / 16695, -71.0 / 1920, 17253.0 / 339200, -22.0 / 525, 1.0 / 40};
+static const double P[STAGES + 1][4] = {
+    {1, -8048581381.0 / 2820520608, 8663915743.0 / 2820520608, -12715105075.0 / 11282082432},
+    {0, 0, 0, 0},
+    {0, 131558114200.0 / 32700410799, -68118460800.0 / 10900136933, 87487479700.0 / 32700410799},
+    {0, -1754552775.0 / 470086768, 14199869525.0 / 1410260304, -10690763975.0 / 1880347072},
+    {0, 127303824393.0 / 49829197408, -318862633887.0 / 49829197408,
+     701980252875.0 / 199316789632},
+    {0, -282668133.0 / 205662961, 2019193451.0 / 616988883, -1453857185.0 / 822651844},
+    {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
+};
+
+int evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS])
+{
+    step->evaluations++;
+    return acceleration(step->plant, y, y + N_JOINTS, a);
+}
+
+double dormand_prince(Step *step)
+{
+    const double rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
+    double *y_new = step->y_new, sum = 0.0;
+    for (int stage = 1; stage <= STAGES; stage++) {
+        double weight[STAGES], *a = step->K[stage] + N_JOINTS;
+        for (int s = 0; s < stage; s++)
+            weight[s] = step->size * A[stage - 1][s];
+        for (int i = 0; i < N_STATES; i++) {
+            double change = 0.0;
+            for (int s = 0; s < stage; s++)
+                change += weight[s] * step->K[s][i];
+            y_new[i] = step->y[i] + change;
+        }
+        memcpy(step->K[stage], y_new + N_JOINTS, N_JOINTS * sizeof *y_new);
+        step->rank[stage] = evaluate(step, y_new, a);
+        if (step->stops.any_held) {
+            double pressed[N_JOINTS];
+            restrain(step->plant, &step->stops, y_new, a, pressed);
+        }
+    }
+    for (int i = 0; i < N_STATES; i++) {
+        double error = 0.0;
+        for (int s = 0; s <= STAGES; s++)
+            error += E[s] * step->K[s][i];
+        const double size = fabs(step->y[i]), size_new = fabs(y_new[i]);
+        const double ratio =
+            step->size * error / (atol + rtol * (size > size_new ? size : size_new));
+        sum += ratio * ratio;
+    }
+    return sqrt(sum / N_STATES);
+}
+
+void interpolate(Step *step)
+{
+    for (int i = 0; i < N_STATES; i++)
+        for (int k = 0; k < 4; k++) {
+            step->Q[i][k] = 0.0;
+            for (int s = 0; s <= STAGES; s++)
+                step->Q[i][k] += step->K[s][i] * P[s][k];
+        }
+}
+
+void dense_output(const Step *step, double passed, double y[N_STATES])
+{
+    const double x = passed / step->size;
+    for (int i = 0; i < N_STATES; i++) {
+        const double *c = step->Q[i];
+        const double slope = c[0] + c[1] * x + c[2] * (x * x) + c[3] * (x * x * x);
+        y[i] = passed == step->size ? step->y_new[i] : step->y[i] + step->size * x * slope;
+    }
+}

@@ -1,0 +1,142 @@
+/**
+ * An FMU that is stepped by the server of this page: orders go up, samples come down.
+ *
+ * @typedef {Object} News what has happened
+ * @property {number} run number of the run
+ * @property {number} t of the latest sample, s; there may be more than there was room for
+ * @property {number} heard how many orders of this page were heard by then
+ * @property {number[][]} rows samples, each with its time first
+ * @property {Record<string, Value>} values inputs and parameters
+ * @property {boolean} playing
+ * @property {number} recorded
+ * @property {number} missed
+ * @property {number} steps
+ * @property {number} worst s
+ * @property {string[]} notes the latest of all
+ * @property {number} noted how many there were
+ */
+
+const NOTED = 8000; // ms that a note is shown
+const PACE_WINDOW = 1000; // ms over which the real-time factor is taken
+
+class Remote extends Samples {
+  without = ["scrub", "loops", "pace", "download"];
+  told = 0; // orders
+  run = -1;
+  noted = -1;
+  forgetting = 0; // timer of the note
+  /** @type {[number, number][]} by the clock, ms, and of the robot, s */
+  past = [];
+
+  /**
+   * @param {Facts} facts
+   * @param {WebSocket} socket
+   */
+  constructor(facts, socket) {
+    super(facts, true);
+    this.socket = socket;
+  }
+
+  /**
+   * That of this page's server, once its first sample is there.
+   * @param {Facts} facts
+   * @returns {Promise<Remote>}
+   */
+  static connect(facts) {
+    const socket = new WebSocket(`${location.origin.replace("http", "ws")}/socket`);
+    const remote = new Remote(facts, socket);
+    return new Promise((resolve, reject) => {
+      socket.onmessage = ({ data }) => {
+        remote.hear(JSON.parse(data));
+        resolve(remote);
+      };
+      socket.onclose = () => {
+        remote.said = "twodof has ended, or cannot be reached: reload this page";
+        remote.playing = false;
+        reject(new Error(remote.said));
+      };
+    });
+  }
+
+  /** @param {News} news */
+  hear(news) {
+    if (news.run !== this.run) {
+      this.count = 0;
+      this.past = [];
+    }
+    if ((this.count + news.rows.length) * this.width > MOST_NUMBERS) {
+      this.data.copyWithin(0, (this.count >> 1) * this.width, this.count * this.width);
+      this.count -= this.count >> 1;
+    }
+    for (const row of news.rows) this.append(row);
+    if (news.heard === this.told) {
+      this.values = new Map(Object.entries(news.values));
+      this.playing = news.playing;
+    }
+    if (this.noted >= 0 && news.noted > this.noted) {
+      this.notice = news.notes.slice(this.noted - news.noted).join("\n");
+      clearTimeout(this.forgetting);
+      this.forgetting = setTimeout(() => (this.notice = ""), NOTED);
+    }
+    ({ run: this.run, noted: this.noted, recorded: this.recorded } = news);
+    this.news = news;
+    const now = performance.now();
+    if (!this.playing) this.past = [];
+    this.past.push([now, news.t]);
+    while (now - this.past[0][0] > PACE_WINDOW) this.past.shift();
+  }
+
+  /**
+   * @param {string} order
+   * @param {unknown} value
+   */
+  tell(order, value = null) {
+    this.told += 1;
+    this.socket.send(JSON.stringify([order, value]));
+  }
+
+  /**
+   * Set an input from the next step on; a parameter begins the run anew.
+   * @param {string} name of a variable, or of a vector: a number sets all of its elements
+   * @param {Value | number[]} value
+   */
+  set(name, value) {
+    const pairs = this.checked(name, value);
+    this.values = new Map([...this.values, ...pairs]);
+    this.tell("change", Object.fromEntries(pairs));
+  }
+
+  /** @param {boolean} on */
+  play(on) {
+    super.play(on);
+    this.tell("play", on);
+  }
+
+  /** It is advanced elsewhere. */
+  advance() {}
+
+  step() {
+    this.playing = false;
+    this.tell("step");
+  }
+
+  /** @param {boolean} all */
+  startAgain(all = false) {
+    this.tell("reset", all);
+  }
+
+  record() {
+    this.tell("record", !this.recorded);
+  }
+
+  /** @returns {[string, string][]} */
+  remarks() {
+    const { missed, steps, worst } = /** @type {News} */ (this.news);
+    const [[first, from], [last, to]] = [this.past[0], this.past[this.past.length - 1]];
+    const factor = last - first > PACE_WINDOW / 2 ? ((1000 * (to - from)) / (last - first)).toFixed(2) : "\u2013";
+    return [
+      ["real-time factor", factor],
+      ["deadlines missed", `${missed} of ${steps}, worst ${(1000 * worst).toFixed(1)} ms`],
+    ];
+  }
+}

@@ -1,0 +1,228 @@
+/**
+ * A robot's motion, sample by sample: what was told, and what came of it; by whoever it is stepped.
+ *
+ * @typedef {Object} JointFacts
+ * @property {string} name
+ * @property {boolean} prismatic
+ * @property {number | null} low
+ * @property {number | null} high
+ * @property {number | null} effort
+ *
+ * @typedef {Object} Link
+ * @property {number} parent
+ * @property {number[]} place
+ * @property {number[]} axis
+ * @property {boolean} prismatic
+ * @property {number} column
+ * @property {number} ratio
+ * @property {number} offset
+ *
+ * @typedef {Object} Facts
+ * @property {string} name
+ * @property {string} robot
+ * @property {string} frame
+ * @property {string} axes
+ * @property {string} control
+ * @property {number} step
+ * @property {string[]} recorded groups of variables that a sample holds, in its order
+ * @property {string[]} remarks what is not as it should be
+ * @property {JointFacts[]} joints
+ * @property {Variable[]} variables
+ * @property {Link[]} links
+ * @property {number} frameLink
+ * @property {{link: number, place: number[], colour: number[]}[]} shapes
+ * @property {{low: number[], size: number, vertices: number, triangles: number}[]} meshes
+ * @property {Record<string, unknown>} provenance
+ *
+ * @typedef {number | boolean} Value
+ */
+
+const WINDOW = 10; // s that are shown of a run that goes on
+const MOST_NUMBERS = 2 ** 24; // 128 MiB: an hour of an arm of seven joints at 100 Hz
+
+class Samples {
+  count = 0;
+  playing = true;
+  steered = true; // by its inputs
+  said = ""; // what the user is to know, until something is asked for
+  notice = ""; // the same, for some time
+  recorded = 0; // samples in a bag that is being written
+  /** @type {string[]} what of the page it has no use for */
+  without = [];
+
+  /**
+   * @param {Facts} facts
+   * @param {boolean} timed whether each sample begins with its time
+   */
+  constructor(facts, timed) {
+    this.facts = facts;
+    /** @type {Map<string, Variable>} */
+    this.variables = new Map(facts.variables.map((variable) => [variable.name, variable]));
+    /** @type {Map<string, string[]>} names of a vector's elements, or of the scalar */
+    this.groups = new Map();
+    for (const { name } of facts.variables) {
+      const group = name.split("[")[0];
+      this.groups.set(group, [...(this.groups.get(group) ?? []), name]);
+    }
+    /** @type {Map<string, [number, number]>} where a group begins in a sample, and its length */
+    this.columns = new Map();
+    this.width = Number(timed);
+    for (const group of facts.recorded) {
+      const { length } = this.groups.get(group) ?? [];
+      this.columns.set(group, [this.width, length]);
+      this.width += length;
+    }
+    this.data = new Float64Array(1024 * this.width);
+    /** @type {Map<string, Value>} */
+    this.values = this.defaults();
+  }
+
+  /**
+   * @param {string} name
+   * @returns {Variable}
+   */
+  variable(name) {
+    const variable = this.variables.get(name);
+    if (!variable) throw new Error(`there is no variable '${name}'`);
+    return variable;
+  }
+
+  /**
+   * Inputs and parameters as they are at first.
+   * @returns {Map<string, Value>}
+   */
+  defaults() {
+    const told = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
+    return new Map(told.map((v) => [v.name, /** @type {Value} */ (v.start)]));
+  }
+
+  /**
+   * What is to be set, element by element.
+   * @param {string} name of a variable, or of a vector: a number sets all of its elements
+   * @param {Value | number[]} value
+   * @returns {[string, Value][]}
+   */
+  checked(name, value) {
+    const names = this.groups.get(name) ?? [name];
+    const values = Array.isArray(value) ? value : names.map(() => value);
+    if (values.length !== names.length) throw new Error(`${name} has ${names.length} elements`);
+    return names.map((element, i) => {
+      const { causality, start } = this.variable(element);
+      if (!this.values.has(element)) throw new Error(`${element}, ${causality}, cannot be set`);
+      if (typeof values[i] !== typeof start || !Number.isFinite(Number(values[i])))
+        throw new Error(`${element} = ${values[i]} is not a ${typeof start}`);
+      return [element, values[i]];
+    });
+  }
+
+  /**
+   * Take one sample more.
+   * @param {Numbers} sample
+   */
+  append(sample) {
+    if ((this.count + 1) * this.width > this.data.length) {
+      const longer = new Float64Array(2 * this.data.length);
+      longer.set(this.data);
+      this.data = longer;
+    }
+    this.data.set(sample, this.count * this.width);
+    this.count += 1;
+  }
+
+  /** @param {boolean} on */
+  play(on) {
+    this.playing = on;
+  }
+
+  /** @param {number} k */
+  time(k) {
+    return this.data[k * this.width];
+  }
+
+  /**
+   * Number of the sample that is nearest to a time, s.
+   * @param {number} t
+   */
+  nearest(t) {
+    let first = 0, last = this.count - 1;
+    while (first < last) {
+      const middle = (first + last) >> 1;
+      if (this.time(middle) + this.time(middle + 1) < 2 * t) first = middle + 1;
+      else last = middle;
+    }
+    return first;
+  }
+
+  /** Number of the sample that is shown. */
+  get now() {
+    return this.count - 1;
+  }
+
+  /**
+   * Times that are of interest, s.
+   * @returns {[number, number]}
+   */
+  get span() {
+    const end = this.time(this.now);
+    return [Math.max(0, end - WINDOW), Math.max(end, WINDOW)];
+  }
+
+  /**
+   * More to tell beside the samples, names and texts.
+   * @returns {[string, string][]}
+   */
+  remarks() {
+    return [];
+  }
+
+  /**
+   * A number of a sample; not one where there is none.
+   * @param {string} group
+   * @param {number} k number of the sample
+   * @param {number} i
+   */
+  value(group, k, i) {
+    const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
+    return i < size ? this.data[k * this.width + begin + i] : NaN;
+  }
+
+  /**
+   * A vector of a sample, empty where there is none.
+   * @param {string} group
+   * @param {number} k number of the sample
+   */
+  at(group, k = this.now) {
+    const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
+    return this.data.subarray(k * this.width + begin, k * this.width + begin + size);
+  }
+
+  /**
+   * A vector of inputs or parameters as they are set now.
+   * @param {string} group
+   * @returns {number[]}
+   */
+  held(group) {
+    return (this.groups.get(group) ?? []).map((name) => Number(this.values.get(name)));
+  }
+
+  /**
+   * A target: of the latest sample, what is set by now.
+   * @param {string} group
+   * @param {number} k number of the sample
+   */
+  target(group, k) {
+    return this.steered && k === this.count - 1 ? this.held(group) : [...this.at(group, k)];
+  }
+
+  /** What it is meant to follow, and the target that it has; null where there is none. */
+  get follows() {
+    return [["x", "x_des"], ["q", "q_des"]].find(([, target]) => this.groups.has(target)) ?? null;
+  }
+
+  /** Distance of the end effector from its target, m, or of the joints from theirs; NaN without. */
+  error(k = this.now) {
+    if (!this.follows) return NaN;
+    const [now, target] = this.follows.map((group) => this.at(group, k));
+    return Math.hypot(...target.map((value, i) => value - now[i]));
+  }
+}

@@ -1,0 +1,83 @@
+"""The FMU of each control in importers of others, beside FMPy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+from harness import in_child_process
+
+import twodof
+from twodof import FmuOptions
+
+COMMANDS = {
+    "task": {"x_des[1]": 0.1, "x_des[2]": 0.2},
+    "pose": {"x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5, "quat_des[4]": 0.8},
+    "joint": {"q_des[1]": 0.9, "q_des[2]": -0.6},
+    "effort": {"tau_cmd[1]": 0.05, "tau_cmd[2]": -0.02},
+}
+Q = ("q[1]", "q[2]")
+TIGHT = {"rtol": 1e-10, "atol": 1e-12}
+END = 0.4  # s, before the bare arm has fallen onto a stop
+
+
+def built(control: str, folder: Path, fmi: int = 2) -> tuple[str, list[float]]:
+    """An FMU, without arrays, and where FMPy's co-simulation ends."""
+    fmu = twodof.build_fmu(
+        folder / "Arm.fmu", FmuOptions(control=control, native=True, fmi=fmi, arrays=fmi == 2)
+    )
+    result = fmpy.simulate_fmu(
+        str(fmu), stop_time=END, step_size=0.01, output_interval=0.01, output=Q,
+        start_values={**COMMANDS[control], **TIGHT}, fmi_type="CoSimulation",
+    )  # fmt: skip
+    end = [float(result[name][-1]) for name in Q]
+    assert np.abs(np.subtract(end, (0.5, 0.35))).max() > 0.1  # it has moved
+    return str(fmu), end
+
+
+@pytest.mark.parametrize("control", COMMANDS)
+@in_child_process
+def test_libcosim(control: str, tmp_path: Path) -> None:
+    from libcosimpy.CosimExecution import CosimExecution
+    from libcosimpy.CosimObserver import CosimObserver
+    from libcosimpy.CosimSlave import CosimLocalSlave
+
+    fmu, expected = built(control, tmp_path)
+    known = {v.name: v.valueReference for v in fmpy.read_model_description(fmu).modelVariables}
+    execution = CosimExecution.from_step_size(10_000_000)
+    arm = execution.add_local_slave(CosimLocalSlave(fmu, "arm"))
+    for name, value in {**COMMANDS[control], **TIGHT}.items():
+        execution.real_initial_value(arm, known[name], value)
+    observer = CosimObserver.create_last_value()
+    execution.add_observer(observer)
+    execution.step(40)
+    found = observer.last_real_values(arm, [known[name] for name in Q])
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("control, fmi", [*((control, 2) for control in COMMANDS), ("pose", 3)])
+@in_child_process
+def test_casadi(control: str, fmi: int, tmp_path: Path) -> None:
+    """Model Exchange by the classical Runge–Kutta method written here."""
+    import casadi
+
+    fmu, expected = built(control, tmp_path, fmi)
+    dae = casadi.DaeBuilder("arm", str(fmpy.extract(fmu, str(tmp_path / "unzipped"))))
+    f = dae.create("f", ["x", "u"], ["ode"])
+    start = {name: float(np.squeeze(dae.start(name))) for name in (*dae.x(), *dae.u())}
+    u = np.array([COMMANDS[control].get(name, start[name]) for name in dae.u()])
+    x, h = np.array([start[name] for name in dae.x()]), END / 800
+
+    def rate(state: np.ndarray) -> np.ndarray:
+        return np.array(f(state, u)).ravel()
+
+    for _ in range(800):
+        k1 = rate(x)
+        k2 = rate(x + h / 2 * k1)
+        k3 = rate(x + h / 2 * k2)
+        k4 = rate(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    end = dict(zip(dae.x(), x))
+    np.testing.assert_allclose([end[name] for name in Q], expected, rtol=0.0, atol=1e-8)

@@ -1,0 +1,339 @@
+"""Trajectories of a bag, followed by an arm under joint control.
+
+Truths are the three interpolations in closed form, SciPy's splines, and the exact answer of
+q̈ = c − Kd q̇ − Kp q to what is held over a step; the bags are rosbags' with its own definitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.integrate import quad
+from scipy.interpolate import BPoly
+from scipy.linalg import expm
+
+import twodof
+from twodof.cli.main import main
+from twodof.errors import InputError
+
+HUMBLE = get_typestore(Stores.ROS2_HUMBLE)
+JOINT_STATE, TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
+NAMES = ("joint1", "joint2")
+START = np.array([0.5, 0.35])  # of the default arm
+KP, KD = 50.0, 40.0
+BEGIN = 1_700_000_000_000_000_000
+SECOND = 1_000_000_000
+Point = tuple[Any, ...]
+"""Time from start, s; positions; velocities; accelerations; efforts: so many as there are."""
+
+
+def trajectory(points: Sequence[Point], names: Sequence[str] = NAMES, stamp: int = 0) -> Any:
+    types = HUMBLE.types
+
+    def time(kind: str, ns: int) -> Any:
+        return types[f"builtin_interfaces/msg/{kind}"](*divmod(ns, SECOND))
+
+    make, empty = types["trajectory_msgs/msg/JointTrajectoryPoint"], ((),) * 4
+    stored = [
+        make(*(np.array(part, float) for part in (*parts, *empty)[:4]),
+             time("Duration", round(after * SECOND)))
+        for after, *parts in points
+    ]  # fmt: skip
+    header = types["std_msgs/msg/Header"](time("Time", stamp), "")
+    return types[TRAJECTORY](header, [*names], stored)
+
+
+def write(path: Path, *commands: tuple[float, Any], topic: str = "/go") -> Path:
+    """A bag whose first joint state is at BEGIN, and messages so many seconds after."""
+    header = HUMBLE.types["std_msgs/msg/Header"](
+        HUMBLE.types["builtin_interfaces/msg/Time"](0, 0), ""
+    )
+    none = np.zeros(0)
+    state = HUMBLE.types[JOINT_STATE](header, [], none, none, none)
+    with Writer(path, version=8) as writer:
+        states = writer.add_connection("/joint_states", JOINT_STATE, typestore=HUMBLE)
+        writer.write(states, BEGIN, HUMBLE.serialize_cdr(state, JOINT_STATE))
+        for t, message in commands:
+            kind = message.__msgtype__
+            there = [c for c in writer.connections if (c.topic, c.msgtype) == (topic, kind)]
+            here = there[0] if there else writer.add_connection(topic, kind, typestore=HUMBLE)
+            cdr = HUMBLE.serialize_cdr(message, kind)
+            writer.write(here, BEGIN + round(t * SECOND), cdr)
+    return path
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default arm under joint control."""
+    path = tmp_path_factory.mktemp("joint") / "Joint.fmu"
+    return twodof.build_fmu(path, twodof.FmuOptions(control="joint", native=True))
+
+
+def held(fmu: Path, bag: Path, step: float, count: int, **options: Any) -> np.ndarray:
+    """What the inputs are from each of so many communication points on: q, v, a of both joints."""
+    now: dict[str, float] = {}
+    changes, k, table = twodof.read_commands(fmu, bag, step=step, **options), 0, []
+    for i in range(count):
+        while k < len(changes) and changes[k][0] <= (i + 1e-9) * step:
+            now |= changes[k][1]
+            k += 1
+        table.append(
+            [[now[f"{group}[{j}]"] for j in (1, 2)] for group in ("q_des", "v_des", "a_des")]
+        )
+    return np.array(table)
+
+
+def linear(s: float, T: float, a: Point, b: Point) -> tuple[float, float, float]:
+    return a[0] + (b[0] - a[0]) * s / T, (b[0] - a[0]) / T, 0.0
+
+
+def cubic(s: float, T: float, a: Point, b: Point) -> tuple[float, float, float]:
+    """In Hermite's basis."""
+    u = s / T
+    q = (2 * u**3 - 3 * u**2 + 1) * a[0] + (u**3 - 2 * u**2 + u) * T * a[1]
+    q += (3 * u**2 - 2 * u**3) * b[0] + (u**3 - u**2) * T * b[1]
+    v = (6 * u**2 - 6 * u) * (a[0] - b[0]) / T + (3 * u**2 - 4 * u + 1) * a[1]
+    v += (3 * u**2 - 2 * u) * b[1]
+    acc = (12 * u - 6) * (a[0] - b[0]) / T**2 + ((6 * u - 4) * a[1] + (6 * u - 2) * b[1]) / T
+    return q, v, acc
+
+
+def quintic(s: float, T: float, a: Point, b: Point) -> tuple[float, float, float]:
+    """As robotics textbooks have it."""
+    d = b[0] - a[0]
+    c3 = (20 * d - (8 * b[1] + 12 * a[1]) * T - (3 * a[2] - b[2]) * T**2) / (2 * T**3)
+    c4 = (-30 * d + (14 * b[1] + 16 * a[1]) * T + (3 * a[2] - 2 * b[2]) * T**2) / (2 * T**4)
+    c5 = (12 * d - 6 * (b[1] + a[1]) * T + (b[2] - a[2]) * T**2) / (2 * T**5)
+    q = a[0] + a[1] * s + a[2] / 2 * s**2 + c3 * s**3 + c4 * s**4 + c5 * s**5
+    v = a[1] + a[2] * s + 3 * c3 * s**2 + 4 * c4 * s**3 + 5 * c5 * s**4
+    return q, v, a[2] + 6 * c3 * s + 12 * c4 * s**2 + 20 * c5 * s**3
+
+
+@pytest.mark.parametrize(("law", "parts"), [(linear, 1), (cubic, 2), (quintic, 3)])
+def test_what_is_held_is_the_mean_of_the_closed_form(
+    arm: Path, tmp_path: Path, law: Any, parts: int
+) -> None:
+    """From rest, through three points at times of no step, to rest."""
+    knots = [0.0, 0.333, 0.7, 1.111]
+    numbers = np.random.default_rng(parts).normal(size=(4, 3, 2))
+    numbers[0] = [START, (0, 0), (0, 0)]
+    points = [(t, *n[:parts]) for t, n in zip(knots[1:], numbers[1:])]
+    bag = write(tmp_path / "bag", (0.0, trajectory(points)))
+    table = held(arm, bag, 0.05, 30)
+
+    def wanted(t: float, order: int, joint: int) -> float:
+        for (begin, end), (a, b) in zip(pairwise(knots), pairwise(numbers)):
+            if begin <= t < end:
+                return float(law(t - begin, end - begin, a[:, joint], b[:, joint])[order])
+        return float(numbers[-1, 0, joint]) if order == 0 else 0.0
+
+    for k, order, joint in np.ndindex(table.shape):
+        edges = [k * 0.05, *(t for t in knots if k * 0.05 < t < (k + 1) * 0.05), (k + 1) * 0.05]
+        whole = sum(quad(wanted, *e, (order, joint), epsabs=1e-13)[0] for e in pairwise(edges))
+        assert table[k, order, joint] == pytest.approx(whole / 0.05, rel=1e-12, abs=1e-12)
+    np.testing.assert_array_equal(table[-1], [numbers[-1, 0], (0, 0), (0, 0)])  # held to the bit
+
+
+THERE = ((0.8, 0.1), (0.0, 0.0), (0.0, 0.0))
+BACK = ((0.2, 0.5), (0.0, 0.0), (0.0, 0.0))
+
+
+def spline(times: Sequence[float], points: Sequence[Any]) -> BPoly:
+    """By SciPy, through points whose parts are given."""
+    orders = [2 * min(len(a), len(b)) - 1 for a, b in pairwise(points)]
+    return BPoly.from_derivatives(times, [np.array(p, float) for p in points], orders)
+
+
+def test_the_robot_does_exactly_what_is_held(arm: Path, tmp_path: Path) -> None:
+    """From off the trajectory, at each step, by ë + Kd ė + Kp e = c, which is constant in it."""
+    bag = write(tmp_path / "bag", (0.0, trajectory([(0.0, *THERE), (1.0, *BACK), (1.5, *THERE)])))
+    out, h = tmp_path / "model", 0.01
+    options = ["--stop-time", "2", "--set", "q_start=0.7,0.2"]
+    assert main(["run", str(arm), "--input", f"{bag}:/go", *options, "-o", str(out)]) == 0
+    path = spline([0.0, 1.0, 1.5], [THERE, BACK, THERE])
+
+    def mean(nu: int, k: int) -> Any:
+        """Of a derivative, over a step."""
+        if k >= 150:
+            return np.array(THERE[nu])
+        whole = (path.derivative(nu) if nu else path).antiderivative()
+        return (whole((k + 1) * h) - whole(k * h)) / h
+
+    flow = expm(np.array([[0.0, 1.0, 0.0], [-KP, -KD, 1.0], [0.0, 0.0, 0.0]]) * h)
+    state, q = np.array([(0.7, 0.2), (0.0, 0.0)]), [(0.7, 0.2)]
+    for k in range(200):
+        c = mean(2, k) + KD * mean(1, k) + KP * mean(0, k)
+        state = (flow @ np.vstack([state, c]))[:2]
+        q.append(state[0])
+    assert np.abs(twodof.read_bag(out).q - q).max() < 1e-9
+
+
+def test_the_robot_stays_on_the_trajectory(arm: Path, tmp_path: Path) -> None:
+    """As what is held comes closer to what is wanted, with the square of the step."""
+    near = ((0.52, 0.34), (0.0, 0.0), (0.0, 0.0))
+    rest = (START, (0.0, 0.0), (0.0, 0.0))
+    path = spline([0.0, 1.0], [rest, near])
+    bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *near)])))
+
+    def off(step: float) -> float:
+        changes = twodof.read_commands(arm, bag, step=step)
+        run = twodof.samples(arm, changes=changes, stop_time=1.0, step=step)
+        return max(float(np.abs(sample.q - path(sample.t)).max()) for sample in run)
+
+    errors = [off(step) for step in (1e-2, 1e-3, 1e-4)]
+    assert errors[0] < 1e-6 and errors[2] < 1e-9
+    assert [a / b for a, b in pairwise(errors)] == pytest.approx([100.0, 100.0], rel=0.05)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(
+    arm: Path, tmp_path: Path, parts: int
+) -> None:
+    """In its joints alone; between two points by what both have."""
+    stops = [(START, (0.0, 0.0), (0.0, 0.0)), THERE, BACK, THERE, BACK, THERE, BACK]
+    first = trajectory([(t, *stop) for t, stop in zip((1.0, 1.6, 1.7, 1.8, 1.9, 2.0), stops[1:])])
+    goals = [((0.3,), (-0.2,), (0.5,))[:parts], ((0.4,), (0.0,), (0.0,))]
+    points = [(0.25, *goals[0]), (0.5, *goals[1])]
+    second = trajectory(points, ["joint2"], BEGIN + SECOND * 5 // 4)
+    bag = write(tmp_path / "bag", (0.0, first), (1.25, second))
+    old = spline([0.0, 1.0, 1.6, 1.7, 1.8, 1.9, 2.0], stops)
+    at = [(old.derivative(nu) if nu else old)(1.25)[1:] for nu in range(3)]
+    new = spline([1.25, 1.5, 1.75], [at, *goals])
+    table, h = held(arm, bag, 0.01, 250), 0.01
+    for k in range(200):
+        wanted = np.diff(old.antiderivative()([k * h, (k + 1) * h]), axis=0)[0] / h
+        if k >= 125:
+            wanted[1:] = np.diff(new.antiderivative()([k * h, (k + 1) * h]), axis=0)[0] / h
+        if k >= 175:
+            wanted[1] = 0.4
+        assert table[k, 0] == pytest.approx(wanted, abs=1e-12)
+    np.testing.assert_array_equal(table[176, :, 1], (0.4, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("came", "stamp", "points", "path"),
+    [
+        (0.5, 0.0, [(1.0, (0.8,))], spline([0.5, 1.5], [[0.5], [0.8]])),
+        (0.5, 1.0, [(1.0, (0.8,))], spline([0.5, 2.0], [[0.5], [0.8]])),
+        (0.5, 0.25, [(1.0, (0.8,))], spline([0.5, 1.25], [[0.5], [0.8]])),
+        # under way when it comes, and from where it is by then
+        (0.5, 0.25, [(0.0, (0.5,)), (1.0, (0.9,))], spline([0.5, 1.25], [[0.6], [0.9]])),
+        (0.5, 0.0, [(0.0, (0.8,))], None),
+    ],
+)
+def test_when_it_starts(
+    arm: Path, tmp_path: Path, came: float, stamp: float, points: Any, path: BPoly | None
+) -> None:
+    begin = BEGIN + round(stamp * SECOND) if stamp else 0
+    bag = write(tmp_path / "bag", (came, trajectory(points, ["joint1"], begin)))
+    table = held(arm, bag, 0.01, 250)
+    for k in range(250):
+        t, start = (k + 0.5) * 0.01, path.x[0] if path else came
+        end = path.x[-1] if path else came
+        wanted = 0.5 if t < start else float(path(t)) if path and t < end else points[-1][1][0]
+        assert table[k, 0, 0] == pytest.approx(wanted, abs=1e-12)
+    assert (table[:, 0, 1] == 0.35).all() and (table[:, 1:, 1] == 0.0).all()
+
+
+def test_it_begins_where_the_run_does(arm: Path, tmp_path: Path) -> None:
+    bag = write(tmp_path / "bag", (1.0, trajectory([(1.0, (0.8,))], ["joint1"])))
+    for settings in ({"q_start": (0.1, 0.2)}, {"q_start": 0.0, "q_des": (0.1, 0.2)}):
+        table = held(arm, bag, 0.01, 151, settings=settings)
+        np.testing.assert_array_equal(table[0], [(0.1, 0.2), (0, 0), (0, 0)])
+        assert table[150, 0] == pytest.approx([0.1 + 0.505 * 0.7, 0.2], abs=1e-12)
+
+
+def test_joints_of_another_robot_are_left_out(
+    arm: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a trajectory, and of a joint state."""
+    names, none = ["finger", "joint2", "elbow"], np.zeros(0)
+    message = trajectory([(1.0, (0.1, 0.2, 0.3), (0.0, 0.5, 1.0))], names)
+    state = HUMBLE.types[JOINT_STATE](message.header, names, np.array([0.1, 0.2, 0.3]), none, none)
+    for name, command in (("a", message), ("b", state)):
+        bag = write(tmp_path / name, (0.0, command))
+        last = twodof.read_commands(arm, bag)[-1][1]
+        assert (last["q_des[2]"], last["v_des[2]"]) == (0.2, 0.0)
+        told = "joints that this robot has not are left out: 'elbow, finger'"
+        assert caplog.messages == [f"'{bag}': {told}"]
+        caplog.clear()
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (trajectory([]), "has no points whose times ascend"),
+        (trajectory([(1.0, *THERE), (1.0, *BACK)]), "has no points whose times ascend"),
+        (trajectory([(1.0, (0.1,))]), "has 1 positions for 2 joints"),
+        (trajectory([(1.0, (0.1, 0.1), (0.1,))]), "has 1 velocities for 2 joints"),
+        (trajectory([(1.0, (0.1, 0.1), (), (0.1, 0.1))]), "has 0 velocities for 2 joints"),
+        (trajectory([(1.0, (0.1, 0.1), (0.0, 0.0), (0.1,))]), "has 1 accelerations for 2 joints"),
+        (trajectory([(1.0, (), (0.1, 0.1))]), "has 0 positions for 2 joints"),
+        (trajectory([(1.0, (), (), (), (1.0, 1.0))]), "has 0 positions for 2 joints"),
+        (trajectory([(1.0, (0.1, NAN))]), "is not finite"),
+        (trajectory([(1.0, (0.1,))], ["elbow"]), "is of no joint of this robot: 'elbow'"),
+        (trajectory([(1.0, (0.1, 0.2))], ["joint1"] * 2), "names a joint twice: 'joint1, joint1'"),
+        (trajectory([(-1.0, *THERE)], NAMES, BEGIN + SECOND // 2), "ends 1 s before it starts"),
+        (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp is 0"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_followed(
+    arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], message: Any, reason: str
+) -> None:
+    bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *THERE)])), (0.5, message))
+    assert main(["run", str(arm), "--input", f"{bag}:/go", "-o", str(tmp_path / "none")]) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"twodof: error: '{bag}': the command at 0.5 s ") and reason in line
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("points", "options", "reason"),
+    [
+        ([(2e9, *THERE)], [], "its trajectories take 2e+09 s, more than 1000000 steps of 0.01 s"),
+        ([(1.0, *THERE)], ["--step", "0"], "more than 1000000 steps of 0 s"),
+        ([(1e-9, (1e300, 0.0), (0.0, 0.0), (0.0, 0.0))], [], "is not finite"),
+    ],
+)
+def test_what_would_have_no_end(
+    arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
+    points: Any, options: list[str], reason: str,
+) -> None:  # fmt: skip
+    bag = write(tmp_path / "bag", (0.0, trajectory(points)))
+    given = ["run", str(arm), "--input", str(bag), *options, "-o", str(tmp_path / "none")]
+    assert main(given) == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("twodof: error: ") and reason in line
+
+
+@pytest.mark.parametrize("control", ["effort", "task"])
+def test_another_control_follows_none(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], control: str
+) -> None:
+    bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *THERE)])))
+    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", twodof.FmuOptions(control=control))
+    for given in (f"{bag}:/go", str(bag)):
+        assert main(["run", str(fmu), "--input", given, "-o", str(tmp_path / "none")]) == 1
+        (line,) = capfd.readouterr().err.splitlines()
+        assert f"'{bag}' has no commands" in line and "for this FMU, which follows" in line
+
+
+def test_a_topic_of_two_types_is_refused(arm: Path, tmp_path: Path) -> None:
+    state = HUMBLE.types[JOINT_STATE](
+        trajectory([]).header, ["joint1"], np.zeros(1), np.zeros(0), np.zeros(0)
+    )
+    both = [(0.0, trajectory([(1.0, *THERE)])), (0.5, state)]
+    for name, commands in (("a", both), ("b", [(0.0, state), (0.5, both[0][1])])):
+        bag = write(tmp_path / name, *commands)
+        with pytest.raises(InputError, match="has trajectories and other commands on /go"):
+            twodof.read_commands(arm, bag)

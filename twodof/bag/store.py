@@ -1,0 +1,299 @@
+"""A bag's folder while it is written: its files, its lock, and the thread that stores."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sqlite3
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
+from typing import Protocol
+
+from rosbags.rosbag2 import WriterError
+
+from ..errors import BagError
+from ..files import lock, read_file, sync
+from ..ros.cdr import Rows
+from ..ros.messages import STORE, Topic
+from .contents import MAX_METADATA
+from .provenance import read_provenance, robots_of
+from .storage import REMOVED, STORAGES, BagWriter, Stamps, check_path
+
+RESERVE = "reserve"
+RESERVE_SIZE = 2 * 1024**2
+FLUSH_PERIOD = 0.5  # s of wall time
+PAUSE = 0.0005  # s between two looks at how far the thread is
+
+
+class Part(Protocol):
+    """What one robot gives to a bag."""
+
+    namespace: str
+
+    def open(self) -> None:
+        """Add the robot's topics to the store, and its provenance to the folder."""
+
+    def hand_over(self) -> None:
+        """Give the store what is queued; called by the store's thread."""
+
+    def stored(self) -> int:
+        """How many samples are in the bag."""
+
+    def metadata(self) -> tuple[str, str]:
+        """Key and text of the robot's provenance, for the bag's own metadata.
+
+        Raises:
+            OSError: it was removed.
+        """
+
+
+class Store:
+    """A folder with the messages of one robot, or of several: opened by the first of them, closed
+    by the last.
+
+    Args:
+        path, storage, overwrite, fsync: as of ``Bag``.
+
+    Raises:
+        BagError: the folder exists or cannot be written.
+    """
+
+    def __init__(self, path: Path, storage: str, *, overwrite: bool, fsync: bool) -> None:
+        if storage not in STORAGES:
+            raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
+        check_path(path, storage)
+        self.path, self.fsync = path, fsync
+        self._storage, self._overwrite = storage, overwrite
+        self._parts: list[Part] = []
+        self._entered = 0  # of them have not left
+        self._names: set[str] = set()  # of the robots in the bag that was closed
+        _check_free(path, overwrite)
+
+    def enter(self, part: Part) -> None:
+        """Take one robot's part; the first makes the folder.
+
+        Raises:
+            BagError: it cannot be written, or has samples already.
+        """
+        if self._begun if self._entered else self._names and part.namespace not in self._names:
+            raise BagError(f"the bag '{self.path}' has begun, and takes no robot any more")
+        names = [part.namespace for part in (*self._parts, part)]
+        if len(names) > len(set(names)) or ("" in names and len(names) > 1):
+            raise BagError(f"the robots of the bag '{self.path}' need namespaces that differ")
+        try:
+            if not self._entered:
+                _check_free(self.path, self._overwrite, clear=True)
+                self._create()
+            try:
+                part.open()
+                self._writer.flush()
+                if self.fsync:
+                    sync(self.path, self.path.absolute().parent)
+            except BaseException:
+                if not self._entered:
+                    self._remove()
+                raise
+        except WriterError as error:  # the folder appeared meanwhile and is not ours
+            raise BagError(f"cannot write the bag '{self.path}': {error}") from error
+        except (OSError, sqlite3.Error) as error:
+            raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
+        self._parts.append(part)
+        self._entered += 1
+
+    def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
+        """Numbers of new connections, in the order of the topics."""
+        return [
+            self._writer.add_connection(
+                name, topic.type, typestore=STORE, offered_qos_profiles=[topic.qos]
+            ).id
+            for name, topic in topics.items()
+        ]
+
+    def count(self, connection: int) -> int:
+        """How many messages of a connection are written."""
+        return self._writer.counts[connection]
+
+    def give(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
+        """Write messages, of each connection one by each stamp."""
+        self._writer.write_all(stamps, messages)
+
+    def check(self) -> None:
+        """Raise what has ended the thread, if anything has."""
+        if self._failure is not None:
+            self._wait(lambda: False)
+            raise self._error(self._failure) from self._failure
+
+    def flush(self) -> None:
+        """Have the thread store what is queued; it begins with the first, when all are there.
+
+        It is a thread so that Ctrl-C, which Python raises in the main one, never comes between the
+        bytes of a message, and what is written reaches the disk also while the FMU takes its time.
+        """
+        before = self._stores
+        self._due.put(None)
+        self._begin()
+        self._wait(lambda: self._stores > before)
+
+    def leave(self, exception: object) -> None:
+        """End one robot's part; the last closes the bag.
+
+        Raises:
+            BagError: the disk is full or the folder is gone, unless such an exception is on its
+                way already.
+        """
+        self._entered -= 1
+        if self._entered:
+            return
+        self._closing = True
+        self._due.put(None)
+        self._begin()
+        self._wait(lambda: False)  # if this is interrupted, the thread still ends its work
+        self._names = {part.namespace for part in self._parts}
+        self._parts.clear()
+        if self._failure is not None and not isinstance(exception, BagError):
+            raise self._error(self._failure) from self._failure
+
+    def _create(self) -> None:
+        """Create the bag's folder, or leave nothing of it."""
+        self._writer = BagWriter(self.path, self._storage, fsync=self.fsync)
+        self._lock = -1  # no descriptor yet
+        self._due: SimpleQueue[None] = SimpleQueue()
+        self._stores = 0
+        self._begun = self._closing = self._closed = self._ended = False
+        self._failure: Exception | None = None
+        try:
+            self._writer.open()
+            self._lock = lock(self.path, wait=True)  # before it is a bag that others may overwrite
+            with (self.path / RESERVE).open("wb") as reserve:
+                reserve.write(b"\0" * RESERVE_SIZE)
+                reserve.flush()
+                os.fsync(reserve.fileno())
+        except (WriterError, BlockingIOError):  # the folder is another's
+            raise
+        except BaseException:
+            self._remove()
+            raise
+
+    def _remove(self) -> None:
+        with suppress(OSError, sqlite3.Error):
+            self._writer.abort()
+        shutil.rmtree(self.path, ignore_errors=True)
+        with suppress(OSError):
+            os.close(self._lock)
+
+    def _begin(self) -> None:
+        if not self._begun:
+            self._begun = True
+            Thread(target=self._keep_storing, name="bag writer").start()
+
+    def _wait(self, done: Callable[[], bool]) -> None:
+        """Wait until something is done, or the thread has ended.
+
+        Without a lock, an event or a join: Ctrl-C, which Python raises between any two instructions
+        of this thread, would leave a lock taken for ever if it came when that had just been.
+        """
+        while not (done() or self._ended):
+            time.sleep(PAUSE)
+
+    def _keep_storing(self) -> None:
+        """The thread: stores what is queued twice a second, and when asked to; then closes."""
+        try:
+            closing = False
+            while not closing:
+                with suppress(Empty):
+                    self._due.get(timeout=FLUSH_PERIOD)
+                if closing := self._closing:
+                    (self.path / RESERVE).unlink(missing_ok=True)
+                self._store()
+                self._stores += 1
+        except Exception as error:  # raised in the main thread
+            self._failure = error
+        try:
+            self._close()
+        except Exception as error:
+            self._failure = error
+        finally:
+            os.close(self._lock)
+            self._ended = True
+
+    def _store(self) -> None:
+        for part in self._parts:
+            part.hand_over()
+        self._writer.flush()
+
+    def _close(self) -> None:
+        """Close the bag; after a failure give up the reserve and store what is still there."""
+        storage = self._writer.storage
+        assert storage is not None
+        if self._failure is not None:
+            if not storage.path.exists():
+                self._writer.abort()
+                return
+            (self.path / RESERVE).unlink(missing_ok=True)
+            storage.salvage()
+            self._store()
+        for part in self._parts:
+            with suppress(OSError):  # it was removed: the messages are worth closing without it
+                self._writer.set_custom_data(*part.metadata())
+        self._writer.close()
+        if self.fsync:
+            sync(storage.path, self.path / "metadata.yaml", self.path)
+        self._closed = True
+
+    def _error(self, failure: Exception) -> Exception:
+        """What the main thread raises for a failure of the thread."""
+        if not isinstance(failure, OSError | sqlite3.Error):
+            return failure
+        gone = not self.path.exists()  # the storage fails with this or that then
+        reason = REMOVED if gone else _reason(failure)
+        reason = f"cannot go on writing the bag '{self.path}': {reason}"
+        if self._closed:
+            kept = min(part.stored() for part in self._parts)
+            return BagError(f"{reason}; it is closed with its first {kept} samples")
+        if not gone:
+            return BagError(f"{reason}; then make it whole with 'twodof recover {self.path}'")
+        return BagError(reason)
+
+
+def _reason(error: Exception) -> str:
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    if full or "full" in str(error):
+        return "the disk is full"
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
+    """Refuse what is in a bag's place; with ``clear``, remove what may be overwritten."""
+    try:
+        if not path.exists():
+            return
+        if not overwrite:
+            reason = "exists already; choose another with `path` or give `overwrite=True`"
+            raise BagError(f"'{path}' {reason}")
+        held = lock(path)
+        try:
+            if path.is_symlink() or not _is_bag(path):
+                raise BagError(f"'{path}' is not a bag and is not overwritten")
+            if clear:
+                shutil.rmtree(path)
+        finally:
+            os.close(held)
+    except BlockingIOError as error:
+        reason = "is being written by another process and is not overwritten"
+        raise BagError(f"'{path}' {reason}") from error
+    except OSError as error:
+        raise BagError(f"cannot write the bag '{path}': {error.strerror}") from error
+
+
+def _is_bag(path: Path) -> bool:
+    """A folder with rosbag2's metadata, or with our provenance where the writer died."""
+    try:
+        metadata = read_file(path / "metadata.yaml", MAX_METADATA)
+        return metadata.startswith(b"rosbag2_bagfile_information:")
+    except OSError:
+        return any(read_provenance(path, name) for name in robots_of(path))

@@ -1,0 +1,167 @@
+"""One page for browsers, and a websocket for it: a server on a thread of its own.
+
+It answers requests of its own page alone: whatever else a browser has open cannot read it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import re
+import socket
+import sys
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from http import HTTPStatus
+from ipaddress import ip_address
+from threading import Event, Thread
+
+from ..errors import PageError
+
+try:
+    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.datastructures import Headers
+    from websockets.exceptions import ConnectionClosed
+    from websockets.http11 import Request, Response
+except ImportError as missing:
+    raise PageError(
+        f"cannot show a page: {missing}; install the package 'websockets' (the extra 'view')"
+    ) from missing
+
+HOST, PORT = "127.0.0.1", 8080
+SLOW = 60.0  # s that a page may take to a browser
+CLOSING = 1.0  # s
+LARGEST = 64 * 1024  # bytes of a message from a browser
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+REFUSED = "open this page as twodof prints it; --host gives it another address or name\n"
+HEADERS = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Connection": "close",
+}
+Connection = ServerConnection
+Talk = Callable[[Connection], Awaitable[None]]
+
+_silent = logging.getLogger(__name__)  # who asks for what else is none of the user's business
+_silent.setLevel(logging.CRITICAL + 1)
+
+
+class Server:
+    """A page that is served as long as the context lasts.
+
+    Args:
+        page: its HTML.
+        host, port: where to listen; port 0: any that is free.
+        talk: to each websocket that the page opens; None: it opens none.
+
+    Attributes:
+        url: where the page is.
+
+    Raises:
+        PageError: the port is in use, or the host is not this machine's.
+    """
+
+    def __init__(
+        self, page: bytes, host: str = HOST, port: int = PORT, talk: Talk | None = None
+    ) -> None:
+        self._page, self._host, self._talk = page, host, talk
+        self._started = Event()
+        self._socket, self._address = _listen(host, port)
+        shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self._socket.getsockname()[1]}"
+
+    def __enter__(self) -> Server:
+        self._thread = Thread(target=asyncio.run, args=(self._serve(),), daemon=True)
+        self._thread.start()
+        self._started.wait()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._loop.call_soon_threadsafe(self._ended.set)
+        self._thread.join()
+
+    async def _serve(self) -> None:
+        self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
+        server = await serve(
+            self._talked, sock=self._socket, process_request=self._answer, logger=_silent,
+            compression=None, max_size=LARGEST, open_timeout=SLOW, close_timeout=SLOW,
+        )  # fmt: skip
+        self._started.set()
+        await self._ended.wait()
+        server.close()
+        await asyncio.wait([asyncio.ensure_future(server.wait_closed())], timeout=CLOSING)
+
+    async def _talked(self, connection: Connection) -> None:
+        if self._talk is not None:
+            with suppress(ConnectionClosed):
+                await self._talk(connection)
+
+    def _answer(self, connection: Connection, request: Request) -> Response | None:
+        if not _is_own(request, self._host, self._address):
+            return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
+        if request.path == "/socket" and self._talk is not None:
+            return None
+        if request.path != "/":
+            return connection.respond(HTTPStatus.NOT_FOUND, "there is one page, /\n")
+        headers = Headers(HEADERS)
+        headers["Content-Length"] = str(len(self._page))
+        return Response(HTTPStatus.OK.value, "OK", headers, self._page)
+
+
+def _is_own(request: Request, host: str, address: str) -> bool:
+    """Whether a request is for this page, by what was asked to listen on, and not another's.
+
+    Any website may have its own name resolve to this machine, and then its Origin is the Host that
+    it asks for. An address is not resolved, so where all are listened on, any is good.
+
+    Args:
+        request: what is asked for.
+        host, address: what was asked to listen on, and what that is resolved to.
+    """
+    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    foreign = any(origin.partition("://")[2] not in hosts for origin in origins)
+    if len(hosts) != 1 or foreign:
+        return False
+    name = re.sub(r":\d+$", "", hosts[0].lower()).strip("[]")
+    listening = ip_address(address)
+    if listening.is_unspecified:
+        return name in (*LOOPBACK, socket.gethostname().lower()) or _is_address(name)
+    return name in (host.lower(), address) or (listening.is_loopback and name in LOOPBACK)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _listen(host: str, port: int) -> tuple[socket.socket, str]:
+    """A socket that is bound, and the address that it is bound to."""
+    if not 0 <= port <= 65535:
+        raise PageError(f"port {port} is not in 0…65535")
+    if not host:  # which to the operating system is all of them
+        raise PageError("`host` is empty; 0.0.0.0 is all addresses of this machine")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        bound = socket.socket(family, kind, protocol)
+        if sys.platform != "win32":
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        bound.listen()
+    except UnicodeError as error:
+        raise PageError(f"cannot listen on {host}:{port}: {error}") from error
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise PageError(
+                f"port {port} of {host} is in use; choose another with `port`, or 0 for any that"
+                " is free"
+            ) from error
+        raise PageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
+    return bound, str(address[0])

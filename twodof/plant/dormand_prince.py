@@ -1,0 +1,108 @@
+"""One step of Dormand–Prince 5(4) and its interpolant.
+
+Coefficients, error norm and dense output are those of SciPy's ``RK45``.
+Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from math import sqrt
+
+import numpy as np
+
+State = list[float]
+"""(q, v), 2n values. Plain floats: at this size a call of numpy costs more than the arithmetic."""
+
+A = (
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (44 / 45, -56 / 15, 32 / 9),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+)
+"""Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution."""
+E = (-71 / 57600, 0.0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40)
+P = np.array(
+    [
+        [1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
+        [0, 0, 0, 0],
+        [0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
+        [0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
+        [0, 127303824393 / 49829197408, -318862633887 / 49829197408, 701980252875 / 199316789632],
+        [0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
+        [0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
+    ]
+)
+STAGES = 6
+"""Evaluations of the right-hand side that a step costs."""
+
+
+@lru_cache(maxsize=8)  # most steps are of one size
+def _weights(step: float) -> list[list[float]]:
+    """The rows of A, and E, times the step."""
+    return [[step * weight for weight in row] for row in (*A, E)]
+
+
+def dormand_prince(
+    rates: Callable[[State], State], y: State, step: float, k1: State
+) -> tuple[State, list[State]]:
+    """One step from y, where the derivative is k1: y_new and the derivatives at the stages.
+
+    Args:
+        rates: ẏ at a state.
+        step: s.
+    """
+    s2, s3, s4, s5, s6, s7, _ = _weights(step)
+    (a,) = s2
+    k2 = rates([u + a * p for u, p in zip(y, k1)])
+    a, b = s3
+    k3 = rates([u + (a * p + b * q) for u, p, q in zip(y, k1, k2)])
+    a, b, c = s4
+    k4 = rates([u + (a * p + b * q + c * r) for u, p, q, r in zip(y, k1, k2, k3)])
+    a, b, c, d = s5
+    k5 = rates([u + (a * p + b * q + c * r + d * s) for u, p, q, r, s in zip(y, k1, k2, k3, k4)])
+    a, b, c, d, e = s6
+    k6 = rates(
+        [
+            u + (a * p + b * q + c * r + d * s + e * t)
+            for u, p, q, r, s, t in zip(y, k1, k2, k3, k4, k5)
+        ]
+    )
+    a, _, b, c, d, e = s7
+    y_new = [
+        u + (a * p + b * q + c * r + d * s + e * t)
+        for u, p, q, r, s, t in zip(y, k1, k3, k4, k5, k6)
+    ]
+    return y_new, [k1, k2, k3, k4, k5, k6, rates(y_new)]
+
+
+def error_norm(
+    K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float
+) -> float:
+    """Root mean square of the error over its tolerance; the step passes below 1."""
+    a, _, b, c, d, e, f = _weights(step)[-1]
+    k1, _, k3, k4, k5, k6, k7 = K
+    total = 0.0
+    for old, new, p, q, r, s, t, u in zip(y, y_new, k1, k3, k4, k5, k6, k7):
+        size = max(abs(old), abs(new))
+        error = a * p + b * q + c * r + d * s + e * t + f * u
+        ratio = error / (atol + rtol * size)
+        total += ratio * ratio
+    return sqrt(total / len(y))
+
+
+def interpolant(y: State, y_new: State, K: list[State], step: float) -> Callable[[float], State]:
+    """State at a time within the step that these are of, to fourth order; y_new at its end."""
+    start, Q = np.array(y), np.array(K).T.dot(P)
+
+    def state(passed: float) -> State:
+        if passed == step:
+            return y_new
+        x = passed / step
+        reached: State = (start + step * x * Q.dot((1.0, x, x * x, x * x * x))).tolist()
+        return reached
+
+    return state

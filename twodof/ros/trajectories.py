@@ -1,0 +1,202 @@
+"""Trajectories of joints, and what an FMU is told of them.
+
+From one point to the next a joint's position is a polynomial, by what both points have:
+
+    positions                               q(s) = Σ cᵢ sⁱ, linear
+    positions, velocities                   cubic
+    positions, velocities, accelerations    quintic
+
+and behind the last point it rests there. Inputs are held over a communication step: what is held is
+the mean over the step, with which a robot does not lag half a step behind.
+
+Source: ros2_controllers, joint_trajectory_controller, "Trajectory Representation".
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from math import comb, factorial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.polynomial.polynomial import polyder, polyval
+from numpy.typing import NDArray
+
+from ..experiments import NANOSECONDS
+from .commands import CommandError, deserialise, known_joints, sized
+from .messages import JOINT_TRAJECTORY
+
+Array = NDArray[np.float64]
+
+MAX_TRAJECTORY = 4 * 1024**2  # bytes; some ten thousand points, read within a second
+PARTS = ("positions", "velocities", "accelerations")
+DEGREE = 5
+ORDERS = np.arange(DEGREE + 1)
+BINOMIALS = np.array([[comb(j, i) for j in ORDERS] for i in ORDERS])
+FACTORIALS = np.array([factorial(i) for i in ORDERS])
+HIGHER = {
+    1: np.array([[1.0]]),
+    2: np.array([[3.0, -1.0], [-2.0, 1.0]]),
+    3: np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]),
+}
+"""cᵢ Tⁱ of the higher half of i, from what the lower half misses of q, T q̇, T² q̈ at the end T."""
+NODES, WEIGHTS = leggauss(3)  # exact up to degree 5
+
+
+class Trajectory(NamedTuple):
+    """Where joints are to go.
+
+    Attributes:
+        start: from when on, s.
+        joints: indices of the n joints.
+        times: of the points, s, ascending; some may be before the start.
+        points: position and, where they have any, velocity and acceleration, k × n each.
+        strangers: names of joints that the robot has not.
+    """
+
+    start: float
+    joints: list[int]
+    times: list[float]
+    points: list[Array]
+    strangers: tuple[str, ...] = ()
+
+
+def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int) -> Trajectory:
+    """A JointTrajectory.
+
+    It starts when it came, and its points are as long after its stamp, or where that is 0 after
+    its start, as they say.
+
+    Args:
+        cdr: the message.
+        joints: indices of the robot's joints by name.
+        came: when, ns since the epoch.
+        begin: the time 0 of the run, ns since the epoch.
+
+    Raises:
+        CommandError: it cannot be read, is not finite, of no joint of this robot, has no points or
+            such as do not ascend in time or lack what goes before, or ends before it starts.
+    """
+    message = deserialise(JOINT_TRAJECTORY, cdr, MAX_TRAJECTORY)
+    known = known_joints(message.joint_names, joints)
+    stamp = _nanoseconds(message.header.stamp) or came
+    times = [stamp + _nanoseconds(point.time_from_start) for point in message.points]
+    if not times or any(late <= early for early, late in pairwise(times)):
+        raise CommandError("times", "has no points whose times ascend")
+    if times[-1] < came:
+        late = f"{(came - times[-1]) / NANOSECONDS:.3g} s before it starts"
+        raise CommandError("stamp", f"ends {late}; its stamp is 0, or by the clock of the bag")
+    points = []
+    for point in message.points:
+        count = 3 if len(point.accelerations) else 2 if len(point.velocities) else 1
+        parts = [sized(getattr(point, what), what, message.joint_names) for what in PARTS[:count]]
+        points.append(np.array(parts)[:, [k for _, k in known]])
+    if not all(np.isfinite(point).all() for point in points):
+        raise CommandError("finite", "is not finite")
+    begins, *seconds = ((t - begin) / NANOSECONDS for t in (came, *times))
+    strangers = tuple(name for name in message.joint_names if name not in joints)
+    return Trajectory(begins, [i for i, _ in known], seconds, points, strangers)
+
+
+def _nanoseconds(time: Any) -> int:
+    """Of a Time or a Duration."""
+    return int(time.sec * NANOSECONDS + time.nanosec)
+
+
+class _Path:
+    """What is wanted of a joint over time: polynomials, each until the next begins.
+
+    Args:
+        begin: from when on there is anything, s.
+        q: where it rests until it is told of more.
+    """
+
+    def __init__(self, begin: float, q: float) -> None:
+        self._begins, self._pieces = [begin], [np.array([q, *[0.0] * DEGREE])]
+
+    def before(self, t: float) -> Array:
+        """Position, velocity and acceleration just before a time after the begin."""
+        i = bisect_left(self._begins, t) - 1
+        values: Array = _moved(self._pieces[i], t - self._begins[i])[:3] * FACTORIALS[:3]
+        return values
+
+    def replace(self, begins: Sequence[float], pieces: Sequence[Array]) -> None:
+        """Go on with others, from the first of their begins on."""
+        keep = bisect_left(self._begins, begins[0])
+        self._begins[keep:], self._pieces[keep:] = begins, pieces
+
+    def means(self, grid: Array) -> Array:
+        """Position, velocity and acceleration, means of N times from each to the next, N − 1 × 3.
+
+        All that begins does so within them.
+        """
+        edges = np.union1d(grid, self._begins)
+        spans, steps = np.diff(edges), np.searchsorted(grid, edges[:-1], "right") - 1
+        times = edges[:-1, None] + spans[:, None] * (NODES + 1.0) / 2.0
+        means = []
+        for order in range(3):
+            start = self._values(order, grid[:-1])  # so that what rests does so to the bit
+            off = (self._values(order, times) - start[steps, None]) @ (WEIGHTS / 2.0) * spans
+            total = np.add.reduceat(off, np.searchsorted(edges, grid[:-1]))
+            means.append(start + total / np.diff(grid))
+        return np.stack(means, axis=1)
+
+    def _values(self, order: int, times: Array) -> Array:
+        at = np.searchsorted(self._begins, times, "right") - 1
+        pieces = polyder(np.stack(self._pieces, axis=1), order)[:, at]
+        values: Array = polyval(times - np.asarray(self._begins)[at], pieces, tensor=False)
+        return values
+
+
+def follow(
+    trajectories: Iterable[Trajectory], rest: Sequence[float], grid: Array
+) -> dict[int, Array]:
+    """What joints do that go along trajectories, each along the latest that names it.
+
+    Where a trajectory has points after its start alone, it goes to the first of them from what was
+    wanted just before the start.
+
+    Args:
+        trajectories: in the order in which they came.
+        rest: where each joint is before.
+        grid: N communication points, s; the first before and the last after all trajectories.
+
+    Returns:
+        By index of the joint, means from each of these times to the next of position, velocity and
+        acceleration, N − 1 × 3.
+    """
+    paths: dict[int, _Path] = {}
+    with np.errstate(all="ignore"):  # who takes the values refuses such
+        for start, joints, times, points, _ in trajectories:
+            own = [paths.setdefault(i, _Path(grid[0], rest[i])) for i in joints]
+            if times[0] > start:
+                wanted = np.stack([path.before(start) for path in own], axis=1)
+                times, points = [start, *times], [wanted, *points]
+            first = max(k for k, t in enumerate(times) if t <= start)
+            pieces = [
+                _piece(t[1] - t[0], *ends)
+                for t, ends in zip(pairwise(times[first:]), pairwise(points[first:]))
+            ] + [np.vstack([points[-1][:1], np.zeros((DEGREE, len(joints)))])]
+            pieces[0] = _moved(pieces[0], start - times[first])
+            for path, own_pieces in zip(own, np.stack(pieces).transpose(2, 0, 1)):
+                path.replace([start, *times[first + 1 :]], [*own_pieces])
+        return {i: path.means(grid) for i, path in paths.items()}
+
+
+def _piece(T: float, start: Array, end: Array) -> Array:
+    """Of n joints the polynomials between two points T apart, 6 × n, by what both of them have."""
+    k, piece = min(len(start), len(end)), np.zeros((DEGREE + 1, start.shape[1]))
+    piece[:k] = start[:k] / FACTORIALS[:k, None]
+    missed = end[:k] - _moved(piece, T)[:k] * FACTORIALS[:k, None]
+    powers = T ** np.arange(2 * k)[:, None]
+    piece[k : 2 * k] = HIGHER[k] @ (missed * powers[:k]) / powers[k:]
+    return piece
+
+
+def _moved(piece: Array, by: float) -> Array:
+    """A polynomial that begins so much later: q(by + s) in powers of s."""
+    moved: Array = BINOMIALS * by ** np.maximum(ORDERS - ORDERS[:, None], 0) @ piece
+    return moved
