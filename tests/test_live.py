@@ -296,6 +296,22 @@ def test_the_end_does_not_wait_for_orders(native_path: Path) -> None:
     assert loop.news()["run"] < 5
 
 
+@pytest.mark.parametrize("everything", [False, True])
+def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> None:
+    """What is set before a step holds for it, and what is set after a reset is not reset."""
+    loop = loop_of(native_path)
+    for order, value in (
+        ("change", {"x_des[1]": 0.11}), ("step", None), ("change", {"x_des[1]": 0.12}),
+        ("step", None), ("reset", everything), ("change", {"x_des[2]": 0.07}), ("step", None),
+    ):  # fmt: skip
+        loop.tell(order, value)
+    loop.play(lambda: loop.news()["run"] > 1 and loop.news()["t"] == 0.01)
+    news = loop.news()
+    target = [0.2 if everything else 0.12, 0.07]
+    assert [news["values"][f"x_des[{i}]"] for i in (1, 2)] == target
+    assert news["rows"][-1][-2:] == target
+
+
 def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path: Path) -> None:
     loop, told = loop_of(native_path), [{"payload": 0.3}, {"x_des[1]": 0.11}, None, {"rtol": 0.0}]
 

@@ -89,7 +89,7 @@ class Loop:
         self.viewers = 0
         self._recording: Excerpt | None = None
         self._changes: dict[str, Value] = {}
-        self._playing, self._singles = True, 0
+        self._playing = True
         self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._groups = [name for group in TOLD for name in fmu.vector(group)]
         self._lock = Lock()  # of what news are made of
@@ -108,18 +108,14 @@ class Loop:
         with self._lock:
             self._rows.clear()
             self._count, self._number = 0, self._number + 1
-            self._values = {**self._run.start_values, **self._changes}
+            self._values = dict(self._run.start_values)
         self._take(sample)
 
     def play(self, stop: Callable[[], bool]) -> None:
         """Step the FMU as pages ask, until ``stop`` is true."""
         try:
             while not stop():
-                if self._singles and not self._broken:
-                    self._singles -= 1
-                    self.pace.restart()
-                    self._step()
-                elif self._playing and self.viewers and not self._broken:
+                if self._playing and self.viewers and not self._broken:
                     self._step(paced=True)
                 else:
                     self.pace.restart()
@@ -149,9 +145,6 @@ class Loop:
             if order == "change":
                 value = resolve(self._run.fmu, value)
                 self._values |= value
-                inputs = self._sample.inputs
-                self._changes |= {name: value[name] for name in value if name in inputs}
-                value = {name: value[name] for name in value if name not in inputs}
             elif order in ("play", "step"):
                 self._playing = order == "play" and bool(value)
         self._orders.put((order, value))
@@ -198,10 +191,11 @@ class Loop:
             order, value = self._orders.get(timeout=patience)
         except Empty:
             return
-        if order == "change" and value:
-            self._restart(value)
-        elif order == "step":
-            self._singles += 1
+        if order == "change":
+            self._change(value)
+        elif order == "step" and not self._broken:
+            self.pace.restart()
+            self._step()
         elif order == "reset":
             self._restart({}, self._first if value else None)
         elif order == "record" and not value:
@@ -209,13 +203,18 @@ class Loop:
         elif order == "record" and self._recording is None:
             self._record()
 
-    def _take_changes(self) -> dict[str, Value]:
+    def _change(self, values: Mapping[str, Value]) -> None:
+        """Inputs from the next step on; a parameter begins the run anew."""
+        inputs = self._sample.inputs
+        self._changes |= {name: values[name] for name in values if name in inputs}
         with self._lock:
-            changes, self._changes = self._changes, {}
-        return changes
+            self._values |= values  # again: a reset that was asked for before came between
+        parameters = {name: values[name] for name in values if name not in inputs}
+        if parameters:
+            self._restart(parameters)
 
     def _step(self, *, paced: bool = False) -> None:
-        changes = self._take_changes()
+        changes, self._changes = self._changes, {}
         try:
             self._take(self._source.send(changes or None), paced)
         except (SimulationError, StopIteration) as error:
@@ -250,9 +249,8 @@ class Loop:
         """The arm back to its start; inputs and parameters stay, but for values, or as at first."""
         self._end_recording()
         self._source.close()
-        now = {**self._sample.inputs, **self._take_changes()}
+        now, self._changes = {**self._sample.inputs, **self._changes}, {}
         runs = [first or self._starting({**now, **values}), self._starting(now), self._run]
-        self._singles = 0
         for self._run in runs:
             try:
                 return self._begin()
