@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from threading import Lock
+from threading import RLock
 from typing import Any
 
 from ..bag.writer import Bag
@@ -92,7 +92,7 @@ class Loop:
         self._playing = True
         self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._groups = [name for group in TOLD for name in fmu.vector(group)]
-        self._lock = Lock()  # of what news are made of
+        self._lock = RLock()  # of what news are made of
         self._rows: deque[list[float]] = deque(maxlen=MOST_ROWS)
         self._notes: deque[str] = deque(maxlen=MOST_NOTES)
         self._number = self._count = self._noted = 0
@@ -109,7 +109,7 @@ class Loop:
             self._rows.clear()
             self._count, self._number = 0, self._number + 1
             self._values = dict(self._run.start_values)
-        self._take(sample)
+            self._take(sample)  # in one go: there are no news of a run without a sample
 
     def play(self, stop: Callable[[], bool]) -> None:
         """Step the FMU as pages ask, until ``stop`` is true."""
