@@ -53,6 +53,16 @@ SAMPLES = "() => [...arm.data.subarray(0, arm.count * arm.width)]"
 DRAWN = """async () => {
     for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
 }"""
+AT_REST = """async () => {
+    const asked = () => arm.news === undefined || arm.news.heard === arm.told && !arm.news.playing;
+    if (arm.playing || !asked()) return false;
+    const {run, count} = arm;
+    await new Promise((resolve) => setTimeout(resolve, 200));
+    for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
+    return !arm.playing && asked() && arm.run === run && arm.count === count;
+}"""
+"""Whether the arm stands still for longer than a step, news of it and a picture of the numbers
+take, so that these are shown as they are now."""
 NOTES = ".arm .bar, .arm .said { visibility: hidden }"
 LATENCY = """([label, text, row]) => new Promise(resolve => {
     const cell = document.querySelector(`[data-value="${row}"]`), before = cell.textContent;
@@ -75,7 +85,9 @@ def chromium() -> Iterator[Browser]:
     """A headless browser that renders in software."""
     program = needs("chromium", "chromium-browser", "google-chrome")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
+        browser = playwright.chromium.launch(
+            executable_path=program, args=ARGUMENTS, timeout=1e3 * PATIENCE
+        )
         yield browser
         browser.close()
 
@@ -203,6 +215,12 @@ def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], A
         assert time.monotonic() < end, found
         page.wait_for_timeout(20)
     return found
+
+
+def at_rest(page: Page) -> dict[str, str]:
+    """The readout once the arm stands still and all is shown."""
+    until(page, bool, lambda page: page.evaluate(AT_REST))
+    return rows(page)
 
 
 def press(page: Page, name: str) -> None:

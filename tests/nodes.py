@@ -31,7 +31,7 @@ TWODOF = [sys.executable, "-m", "twodof"]
 STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
 LATCHED = ("/robot_description", "/tf_static")
 COMMANDS = ("/target_command", "/clicked_point")
-PATIENCE = 20.0  # s
+PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
 
 
 @pytest.fixture(scope="session")
@@ -106,6 +106,10 @@ class Node:
             assert time.monotonic() < end, self.told[-3:]
             time.sleep(0.02)
 
+    def sees(self, last: Any, topic: str = "/joint_states") -> None:
+        """Wait for a message, which is the last so far."""
+        self.until(lambda: self.messages(topic)[-1:] == [last])
+
     def hears(self, topic: str = "/joint_states", more: int = 5) -> None:
         """Wait for some more messages."""
         before = len(self.messages(topic))
@@ -177,7 +181,7 @@ def published(
 
 def ended(process: subprocess.Popen[str], status: int = 0) -> tuple[str, str]:
     """What it said at its end."""
-    out, err = process.communicate(timeout=90.0)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == status, err
     return out, err
 

@@ -44,6 +44,7 @@ from bags import (
     read_with_sqlite3,
     sample,
 )
+from harness import wait_until
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
@@ -408,8 +409,8 @@ def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(
             bag.write(sample)
             sample = steps.send(ANSWERS.get(k))
         shutil.copytree(bag.path, tmp_path / "early")
-        while json.loads((bag.path / "run.json").read_text())["input_changes"] != CHANGES:
-            time.sleep(0.05)
+        there = bag.path / "run.json"
+        wait_until(lambda: json.loads(there.read_text())["input_changes"] == CHANGES)
     assert json.loads((tmp_path / "early" / "run.json").read_text())["input_changes"] in (
         CHANGES[:0], CHANGES[:1], CHANGES,
     )  # fmt: skip
@@ -423,7 +424,7 @@ def test_provenance_says_where_it_was_full(
         for k in range(1000):
             inputs = {"x_des[1]": k / 7}
             bag.write(sample(run, k)._replace(inputs=inputs, since=(k - 1) / 100))
-            if k % 100 == 0:
+            if k % 250 == 0:
                 time.sleep(0.6)  # a flush
     text = (tmp_path / "bag" / "run.json").read_text()
     provenance = json.loads(text)

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from bags import SECOND
-from harness import cannot_run, needs
+from harness import cannot_run, needs, wait_until
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from nodes import LATCHED, PATIENCE, STREAMS, ended, listed, published, recorded, stamp_of
@@ -87,15 +87,16 @@ def viewed(
         listening = []
 
         def opened(server: Foxglove) -> None:
-            connection = connect(server.url, subprotocols=["foxglove.sdk.v1"])  # type: ignore[list-item]
-            listening.append(pool.submit(Client(connection).listen, react))
+            client = Client(connect(server.url, subprotocols=["foxglove.sdk.v1"]))  # type: ignore[list-item]
+            listening.append(pool.submit(client.listen, react))
+            wait_until(lambda: len(client.channels) == len(STREAMS + LATCHED))
 
         viewer = Foxglove(0, scene=True, effort=True, opened=opened)
         twodof.simulate(
             fmu, viewer, twodof.Bag(bag, scene=True, effort=True), stop_time=seconds, step=step,
             pace=twodof.RealTime(), steer=viewer.command,
         )  # fmt: skip
-        yield listening[0].result(20.0)
+        yield listening[0].result(PATIENCE)
 
 
 def test_every_topic_is_received_and_is_that_of_the_bag(native_path: Path, tmp_path: Path) -> None:

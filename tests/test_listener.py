@@ -135,7 +135,7 @@ def test_a_controller_in_real_time_misses_nothing(
         _, err = ended(process)
     assert err == ""
     states = recorded(bag)["/joint_states"]
-    node.until(lambda: node.messages("/joint_states")[-1] == states[-1])
+    node.sees(states[-1])
     heard = node.messages("/joint_states")
     assert heard == states[-len(heard) :] and len(heard) > 100  # all since it joined
     node.leave()
@@ -163,10 +163,11 @@ def test_lockstep_says_who_is_missing(
     fmu = bare(2)
 
     def ends(bag: str, *told: str) -> None:
-        options = ["--lockstep", "--timeout", "3", "-o", str(tmp_path / bag)]
+        timeout = "1" if bag == "nobody" else "5"  # in which a busy machine finds a node
+        options = ["--lockstep", "--timeout", timeout, "-o", str(tmp_path / bag)]
         with published(number, fmu, *options) as process:
-            for line in 15 * told:  # one that comes before its sender is discovered is lost
-                node.say(line)
+            while told and process.poll() is None:  # what is sent before it is heard is lost
+                node.say(*told)
                 time.sleep(0.1)
             _, err = ended(process, 1)
         (line,) = err.splitlines()
@@ -318,7 +319,7 @@ def test_several_robots_are_in_step_and_apart(
     topics = [f"/{name}/joint_states" for name in names]
     node = listen(*(f"{t}=state" for t in topics), "/clock=clock", "/right/joint_commands=command")
     bag = tmp_path / "bag"
-    with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "6") as process:  # type: ignore[arg-type]
+    with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "9") as process:  # type: ignore[arg-type]
         node.hears("/Bare2/joint_states", more=50)
         node.say("/right/joint_commands 1 0 joint1,joint2 0.9,-0.6 0,0 -")
         _, err = ended(process)
@@ -326,7 +327,7 @@ def test_several_robots_are_in_step_and_apart(
     assert err.count("WARNING") == 1
     bags = [recorded(bag)[topic] for topic in topics]
     stamps = [stamp_of(state[0]) for state in bags[0]]
-    assert len(stamps) == 601 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
+    assert len(stamps) == 901 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
     for topic, states in zip(topics, bags):
         heard = node.messages(topic)
         assert len(heard) > 500 and heard == states[-len(heard) :]
@@ -336,7 +337,7 @@ def test_several_robots_are_in_step_and_apart(
     print(f"three robots within {usual:.3f} ms, 99 % within {most:.3f} ms")
     ends = [state[-1][2] for state in bags]
     assert np.abs(np.subtract(ends[1], [0.9, -0.6])).max() < 0.2  # it was 0.95
-    alone = [[*s.q] for s in twodof.samples(jointed, step=0.01, stop_time=6.0)]
+    alone = [[*s.q] for s in twodof.samples(jointed, step=0.01, stop_time=9.0)]
     assert [state[2] for state in bags[0]] == alone
 
 
@@ -345,18 +346,19 @@ def test_the_clock_is_that_of_the_simulation(
     native_path: Path, number: int, listen: Listen, speed: float
 ) -> None:
     node = listen("/clock=clock", "/joint_states")
-    simulated = 4 * speed
+    end = 5 * speed
     options = ["--clock", "--speed", str(speed), "--stamp-start", "100"]
-    with published(number, native_path, *options, "--stop-time", str(simulated)) as process:
+    with published(number, native_path, *options, "--stop-time", str(end)) as process:
         assert ended(process)[1] == ""
     told = [it for it in node.told if it[:2] == ["message", "/clock"]]
     stamps = [seconds * SECOND + rest for _, _, _, (seconds, rest) in told]
-    points = [100 * SECOND + k * SECOND // 100 for k in range(round(simulated * 100) + 1)]
+    points = [100 * SECOND + k * SECOND // 100 for k in range(round(end * 100) + 1)]
     states = [stamp_of(m[0]) for m in node.messages("/joint_states")]
     for heard in (stamps, states):  # at 1,000 a second a busy machine may lose some
         assert heard == sorted({*heard} & {*points}) and len(heard) > len(points) / 2
-    wall = (told[-1][2] - told[0][2]) / SECOND
-    assert (stamps[-1] - stamps[0]) / SECOND / wall == pytest.approx(speed, rel=0.1)
+    apart = len(told) // 8  # over an eighth of them, and mostly: a busy machine may stand still
+    simulated, wall = (np.subtract(t[apart:], t[:-apart]) for t in (stamps, [it[2] for it in told]))
+    assert np.median(simulated / wall) == pytest.approx(speed, rel=0.1)
 
 
 def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
@@ -365,22 +367,25 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
     def clock() -> list[int]:
         return [seconds * SECOND + rest for seconds, rest in node.messages("/clock")]
 
+    def stands() -> bool:
+        before = clock()[-1]
+        time.sleep(1.0)
+        return clock()[-1] == before
+
     with published(number, native_path, "--clock", "--stamp-start", "0") as process:
         node.hears("/clock")
         node.say("/pause true")
-        time.sleep(1.0)
+        node.until(stands)
         paused = clock()[-1]
-        time.sleep(0.5)
-        assert clock()[-1] == paused
         node.say("/step 3")
         node.until(lambda: clock()[-1] > paused)
-        time.sleep(0.5)
+        node.until(stands)
         assert clock()[-1] == paused + 3 * SECOND // 100
+        before = len(clock())
         node.say("/pause false")
-        node.hears("/clock", more=30)
-        began = time.time_ns()
-        node.hears("/clock", more=50)
-        assert time.time_ns() - began > 0.4 * SECOND  # what was missed is not made up for
+        node.hears("/clock", more=80)
+        arrivals = [it[2] for it in node.told if it[:2] == ["message", "/clock"]][before:]
+        assert arrivals[79] - arrivals[0] > 0.4 * SECOND  # what was missed is not made up for
         process.send_signal(signal.SIGINT)
         assert ended(process, 130)[1] == ""
     assert np.ptp(np.diff(clock())) == 0

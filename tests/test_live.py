@@ -7,10 +7,12 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from threading import Event, Thread
 
 import browser
 import numpy as np
@@ -21,6 +23,7 @@ from browser import (
     LINKS,
     Served,
     area,
+    at_rest,
     chromium,
     colours,
     connect,
@@ -36,6 +39,7 @@ from browser import (
     type_into,
     until,
 )
+from harness import wait_until
 from playwright.sync_api import Browser, Locator, Page
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
@@ -77,22 +81,27 @@ def arm(shown: Browser, command: Served) -> Iterator[Page]:
 @pytest.fixture
 def page(arm: Page) -> Page:
     """A page whose arm is at its start, paused, with the inputs of the FMU."""
-    if arm.get_by_role("button", name="Pause").count():
+    if arm.evaluate("arm.playing"):
         pause(arm)
-    press(arm, "Defaults")
-    until(arm, lambda found: found["time"] == "0.000 s" and is_settled(arm))
+    begin_anew(arm, "Defaults")
+    until(arm, bool, lambda arm: arm.evaluate(AS_AT_FIRST))
+    assert at_rest(arm)["time"] == "0.000 s"
     return arm
 
 
-def is_settled(page: Page) -> bool:
-    """Whether all that was asked for was done."""
-    return bool(page.evaluate("arm.held('Kp')[0] === 50 && arm.held('x_des')[0] === 0.2"))
+AS_AT_FIRST = "() => [...arm.defaults()].every(([name, start]) => arm.values.get(name) === start)"
+
+
+def begin_anew(page: Page, name: str) -> None:
+    """Press a button that begins a run, until that has begun."""
+    run = page.evaluate("arm.run")
+    press(page, name)
+    until(page, lambda now: now > run, lambda page: page.evaluate("arm.run"))
 
 
 def pause(page: Page) -> None:
     press(page, "Pause")
-    page.get_by_role("button", name="Play").wait_for()  # else the next click is on "Pause" again
-    until(page, lambda found: found["real-time factor"] == "\u2013")
+    at_rest(page)
 
 
 def joints(found: dict[str, str]) -> list[float]:
@@ -105,8 +114,9 @@ def time_of(found: dict[str, str]) -> float:
 
 def watch(page: Page, until_time: float, *, least: int = 1) -> list[dict[str, str]]:
     """The readout at some moments, so many at least."""
-    seen = [rows(page)]
+    seen, end = [rows(page)], time.monotonic() + browser.PATIENCE
     while time_of(seen[-1]) < until_time or len(seen) < least:
+        assert time.monotonic() < end, seen[-1]
         page.wait_for_timeout(30)
         seen.append(rows(page))
     return seen
@@ -229,8 +239,7 @@ def test_a_parameter_begins_the_run_anew(page: Page) -> None:
     page.get_by_text("rtol = 0 must be > 0").wait_for()
     until(page, lambda value: value == 1e-3, lambda page: page.evaluate("arm.values.get('rtol')"))
     assert page.evaluate("arm.values.get('payload')") == 0.5
-    press(page, "Reset")  # inputs and parameters stay
-    page.wait_for_timeout(300)
+    begin_anew(page, "Reset")  # inputs and parameters stay
     assert page.evaluate("[arm.values.get('payload'), arm.at('tau')[0]]") == [0.5, heavy]
     press(page, "Defaults")
     until(page, lambda value: value == 0, lambda page: page.evaluate("arm.values.get('payload')"))
@@ -246,7 +255,7 @@ def test_a_parameter_begins_the_run_anew(page: Page) -> None:
 def test_who_gives_no_orders_is_not_listened_to(
     command: Served, page: Page, orders: list[str | bytes]
 ) -> None:
-    with open_socket(command.url.replace("http:", "ws:") + "/socket") as connection:
+    with open_socket(socket_of(command)) as connection:
         for order in orders:
             connection.send(order)
         with pytest.raises(ConnectionClosed):
@@ -258,10 +267,12 @@ def test_who_gives_no_orders_is_not_listened_to(
 
 @pytest.mark.parametrize("values", [{"q[1]": 1.0}, {"Kp": "much"}, {"Kp": [1]}, {"other": 0}])
 def test_a_setting_that_is_none_is_told(command: Served, page: Page, values: dict) -> None:
-    with open_socket(command.url.replace("http:", "ws:") + "/socket") as connection:
+    before = page.evaluate("arm.noted")
+    with open_socket(socket_of(command)) as connection:
         connection.send(json.dumps(["change", values]))
+        until(page, lambda noted: noted > before, lambda page: page.evaluate("arm.noted"))
         name = next(iter(values)).split("[")[0]
-        until(page, lambda said: name in said, lambda page: page.inner_text("#arm-said"))
+        until(page, lambda said: name in said, told)
         connection.send(json.dumps(["change", {"Kp": 60.0}]))
         until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
 
@@ -281,6 +292,10 @@ def test_who_never_reads_holds_nothing_up(
         status, output, errors = command.interrupt()
         assert (status, errors) == (130, "") and "bag " in output
         deaf.close()
+
+
+def socket_of(command: Served) -> str:
+    return command.url.replace("http:", "ws:") + "/socket"
 
 
 def loop_of(fmu: Path) -> Loop:
@@ -312,6 +327,28 @@ def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> 
     assert news["rows"][-1][-2:] == target
 
 
+def test_there_are_no_news_of_a_run_without_a_sample(native_path: Path) -> None:
+    """While a page asks for them all the time."""
+    loop, ended, counts = loop_of(native_path), Event(), set()
+
+    def ask() -> None:
+        while not ended.is_set():
+            counts.add(len(loop.news()["rows"]))
+
+    asking, interval = Thread(target=ask), sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        asking.start()
+        for _ in range(60):
+            loop.tell("reset")
+        loop.play(lambda: loop.news()["run"] > 60)
+    finally:
+        sys.setswitchinterval(interval)
+        ended.set()
+        asking.join()
+    assert counts == {1}
+
+
 def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path: Path) -> None:
     loop, told = loop_of(native_path), [{"payload": 0.3}, {"x_des[1]": 0.11}, None, {"rtol": 0.0}]
 
@@ -341,6 +378,7 @@ def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
 def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> None:
     """By its policy: nothing else that it would ask for is asked for."""
     with socket.create_server(("127.0.0.1", 0)) as other, shown.new_context() as context:
+        context.set_default_timeout(1e3 * browser.PATIENCE)
         page, port = context.new_page(), other.getsockname()[1]
         page.goto(command.url)
         page.wait_for_selector(browser.READY)
@@ -452,9 +490,8 @@ def test_full_disk_ends_the_recording_alone(
                 while True:
                     other.write(bytes(256))
                     other.flush()
-            until(page, lambda said: "The recording has ended" in said, told)
+            said = until(page, lambda said: "The recording has ended" in said, told)
             page.get_by_role("button", name="Record", exact=True).wait_for()
-            said = told(page)
             press(page, "Record")
             until(page, lambda said: "There is no recording" in said, told)
             watch(page, time_of(rows(page)) + 0.3)
@@ -515,42 +552,49 @@ def test_joint_that_slides_has_its_own_units(shown: Browser, tmp_path: Path) -> 
     assert np.subtract(x, (0.4, 0.1)) == pytest.approx(e, abs=2e-5)
 
 
-def record_and_end(
-    shown: Browser, fmu: Path, folder: Path, number: signal.Signals, closed_for: float
-) -> tuple[float, float, int]:
-    """The last time that was shown, that of the bag, and the exit status."""
-    with served("live", fmu, cwd=folder) as command:
-        with opened(shown, command.url) as page:
-            press(page, "Record")
-            page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
-            last = time_of(watch(page, time_of(rows(page)) + 0.3)[-1])
-            if not closed_for:
-                status, output, errors = command.interrupt(number)
-        if closed_for:
-            time.sleep(closed_for)
-            status, output, errors = command.interrupt(number)
+def record(shown: Browser, command: Served) -> float:
+    """The last time that was shown of an arm whose motion is being recorded, when the page goes."""
+    with opened(shown, command.url) as page:
+        press(page, "Record")
+        page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
+        return time_of(watch(page, time_of(rows(page)) + 0.3)[-1])
+
+
+def end(command: Served, folder: Path, number: signal.Signals) -> float:
+    """The last time in the bag of a command that is ended by a signal."""
+    status, output, errors = command.interrupt(number)
     (bag,) = folder.glob("rosbag2_*")
-    assert errors == ""
+    assert (status, errors) == (130, "")
     assert f"bag   {bag.name}\n" in output
     assert_consistent(bag, "mcap")
     made = json.loads((bag / "run.json").read_text())
-    return last, made["start_time"] + (len(read_with_mcap(bag)) - 1) * 0.01, status
+    return float(made["start_time"] + (len(read_with_mcap(bag)) - 1) * 0.01)
 
 
 def test_ctrl_c_while_recording_closes_the_bag(
     shown: Browser, fmu_path: Path, tmp_path: Path
 ) -> None:
     """In the Python flavour."""
-    seen, recorded, status = record_and_end(shown, fmu_path, tmp_path, signal.SIGINT, 0.0)
-    assert status == 130
-    assert recorded >= seen - 1e-6
+    with served("live", fmu_path, cwd=tmp_path) as command:
+        seen = record(shown, command)
+        assert end(command, tmp_path, signal.SIGINT) >= seen - 1e-6
 
 
 def test_closing_the_last_page_pauses(shown: Browser, native_path: Path, tmp_path: Path) -> None:
     """And another signal ends as Ctrl-C does."""
-    seen, recorded, status = record_and_end(shown, native_path, tmp_path, signal.SIGTERM, 6.0)
-    assert status == 130
-    assert seen - 1e-6 <= recorded < seen + 4.0
+
+    def stands() -> bool:
+        """Whether time goes on no more than somebody looks."""
+        with open_socket(socket_of(command)) as connection:
+            left = json.loads(connection.recv())["t"]
+        time.sleep(1.0)
+        with open_socket(socket_of(command)) as connection:
+            return bool(json.loads(connection.recv())["t"] < left + 0.5)
+
+    with served("live", native_path, cwd=tmp_path) as command:
+        seen = record(shown, command)
+        wait_until(stands)
+        assert end(command, tmp_path, signal.SIGTERM) >= seen - 1e-6
 
 
 def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:

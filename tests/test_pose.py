@@ -312,8 +312,8 @@ while not writer.get_matched_subscriptions():
     time.sleep(0.01)
 for frame, xyz, quat in said:
     said = Layout(Stamp(), frame, Numbers(7)).pack(np.array([0]), np.array([[*xyz, *quat]]))
+    time.sleep(0.3)  # that it is heard, and after the one before
     writer.write(writer.data_type(said.tobytes()))
-    time.sleep(0.3)
 time.sleep(60)
 """
 

@@ -42,16 +42,17 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
     length: Callable[[int, int], int],
 ) -> None:  # fmt: skip
-    seconds = length(60, 4)
+    seconds, before = length(60, 4), 4  # in which a busy machine finds the node
     node = listen(*STREAMS, *LATCHED)
     bag = tmp_path / "bag"
-    options = ["--scene", "--effort", "--stop-time", str(seconds + 2), "-o", str(bag)]
+    options = ["--scene", "--effort", "--stop-time", str(seconds + before), "-o", str(bag)]
     with published(number, native_path, *options) as process:
         out, err = ended(process)
     assert err == ""
     truth = recorded(bag)
-    node.until(lambda: all(node.messages(topic)[-1:] == truth[topic][-1:] for topic in STREAMS))
-    assert len(truth["/joint_states"]) == 100 * (seconds + 2) + 1
+    for topic in STREAMS:
+        node.sees(truth[topic][-1], topic)
+    assert len(truth["/joint_states"]) == 100 * (seconds + before) + 1
     for topic in STREAMS:
         heard = node.messages(topic)
         assert len(heard) >= 100 * seconds + 1
@@ -60,7 +61,9 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
         assert node.messages(topic) == truth[topic]
     state = truth["/joint_states"][0]
     assert state[1] == ["joint1", "joint2"] and len(state[4]) == 2  # names, efforts
-    assert re.search(rf"deadlines +\d+ of {100 * (seconds + 2) + 1} missed, worst [\d.]+ ms", out)
+    assert re.search(
+        rf"deadlines +\d+ of {100 * (seconds + before) + 1} missed, worst [\d.]+ ms", out
+    )
 
 
 TYPES = {  # as 'ros2 topic info --verbose' tells them
@@ -124,7 +127,7 @@ def test_the_last_sample_before_a_signal_is_in_the_bag_and_on_the_wire(
         out, err = ended(process, 130)
     assert err == ""
     truth = recorded(bag)["/joint_states"]
-    node.until(lambda: node.messages("/joint_states")[-1] == truth[-1])
+    node.sees(truth[-1])
     heard = node.messages("/joint_states")
     assert heard == truth[-len(heard) :]
     assert assert_consistent(bag, "mcap") == len(truth)
@@ -252,7 +255,7 @@ def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
 ) -> None:
     bag = tmp_path / "bag"
-    with published(number, native_path, "--scene", "--stop-time", "9", "-o", str(bag)) as process:
+    with published(number, native_path, "--scene", "-o", str(bag)) as process:
         stalled, killed = listen(*STREAMS, *LATCHED), listen(*STREAMS)
         stalled.hears()
         killed.hears()
@@ -264,10 +267,12 @@ def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
         back.hears()
         stalled.process.send_signal(signal.SIGCONT)
         stalled.hears(more=50)
-        out, err = ended(process)
+        process.send_signal(signal.SIGINT)
+        out, err = ended(process, 130)
     assert err == ""
-    assert len(recorded(bag)["/joint_states"]) == 901
-    assert re.search(r"\d+ of 901 missed", out)
+    stamps = np.array([stamp_of(state[0]) for state in recorded(bag)["/joint_states"]])
+    assert len(stamps) > 250 and (np.diff(stamps) == SECOND // 100).all()
+    assert re.search(rf"\d+ of {len(stamps)} missed", out)
 
 
 def test_two_publishers_on_one_topic_are_both_heard(
@@ -275,7 +280,7 @@ def test_two_publishers_on_one_topic_are_both_heard(
 ) -> None:
     node = listen("/joint_states")
     bags = [tmp_path / "one", tmp_path / "two"]
-    runs = [["--stop-time", "4", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
+    runs = [["--stop-time", "5", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
     with (
         published(number, native_path, *runs[0], str(bags[0])) as one,
         published(number, native_path, *runs[1], str(bags[1])) as two,
@@ -434,7 +439,7 @@ def test_an_interface_that_goes_and_comes_back(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
 ) -> None:
     bag = tmp_path / "bag"
-    options, inside = ["--stop-time", "8", "-o", str(bag)], isolated(CABLE)
+    options, inside = ["-o", str(bag)], isolated(CABLE)
     with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
         enter = ("nsenter", "--net", "--target", str(process.pid))
         node = listen("--any", "/joint_states", inside=enter)
@@ -443,8 +448,10 @@ def test_an_interface_that_goes_and_comes_back(
             subprocess.run([*enter, "ip", "link", "set", "cable0", state], check=True)
             time.sleep(1.0)
         node.hears()
-        assert ended(process)[1] == ""
-    assert len(recorded(bag)["/joint_states"]) == 801
+        process.send_signal(signal.SIGINT)
+        assert ended(process, 130)[1] == ""
+    stamps = np.array([stamp_of(state[0]) for state in recorded(bag)["/joint_states"]])
+    assert len(stamps) > 200 and (np.diff(stamps) == SECOND // 100).all()
 
 
 MEMORY = """

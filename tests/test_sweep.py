@@ -421,7 +421,7 @@ def test_what_is_interrupted_is_resumed(
             process.communicate()
         else:
             os.killpg(process.pid, signal.SIGINT)
-            out, err = process.communicate(timeout=30)
+            out, err = process.communicate(timeout=120)
             assert err == "", err
             if len(table_of(path)) < 320:
                 assert process.returncode == 130
@@ -780,7 +780,7 @@ def test_a_signal_ends_a_sweep_in_the_midst_of_a_long_run(
     """What is done is stored, and nothing is left running."""
     with asleep(fmu_path, tmp_path) as (process, workers):
         process.send_signal(number)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=120)
     assert (process.returncode, err) == (130, "")
     done = list(table_of(tmp_path / "s")["Kp"])
     assert done in ([2.0], [2.0, 3.0])  # the latter may be in one batch with what sleeps
