@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from .common import CommandLineError, controlled, print_next, print_table, quote
-from .options import check_company
+from .options import add_output, check_company
 
 
 def add(verbs: Any) -> None:
     """Add the verb and its options."""
     build = verbs.add_parser("build", help="build an FMU from a URDF")
-    build.add_argument("-o", dest="output", metavar="FILE.fmu", help="default: <name>.fmu")
+    add_output(build, "FILE.fmu", "default: <name>.fmu")
     build.add_argument(
         "robot", nargs="?", type=Path, metavar="URDF",
         help="or a xacro file; default: the shipped planar 2-DoF arm",

@@ -25,7 +25,7 @@ from .common import (
     print_table,
     quote,
 )
-from .options import add_frame_option, add_run_options, check_company, file_name
+from .options import add_frame_option, add_output, add_run_options, check_company
 
 if TYPE_CHECKING:
     from ..bag.writer import Bag
@@ -49,13 +49,7 @@ def add(verbs: Any) -> None:
         help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME"
         " or its file's",
     )  # fmt: skip
-    publish.add_argument(
-        "-o",
-        dest="output",
-        type=file_name,
-        metavar="BAG",
-        help="record a bag too, one of all robots",
-    )
+    add_output(publish, "BAG", "record a bag too, one of all robots")
     add_frame_option(publish)
     publish.add_argument("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
     publish.add_argument(
