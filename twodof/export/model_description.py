@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
@@ -17,6 +17,10 @@ from ..plant.variables import (
     Variable,
     count_event_indicators,
 )
+from ..version import __version__
+from .flavours import Flavour
+from .model_description3 import xml_text
+from .options import FmuOptions
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
@@ -77,46 +81,39 @@ IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
 
 
 def model_description(
-    robot: Robot,
-    table: Sequence[Variable],
-    control: str,
-    *,
-    name: str,
-    guid: str,
-    version: str,
-    flavour: Mapping[str, str],
-    exchanges: bool = False,
-    source_files: Sequence[str] = (),
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour, guid: str
 ) -> bytes:
     """The XML text.
 
     Args:
-        robot, table, control: the robot, its variables, and the name of its control law.
-        name: model name and model identifier.
+        options: with the model's name and control law.
+        robot, table: the robot and its variables.
+        flavour: says which interfaces there are, what they can do, and their source files.
         guid: as it shall stand in the file; "" while it is being computed.
-        version: version of this package.
-        flavour: further attributes of <CoSimulation>, needsExecutionTool among them.
-        exchanges: whether there is <ModelExchange> too.
-        source_files: names under sources/ that a tool compiles.
     """
+    law = CONTROLS[options.control]
     root = ET.Element(
         "fmiModelDescription",
         fmiVersion="2.0",
-        modelName=name,
+        modelName=options.name,
         guid=guid,
         description=f"Robot '{robot.name}' with {len(robot.joints)} joints under"
-        f" {CONTROLS[control].title.format(frame=robot.frame)}",
-        version=version,
+        f" {law.title.format(frame=robot.frame)}",
+        version=__version__,
         author=AUTHOR,
         copyright=f"Copyright (c) {AUTHOR}; of the robot's description, its author's",
         license="BSD-3-Clause",
-        generationTool=f"{VENDOR} {version}",
+        generationTool=f"{VENDOR} {__version__}",
         variableNamingConvention="structured",
     )
-    indicators = count_event_indicators(robot, control) if exchanges else None
-    _interfaces(
-        root, {"modelIdentifier": name, **CAPABILITIES, **flavour}, indicators, source_files
-    )
+    capabilities = {"modelIdentifier": options.name, **CAPABILITIES, **flavour.attributes}
+    if flavour.exchanges:
+        indicators = count_event_indicators(robot, options.control)
+        root.set("numberOfEventIndicators", str(indicators))
+        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
+        _source_files(ET.SubElement(root, "ModelExchange", exchange), flavour.source_files)
+    stepping = {**capabilities, "canHandleVariableCommunicationStepSize": "true"}
+    _source_files(ET.SubElement(root, "CoSimulation", stepping), flavour.source_files)
     used = {variable.unit for variable in table}
     _units(root, used)
     _types(root, used)
@@ -130,27 +127,10 @@ def model_description(
         stopTime=repr(DEFAULT_STOP_TIME),
         stepSize=repr(DEFAULT_STEP),
     )
-    _vendor_annotation(root, robot, control)
-    _variables(root, robot, table, exchanges)
-    _structure(root, robot, table, CONTROLS[control])
-    ET.indent(root)
-    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text + b"\n"
-
-
-def _interfaces(
-    root: ET.Element,
-    capabilities: Mapping[str, str],
-    indicators: int | None,
-    source_files: Sequence[str],
-) -> None:
-    """Co-simulation, and Model Exchange where there are event indicators to tell of."""
-    if indicators is not None:
-        root.set("numberOfEventIndicators", str(indicators))
-        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
-        _source_files(ET.SubElement(root, "ModelExchange", exchange), source_files)
-    stepping = {**capabilities, "canHandleVariableCommunicationStepSize": "true"}
-    _source_files(ET.SubElement(root, "CoSimulation", stepping), source_files)
+    _vendor_annotation(root, robot, options.control)
+    _variables(root, robot, table, flavour.exchanges)
+    _structure(root, robot, table, law)
+    return xml_text(root)
 
 
 def _source_files(interface: ET.Element, names: Sequence[str]) -> None:
@@ -185,10 +165,10 @@ def _types(root: ET.Element, used: Collection[str]) -> None:
 def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
     """What a logger needs to know beyond variable names."""
     tool = ET.SubElement(ET.SubElement(root, "VendorAnnotations"), "Tool", name=VENDOR)
-    task = ET.SubElement(tool, "Robot", name=robot.name, root=robot.root)
-    task.set("frame", robot.frame)
-    task.set("axes", robot.axes)
-    task.set("control", control)
+    task = ET.SubElement(
+        tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes,
+        control=control,
+    )  # fmt: skip
     for joint, prismatic in zip(robot.joints, robot.prismatic, strict=True):
         ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
 
