@@ -18,12 +18,12 @@ from ..errors import BagError
 from ..experiments import NANOSECONDS, TIME_TOLERANCE
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .provenance import KNOWN_UNTIL
+from .records import Stamps
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 Schedule = list[tuple[int, Mapping[str, Any]]]
 """Communication points, ascending from 0, and values of inputs and parameters from each on."""
 
