@@ -10,6 +10,7 @@ from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
 from ..plant.variables import (
     CONTROLS,
+    DISTURBANCES,
     NO_RANGE,
     RANGES,
     Control,
@@ -238,54 +239,34 @@ def _size(typed: ET.Element, within: Range, nominal: float) -> None:
 
 def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], control: Control) -> None:
     moves = robot.moves_frame()
-    effort = control.commands == "effort"
-    inputs = (*control.inputs, "tau_ext", "f_ext")
+    inputs = (*control.inputs, *DISTURBANCES)
     law = ("gravity", *control.parameters, "limit_effort")
+    own, frame, every = "that joint's", "those of joints that move the frame", "all"
+    during = {
+        "q": (("q",), own), "v": (("v",), own), "der_q": (("v",), own),
+        "x": (("q",), frame), "quat": (("q",), frame),
+        "xd": (STATES, frame), "omega": (STATES, frame),
+        "tau": ((*STATES, *control.inputs), every), "der_v": ((*STATES, *inputs), every),
+    }  # fmt: skip
+    at_the_start = {
+        "q": (START, own), "x": (START, frame), "quat": (START, frame),
+        **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, every)),
+        "tau": ((*IMPACT, *law, *control.inputs), every),
+        "der_v": ((*IMPACT, *law, *inputs), every),
+    }  # fmt: skip
+    if control.commands == "effort":
+        during["tau"] = (control.inputs, own)
+        at_the_start["tau"] = (("limit_effort", *control.inputs), own)
 
-    def known(groups: Sequence[str], joint: int | None = None, of_frame: bool = False) -> str:
-        """1-based indices of variables, for one joint, for those that move the frame, or all."""
+    def known(unknown: Variable, groups: Sequence[str], whose: str) -> str:
+        """1-based indices of variables that an unknown depends on."""
         return " ".join(
             str(i)
             for i, variable in enumerate(table, start=1)
             if variable.group in groups
-            and (joint is None or variable.index in (joint, None))
-            and (not of_frame or (variable.index is not None and moves[variable.index]))
+            and (whose != own or variable.index in (unknown.index, None))
+            and (whose != frame or (variable.index is not None and moves[variable.index]))
         )
-
-    def now(variable: Variable) -> str:
-        """During the run: on states and inputs."""
-        own = variable.index
-        groups = {
-            "q": known(("q",), joint=own),
-            "v": known(("v",), joint=own),
-            "x": known(("q",), of_frame=True),
-            "quat": known(("q",), of_frame=True),
-            "omega": known(STATES, of_frame=True),
-            "xd": known(STATES, of_frame=True),
-            "tau": known(control.inputs, joint=own)
-            if effort
-            else known((*STATES, *control.inputs)),
-            "der_q": known(("v",), joint=own),
-            "der_v": known((*STATES, *inputs)),
-        }
-        return groups[variable.group]
-
-    def at_the_start(variable: Variable) -> str:
-        own = variable.index
-        groups = {
-            "q": known(START, joint=own),
-            "v": known(IMPACT),
-            "x": known(START, of_frame=True),
-            "quat": known(START, of_frame=True),
-            "omega": known(IMPACT),
-            "xd": known(IMPACT),
-            "tau": known(("limit_effort", *control.inputs), joint=own)
-            if effort
-            else known((*IMPACT, *law, *control.inputs)),
-            "der_q": known(IMPACT),
-            "der_v": known((*IMPACT, *law, *inputs)),
-        }
-        return groups[variable.group]
 
     structure = ET.SubElement(root, "ModelStructure")
     outputs = ET.SubElement(structure, "Outputs")
@@ -294,5 +275,6 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
     for i, variable in enumerate(table, start=1):
         if variable.causality in ("output", "local"):
             kind = outputs if variable.causality == "output" else derivatives
-            ET.SubElement(kind, "Unknown", index=str(i), dependencies=now(variable))
-            ET.SubElement(initial, "Unknown", index=str(i), dependencies=at_the_start(variable))
+            for parent, rule in ((kind, during), (initial, at_the_start)):
+                dependencies = known(variable, *rule[variable.group])
+                ET.SubElement(parent, "Unknown", index=str(i), dependencies=dependencies)
