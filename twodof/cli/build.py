@@ -97,7 +97,6 @@ def call(options: argparse.Namespace) -> int:
     from ..export.options import FmuOptions
     from ..export.package import build_fmu
 
-    gravity = None if options.gravity is None else tuple(options.gravity)
     chosen = FmuOptions(
         urdf=options.urdf or options.robot,
         mesh_dir=options.mesh_dir,
@@ -105,8 +104,8 @@ def call(options: argparse.Namespace) -> int:
         lock=_locks(options.locks),
         meshes=not options.no_meshes,
         axes=options.axes,
-        gravity=gravity,
-        q_start=None if options.q_start is None else tuple(options.q_start),
+        gravity=options.gravity and tuple(options.gravity),
+        q_start=options.q_start and tuple(options.q_start),
         control="pose" if options.orientation else options.control,
         name=options.name,
         link_environment=options.link_environment,
