@@ -2,6 +2,7 @@
 
 import json
 import re
+import zipfile
 
 import fmpy
 import numpy as np
@@ -106,6 +107,18 @@ def test_groups_that_are_chosen(bare):
     assert model.outputs == ("x[1]", "x[2]", "tau[1]", "tau[2]")
     with pytest.raises(twodof.TwoDofError, match="there is no 'Kp'; there are tau_cmd"):
         twodof.linearise(bare, inputs=["Kp"])
+
+
+def test_names_of_an_fmu_are_no_commands_to_the_terminal(bare, tmp_path, capsys):
+    other = tmp_path / "Other.fmu"
+    with zipfile.ZipFile(bare) as archive, zipfile.ZipFile(other, "w") as changed:
+        for name in archive.namelist():
+            content = archive.read(name)
+            changed.writestr(name, content.replace(b'"f_ext[1]"', '"\x9b2J[1]"'.encode()))
+    assert main(["linearise", str(other), "--at", "q=0.1,0.2"]) == 0
+    text = capsys.readouterr().out
+    assert text.count(r"\x9b2J[1]") == 3  # of the point, of B and of D
+    assert all(c.isprintable() or c == "\n" for c in text)
 
 
 def test_the_command_prints_the_model(bare, capsys):

@@ -8,10 +8,10 @@ import logging
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ from .errors import InputError
 from .files import check_file
 from .fmu import Fmu, load_fmu
 from .plant.variables import CONTROLS
+from .plant.variables import Value as Value
 
-Value = float | bool
 Setting = Any
 """A number, a Boolean, or a sequence or array of numbers; checked by ``resolve``."""
 Changes = list[tuple[float, dict[str, Value]]]
@@ -138,7 +138,7 @@ def experiment(
         start_time=start_time,
         step=step,
         steps=_steps(start_time, stop_time, step),
-        start_values={**_declared_starts(fmu), **given},
+        start_values={**fmu.start_values, **given},
         given=given,
         changes=[*due],
         stamp_start=stamp_start,
@@ -196,17 +196,6 @@ def default(fmu: Fmu, name: str, fallback: float) -> float:
     return fallback if number is None else float(number)
 
 
-def _declared_starts(fmu: Fmu) -> dict[str, Value]:
-    starts: dict[str, Value] = {}
-    for name, variable in fmu.variables.items():
-        if variable.causality in ("input", "parameter") and variable.start is not None:
-            if variable.type == "Boolean":
-                starts[name] = variable.start in ("true", "1")
-            elif variable.type == "Real":
-                starts[name] = float(variable.start)
-    return starts
-
-
 def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
     """Values by variable name; a group's name sets all of its elements.
 
@@ -218,11 +207,8 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
     for name, setting in settings.items():
         elements = [name] if name in fmu.variables else fmu.vector(name)
         if not elements:
-            settable = {**fmu.groups("input"), **fmu.groups("parameter")}
-            known = [*settable, *(element for group in settable.values() for element in group)]
-            raise InputError(
-                f"there is no variable '{name}'{_of_another(fmu, name) or _suggestion(name, known)}"
-            )
+            remedy = _of_another(fmu, name) or _suggestion(fmu, name, "input", "parameter")
+            raise InputError(f"there is no variable '{name}'{remedy}")
         # arrays give their own kind of numbers
         plain = setting.tolist() if hasattr(setting, "tolist") else setting
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
@@ -261,16 +247,13 @@ def _of_another(fmu: Fmu, name: str) -> str:
     return f": it is of {quoted}; this FMU has control '{fmu.control}'"
 
 
-def _suggestion(name: str, known: Iterable[str]) -> str:
-    known = list(known)
-    near = [f"{name}[1]"] if f"{name}[1]" in known else _nearest(name, known)
-    return f"; did you mean '{near[0]}'?" if near else f"; there are: {', '.join(known)}"
-
-
-def _nearest(name: str, known: list[str]) -> list[str]:
+def _suggestion(fmu: Fmu, name: str, *causalities: str) -> str:
+    """The variable of these causalities that may be meant; all of them where none is near."""
+    groups = {g: names for causality in causalities for g, names in fmu.groups(causality).items()}
+    known = [*groups, *chain(*groups.values())]
     by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
     near = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.4)
-    return [by_lower[match] for match in near]
+    return f"; did you mean '{by_lower[near[0]]}'?" if near else f"; there are: {', '.join(known)}"
 
 
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
@@ -323,9 +306,8 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
     """The inputs that a column sets: one, or all elements of a vector."""
     elements = [name] if name in fmu.variables else fmu.vector(name)
     if not elements:
-        groups = fmu.groups("input")
-        known = [*groups, *(element for group in groups.values() for element in group)]
-        raise InputError(f"'{path}': there is no variable '{name:.50}'{_suggestion(name, known)}")
+        remedy = _suggestion(fmu, name, "input")
+        raise InputError(f"'{path}': there is no variable '{name:.50}'{remedy}")
     if any(fmu.variables[element].causality != "input" for element in elements):
         raise InputError(f"'{path}': {name} is not an input")
     return elements

@@ -3,6 +3,7 @@ folders marked as being written, and folders for a while."""
 
 from __future__ import annotations
 
+import base64
 import codecs
 import errno
 import fcntl
@@ -14,6 +15,7 @@ import stat
 import sys
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
@@ -21,6 +23,7 @@ from pathlib import Path, PurePosixPath
 
 from .errors import TwoDofError
 
+MAX_URDF = 8 * 1024**2
 MAX_ARCHIVE = 2 * 1024**3
 MAX_DIRECTORY = 4 * 1024**2  # of a zip: some 50,000 members
 MAX_UNZIPPED = 2 * 1024**3
@@ -70,6 +73,23 @@ def read_file(path: str | Path, most: int) -> bytes:
     check_file(path, most)
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
+
+
+def read_urdf_text(path: str | Path, kind: type[TwoDofError]) -> str:
+    """The text of a URDF; raises ``kind`` where it cannot be read, or is not UTF-8."""
+    with refusing(kind, f"read the URDF '{path}'"):
+        content = read_file(path, MAX_URDF)
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise kind(f"the URDF '{path}' is not UTF-8 text") from error
+
+
+def head_of(path: Path, size: int) -> bytes:
+    """The first bytes of a file; none where it cannot be read."""
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(size)
+    return b""
 
 
 def shown(path: str | Path) -> str:
@@ -240,6 +260,11 @@ def free_name(
     """The name, or that with the first number from 2 on, under which there is nothing to lose."""
     names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
     return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
+
+
+def packed(content: bytes) -> str:
+    """Compressed, as base64, for a page: zlib's format is what browsers call deflate."""
+    return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
 def sync(*paths: Path) -> None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Any
 from zlib import crc32
 
 import lz4.frame
@@ -152,8 +152,11 @@ class Tables:
             number, name, _, text, _ = fields("Hsss", content, position)
             self._schemas[number] = (name, text)
             return
-        number, channel = _channel(content, position, self._schemas)
-        self.channels[number] = channel
+        number, schema, topic, encoding, length, position = fields("HHssI", content, position)
+        entries = _entries(content[position : position + length])
+        name, text = self._schemas[schema]
+        qos, hashed = entries.get("offered_qos_profiles", ""), entries.get("topic_type_hash", "")
+        self.channels[number] = Channel(topic, name, encoding, text, qos, hashed)
         if len(self.channels) > MAX_TOPICS:
             raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
 
@@ -179,36 +182,28 @@ def _records(
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise DamageError(f"'{path.name}' is no MCAP file")
-        yield from _records_of(path, file, allowance, wanted)
-
-
-def _records_of(
-    path: Path, file: BinaryIO, allowance: Allowance, wanted: Sequence[int]
-) -> Iterator[tuple[int, bytes]]:
-    size, position = path.stat().st_size, len(MAGIC)
-    while True:
-        start = position
-        head = file.read(HEAD.size)
-        if len(head) < HEAD.size:
-            raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
-        opcode, length = HEAD.unpack(head)
-        allowance.spend(RECORD)
-        position += HEAD.size + length
-        if opcode == 0 or position > size:
-            raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
-        if opcode in wanted and length > MAX_CHUNK:
-            raise DamageError(f"'{path.name}' has a record of {length} bytes")
-        if opcode == FOOTER:
-            file.seek(length, 1)
-            if file.read(len(MAGIC)) != MAGIC:
-                raise DamageError(f"'{path.name}' ends in the middle, at byte {size}")
-            return
-        if opcode == CHUNK and opcode in wanted:
-            yield opcode, file.read(length)
-        elif opcode in wanted:
-            yield opcode, head + file.read(length)
-        elif length:
-            file.seek(length, 1)
+        size, position = path.stat().st_size, len(MAGIC)
+        while True:
+            start = position
+            head = file.read(HEAD.size)
+            if len(head) < HEAD.size:
+                raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
+            opcode, length = HEAD.unpack(head)
+            allowance.spend(RECORD)
+            position += HEAD.size + length
+            if opcode == 0 or position > size:
+                raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
+            if opcode in wanted and length > MAX_CHUNK:
+                raise DamageError(f"'{path.name}' has a record of {length} bytes")
+            if opcode == FOOTER:
+                file.seek(length, 1)
+                if file.read(len(MAGIC)) != MAGIC:
+                    raise DamageError(f"'{path.name}' ends in the middle, at byte {size}")
+                return
+            if opcode in wanted:
+                yield opcode, (b"" if opcode == CHUNK else head) + file.read(length)
+            elif length:
+                file.seek(length, 1)
 
 
 def unpack_chunk(path: Path, content: bytes, allowance: Allowance) -> bytes:
@@ -230,18 +225,6 @@ def unpack_chunk(path: Path, content: bytes, allowance: Allowance) -> bytes:
     if len(packed) != size or (crc and crc32(packed) != crc):
         raise DamageError(f"'{path.name}' has a damaged chunk")
     return packed
-
-
-def _channel(
-    content: bytes, position: int, schemas: dict[int, tuple[str, str]]
-) -> tuple[int, Channel]:
-    number, schema, topic, encoding, length, position = fields("HHssI", content, position)
-    entries = _entries(content[position : position + length])
-    name, definition = schemas[schema]
-    qos = entries.get("offered_qos_profiles", "")
-    return number, Channel(
-        topic, name, encoding, definition, qos, entries.get("topic_type_hash", "")
-    )
 
 
 def _entries(metadata: bytes) -> dict[str, str]:

@@ -99,10 +99,7 @@ def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
-        "robot": fmu.robot,
-        "frame": fmu.frame,
-        "root": fmu.root,
-        "axes": fmu.axes,
+        **{key: getattr(fmu, key) for key in ("robot", "frame", "root", "axes")},
         "joints": list(fmu.joints),
         "start_time": run.start_time,
         "step": run.step,

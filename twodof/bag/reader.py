@@ -20,8 +20,8 @@ from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, STORE, TARGET
 from .contents import read_messages, stated_count, storage_files
 from .outline import Indices, Outline
 from .provenance import read_provenance, robot_in, robots_of
-from .recording import Array, Heard, Recording, Stamps, TopicCount
-from .records import Allowance, DamageError
+from .recording import Array, Heard, Recording, TopicCount
+from .records import Allowance, DamageError, Stamps
 from .summary import read_summary
 
 MAX_JOINT_STATE = 1024**2  # bytes; some ten thousand joints
@@ -119,10 +119,7 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 def _read(
-    path: Path,
-    kind: type[_JointStates],
-    targets: _Targets | None,
-    outline: Outline | None = None,
+    path: Path, kind: type[_JointStates], targets: _Targets | None, outline: Outline | None = None
 ) -> Recording:
     """What a kind of reader keeps of a bag's joint states, and of these an outline."""
     counts: Counter[tuple[str, str]] = Counter()

@@ -18,12 +18,12 @@ from ..errors import BagError
 from ..experiments import NANOSECONDS, TIME_TOLERANCE
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .provenance import KNOWN_UNTIL
+from .records import Stamps
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 Schedule = list[tuple[int, Mapping[str, Any]]]
 """Communication points, ascending from 0, and values of inputs and parameters from each on."""
 
@@ -68,6 +68,10 @@ class Recording:
         tau: efforts (N·m, N), N × n, or N × 0 where the bag has none.
         heard: what /target said; None where the bag has no such points.
         provenance: what the logger wrote about the run, {} for a bag from elsewhere.
+
+    Raises:
+        BagError: by what the provenance tells, where it does not fit the samples, and by ``steps``
+            where there is none.
     """
 
     path: Path
@@ -99,11 +103,7 @@ class Recording:
 
     @cached_property
     def schedule(self) -> Schedule:
-        """The inputs and parameters that held, each from its communication point on.
-
-        Raises:
-            BagError: the provenance does not fit the samples.
-        """
+        """The inputs and parameters that held, each from its communication point on."""
         try:
             return self._schedule()
         except (KeyError, ValueError, ArithmeticError) as error:
@@ -111,11 +111,7 @@ class Recording:
 
     @cached_property
     def steps(self) -> NDArray[np.int64]:
-        """Number of communication steps before each sample; a recovered bag may have gaps.
-
-        Raises:
-            BagError: the bag has no provenance, or one that does not fit the samples.
-        """
+        """Number of communication steps before each sample; a recovered bag may have gaps."""
         step = self.provenance.get("step", 0.0)
         least = self.t[-1] / (MOST_LOST * max(self.count, len(self.t)))
         if not (0.0 < step < inf and least <= step):
@@ -129,9 +125,6 @@ class Recording:
 
         As the provenance has it, or else the bag's /target in the robot's root frame, which is
         then all of x, y, z where the task axes are not known. N × 0 where neither knows it.
-
-        Raises:
-            BagError: the provenance does not fit the samples.
         """
         held = self.held("x_des", len(self.axes))
         if held.size:
@@ -143,19 +136,11 @@ class Recording:
 
     @property
     def target_quat(self) -> Array:
-        """Target orientation in effect up to each sample, quat_des, N × 4; N × 0 without one.
-
-        Raises:
-            BagError: the provenance does not fit the samples.
-        """
+        """Target orientation in effect up to each sample, quat_des, N × 4; N × 0 without one."""
         return self.held("quat_des", 4)
 
     def held(self, group: str, size: int) -> Array:
-        """A vector of inputs in effect up to each sample, N × size; N × 0 where it is not known.
-
-        Raises:
-            BagError: the provenance does not fit the samples.
-        """
+        """A vector of inputs in effect up to each sample, N × size; N × 0 where it is not known."""
         names = [f"{group}[{i + 1}]" for i in range(size)]
         if not size or names[0] not in self.schedule[0][1] or KNOWN_UNTIL in self.provenance:
             return np.empty((len(self.stamps), 0))
@@ -166,11 +151,7 @@ class Recording:
 
     @cached_property
     def x(self) -> Array:
-        """End effector position along the task axes, m, N × m; N × 0 where the robot is not known.
-
-        Raises:
-            BagError: the robot in the provenance does not fit the samples.
-        """
+        """End effector position along the task axes, m, N × m; N × 0 where no robot is known."""
         text = self.provenance.get("urdf")
         if text is None or not self.axes:
             return np.empty((len(self.stamps), 0))
@@ -190,7 +171,7 @@ class Recording:
         Columns are named as the FMU's variables, "q[1]" of the first joint.
 
         Raises:
-            BagError: pandas is missing, or as ``x`` and ``target``.
+            BagError: pandas is missing.
         """
         try:
             import pandas as pd

@@ -25,6 +25,9 @@ MAX_RATIO = 1000  # of unpacked to packed; an arm at rest reaches 24, one of 50 
 RECORD = 2000  # bytes that a record counts for; a message takes 3 of the file at least, packed
 TEXT = 100  # bytes that one of a topic's texts counts for, which are kept
 
+Stamps = NDArray[np.int64]
+"""ns since the epoch, N."""
+
 
 class Channel(NamedTuple):
     """A topic as a bag's file describes it."""
@@ -41,7 +44,7 @@ class Batch(NamedTuple):
     """Messages of a channel that are equally long: log times in ns, N, and N × bytes."""
 
     channel: Channel
-    stamps: NDArray[np.int64]
+    stamps: Stamps
     messages: Rows
 
 

@@ -17,7 +17,6 @@ from typing import Final, Literal
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionMode
@@ -27,8 +26,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from ..errors import BagError
 from ..ros.cdr import Rows
 from .mcap import HEAD, MAGIC, MESSAGE
-
-Stamps = NDArray[np.int64]
+from .records import Stamps as Stamps
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}

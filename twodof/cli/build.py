@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from .common import CommandLineError, controlled, print_next, print_table, quote
-from .options import check_company
+from .options import add_output, check_company
 
 
 def add(verbs: Any) -> None:
     """Add the verb and its options."""
     build = verbs.add_parser("build", help="build an FMU from a URDF")
-    build.add_argument("-o", dest="output", metavar="FILE.fmu", help="default: <name>.fmu")
+    add_output(build, "FILE.fmu", "default: <name>.fmu")
     build.add_argument(
         "robot", nargs="?", type=Path, metavar="URDF",
         help="or a xacro file; default: the shipped planar 2-DoF arm",
@@ -97,7 +97,6 @@ def call(options: argparse.Namespace) -> int:
     from ..export.options import FmuOptions
     from ..export.package import build_fmu
 
-    gravity = None if options.gravity is None else tuple(options.gravity)
     chosen = FmuOptions(
         urdf=options.urdf or options.robot,
         mesh_dir=options.mesh_dir,
@@ -105,8 +104,8 @@ def call(options: argparse.Namespace) -> int:
         lock=_locks(options.locks),
         meshes=not options.no_meshes,
         axes=options.axes,
-        gravity=gravity,
-        q_start=None if options.q_start is None else tuple(options.q_start),
+        gravity=options.gravity and tuple(options.gravity),
+        q_start=options.q_start and tuple(options.q_start),
         control="pose" if options.orientation else options.control,
         name=options.name,
         link_environment=options.link_environment,

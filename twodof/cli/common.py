@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from ..pace import RealTime
 
 INTERRUPTED = 130
-NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM")
-SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 PATIENCE = 5.0  # s for what is under way to end when it was asked to
 
 
@@ -91,8 +90,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
                 signal.signal(number, signal.SIG_IGN)
             raise KeyboardInterrupt
         asked = True
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE)
 
     before = {number: signal.signal(number, ask) for number in SIGNALS}
     try:
@@ -102,8 +100,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt from error
         raise
     finally:
-        if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -296,10 +293,9 @@ def print_best(table: DataFrame) -> None:
     best = best_runs(table)
     units = [METRICS[name].unit if name in METRICS else "" for name in best.columns]
     rows = [[f"{value:.4g}" for value in row] for row in best.to_numpy()]
-    widths = [max(map(len, cells)) for cells in zip(best.columns, units, *rows)]
     print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
-    for cells in [best.columns, units, *rows] if rows else []:
-        print(plain("  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths))))
+    if rows:
+        print_table(best.columns, units, *rows, align=str.rjust, before="  ")
 
 
 def quote(path: Path) -> str:
@@ -320,11 +316,13 @@ def print_json(**facts: object) -> None:
     print(json.dumps(plain(facts), indent=2))
 
 
-def print_table(*rows: tuple[str, str]) -> None:
-    """Labels and texts, one pair a line."""
-    width = max(len(label) for label, _ in rows)
-    for label, text in rows:
-        print(plain(f"{label.ljust(width)}  {text}"))
+def print_table(
+    *rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = ""
+) -> None:
+    """Texts in columns, a row a line; each line begins with what is to stand before."""
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    for row in rows:
+        print(plain(before + "  ".join(map(align, row, widths)).rstrip()))
 
 
 def plain(text: str) -> str:

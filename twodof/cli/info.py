@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from .common import best_runs, controlled, plain, print_best, print_json, print_table
+from .common import best_runs, controlled, print_best, print_json, print_table
 from .options import add_json_option
 
 if TYPE_CHECKING:
@@ -141,11 +141,9 @@ def _print_fmu(fmu: Fmu) -> None:
         )
         if getattr(simulation, name)
     ]
+    made = ", ".join(filter(None, (fmu.name, fmu.description.generationTool)))
     print_table(
-        (
-            "FMU",
-            f"{fmu.path} ({', '.join(filter(None, (fmu.name, fmu.description.generationTool)))})",
-        ),
+        ("FMU", f"{fmu.path} ({made})"),
         ("FMI", fmu.description.fmiVersion),
         ("digest", fmu.guid),
         ("platforms", ", ".join(fmu.platforms) or "none"),
@@ -162,11 +160,8 @@ def _print_fmu(fmu: Fmu) -> None:
             starts = ", ".join(_start(v.start) for v in variables if v.start is not None)
             units = ", ".join(dict.fromkeys(variable.unit or "" for variable in variables))
             rows.append((f"{group}{size}", units, starts, causality))
-    widths = [max(len(row[column]) for row in rows) for column in range(3)]
     print()
-    for row in rows:
-        cells = [*(cell.ljust(w) for cell, w in zip(row, widths)), row[3]]
-        print(plain("  ".join(cells).rstrip()))
+    print_table(*rows)
 
 
 def _start(text: str) -> str:
@@ -194,9 +189,7 @@ def _print_bag(run: Recording) -> None:
         rows.append(("made by", run.provenance["command_line"] or "the Python API"))
     print_table(*rows)
     print()
-    width = max(len(topic.name) for topic in run.topics)
-    for topic in run.topics:
-        print(plain(f"{topic.name.ljust(width)}  {topic.count:8d}  {topic.type}"))
+    print_table(*((topic.name, f"{topic.count:8d}", topic.type) for topic in run.topics))
 
 
 def _state(run: Recording, k: int) -> str:

@@ -61,13 +61,6 @@ def _print(model: LinearModel) -> None:
         print(f"\n{name}")
         rows = model.states if name in "AB" else model.outputs
         columns = model.states if name in "AC" else model.inputs
-        _print_matrix(getattr(model, name).tolist(), rows, columns)
-
-
-def _print_matrix(
-    matrix: list[list[float]], rows: tuple[str, ...], columns: tuple[str, ...]
-) -> None:
-    cells = [["", *columns], *([row, *(f"{x:.6g}" for x in r)] for row, r in zip(rows, matrix))]
-    widths = [max(map(len, column)) for column in zip(*cells)]
-    for line in cells:
-        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths)).rstrip())
+        values = ((f"{x:.6g}" for x in row) for row in getattr(model, name).tolist())
+        cells = ([row, *texts] for row, texts in zip(rows, values))
+        print_table(["", *columns], *cells, align=str.rjust)

@@ -14,7 +14,14 @@ from .common import (
     print_next,
     quote,
 )  # fmt: skip
-from .options import add_page_options, add_set_option, add_step_option, file_name, page_place
+from .options import (
+    add_output,
+    add_page_options,
+    add_set_option,
+    add_step_option,
+    file_name,
+    page_place,
+)
 
 
 def add(verbs: Any) -> None:
@@ -26,7 +33,7 @@ def add(verbs: Any) -> None:
     live.add_argument(
         "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
     )
-    live.add_argument("-o", dest="output", type=file_name, metavar="BAG", help="name of recordings")
+    add_output(live, "BAG", "name of recordings")
     add_step_option(live)
     add_set_option(live)
     add_page_options(live)

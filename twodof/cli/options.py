@@ -48,6 +48,11 @@ def file_name(text: str) -> str:
     return text
 
 
+def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    """Where what is made goes."""
+    parser.add_argument("-o", dest="output", type=file_name, metavar=metavar, help=text)
+
+
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Of a run that may leave a bag, but for what is run."""
     parser.add_argument(
@@ -55,10 +60,9 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     )
     add_set_option(parser)
     parser.add_argument(
-        "--input",
-        metavar="CSV|BAG[:TOPIC]",
+        "--input", metavar="CSV|BAG[:TOPIC]",
         help="inputs over time: a column 'time' and one for each input; or a bag's commands",
-    )
+    )  # fmt: skip
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
     parser.add_argument(
         "--scene", action="store_true", help="add robot description, tf, target and end effector"

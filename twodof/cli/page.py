@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import chosen_fmu, parse_settings, print_table
-from .options import add_frame_option, add_set_option, add_step_option, file_name
+from .options import add_frame_option, add_output, add_set_option, add_step_option, file_name
 
 
 def add(verbs: Any) -> None:
@@ -18,15 +18,10 @@ def add(verbs: Any) -> None:
         " browser, a target to drag. It needs no network and no server.",
     )  # fmt: skip
     page.add_argument(
-        "fmu",
-        nargs="?",
-        type=file_name,
-        metavar="FMU|URDF",
+        "fmu", nargs="?", type=file_name, metavar="FMU|URDF",
         help="default: the default arm's native FMU",
-    )
-    page.add_argument(
-        "-o", dest="output", type=file_name, metavar="FILE.html", help="default: <name>.html"
-    )
+    )  # fmt: skip
+    add_output(page, "FILE.html", "default: <name>.html")
     add_frame_option(page)
     add_step_option(page)
     add_set_option(page)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .common import CommandLineError, print_best, print_table
-from .options import add_robot_options
+from .options import add_output, add_robot_options
 
 if TYPE_CHECKING:
     from ..plots.figure import Drawing
@@ -22,9 +22,7 @@ def add(verbs: Any) -> None:
         " error; of a sweep, each metric over the variables.",
     )  # fmt: skip
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
-    plot.add_argument(
-        "-o", dest="output", metavar="FILE", help=".png, .svg, .pdf or .html (a window)"
-    )
+    add_output(plot, "FILE", ".png, .svg, .pdf or .html (a window)")
     plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     add_robot_options(plot)
     plot.set_defaults(call=call)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,10 +24,9 @@ from .common import (
     print_table,
     quote,
 )
-from .options import add_frame_option, add_run_options, check_company, file_name
+from .options import add_frame_option, add_output, add_run_options, check_company
 
 if TYPE_CHECKING:
-    from ..bag.writer import Bag
     from ..experiments import Experiment
     from ..ros.foxglove import Foxglove
     from ..ros.publisher import Publisher
@@ -49,13 +47,7 @@ def add(verbs: Any) -> None:
         help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME"
         " or its file's",
     )  # fmt: skip
-    publish.add_argument(
-        "-o",
-        dest="output",
-        type=file_name,
-        metavar="BAG",
-        help="record a bag too, one of all robots",
-    )
+    add_output(publish, "BAG", "record a bag too, one of all robots")
     add_frame_option(publish)
     publish.add_argument("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
     publish.add_argument(
@@ -115,7 +107,10 @@ def call(options: argparse.Namespace) -> int:
     options.storage = options.storage or "mcap"
     robots = _robots(options)
     bag = bag_of(options, options.output) if options.output else None
-    bags = {} if bag is None else _bags(bag, options.namespace, robots)
+    bags = {}
+    if bag is not None:  # a part of it for each robot, in its namespace
+        space = options.namespace
+        bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
     wire: dict[str, Any] = dict(
         place=network(subnet=options.subnet), scene=options.scene, effort=options.effort,
         clock=options.clock, namespace=options.namespace, state_topic=options.state_topic,
@@ -169,11 +164,6 @@ def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
     if options.foxglove and "" not in robots:
         raise CommandLineError("--foxglove serves one robot")
     return robots
-
-
-def _bags(bag: Bag, namespace: str, robots: Iterable[str]) -> dict[str, Bag]:
-    """The robots' parts of one bag, by name, in their namespaces."""
-    return {name: bag.of(f"{namespace}/{name}") if name else bag for name in robots}
 
 
 def _foxglove(options: argparse.Namespace) -> Foxglove:

@@ -18,7 +18,7 @@ from .common import (
     print_summary,
     quote,
 )
-from .options import add_fmu, add_run_options, add_time_options, file_name
+from .options import add_fmu, add_output, add_run_options, add_time_options
 
 if TYPE_CHECKING:
     from ..experiments import Experiment
@@ -31,9 +31,7 @@ def add(verbs: Any) -> None:
         "run", help="simulate an FMU and write a bag",
         description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
     )  # fmt: skip
-    run.add_argument(
-        "-o", dest="output", type=file_name, metavar="BAG", help="default: rosbag2_<date and time>"
-    )
+    add_output(run, "BAG", "default: rosbag2_<date and time>")
     add_time_options(run)
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run)

@@ -25,6 +25,7 @@ from .common import (
 )  # fmt: skip
 from .options import (
     add_json_option,
+    add_output,
     add_set_option,
     add_time_options,
     check_company,
@@ -54,9 +55,7 @@ def add(verbs: Any) -> None:
     )  # fmt: skip
     add_time_options(sweep)
     add_set_option(sweep)
-    sweep.add_argument(
-        "-o", dest="output", type=file_name, metavar="OUT", help="default: sweep_<date and time>"
-    )
+    add_output(sweep, "OUT", "default: sweep_<date and time>")
     sweep.add_argument(
         "--resume", action="store_true", help="go on with OUT; what is done is not repeated"
     )

@@ -19,11 +19,9 @@ def add(verbs: Any) -> None:
     )  # fmt: skip
     view.add_argument("bag", metavar="BAG", type=Path)
     view.add_argument(
-        "--export",
-        type=file_name,
-        metavar="FILE.html",
+        "--export", type=file_name, metavar="FILE.html",
         help="write one self-contained file instead",
-    )
+    )  # fmt: skip
     add_robot_options(view)
     view.add_argument(
         "--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes"

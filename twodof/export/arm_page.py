@@ -10,7 +10,6 @@ import base64
 import hashlib
 import html
 import json
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..files import data_file
+from ..files import data_file, packed
 from ..geometry.kinematics import Array, Kinematics, Placement
 from ..geometry.shapes import Shape, sphere
 from ..plant.urdf import UNBOUNDED, Joint, Urdf, read_urdf
@@ -102,13 +101,13 @@ def live_part(arm: Arm) -> LivePart:
         "versions": versions(),
         "urdf": arm.urdf,
     }
-    source = {"engine": _packed(module)}
+    source = {"engine": packed(module)}
     return _part(arm, source, " 'wasm-unsafe-eval'", provenance=provenance)
 
 
 def replayed_part(arm: Arm, samples: Array) -> LivePart:
     """The arm, with samples: N × (time in s, groups in ``RECORDED``)."""
-    return _part(arm, {"samples": _packed(samples.astype("<f8").tobytes())})
+    return _part(arm, {"samples": packed(samples.astype("<f8").tobytes())})
 
 
 def served_part(arm: Arm) -> LivePart:
@@ -128,7 +127,7 @@ def _part(arm: Arm, source: Mapping[str, str], more: str = "", **others: Any) ->
         '<link rel="icon" href="data:,">\n'
         f"<style>\n{_asset('arm.css')}</style>\n"
     )
-    parts = {"facts": data, "meshes": _packed(meshes), **source}.items()
+    parts = {"facts": data, "meshes": packed(meshes), **source}.items()
     blocks = "\n".join(
         f'<script type="application/json" id="arm-{name}">{text}</script>' for name, text in parts
     )
@@ -149,11 +148,6 @@ def arm_page(title: str, part: LivePart) -> bytes:
 
 def _asset(name: str) -> str:
     return data_file("fmu_src", "page", name).read_text("utf-8")
-
-
-def _packed(content: bytes) -> str:
-    """Compressed, as base64: zlib's format is what browsers call deflate."""
-    return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
 def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:

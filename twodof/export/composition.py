@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ from ..files import data_file
 from ..geometry.shapes import link_shapes
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
-from ..plant.urdf import RobotError, read_urdf
+from ..plant.urdf import read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
-from ..version import __version__
 from .arm_page import Arm, LivePart, live_part
 from .compiler import PLATFORMS, TARGETS, compiles_for_the_web, host_platform
 from .documentation import documentation
@@ -45,7 +43,11 @@ def is_live(options: FmuOptions) -> bool:
 
 
 def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
-    """The flavour, what the GUID is of, and what gives all other files: it compiles."""
+    """The flavour, what the GUID is of, and what gives all other files: it compiles.
+
+    Raises:
+        BuildError, RobotError: naming what is wrong; so does what compiles.
+    """
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
     if options.control not in CONTROLS:
@@ -53,12 +55,8 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     path = Path(options.urdf or data_file("urdf", "2dof.urdf"))
     mesh_dir = _mesh_dir(options)
     text = read_text(path, mesh_dir)
-    try:
-        text = lock_joints(text, options.lock) if options.lock else text
-        frame = options.frame or end_effector(read_urdf(text))
-    except RobotError as error:
-        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
-    options = replace(options, frame=frame)
+    text = lock_joints(text, options.lock) if options.lock else text
+    options = replace(options, frame=options.frame or end_effector(read_urdf(text)))
     if not options.meshes:
         text = without_meshes(text)
     robot, table, starts = _model(options, text)
@@ -69,17 +67,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     files.update(flavour.files)
 
     def describe(guid: str) -> bytes:
-        description = model_description(
-            robot,
-            table,
-            options.control,
-            name=options.name,
-            guid=guid,
-            version=__version__,
-            flavour=flavour.attributes,
-            exchanges=flavour.exchanges,
-            source_files=flavour.source_files,
-        )
+        description = model_description(options, robot, table, flavour, guid)
         return model_description3(description, flavour.arrays) if flavour.fmi == 3 else description
 
     digest = hashlib.sha256(describe(""))
@@ -88,36 +76,19 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     guid = digest.hexdigest()
     files["modelDescription.xml"] = describe(guid)
     files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
-    return flavour, files, partial(_finish, options, robot, table, flavour, guid, files)
 
+    def finish() -> Files:
+        """What the GUID is not of: binaries and documentation."""
+        with ThreadPoolExecutor(1) as compiling:  # the page is compiled meanwhile
+            binaries = compiling.submit(flavour.binaries, guid)
+            signed, live = flavour.signed(guid), LivePart("", "")
+            if is_live(options):
+                variables = engine_variables(robot, table, options.control, flavour.fmi)
+                live = _live_part(options, robot, variables, guid, {**files, **signed})
+            described = documentation(options, robot, table, flavour, guid, urdf, live)
+            return {**signed, **binaries.result(), **described}
 
-def _finish(
-    options: FmuOptions,
-    robot: Robot,
-    table: Sequence[Variable],
-    flavour: Flavour,
-    guid: str,
-    files: Files,
-) -> Files:
-    """What the GUID is not of: binaries and documentation."""
-    with ThreadPoolExecutor(1) as compiling:  # the page is compiled meanwhile
-        binaries = compiling.submit(flavour.binaries, guid)
-        signed, live = flavour.signed(guid), LivePart("", "")
-        if is_live(options):
-            variables = engine_variables(robot, table, options.control, flavour.fmi)
-            live = _live_part(options, robot, variables, guid, {**files, **signed})
-        described = documentation(
-            robot,
-            table,
-            options.control,
-            flavour,
-            name=options.name,
-            guid=guid,
-            version=__version__,
-            urdf=files["resources/robot.urdf"].decode(),
-            live=live,
-        )
-        return {**signed, **binaries.result(), **described}
+    return flavour, files, finish
 
 
 def _live_part(
@@ -133,10 +104,7 @@ def _live_part(
         if variable.causality != "local"
     ]  # fmt: skip
     folder, urdf = "sources/", files["resources/robot.urdf"].decode()
-    try:
-        shapes, _ = link_shapes(read_urdf(urdf), lambda name: files.get(f"resources/{name}"))
-    except RobotError as error:
-        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    shapes, _ = link_shapes(read_urdf(urdf), lambda name: files.get(f"resources/{name}"))
     return live_part(
         Arm(
             name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
@@ -149,11 +117,7 @@ def _live_part(
 
 
 def _flavour(
-    options: FmuOptions,
-    robot: Robot,
-    table: list[Variable],
-    urdf: str,
-    starts: Mapping[str, Any],
+    options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Mapping[str, Any]
 ) -> Flavour:
     if not options.native:
         if options.platforms or options.fmi or not options.arrays:
@@ -161,9 +125,7 @@ def _flavour(
                 "the platforms, the version of FMI and its arrays can be chosen for the native"
                 " flavour only, `native=True`"
             )
-        return python_flavour(
-            robot, options.control, urdf, starts, options.name, options.link_environment
-        )
+        return python_flavour(options, robot, urdf, starts)
     if options.link_environment:
         raise BuildError("a native FMU needs no environment to link (`link_environment=True`)")
     fmi = options.fmi or (2 if options.platforms or host_platform() else 3)
@@ -182,8 +144,7 @@ def _flavour(
             raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}{other}")
     if fmi == 2 and not options.arrays:
         raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` goes with `fmi=3`")
-    arrays = fmi == 3 and options.arrays
-    return native_flavour(robot, options.control, table, options.name, platforms, fmi, arrays)
+    return native_flavour(options, robot, table, fmi, platforms)
 
 
 def _mesh_dir(options: FmuOptions) -> Path | None:
@@ -196,11 +157,8 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
     """The robot, its variables, and the start values that are not the table's own."""
     shipped = options.urdf is None
     axes = options.axes or ("xy" if shipped else "xyz")
-    try:
-        assert options.frame is not None
-        robot = load_robot(urdf, options.frame, axes)
-    except RobotError as error:
-        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
+    assert options.frame is not None
+    robot = load_robot(urdf, options.frame, axes)
     for warning in robot.warnings:
         logger.warning("%s: %s", options.urdf, warning)
     if options.control == "pose" and sum(robot.moves_frame()) < len(axes) + 3:

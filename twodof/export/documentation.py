@@ -11,8 +11,10 @@ from string import Template
 from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
+from ..version import __version__
 from .arm_page import LivePart
 from .flavours import Files, Flavour
+from .options import FmuOptions
 
 LAWS = {
     "task": """x, J    position and Jacobian of $frame, rows of the task axes, LOCAL_WORLD_ALIGNED
@@ -33,26 +35,18 @@ q̈_cmd = J⁺ ((a_cmd, α_cmd) − J̇ v) − Kn (I − J⁺J) v   J⁺ drops s
 
 
 def documentation(
-    robot: Robot,
-    table: Sequence[Variable],
-    control: str,
-    flavour: Flavour,
-    *,
-    name: str,
-    guid: str,
-    version: str,
-    urdf: str,
-    live: LivePart,
-) -> Files:
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour,
+    guid: str, urdf: str, live: LivePart,
+) -> Files:  # fmt: skip
     """Files of the folder by their path in the FMU.
 
     Args:
-        robot, table, control: the robot, its variables, and the name of its control law.
+        options, robot, table, guid: as of the model description.
         flavour: says what the FMU depends on, cannot do, and whose code it contains.
-        name, guid, version: of the model description.
         urdf: text of resources/robot.urdf.
         live: the arm itself, or nothing.
     """
+    frame = html.escape(robot.frame)
     rows = "\n".join(
         "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in _row(variable)) + "</tr>"
         for variable in table
@@ -61,17 +55,17 @@ def documentation(
     page = Template(template).substitute(
         head=live.head,
         live=live.body,
-        name=name,
+        name=options.name,
         robot=html.escape(robot.name),
-        frame=html.escape(robot.frame),
+        frame=frame,
         axes=", ".join(robot.axes),
-        control=CONTROLS[control].title.format(frame=html.escape(robot.frame)),
-        law=LAWS[control].replace("$frame", html.escape(robot.frame)),
+        control=CONTROLS[options.control].title.format(frame=frame),
+        law=LAWS[options.control].replace("$frame", frame),
         root=html.escape(robot.root),
         variables=rows,
         kinds="co-simulation and Model Exchange" if flavour.exchanges else "co-simulation",
         limitations=flavour.limitations,
-        version=version,
+        version=__version__,
         guid=guid,
         urdf_digest=hashlib.sha256(urdf.encode()).hexdigest(),
     )

@@ -24,6 +24,7 @@ from .compiler import EXTENSIONS, UNITS, compile_library
 from .mechanism import mechanism_source
 from .model_description3 import build_description, terminals_and_icons
 from .native import model_header
+from .options import FmuOptions
 
 LOG = logging.getLogger(__name__)
 
@@ -74,20 +75,15 @@ class Flavour:
 
 
 def python_flavour(
-    robot: Robot,
-    control: str,
-    urdf: str,
-    starts: Mapping[str, Any],
-    name: str,
-    link_environment: bool,
+    options: FmuOptions, robot: Robot, urdf: str, starts: Mapping[str, Any]
 ) -> Flavour:
     """The plant as Python code behind pythonfmu's wrapper, for linux64."""
     config: dict[str, Any] = {
         "frame": robot.frame,
         "axes": robot.axes,
-        "control": control,
+        "control": options.control,
         "starts": starts,
-        "site_packages": _site_packages() if link_environment else [],
+        "site_packages": _site_packages() if options.link_environment else [],
     }
     identity = hashlib.sha256(urdf.encode() + json.dumps(config, sort_keys=True).encode())
     config["identity"] = identity.hexdigest()
@@ -106,7 +102,7 @@ def python_flavour(
         source_files=(),
         platforms=("linux64",),
         signed=lambda guid: {},
-        binaries=lambda guid: {f"binaries/linux64/{name}.so": wrapper.read_bytes()},
+        binaries=lambda guid: {f"binaries/linux64/{options.name}.so": wrapper.read_bytes()},
         dependencies=data_file("fmu_src", "externalDependencies.txt").read_bytes(),
         limitations=data_file("fmu_src", "limitations.html").read_text("utf-8"),
         licences=("pythonfmu",),
@@ -128,15 +124,10 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
 
 
 def native_flavour(
-    robot: Robot,
-    control: str,
-    table: Sequence[Variable],
-    name: str,
-    platforms: Sequence[str],
-    fmi: int,
-    arrays: bool,
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], fmi: int, platforms: Sequence[str]
 ) -> Flavour:
     """The plant as C99 sources, compiled for the platforms."""
+    name, control, arrays = options.name, options.control, options.arrays and fmi == 3
     fmpy = find_spec("fmpy")  # it comes with the headers of the standard
     assert fmpy is not None and fmpy.origin is not None
     headers = Path(fmpy.origin).parent / "c-code"

@@ -38,9 +38,7 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
     missing: list[str] = []
     for mesh in tree.iter("mesh"):
         uri = mesh.get("filename")
-        if uri is None:
-            continue
-        if uri in missing:
+        if uri is None or uri in missing:
             continue
         if uri not in names:
             try:

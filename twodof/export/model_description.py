@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
 from ..plant.variables import (
     CONTROLS,
+    DISTURBANCES,
     NO_RANGE,
     RANGES,
     Control,
@@ -17,6 +18,10 @@ from ..plant.variables import (
     Variable,
     count_event_indicators,
 )
+from ..version import __version__
+from .flavours import Flavour
+from .model_description3 import xml_text
+from .options import FmuOptions
 
 UNITS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
@@ -77,46 +82,39 @@ IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
 
 
 def model_description(
-    robot: Robot,
-    table: Sequence[Variable],
-    control: str,
-    *,
-    name: str,
-    guid: str,
-    version: str,
-    flavour: Mapping[str, str],
-    exchanges: bool = False,
-    source_files: Sequence[str] = (),
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour, guid: str
 ) -> bytes:
     """The XML text.
 
     Args:
-        robot, table, control: the robot, its variables, and the name of its control law.
-        name: model name and model identifier.
+        options: with the model's name and control law.
+        robot, table: the robot and its variables.
+        flavour: says which interfaces there are, what they can do, and their source files.
         guid: as it shall stand in the file; "" while it is being computed.
-        version: version of this package.
-        flavour: further attributes of <CoSimulation>, needsExecutionTool among them.
-        exchanges: whether there is <ModelExchange> too.
-        source_files: names under sources/ that a tool compiles.
     """
+    law = CONTROLS[options.control]
     root = ET.Element(
         "fmiModelDescription",
         fmiVersion="2.0",
-        modelName=name,
+        modelName=options.name,
         guid=guid,
         description=f"Robot '{robot.name}' with {len(robot.joints)} joints under"
-        f" {CONTROLS[control].title.format(frame=robot.frame)}",
-        version=version,
+        f" {law.title.format(frame=robot.frame)}",
+        version=__version__,
         author=AUTHOR,
         copyright=f"Copyright (c) {AUTHOR}; of the robot's description, its author's",
         license="BSD-3-Clause",
-        generationTool=f"{VENDOR} {version}",
+        generationTool=f"{VENDOR} {__version__}",
         variableNamingConvention="structured",
     )
-    indicators = count_event_indicators(robot, control) if exchanges else None
-    _interfaces(
-        root, {"modelIdentifier": name, **CAPABILITIES, **flavour}, indicators, source_files
-    )
+    capabilities = {"modelIdentifier": options.name, **CAPABILITIES, **flavour.attributes}
+    if flavour.exchanges:
+        indicators = count_event_indicators(robot, options.control)
+        root.set("numberOfEventIndicators", str(indicators))
+        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
+        _source_files(ET.SubElement(root, "ModelExchange", exchange), flavour.source_files)
+    stepping = {**capabilities, "canHandleVariableCommunicationStepSize": "true"}
+    _source_files(ET.SubElement(root, "CoSimulation", stepping), flavour.source_files)
     used = {variable.unit for variable in table}
     _units(root, used)
     _types(root, used)
@@ -130,27 +128,10 @@ def model_description(
         stopTime=repr(DEFAULT_STOP_TIME),
         stepSize=repr(DEFAULT_STEP),
     )
-    _vendor_annotation(root, robot, control)
-    _variables(root, robot, table, exchanges)
-    _structure(root, robot, table, CONTROLS[control])
-    ET.indent(root)
-    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text + b"\n"
-
-
-def _interfaces(
-    root: ET.Element,
-    capabilities: Mapping[str, str],
-    indicators: int | None,
-    source_files: Sequence[str],
-) -> None:
-    """Co-simulation, and Model Exchange where there are event indicators to tell of."""
-    if indicators is not None:
-        root.set("numberOfEventIndicators", str(indicators))
-        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
-        _source_files(ET.SubElement(root, "ModelExchange", exchange), source_files)
-    stepping = {**capabilities, "canHandleVariableCommunicationStepSize": "true"}
-    _source_files(ET.SubElement(root, "CoSimulation", stepping), source_files)
+    _vendor_annotation(root, robot, options.control)
+    _variables(root, robot, table, flavour.exchanges)
+    _structure(root, robot, table, law)
+    return xml_text(root)
 
 
 def _source_files(interface: ET.Element, names: Sequence[str]) -> None:
@@ -185,10 +166,10 @@ def _types(root: ET.Element, used: Collection[str]) -> None:
 def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
     """What a logger needs to know beyond variable names."""
     tool = ET.SubElement(ET.SubElement(root, "VendorAnnotations"), "Tool", name=VENDOR)
-    task = ET.SubElement(tool, "Robot", name=robot.name, root=robot.root)
-    task.set("frame", robot.frame)
-    task.set("axes", robot.axes)
-    task.set("control", control)
+    task = ET.SubElement(
+        tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes,
+        control=control,
+    )  # fmt: skip
     for joint, prismatic in zip(robot.joints, robot.prismatic, strict=True):
         ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
 
@@ -258,54 +239,34 @@ def _size(typed: ET.Element, within: Range, nominal: float) -> None:
 
 def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], control: Control) -> None:
     moves = robot.moves_frame()
-    effort = control.commands == "effort"
-    inputs = (*control.inputs, "tau_ext", "f_ext")
+    inputs = (*control.inputs, *DISTURBANCES)
     law = ("gravity", *control.parameters, "limit_effort")
+    own, frame, every = "that joint's", "those of joints that move the frame", "all"
+    during = {
+        "q": (("q",), own), "v": (("v",), own), "der_q": (("v",), own),
+        "x": (("q",), frame), "quat": (("q",), frame),
+        "xd": (STATES, frame), "omega": (STATES, frame),
+        "tau": ((*STATES, *control.inputs), every), "der_v": ((*STATES, *inputs), every),
+    }  # fmt: skip
+    at_the_start = {
+        "q": (START, own), "x": (START, frame), "quat": (START, frame),
+        **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, every)),
+        "tau": ((*IMPACT, *law, *control.inputs), every),
+        "der_v": ((*IMPACT, *law, *inputs), every),
+    }  # fmt: skip
+    if control.commands == "effort":
+        during["tau"] = (control.inputs, own)
+        at_the_start["tau"] = (("limit_effort", *control.inputs), own)
 
-    def known(groups: Sequence[str], joint: int | None = None, of_frame: bool = False) -> str:
-        """1-based indices of variables, for one joint, for those that move the frame, or all."""
+    def known(unknown: Variable, groups: Sequence[str], whose: str) -> str:
+        """1-based indices of variables that an unknown depends on."""
         return " ".join(
             str(i)
             for i, variable in enumerate(table, start=1)
             if variable.group in groups
-            and (joint is None or variable.index in (joint, None))
-            and (not of_frame or (variable.index is not None and moves[variable.index]))
+            and (whose != own or variable.index in (unknown.index, None))
+            and (whose != frame or (variable.index is not None and moves[variable.index]))
         )
-
-    def now(variable: Variable) -> str:
-        """During the run: on states and inputs."""
-        own = variable.index
-        groups = {
-            "q": known(("q",), joint=own),
-            "v": known(("v",), joint=own),
-            "x": known(("q",), of_frame=True),
-            "quat": known(("q",), of_frame=True),
-            "omega": known(STATES, of_frame=True),
-            "xd": known(STATES, of_frame=True),
-            "tau": known(control.inputs, joint=own)
-            if effort
-            else known((*STATES, *control.inputs)),
-            "der_q": known(("v",), joint=own),
-            "der_v": known((*STATES, *inputs)),
-        }
-        return groups[variable.group]
-
-    def at_the_start(variable: Variable) -> str:
-        own = variable.index
-        groups = {
-            "q": known(START, joint=own),
-            "v": known(IMPACT),
-            "x": known(START, of_frame=True),
-            "quat": known(START, of_frame=True),
-            "omega": known(IMPACT),
-            "xd": known(IMPACT),
-            "tau": known(("limit_effort", *control.inputs), joint=own)
-            if effort
-            else known((*IMPACT, *law, *control.inputs)),
-            "der_q": known(IMPACT),
-            "der_v": known((*IMPACT, *law, *inputs)),
-        }
-        return groups[variable.group]
 
     structure = ET.SubElement(root, "ModelStructure")
     outputs = ET.SubElement(structure, "Outputs")
@@ -314,5 +275,6 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
     for i, variable in enumerate(table, start=1):
         if variable.causality in ("output", "local"):
             kind = outputs if variable.causality == "output" else derivatives
-            ET.SubElement(kind, "Unknown", index=str(i), dependencies=now(variable))
-            ET.SubElement(initial, "Unknown", index=str(i), dependencies=at_the_start(variable))
+            for parent, rule in ((kind, during), (initial, at_the_start)):
+                dependencies = known(variable, *rule[variable.group])
+                ET.SubElement(parent, "Unknown", index=str(i), dependencies=dependencies)

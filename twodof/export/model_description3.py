@@ -65,10 +65,11 @@ def model_description3(description: bytes, arrays: bool) -> bytes:
         if variable.get("causality") == "local"
     )
     _annotations(root)
-    return _text(root)
+    return xml_text(root)
 
 
-def _text(root: ET.Element) -> bytes:
+def xml_text(root: ET.Element) -> bytes:
+    """As it stands in a file."""
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
@@ -185,7 +186,7 @@ def build_description(identifier: str, units: Sequence[str]) -> bytes:
     for name in units:
         ET.SubElement(files, "SourceFile", name=name)
     ET.SubElement(build, "Library", name="m")
-    return _text(root)
+    return xml_text(root)
 
 
 def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
@@ -208,4 +209,4 @@ def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
                 terminal, "TerminalMemberVariable", variableName=member, memberName=member,
                 variableKind="signal",
             )  # fmt: skip
-    return _text(root)
+    return xml_text(root)

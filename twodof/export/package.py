@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError
-from ..files import check_archive, data_file, read_member, write_file
+from ..files import check_archive, data_file, read_member, refusing, write_file
+from ..plant.urdf import RobotError
 from ..version import versions
 from .compiler import compiles_for_the_web, host_platform
 from .options import FmuOptions
@@ -45,12 +46,13 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
         return path
     from .composition import compose, is_live  # Pinocchio and SciPy take most of a run's time
 
-    flavour, files, finish = compose(options)
-    held = not made_of and _holds(
-        path, files["modelDescription.xml"], flavour.platforms, is_live(options)
-    )
-    if not held:
-        _write_zip(path, {**files, **finish()}, made_of)
+    try:
+        flavour, files, finish = compose(options)
+        description, platforms = files["modelDescription.xml"], flavour.platforms
+        if made_of or not _holds(path, description, platforms, is_live(options)):
+            _write_zip(path, {**files, **finish()}, made_of)
+    except RobotError as error:
+        raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     return path
 
 
@@ -103,7 +105,5 @@ def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, files[name])
-    try:
+    with refusing(BuildError, f"write '{path}'"):
         write_file(path, content.getvalue())
-    except OSError as error:
-        raise BuildError(f"cannot write '{path}': {error.strerror}") from error

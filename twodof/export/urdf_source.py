@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BuildError
-from ..files import read_file
+from ..files import MAX_URDF, read_urdf_text
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .meshes import places_of
 from .xacro_file import expand
 
 DEFAULT_FRAME = "EndEffector"
-MAX_URDF = 8 * 1024**2
 
 
 def read_text(path: Path, mesh_dir: Path | None) -> str:
@@ -28,12 +27,7 @@ def read_text(path: Path, mesh_dir: Path | None) -> str:
     """
     if path.suffix == ".xacro":
         return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
-    try:
-        return read_file(path, MAX_URDF).decode("utf-8")
-    except OSError as error:
-        raise BuildError(f"cannot read the URDF '{path}': {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
+    return read_urdf_text(path, BuildError)
 
 
 def last_links(urdf: Urdf) -> list[str]:

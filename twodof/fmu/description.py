@@ -45,6 +45,13 @@ class Variable:
     reference: int
     element: int = 0
 
+    @property
+    def start_value(self) -> float | bool | None:
+        """Of a number or Boolean that has one."""
+        if self.start is None or self.type not in ("Real", "Boolean"):
+            return None
+        return float(self.start) if self.type == "Real" else self.start in ("true", "1")
+
 
 @dataclass(frozen=True, repr=False)
 class Fmu:
@@ -110,6 +117,12 @@ class Fmu:
             return None if content is None else content.decode("utf-8")
         except UnicodeDecodeError as error:
             raise FmuError(f"'{self.path}': resources/robot.urdf is not UTF-8 text") from error
+
+    @property
+    def start_values(self) -> dict[str, float | bool]:
+        """Of inputs and parameters, as the description has them."""
+        settable = (v for v in self.variables.values() if v.causality in ("input", "parameter"))
+        return {v.name: v.start_value for v in settable if v.start_value is not None}
 
     def vector(self, group: str) -> list[str]:
         """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
@@ -217,11 +230,9 @@ def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
 
 def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
     """What our own FMUs say of the robot; nothing, and no joints, where others made the FMU."""
-    robot = root.find("VendorAnnotations/Tool[@name='twodof']/Robot")
-    if robot is None:
-        robot = root.find("Annotations/Annotation[@type='twodof']/Robot")
-    if robot is None:
-        robot = ET.Element("Robot")
+    places = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
+    found = (root.find(f"{place}/Robot") for place in places)
+    robot = next((robot for robot in found if robot is not None), ET.Element("Robot"))
     return {
         "robot": robot.get("name", ""),
         "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),

@@ -83,10 +83,12 @@ class Instance:
     ) -> None:
         """Set start values and go through initialisation mode; the stop time may be infinite."""
         self.set(values)
-        stop = stop_time if stop_time < inf else None
-        self._accept(self._slave.setupExperiment, startTime=start_time, stopTime=stop)
-        self._accept(self._slave.enterInitializationMode)
+        self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
         self._accept(self._slave.exitInitializationMode)
+
+    def _set_up(self, **times: float | None) -> None:
+        self._accept(self._slave.setupExperiment, **times)
+        self._accept(self._slave.enterInitializationMode)
 
     def reset(self) -> None:
         """Back to where it was when it was instantiated."""
@@ -146,13 +148,6 @@ class Instance:
             self._slave.terminate()
         self._slave.freeInstance()
 
-    def _call(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
-        self._said = ""
-        try:
-            function(*arguments, **named)
-        except FMICallException as error:
-            self._refuse(error.status)
-
     def _refuse(self, status: int) -> NoReturn:
         """Raise what a call's status means, in the FMU's own words where it said something."""
         self._fatal = status == fmi2.fmi2Fatal
@@ -162,7 +157,11 @@ class Instance:
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
-        self._call(function, *arguments, **named)
+        self._said = ""
+        try:
+            function(*arguments, **named)
+        except FMICallException as error:
+            self._refuse(error.status)
         if self._said:
             raise SimulationError(self._said)
 
@@ -196,19 +195,12 @@ class Instance3(Instance):
         arrays: dict[int, list[float | bool]] = {}
         for variable in self._fmu.variables.values():
             if variable.type in ("Real", "Boolean"):
-                text = variable.start or "0"
-                value = text in ("true", "1") if variable.type == "Boolean" else float(text)
-                arrays.setdefault(variable.reference, []).append(value)
+                value = variable.start_value
+                arrays.setdefault(variable.reference, []).append(0.0 if value is None else value)
         return arrays
 
-    def initialise(
-        self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
-    ) -> None:
-        """As of FMI 2.0, which sets up the experiment by a call of its own."""
-        self.set(values)
-        stop = stop_time if stop_time < inf else None
-        self._accept(self._slave.enterInitializationMode, startTime=start_time, stopTime=stop)
-        self._accept(self._slave.exitInitializationMode)
+    def _set_up(self, **times: float | None) -> None:
+        self._accept(self._slave.enterInitializationMode, **times)
 
     def reset(self) -> None:
         """Back to where it was when it was instantiated."""

@@ -40,11 +40,6 @@ class Placement(NamedTuple):
         translation = self.translation + turned(self.rotation, inner.translation)
         return Placement(translation, self.rotation @ inner.rotation)
 
-    @property
-    def quat(self) -> Array:
-        """Unit quaternions x, y, z, w, N × 4."""
-        return np.asarray(Rotation.from_matrix(self.rotation).as_quat())
-
 
 def turned(rotation: Array, vectors: ArrayLike) -> Array:
     """R v at N samples."""

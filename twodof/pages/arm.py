@@ -11,7 +11,7 @@ from pathlib import Path
 from ..errors import ZIP_ERRORS, FmuError, PageError
 from ..experiments import Experiment, Setting, experiment
 from ..export.arm_page import CONTAINER, Arm, arm_page, live_part
-from ..files import read_member, refusing, write_file
+from ..files import head_of, read_member, refusing, write_file
 from ..fmu import Fmu, read_resource
 from ..geometry.shapes import link_shapes
 from ..plant.urdf import RobotError, read_urdf
@@ -62,11 +62,7 @@ def page(
 
 def is_page(path: Path) -> bool:
     """Whether a file is such a page."""
-    try:
-        with path.open("rb") as file:
-            return CONTAINER in file.read(MAX_HEAD)
-    except OSError:
-        return False
+    return CONTAINER in head_of(path, MAX_HEAD)
 
 
 def arm_of(run: Experiment, sources: Mapping[str, bytes] = NO_SOURCES) -> Arm:

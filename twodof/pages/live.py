@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -58,11 +59,8 @@ def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Server:
         PageError: it cannot be shown.
     """
     arm = arm_of(run)
-
-    async def talk(connection: Connection) -> None:
-        await _talk(loop, connection)
-
-    return Server(arm_page(arm.robot or arm.name, served_part(arm)), host, port, talk)
+    page = arm_page(arm.robot or arm.name, served_part(arm))
+    return Server(page, host, port, partial(_talk, loop))
 
 
 async def _talk(loop: Loop, connection: Connection) -> None:

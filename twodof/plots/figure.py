@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import PlotError
-from ..files import free_name, refusing, write_file
+from ..files import free_name, head_of, refusing, write_file
 from ..version import __version__
 from .scales import GREY, HAIR, INK
 
@@ -202,9 +202,5 @@ tr {{ border-top: 1px solid {HAIR}; }}
 
 
 def _is_ours(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            start = file.read(1024)
-    except OSError:
-        return False
+    start = head_of(path, 1024)
     return start.startswith(b"\x89PNG") and b"tEXtSoftware\0twodof " in start

@@ -9,14 +9,13 @@ from __future__ import annotations
 import base64
 import html
 import json
-import zlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..errors import PlotError
-from ..files import data_file
+from ..files import data_file, packed
 from .closed_form import Array
 from .panels import (
     KINDS,
@@ -26,6 +25,7 @@ from .panels import (
     close_outline,
     duration,
     error_panel,
+    joint_names,
     joint_panels,
     looks,
     track_looks,
@@ -70,15 +70,10 @@ def body(tracks: Sequence[Track]) -> str:
     script = data_file("plots", "interactive.js").read_text("utf-8")
     return (
         f'<div id="plots"></div>\n{_thinned(tracks, over)}'
-        f'<script type="text/plain" id="library">{_packed(get_plotlyjs())}</script>\n'
-        f'<script type="text/plain" id="content">{_packed(json.dumps(content))}</script>\n'
+        f'<script type="text/plain" id="library">{packed(get_plotlyjs().encode())}</script>\n'
+        f'<script type="text/plain" id="content">{packed(json.dumps(content).encode())}</script>\n'
         f"<script>\n{script}</script>"
     )
-
-
-def _packed(text: str) -> str:
-    """Compressed, as base64: zlib's format is what browsers call deflate."""
-    return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
 
 
 def _text(name: str) -> str:
@@ -115,16 +110,12 @@ def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
 # --- what is switched ---
 
 
-def _joints(tracks: Sequence[Track]) -> list[str]:
-    return list(dict.fromkeys(joint.name for track in tracks for joint in track.joints))
-
-
 def _looks(tracks: Sequence[Track]) -> dict[tuple[int, str], Look]:
     """Of each track's joints, and of the track itself, whose joint is "".
 
     Colours tell apart what there is more of, dashes the other.
     """
-    bags, joints = track_looks(tracks), looks(_joints(tracks))
+    bags, joints = track_looks(tracks), looks(joint_names(tracks))
     by_bag = len(bags) > len(joints)
     found = {}
     for i, bag in enumerate(bags):

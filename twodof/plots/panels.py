@@ -88,29 +88,24 @@ def title(tracks: Sequence[Track]) -> str:
     return ", ".join(robots or dict.fromkeys(track.name for track in tracks))
 
 
+def joint_names(tracks: Sequence[Track]) -> list[str]:
+    """Of all joints of all tracks, each once."""
+    return list(dict.fromkeys(joint.name for track in tracks for joint in track.joints))
+
+
 def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
     """The tracks with those joints alone, in that order.
 
     Raises:
         PlotError: no track has a joint of such a name.
     """
-    known = dict.fromkeys(joint.name for track in tracks for joint in track.joints)
+    known = joint_names(tracks)
     for name in names:
         if name not in known:
             raise PlotError(f"no joint '{name}'; there are: {', '.join(known)}")
-    order = list(dict.fromkeys(names))
-    return [
-        replace(
-            track,
-            joints=tuple(
-                sorted(
-                    (joint for joint in track.joints if joint.name in order),
-                    key=lambda joint: order.index(joint.name),
-                )
-            ),
-        )
-        for track in tracks
-    ]
+    chosen = ([joint for joint in track.joints if joint.name in names] for track in tracks)
+    ordered = (sorted(joints, key=lambda joint: names.index(joint.name)) for joints in chosen)
+    return [replace(track, joints=tuple(joints)) for track, joints in zip(tracks, ordered)]
 
 
 def duration(tracks: Sequence[Track]) -> float:
@@ -120,14 +115,11 @@ def duration(tracks: Sequence[Track]) -> float:
 
 def joint_panels(tracks: Sequence[Track]) -> list[Panel]:
     """Of each joint in turn: those of KINDS that any joint has."""
-    found = [
-        (i, track.t, joint) for i, track in enumerate(tracks) for joint in track.joints
-    ]  # fmt: skip
+    found = [(i, track.t, joint) for i, track in enumerate(tracks) for joint in track.joints]
     kinds = [kind for kind in KINDS if any(getattr(joint, kind).size for _, _, joint in found)]
-    names = dict.fromkeys(joint.name for _, _, joint in found)
     return [
-        _joint_panel(kind, [(i, t, joint) for i, t, joint in found if joint.name == name])
-        for name in names
+        _joint_panel(kind, [each for each in found if each[2].name == name])
+        for name in joint_names(tracks)
         for kind in kinds
     ]
 

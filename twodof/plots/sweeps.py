@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import PlotError
 from ..sweeps.metrics import METRICS
 from ..sweeps.results import RANKED, ranked
+from .closed_form import Array
 from .figure import TICK_STYLE, Drawing
 from .scales import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
@@ -31,8 +31,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 if TYPE_CHECKING:
     import pandas
-
-Array = NDArray[np.float64]
 
 PAIRED = ("settling_time", "overshoot", "peak_effort")
 """Metrics of which maps of pairs are drawn: speed, its price in precision and in effort."""
@@ -70,7 +68,8 @@ def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -
     Raises:
         PlotError: it has no finished run.
     """
-    varied = _varied(provenance)
+    design = provenance["design"]
+    varied = [*design["grids"], *design["ranges"]]
     best = ranked(table)
     if best.empty:
         raise PlotError(f"'{name}' has no run that was finished")
@@ -81,14 +80,8 @@ def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -
         for row in best.head(5).to_dict("records")
     ]
     title = f"{provenance['fmu']['name']}: {len(table)} runs over {', '.join(varied)}"
-    grids = frozenset(provenance["design"]["grids"])
-    draw = partial(_draw, table, varied, grids, title, _settings(provenance))
+    draw = partial(_draw, table, varied, {*design["grids"]}, title, _settings(provenance))
     return Drawing(title, Path(name).name, draw, columns)
-
-
-def _varied(provenance: Mapping[str, Any]) -> list[str]:
-    design = provenance["design"]
-    return [*design["grids"], *design["ranges"]]
 
 
 def _in(unit: str) -> str:
@@ -104,7 +97,7 @@ def _settings(provenance: Mapping[str, Any]) -> str:
 def _draw(
     table: pandas.DataFrame,
     varied: Sequence[str],
-    grids: frozenset[str],
+    grids: set[str],
     title: str,
     settings: str,
     figure: Figure,
@@ -243,8 +236,6 @@ def _norm(values: Array) -> Normalize:
     if not known.size:
         return Normalize(0.0, 1.0)
     low, high = max(known.min(), SMALLEST_ERROR), known.max()
-    return (
-        LogNorm(low, high)
-        if known.min() > 0.0 and high > WIDE * low
-        else Normalize(known.min(), high)
-    )
+    if known.min() > 0.0 and high > WIDE * low:
+        return LogNorm(low, high)
+    return Normalize(known.min(), high)

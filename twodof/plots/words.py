@@ -31,11 +31,9 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     if clear and max(map(len, words)) <= 80:
         return words
     names = [track.name for track in tracks]
-    return (
-        names
-        if len(set(names)) == len(names)
-        else [shown(track.recording.path) for track in tracks]
-    )
+    if len(set(names)) < len(names):
+        return [shown(track.recording.path) for track in tracks]
+    return names
 
 
 def common_settings(tracks: Sequence[Track]) -> str:

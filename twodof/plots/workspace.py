@@ -114,6 +114,7 @@ def _arms(columns: list[int], tracks: Sequence[Track], looks: Sequence[Look]) ->
     Those at the end are ever thinner: arms that end in the same place are all seen.
     """
     starts: list[Array] = []
+    alone = len(tracks) == 1
     for i, (track, look) in enumerate(zip(tracks, looks)):
         if track.motion is None:
             continue
@@ -121,10 +122,9 @@ def _arms(columns: list[int], tracks: Sequence[Track], looks: Sequence[Look]) ->
         if not any(np.array_equal(start, other) for other in starts):
             starts.append(start)
             yield Stroke(
-                "arm at the start", i if len(tracks) == 1 else None, start[:, columns], PALE,
+                "arm at the start", i if alone else None, start[:, columns], PALE,
                 3.5, mark="o", depth=2.5,
             )  # fmt: skip
-        alone = len(tracks) == 1
         width = 3.5 if alone else 5.0 - 3.5 * i / (len(tracks) - 1)
         colour = GREY if alone else look.colour
         yield Stroke("arm at the end", i, end[:, columns], colour, width, mark="o", depth=3.0)

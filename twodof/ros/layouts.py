@@ -23,11 +23,7 @@ DESCRIPTION = "/robot_description"
 
 
 def layouts(
-    fmu: Fmu | str | Path,
-    folder: str | Path = ".",
-    *,
-    namespace: str = "",
-    overwrite: bool = False,
+    fmu: Fmu | str | Path, folder: str | Path = ".", *, namespace: str = "", overwrite: bool = False
 ) -> list[Path]:
     """Write the files in which RViz, PlotJuggler and Foxglove show an FMU's robot.
 

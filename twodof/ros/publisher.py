@@ -281,7 +281,6 @@ def publish(
     wire = wire or Publisher()
     if pace is None and not wire.lockstep:
         pace = RealTime()
-
     member = _member(run, wire, sinks, pace, stop, steer)
     return simulate_together([member], pace=pace, stop=stop)[0]
 

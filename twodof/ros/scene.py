@@ -40,11 +40,7 @@ class Scene:
     """
 
     def __init__(
-        self,
-        urdf: str,
-        joints: Sequence[str],
-        frame: str,
-        read: Callable[[str], bytes | None],
+        self, urdf: str, joints: Sequence[str], frame: str, read: Callable[[str], bytes | None]
     ) -> None:
         robot = read_urdf(urdf)
         if frame not in robot.links:

@@ -23,13 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.polynomial.polynomial import polyder, polyval
-from numpy.typing import NDArray
 
 from ..experiments import NANOSECONDS
+from .cdr import Array
 from .commands import CommandError, deserialise, known_joints, sized
 from .messages import JOINT_TRAJECTORY
-
-Array = NDArray[np.float64]
 
 MAX_TRAJECTORY = 4 * 1024**2  # bytes; some ten thousand points, read within a second
 PARTS = ("positions", "velocities", "accelerations")

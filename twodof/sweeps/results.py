@@ -110,12 +110,11 @@ class Results:
 
     def _begin(self) -> None:
         """A part without rows says from the first moment on which sweep this is."""
-        try:
-            self.path.mkdir(parents=True)
-        except FileExistsError:
-            raise self._taken() from None
-        except OSError as error:
-            raise SweepError(f"cannot make '{self.path}': {error.strerror}") from error
+        with refusing(SweepError, f"make '{self.path}'"):
+            try:
+                self.path.mkdir(parents=True)
+            except FileExistsError:
+                raise self._taken() from None
         self._write_part([])
 
     def _taken(self) -> SweepError:
@@ -180,7 +179,8 @@ def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
         SweepError: it cannot be read.
     """
     path = Path(path)
-    files = _files(path)
+    with refusing(SweepError, f"read '{path}'"):
+        files = _files(path)
     if not files:
         raise SweepError(f"'{path}' is no sweep: it has no {WHOLE} and no parts")
     table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import SimulationError
 from ..experiments import Experiment, Value, experiment, resolve
@@ -141,7 +140,7 @@ def _metrics(run: Experiment, outputs: Mapping[str, Array]) -> dict[str, float]:
     return measure(t, q, v, x, tau, target, *limits)
 
 
-def _given(run: Experiment, group: str, size: int) -> NDArray[np.float64]:
+def _given(run: Experiment, group: str, size: int) -> Array:
     """Start values of a vector; NaN where the FMU does not have it so."""
     values: Sequence[Value | None]
     values = [run.start_values.get(name) for name in run.fmu.vector(group)]
