@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
 import re
 import struct
@@ -25,6 +26,7 @@ from harness import needs
 from native_models import GUID, HERE, executable, library, model
 
 from twodof.errors import BuildError
+from twodof.export import compiler
 from twodof.export.compiler import compile_library, universal
 from twodof.files import TEMPORARY
 from twodof.plant.variables import CONTROLS
@@ -630,6 +632,26 @@ def test_a_cache_that_cannot_be_is_named(monkeypatch):
     monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/proc/none")
     with pytest.raises(BuildError, match=r"'/proc/none': .*ZIG_GLOBAL_CACHE_DIR"):
         compile_library({"a.c": b""}, "linux64", "Arm", units=["a.c"])
+
+
+def test_a_cache_whose_kept_sources_are_in_the_way_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path))
+    sources = {"a.c": b"int n;"}
+    digest = hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()[:32]
+    (tmp_path / "twodof" / digest / "a.c").mkdir(parents=True)  # root may write anywhere
+    with pytest.raises(BuildError, match=f"'{tmp_path}': .*; ZIG_GLOBAL_CACHE_DIR"):
+        compile_library(sources, "linux64", "Arm", units=["a.c"])
+
+
+def test_who_has_no_home_compiles(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(compiler, "compiles_for_the_web", lambda: False)  # for zig it takes minutes
+    for name in ("HOME", "XDG_CACHE_HOME", "ZIG_GLOBAL_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 987654321)  # of no user that the machine knows
+    assert os.path.expanduser("~") == "~"
+    assert compile_library({"a.c": b"int n;"}, "linux64", "Arm", units=["a.c"])[:4] == b"\x7fELF"
+    assert not any(tmp_path.iterdir())
 
 
 def test_universal_header():

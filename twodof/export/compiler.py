@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from ..errors import BuildError
@@ -168,16 +169,16 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
         if cache and command[: len(ZIG)] == [*ZIG]:
             digest = hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()[:32]
             place = Path(cache, "twodof", digest)
-            try:
-                place.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise BuildError(
-                    f"zig's cache cannot be '{cache}': {error.strerror}; ZIG_GLOBAL_CACHE_DIR"
-                    " names its folder"
-                ) from error
-        for file, content in sources.items():
-            if not (place / file).exists() or (place / file).read_bytes() != content:
-                write_file(place / file, content)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            for file, content in sources.items():
+                if not (place / file).exists() or (place / file).read_bytes() != content:
+                    write_file(place / file, content)
+        except OSError as error:
+            raise BuildError(
+                f"zig's cache cannot be '{cache}': {error.strerror}; ZIG_GLOBAL_CACHE_DIR"
+                " names its folder"
+            ) from error
         try:
             _run([*command, "-o", str(folder / output)], place, environment)
         except BuildError:
@@ -209,12 +210,11 @@ def _environment(folder: Path) -> dict[str, str]:
     """This process's environment; zig's cache is in the folder where home has no room for it."""
     environment = dict(os.environ)
     if os.name == "posix" and not environment.get("ZIG_GLOBAL_CACHE_DIR"):
-        home = environment.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
-        cache = Path(home, "zig")
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            usable = os.access(cache, os.W_OK)
-        except OSError:
-            usable = False
+        home = environment.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        cache, usable = Path(home, "zig"), False
+        if cache.is_absolute():  # "~" stays where nobody knows of a home
+            with suppress(OSError):
+                cache.mkdir(parents=True, exist_ok=True)
+                usable = os.access(cache, os.W_OK)
         environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else folder / "zig-cache")
     return environment
