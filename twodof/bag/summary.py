@@ -39,7 +39,7 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Summary:
+class McapSummary:
     """A file's channels by number, how many messages each has, and its chunks."""
 
     path: Path
@@ -83,7 +83,7 @@ class Summary:
                         yield batch
 
 
-def read_summary(path: Path) -> Summary | None:
+def read_summary(path: Path) -> McapSummary | None:
     """The summary of an MCAP file; None where it has none that can be believed.
 
     Raises:
@@ -110,7 +110,7 @@ def read_summary(path: Path) -> Summary | None:
         return None
 
 
-def _summary(path: Path, content: bytes, start: int) -> Summary | None:
+def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
     """Of the records of a summary that begins at a place; None where they do not fit together."""
     tables, chunks, counts = Tables(), [], None
     position, said, chunk_count = 0, 0, 0
@@ -135,4 +135,4 @@ def _summary(path: Path, content: bytes, start: int) -> Summary | None:
         return None
     indexed = frozenset().union(*(chunk.channels for chunk in chunks))
     used = {number: count for number, count in counts.items() if count}
-    return Summary(path, tables.channels, used, chunks) if used.keys() <= indexed else None
+    return McapSummary(path, tables.channels, used, chunks) if used.keys() <= indexed else None

@@ -28,7 +28,7 @@ def page(
     step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
 ) -> Path:
-    """Write an FMU as a page: the robot in 3D, its plant alive, what it is told and what it does.
+    """Write an FMU as a page: the robot in 3D, its plant alive, what it is told and does; its path.
 
     The FMU's own C sources are compiled to WebAssembly: its numbers are the FMU's.
 
@@ -37,9 +37,6 @@ def page(
         output: the HTML file, written whole or not at all.
         step: communication step, s; None: the FMU's own.
         settings: start values of inputs and parameters, as for ``experiment``.
-
-    Returns:
-        The path of the page.
 
     Raises:
         FmuError, InputError: the file is no FMU, or a setting is at fault.

@@ -127,7 +127,6 @@ class _Kept(Sink):
         self.samples: list[Sample] = []
 
     def write(self, sample: Sample) -> None:
-        """Keep one."""
         self.samples.append(sample)
 
 
