@@ -25,14 +25,19 @@ from fmpy import fmi2
 from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
 
+FRESH = multiprocessing.get_context("forkserver")
+FRESH.set_forkserver_preload(
+    ["fmpy.fmi2", "hypothesis", "pinocchio", "pytest", "pythonfmu", "scipy.spatial.transform"]
+)
+"""Forks of a process that has imported what takes long to import, and nothing of the package."""
+
 
 def in_child_process(test):
     """Run a test in a fresh process: a crash there is a failure here, and nothing is shared."""
 
     @functools.wraps(test)
     def run(*arguments, **named):
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
+        with ProcessPoolExecutor(1, mp_context=FRESH) as pool:
             pool.submit(_call, test.__module__, test.__name__, arguments, named).result(timeout=120)
 
     return run
