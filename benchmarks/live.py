@@ -43,7 +43,7 @@ def browse(url: str, seconds: float, nice: int) -> None:
     import browser
 
     os.nice(nice)
-    with browser.chromium() as chromium, browser.opened(chromium, url) as page:
+    with browser.chromium() as chromium, browser.opened(chromium, url, begin="") as page:
         print("open", flush=True)
         page.wait_for_timeout(3000)  # shaders are compiled, the page has settled
         end = time.monotonic() + seconds

@@ -53,6 +53,11 @@ SAMPLES = "() => [...arm.data.subarray(0, arm.count * arm.width)]"
 DRAWN = """async () => {
     for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
 }"""
+EVERY_OTHER_FRAME = """{
+    const next = requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = (show) => next(() => next(show));
+}"""
+"""To draw in software 30 times a second in place of 60 leaves a processor to who runs beside it."""
 AT_REST = """async () => {
     const asked = () => arm.news === undefined || arm.news.heard === arm.told && !arm.news.playing;
     if (arm.playing || !asked()) return false;
@@ -93,12 +98,20 @@ def chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def opened(browser: Browser, url: str, *, ready: str = READY, scale: int = 1) -> Iterator[Page]:
-    """A page that is shown, on a screen of so many pixels for one of the page's; at its end, no
-    error is in its console."""
+def opened(
+    browser: Browser,
+    url: str,
+    *,
+    ready: str = READY,
+    scale: int = 1,
+    begin: str = EVERY_OTHER_FRAME,
+) -> Iterator[Page]:  # fmt: skip
+    """A page that is shown, on a screen of so many pixels for one of the page's, and that begins
+    with a script; at its end, no error is in its console."""
     with browser.new_context(viewport=VIEWPORT, device_scale_factor=scale) as context:
         context.set_default_timeout(1e3 * PATIENCE)
         page = context.new_page()
+        page.add_init_script(begin)
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)

@@ -41,9 +41,17 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the files that take longest, so that the processes end at about one time."""
+    """Start with the files that take longest, so that the processes end at about one time.
+
+    What needs a file's page comes last in it: one that is shown draws beside all that runs.
+    """
     place = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+    def order(item: pytest.Item) -> tuple[int, bool]:
+        fixtures = item.fixturenames if isinstance(item, pytest.Function) else ()
+        return place.get(item.path.name, len(place)), "page" in fixtures
+
+    items.sort(key=order)
 
 
 @pytest.fixture(scope="session")

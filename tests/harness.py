@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
 import importlib
 import importlib.util
@@ -26,14 +27,33 @@ from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
 
 
+def shared(factory, name, make):
+    """A folder for all processes of a run of the tests, filled by the first that asks for it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with open(f"{folder}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            begun = factory.mktemp(name)
+            make(begun)
+            begun.rename(folder)
+    return folder
+
+
+FRESH = multiprocessing.get_context("forkserver")
+FRESH.set_forkserver_preload(
+    ["fmpy.fmi2", "hypothesis", "pinocchio", "pytest", "pythonfmu", "scipy.spatial.transform"]
+)
+"""Forks of a process that has imported what takes long to import, and nothing of the package."""
+
+
 def in_child_process(test):
     """Run a test in a fresh process: a crash there is a failure here, and nothing is shared."""
 
     @functools.wraps(test)
     def run(*arguments, **named):
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
-            pool.submit(_call, test.__module__, test.__name__, arguments, named).result(timeout=120)
+        with ProcessPoolExecutor(1, mp_context=FRESH) as pool:
+            pool.submit(_call, test.__module__, test.__name__, arguments, named).result(timeout=600)
 
     return run
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import pytest
 from bags import SECOND
-from harness import cannot_run, needs
+from harness import cannot_run, needs, shared
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -36,29 +36,22 @@ PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
 
 @pytest.fixture(scope="session")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Fast DDS node, compiled."""
+    """The Fast DDS node, compiled once for all processes of the tests."""
     generator, compiler = needs("fastddsgen"), needs("g++", "c++")
     if not Path("/usr/include/fastdds/dds").is_dir():
         cannot_run("the headers of Fast DDS are not installed (Debian: libfastrtps-dev)")
-    folder = tmp_path_factory.mktemp("fastdds")
-    for source in (HERE / "fastdds").iterdir():
-        shutil.copy(source, folder)
-    subprocess.run([generator, "-cs", "ros.idl"], cwd=folder, check=True, capture_output=True)
-    sources = [path.name for path in folder.glob("*.c[px][px]")]
-    command = [
-        compiler,
-        "-std=c++14",
-        "-w",
-        "-I.",
-        *sources,
-        "-lfastrtps",
-        "-lfastcdr",
-        "-o",
-        "node",
-    ]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return folder / "node"
+
+    def make(folder: Path) -> None:
+        for source in (HERE / "fastdds").iterdir():
+            shutil.copy(source, folder)
+        subprocess.run([generator, "-cs", "ros.idl"], cwd=folder, check=True, capture_output=True)
+        sources = [path.name for path in folder.glob("*.c[px][px]")]
+        command = [compiler, "-std=c++14", "-w", "-I.", *sources, "-lfastrtps", "-lfastcdr"]
+        command += ["-o", "node"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+    return shared(tmp_path_factory, "fastdds", make) / "node"
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import (
+    EVERY_OTHER_FRAME,
     HOSTILE,
     LINKS,
     PATIENCE,
@@ -63,6 +64,7 @@ def shown(browser: Browser, path: Path, **context: object) -> Iterator[Page]:
     ) as opened:
         opened.set_default_timeout(1e3 * PATIENCE)
         page = opened.new_page()
+        page.add_init_script(EVERY_OTHER_FRAME)
         said: list[str] = []
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on("console", lambda message: said.append(message.text))

@@ -654,14 +654,17 @@ assert not {"dask", "distributed"} & {*sys.modules}
 """
 
 
-@pytest.mark.parametrize("way", [["-c", PROGRAM], ["program.py"], ["-m", "program"]])
-@pytest.mark.parametrize("variables", [{}, {"PYTHONPATH": ":."}, {"PYTHONSAFEPATH": "1"}])
+@pytest.mark.parametrize(
+    ("way", "variables"),
+    [  # what a way puts on the path and what a variable does are independent of each other
+        (["-c", PROGRAM], {}), (["program.py"], {}), (["-m", "program"], {}),
+        (["program.py"], {"PYTHONPATH": ":."}), (["-c", PROGRAM], {"PYTHONSAFEPATH": "1"}),
+    ],
+)  # fmt: skip
 def test_workers_import_nothing_from_the_working_directory(
     way: list[str], variables: dict[str, str], native_path: Path, tmp_path: Path
 ) -> None:
     """Nor the program itself, which shields nothing by ``if __name__ == "__main__"``."""
-    if "PYTHONSAFEPATH" in variables and way[0] == "-m":
-        variables = {**variables, "PYTHONPATH": str(tmp_path)}
     (tmp_path / "program.py").write_text(PROGRAM)
     done = subprocess.run(
         [sys.executable, *way, str(Path(__file__).parent), str(native_path)], cwd=tmp_path,
