@@ -107,7 +107,8 @@ def opened(
     begin: str = EVERY_OTHER_FRAME,
 ) -> Iterator[Page]:  # fmt: skip
     """A page that is shown, on a screen of so many pixels for one of the page's, and that begins
-    with a script; at its end, no error is in its console."""
+    with a script; at its end, no error is in its console but of a server that
+    has ended."""
     with browser.new_context(viewport=VIEWPORT, device_scale_factor=scale) as context:
         context.set_default_timeout(1e3 * PATIENCE)
         page = context.new_page()
@@ -119,15 +120,16 @@ def opened(
         page.wait_for_selector("canvas")
         page.wait_for_selector(ready)
         yield page
+        errors = [error for error in errors if not error.startswith("WebSocket connection to")]
         assert errors == [], errors
 
 
 class Served:
     """A command with a page: started, its URL read; ended by Ctrl-C."""
 
-    def __init__(self, *arguments: str | Path, cwd: Path) -> None:
+    def __init__(self, *arguments: str | Path, cwd: Path, port: int = 0) -> None:
         self.process = subprocess.Popen(
-            [*COMMAND, *map(str, arguments), "--port", "0", "--no-browser"],
+            [*COMMAND, *map(str, arguments), "--port", str(port), "--no-browser"],
             cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert self.process.stdout is not None
@@ -156,9 +158,9 @@ class Served:
 
 
 @contextmanager
-def served(*arguments: str | Path, cwd: Path) -> Iterator[Served]:
+def served(*arguments: str | Path, cwd: Path, port: int = 0) -> Iterator[Served]:
     """A command that is killed at the end, if it still runs."""
-    command = Served(*arguments, cwd=cwd)
+    command = Served(*arguments, cwd=cwd, port=port)
     try:
         yield command
     finally:

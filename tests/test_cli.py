@@ -395,7 +395,10 @@ BAD: dict[str, Case] = {
         nothing, [*RUN, "--stamp-start", "2147483647", "--stop-time", "2"], "stamp",
     ),
     "info of a folder": (nothing, ["info", "."], r"cannot read the bag '\.'"),
-    "info of a bag's file": (text("a.mcap", "x"), ["info", "a.mcap"], "give the bag's folder"),
+    "info of a bag's file": (text("a.db3", "x"), ["info", "a.db3"], "give the bag's folder"),
+    "info of a file that is no bag": (
+        text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"
+    ),
     "info of too long a name": (nothing, ["info", LONG], f"'{LONG}'.*too long"),
 }  # fmt: skip
 

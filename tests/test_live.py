@@ -655,6 +655,30 @@ def test_text_of_an_fmu_is_text(shown: Browser, tmp_path: Path) -> None:
         browser.assert_shown_as_text(page, "joint1", "joint2")
 
 
+def test_a_page_whose_server_ends_goes_on_with_the_next(
+    shown: Browser, native_path: Path, tmp_path: Path
+) -> None:
+    """Which steps another robot, with inputs of its own."""
+    with served("live", native_path, cwd=tmp_path) as command:
+        port = int(command.url.rpartition(":")[2])
+        with opened(shown, command.url) as page:
+            until(page, lambda found: time_of(found) > 0.1)
+            command.interrupt(signal.SIGKILL)
+            until(page, lambda said: "this page waits for it" in said, told)
+            press(page, "Play")
+            page.wait_for_timeout(2500)  # it looks for one more than once
+            assert "this page waits for it" in told(page)
+            (tmp_path / "slider.urdf").write_text(SLIDER)
+            options = twodof.FmuOptions(urdf=tmp_path / "slider.urdf", frame="tip", axes="xy")
+            slider = twodof.build_fmu(tmp_path / "Slider.fmu", options)
+            with served("live", slider, "--set", "Kp=77", cwd=tmp_path, port=port):
+                page.wait_for_function("() => globalThis.arm?.facts.robot === 'slider'")
+                assert page.evaluate("arm.held('Kp')") == [77, 77]
+                found = until(page, lambda found: time_of(found) > 0.1)
+                assert {"slide", "swing"} <= set(found)
+                assert told(page) == ""
+
+
 def test_port_in_use(native_path: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

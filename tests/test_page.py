@@ -192,6 +192,56 @@ READOUT = """() => {
 """Names in the readout, and how many of its cells do not show all that they hold."""
 
 
+PHONE = {"width": 390, "height": 844}
+CUT = """() => [...document.querySelectorAll("#arm-readout td, .slider span")]
+    .filter(name => name.checkVisibility() && name.scrollWidth > name.clientWidth)
+    .map(name => name.textContent)"""
+"""Names and numbers that are not shown whole."""
+
+
+def test_all_is_seen_of_a_robot_and_its_names(browser, tmp_path) -> None:
+    """Not even where a bare plant hangs down is it behind a button."""
+    ur10 = built(tmp_path, "ur10_robot", frame="tool0", control="effort", meshes=False)
+    with shown(browser, twodof.page(ur10, tmp_path / "ur10.html")) as page:
+        for size in (VIEWPORT, PHONE):
+            page.set_viewport_size(size)
+            until(page, lambda found: found == [], lambda page: page.evaluate(CUT))
+            scene, bar = (
+                page.locator(f".view > {part}").bounding_box() for part in ("canvas", ".bar")
+            )
+            assert scene["y"] + scene["height"] <= bar["y"] + 0.5
+            assert bar["y"] + bar["height"] <= size["height"] and scene["height"] > 300
+        names = page.locator("#arm-readout td:first-child").all_text_contents()
+        titles = page.locator("#arm-readout td[title]").evaluate_all("all => all.map(e => e.title)")
+    short = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
+    assert names == [*short, "end effector"]
+    assert titles == [f"{name}_joint" for name in short]
+
+
+def test_the_arm_is_seen_in_the_dark(browser, arm) -> None:
+    """As graphics of the Web Content Accessibility Guidelines are to be: 3 to 1."""
+    with shown(browser, arm) as page:
+        press(page, "Pause")
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            now = picture(page)
+            if scheme == "light":
+                places = [pixels(now, colour) for colour in LINKS]
+            ground = luminance(now[5, 5])
+            for place in places:
+                light = luminance(np.median(now[place[:, 1], place[:, 0]], axis=0))
+                contrast = (max(light, ground) + 0.05) / (min(light, ground) + 0.05)
+                assert contrast > (3.0 if scheme == "dark" else 2.0), (scheme, contrast)
+        assert ground < 0.05
+
+
+def luminance(colour: np.ndarray) -> float:
+    """Relative, of sRGB."""
+    c = colour / 255
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
 def test_the_arm_runs_in_real_time_and_is_seen_where_it_is(browser, arm) -> None:
     assert arm.stat().st_size < 1.5e6
     with shown(browser, arm) as page:
@@ -287,7 +337,7 @@ def download(page: Page, folder: Path) -> Path:
     return path
 
 
-def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path) -> None:
+def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path, capsys) -> None:
     page_path = twodof.page(panda, tmp_path / "panda.html", settings={"Kd": 30.0})
     with shown(browser, page_path) as page:
         script = {0: {"x_des": [0.45, 0.2, 0.4]}, 40: {"Kp": 70.0}}
@@ -317,6 +367,8 @@ def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path) -> None:
     places = [(p.position.x, p.position.y, p.position.z) for p in poses]
     np.testing.assert_allclose(places, rows[:, 2 * n : 2 * n + 3], rtol=0.0, atol=1e-12)
     assert read_tracks([path])[0].motion is not None
+    assert main(["info", str(path)]) == 0
+    assert "30 s, 3001 joint states, 100 Hz" in capsys.readouterr().out
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(BagError, match="ends in the middle"):
@@ -325,7 +377,7 @@ def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path) -> None:
 
 def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:
     robot = hostile_arm()
-    robot.find("joint").set("name", HOSTILE + "j" * (1000 - len(HOSTILE)))
+    robot.find("joint").set("name", "1 " + HOSTILE + "j" * (998 - len(HOSTILE)))
     (tmp_path / "hostile.urdf").write_text(ET.tostring(robot, encoding="unicode"))
     frame = robot.findall("link")[-1].get("name")
     options = twodof.FmuOptions(
@@ -401,6 +453,10 @@ def test_the_documentation_of_a_native_fmu_is_alive(browser, native_path, tmp_pa
         assert played(page, {}, {}, 100)[-1] == pytest.approx(
             stepped(native_path, {}, {}, 100)[-1], rel=0.0, abs=1e-12
         )
+    with shown(browser, tmp_path / "index.html", is_mobile=True) as page:
+        page.set_viewport_size(PHONE)
+        wide = "[innerWidth, document.documentElement.scrollWidth]"
+        until(page, lambda found: found == [390, 390], lambda page: page.evaluate(wide))
     still = tmp_path / "still.fmu"
     still.write_bytes(native_path.read_bytes())
     options = twodof.FmuOptions(native=True, live_documentation=False)

@@ -1173,6 +1173,21 @@ def test_a_page_answers(gains: dict[int, Recording], tmp_path: Path) -> None:
     assert said == []
 
 
+def test_buttons_of_a_page_cover_no_heading(default: Recording, tmp_path: Path) -> None:
+    """Nor on a phone, where they are always shown."""
+    page = save(drawing(read_tracks([default.bag])), tmp_path / "a.html")
+    phone = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
+    with browser.chromium() as chromium, chromium.new_context(offline=True, **phone) as context:
+        shown = context.new_page()
+        shown.goto(page.as_uri())
+        shown.wait_for_selector("#plots[data-ready]")
+        for plot in shown.locator(".plot").all():
+            buttons = plot.locator(".modebar").bounding_box()
+            heading = plot.locator(".annotation-text").first.bounding_box()
+            assert buttons["width"] > 40 and heading["width"] > 40
+            assert buttons["y"] + buttons["height"] <= heading["y"]
+
+
 def test_efforts_are_drawn_with_their_limits(fmu_path: Path, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     samples = Collector()

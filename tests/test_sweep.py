@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
@@ -19,6 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event
 
+import browser
 import duckdb
 import numpy as np
 import oracles
@@ -27,6 +29,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from harness import asked, changed_plant, children_of, lay_traps, lives, needs, wait_until
+from PIL import Image
 
 import twodof
 from twodof import TwoDofError, sweep
@@ -958,6 +961,33 @@ def panels(path: Path) -> dict[str, object]:
     return {axes.get_label(): axes for axes in figure.axes if " over " in axes.get_label()}
 
 
+LINES = """() => [...document.querySelectorAll(".runs td")].map(cell => {
+    const words = document.createRange();
+    words.selectNodeContents(cell);
+    return new Set([...words.getClientRects()].map(box => box.top)).size;
+})"""
+
+
+def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_phone(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    page = save(drawing(*read_sweep(undisturbed), "a"), tmp_path / "a.html")
+    seen = []
+    with browser.chromium() as chromium:
+        for scheme in ("light", "dark"):
+            with chromium.new_context(color_scheme=scheme, offline=True) as context:
+                shown = context.new_page()
+                shown.set_viewport_size({"width": 390, "height": 844})
+                shown.goto(page.as_uri())
+                seen.append(shown.locator("body > svg").screenshot())
+                ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+                assert max(shown.evaluate(LINES)) == 1
+                assert shown.evaluate("document.documentElement.scrollWidth") == 390
+    assert ground == "rgb(20, 20, 20)"
+    light, dark = (np.asarray(Image.open(io.BytesIO(picture))) for picture in seen)
+    np.testing.assert_array_equal(light[2:-2, 2:-2], dark[2:-2, 2:-2])  # the edge is mixed
+
+
 def test_map_of_two_variables_holds_the_table_and_marks_the_best(undisturbed: Path) -> None:
     table = table_of(undisturbed)
     found = panels(undisturbed)
@@ -965,7 +995,7 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(undisturbed: Pa
         f"{metric} over Kp and Kd" for metric in METRICS if metric != "time_at_limits"
     ]
     for label, axes in found.items():
-        assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, 1/s2", "Kd, 1/s")
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, s⁻²", "Kd, s⁻¹")
         metric = label.split()[0]
         (mesh,) = (c for c in axes.collections if hasattr(c, "get_coordinates"))
         cells = np.ma.filled(mesh.get_array(), np.nan).reshape(16, 20)

@@ -43,6 +43,7 @@ class Controls {
     this.session = session;
     this.reach = reach;
     this.told = told;
+    this.names = shortNames(session.facts.joints);
     /** @type {Map<string, HTMLInputElement[]>} */
     this.fields = new Map();
     for (const [title, open, groups] of GROUPS) {
@@ -97,10 +98,10 @@ class Controls {
    * @param {string} name
    */
   label(name) {
-    const [group, number] = name.replace("]", "").split("["), { joints, axes } = this.session.facts;
+    const [group, number] = name.replace("]", "").split("["), { axes } = this.session.facts;
     if (number === undefined) return name;
     const i = Number(number) - 1;
-    if (PER_JOINT.includes(group)) return joints[i].name;
+    if (PER_JOINT.includes(group)) return this.names[i];
     return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
   }
 
@@ -168,14 +169,21 @@ function unitsOf(joints) {
 }
 
 /**
- * How much of all names is the same at their beginning: whole words of it, which leave something of each.
- * @param {string[]} names
+ * Names without the whole words that all of them begin and end with.
+ * @param {JointFacts[]} joints
  */
-function prefix(names) {
-  if (names.length < 2) return 0;
-  let same = 0;
-  while (same < names[0].length && names.every((name) => name[same] === names[0][same])) same += 1;
-  return Math.max(names[0].lastIndexOf("_", same - 1), names[0].lastIndexOf("/", same - 1)) + 1;
+function shortNames(joints) {
+  const names = joints.map(({ name }) => name), [first] = names;
+  if (names.length < 2) return names;
+  const most = Math.min(...names.map(({ length }) => length)) - 1; // something is left of each
+  let same = 0, alike = 0;
+  while (same < most && names.every((name) => name[same] === first[same])) same += 1;
+  const begin = Math.max(first.lastIndexOf("_", same - 1), first.lastIndexOf("/", same - 1)) + 1;
+  /** @param {string} name */
+  const last = (name) => name[name.length - 1 - alike];
+  while (alike < most - begin && names.every((name) => last(name) === last(first))) alike += 1;
+  const tail = first.slice(first.length - alike), cut = alike - tail.search(/[_/]|$/);
+  return names.map((name) => name.slice(begin, name.length - cut));
 }
 
 /**
@@ -199,7 +207,7 @@ class Readout {
   constructor(session, curves) {
     this.session = session;
     const table = byId("readout"), { joints } = session.facts;
-    const shared = prefix(joints.map(({ name }) => name));
+    const names = shortNames(joints);
     table.append(element("tr", "", ...["", ...unitsOf(joints)].map((unit) => element("th", unit))));
     this.cells = joints.map((joint, i) => {
       const swatch = document.createElement("input");
@@ -207,7 +215,7 @@ class Readout {
       swatch.style.accentColor = COLOURS[i % COLOURS.length];
       swatch.setAttribute("aria-label", `curves of ${joint.name}`);
       swatch.addEventListener("change", () => curves.hidden[swatch.checked ? "delete" : "add"](i));
-      const name = element("td", "", element("label", "", swatch, document.createTextNode(joint.name.slice(shared))));
+      const name = element("td", "", element("label", "", swatch, document.createTextNode(names[i])));
       name.title = joint.name;
       const cells = ["q", "v", "tau"].map(() => element("td", ""));
       cells[0].dataset.value = joint.name;
@@ -244,7 +252,7 @@ class Readout {
     });
     for (const [name, place] of Object.entries(places)) this.tell(name, `(${place.map(digits).join(", ")}) m`);
     const error = session.error(k), unit = session.groups.has("x_des") ? "m" : unitsOf(joints)[0];
-    if (session.follows) this.tell("error", Number.isNaN(error) ? "\u2013" : `${Number(error.toPrecision(4))} ${unit}`);
+    if (session.follows) this.tell("error", Number.isNaN(error) ? "\u2013" : `${Number((error < SMALLEST ? 0 : error).toPrecision(4))} ${unit}`);
     for (const [name, text] of session.remarks()) this.tell(name, text);
   }
 }

@@ -12,7 +12,7 @@
  */
 
 const MARGIN = { left: 58, right: 8, top: 20, bottom: 18 };
-const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c"];
+const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c", "#9467bd"];
 const SMALLEST = 1e-12; // what is below is rounding
 
 class Curves {

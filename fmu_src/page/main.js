@@ -214,7 +214,7 @@ class App {
     if (scene) {
       this.addRobot(scene, links);
       this.addTrail(scene, k, links);
-      scene.draw(camera, fractions(colour("--scene")));
+      scene.draw(camera, fractions(colour("--scene")), Number(colour("--bright")));
     }
     const stopped = robot.atLimit(q, session.values);
     if (this.curves.cursor !== null || this.before - this.drawn > 1000 * PANEL) {

@@ -18,6 +18,19 @@
 
 const NOTED = 8000; // ms that a note is shown
 const PACE_WINDOW = 1000; // ms over which the real-time factor is taken
+const RETRY = 1000; // ms between two looks for a server that was lost
+
+/** A connection to this page's server. */
+function connection() {
+  return new WebSocket(`${location.origin.replace("http", "ws")}/socket`);
+}
+
+/** Look for the server until it speaks, and show what it has now: its robot may be another. */
+function seek() {
+  const socket = connection();
+  socket.onmessage = () => location.reload();
+  socket.onclose = () => setTimeout(seek, RETRY);
+}
 
 class Remote extends Samples {
   without = ["scrub", "loops", "pace", "download"];
@@ -43,7 +56,7 @@ class Remote extends Samples {
    * @returns {Promise<Remote>}
    */
   static connect(facts) {
-    const socket = new WebSocket(`${location.origin.replace("http", "ws")}/socket`);
+    const socket = connection();
     const remote = new Remote(facts, socket);
     return new Promise((resolve, reject) => {
       socket.onmessage = ({ data }) => {
@@ -51,9 +64,11 @@ class Remote extends Samples {
         resolve(remote);
       };
       socket.onclose = () => {
-        remote.said = "twodof has ended, or cannot be reached: reload this page";
+        clearTimeout(remote.forgetting);
+        remote.notice = "twodof has ended, or cannot be reached: this page waits for it";
         remote.playing = false;
-        reject(new Error(remote.said));
+        setTimeout(seek, RETRY);
+        reject(new Error(remote.notice));
       };
     });
   }
@@ -92,7 +107,7 @@ class Remote extends Samples {
    */
   tell(order, value = null) {
     this.told += 1;
-    this.socket.send(JSON.stringify([order, value]));
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify([order, value]));
   }
 
   /**

@@ -11,11 +11,11 @@ const SOLID = [
   }`,
   `#version 300 es
   precision highp float;
-  uniform vec3 light; uniform vec4 colour;
+  uniform vec3 light; uniform vec4 colour; uniform float bright;
   in vec3 turned; out vec4 shown;
   void main() {
     float lit = dot(normalize(turned), light);
-    shown = vec4(colour.rgb * (0.55 + 0.35 * lit + 0.15 * max(lit, 0.0)), colour.a);
+    shown = vec4(mix(colour.rgb, vec3(1.0), bright) * (0.55 + 0.35 * lit + 0.15 * max(lit, 0.0)), colour.a);
   }`,
 ];
 const LINES = [
@@ -148,8 +148,9 @@ class Scene {
    * Show what was added.
    * @param {Camera} camera
    * @param {number[]} background
+   * @param {number} bright how far colours are from their own towards white
    */
-  draw(camera, background) {
+  draw(camera, background, bright) {
     const { gl, canvas } = this;
     const ratio = Math.max(Math.min(devicePixelRatio, 2), this.fineness);
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((n) => Math.max(1, Math.round(n * ratio)));
@@ -160,11 +161,11 @@ class Scene {
     gl.clearColor(background[0], background[1], background[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const light = unit(plus(plus(camera.back, 0.5, camera.up), 0.3, camera.right));
-    this.drawSolids(this.solids.filter(({ colour }) => colour[3] === 1), view, light);
+    this.drawSolids(this.solids.filter(({ colour }) => colour[3] === 1), view, light, bright);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.enable(gl.CULL_FACE); // a far side would be seen in part
-    this.drawSolids(this.solids.filter(({ colour }) => colour[3] < 1), view, light);
+    this.drawSolids(this.solids.filter(({ colour }) => colour[3] < 1), view, light, bright);
     gl.disable(gl.CULL_FACE);
     gl.useProgram(this.line);
     gl.bindVertexArray(this.linesArray);
@@ -181,14 +182,16 @@ class Scene {
    * @param {Scene["solids"]} solids
    * @param {Float64Array} view
    * @param {number[]} light
+   * @param {number} bright
    */
-  drawSolids(solids, view, light) {
+  drawSolids(solids, view, light, bright) {
     const { gl, solid } = this;
     /** @param {string} name */
     const at = (name) => gl.getUniformLocation(solid, name);
     gl.useProgram(solid);
     gl.uniformMatrix4fv(at("view"), false, new Float32Array(view));
     gl.uniform3fv(at("light"), light);
+    gl.uniform1f(at("bright"), bright);
     for (const { mesh, model, colour } of solids) {
       const { low, size, array, count } = this.meshes[mesh];
       gl.bindVertexArray(array);

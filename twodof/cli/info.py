@@ -34,9 +34,9 @@ def call(options: argparse.Namespace) -> int:
         from ..sweeps.results import read_sweep
 
         (_print_sweep_json if options.json else _print_sweep)(path, *read_sweep(path))
-    elif path.is_dir() or (folder.is_dir() and not path.exists()):
+    elif path.is_dir() or path.suffix == ".mcap" or (folder.is_dir() and not path.exists()):
         _show_bags(path, options.json)
-    elif path.suffix in (".mcap", ".db3", ".parquet") and path.is_file():
+    elif path.suffix in (".db3", ".parquet") and path.is_file():
         what = "sweep" if path.suffix == ".parquet" else "bag"
         raise InputError(f"'{path}' is a {what}'s file; give the {what}'s folder, '{path.parent}'")
     elif path.suffix != ".fmu" and path.is_file() and not zipfile.is_zipfile(path):

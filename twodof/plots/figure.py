@@ -51,13 +51,19 @@ h1 { font-size: 1.1em; margin: 0 0 .5em; overflow-wrap: anywhere; }
 #legend td:first-child, #legend th:first-child { text-align: left; min-width: 5em; }
 #legend label { display: flex; gap: .4em; align-items: center; cursor: pointer; }
 #legend .joint label { padding-left: 1em; }
-table.runs { table-layout: auto; overflow-wrap: anywhere; }
+table.runs { display: block; overflow-x: auto; overflow-wrap: anywhere; }
+.runs td { min-width: 5em; }
 @media (max-width: 1150px) { #plots { grid-template-columns: minmax(0, 1fr); } }
+@media (max-width: 500px) {
+  #legend td, #legend th { padding: 1px 3px; } #legend .joint label { padding-left: 0; }
+}
 @media (prefers-color-scheme: dark) {
-  html { background: #15191e; } body { filter: invert(.92) hue-rotate(180deg); }
+  html, html body { background: #141414; }
+  body > :not(svg) { filter: invert(.92) hue-rotate(180deg); }
 }
 """
-"""Of pages. In the dark they are turned inside out, with the hues of their curves."""
+"""Of pages. In the dark all but maps, whose colours are numbers, is turned inside out, with the
+hues of curves."""
 
 
 class Plot(Figure):

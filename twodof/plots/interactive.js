@@ -5,6 +5,7 @@
 /** @typedef {{bag: number, joint: string, label: string, colour: string, dashes: string}} Row */
 /** @typedef {{data: {meta: [number | null, string, string]}[], layout: object}} Chart */
 
+const ROUNDING = 1e-12; // what is less is not told
 const UNITS_OF = { q: "position", v: "velocity", tau: "effort", error: "distance" };
 
 /** @param {string} id @returns {Promise<string>} what was packed into the page under that name */
@@ -70,7 +71,7 @@ class Legend {
     for (const cell of this.cells.values()) cell.textContent = "";
     for (const { data, y } of points) {
       const cell = this.cells.get(data.meta.join(" "));
-      if (cell) cell.textContent = Number(y).toPrecision(5).replace("-", "\u2212");
+      if (cell) cell.textContent = (Math.abs(y) < ROUNDING ? 0 : Number(y)).toPrecision(5).replaceAll("-", "\u2212");
     }
     this.time.textContent = points.length ? `${Number(points[0].x.toPrecision(7))} s` : "";
   }

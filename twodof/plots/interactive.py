@@ -37,12 +37,13 @@ from .workspace import Stroke, View, views, workspace_title
 POINTS = 120_000
 """Of all curves. An hour of seven joints at 100 Hz is known by its extremes every three seconds,
 and the page has some four megabytes."""
-ROW, GAP, EDGE = 150, 34, 44
-"""Pixels: a panel's height, between panels, and below the last."""
+ROW, GAP, EDGE, TOP = 150, 34, 44, 50
+"""Pixels: a panel's height, between panels, below the last, and above the first, for its heading
+and plotly's buttons above that."""
 LAYOUT: dict[str, Any] = {
     "font": {"family": "sans-serif", "size": 12, "color": INK}, "plot_bgcolor": "white",
     "paper_bgcolor": "white", "showlegend": False, "separators": ".", "dragmode": "zoom",
-    "margin": {"l": 64, "r": 14, "t": 26, "b": EDGE},
+    "margin": {"l": 64, "r": 14, "t": TOP, "b": EDGE},
 }  # fmt: skip
 AXIS = {
     "gridcolor": HAIR,
@@ -159,7 +160,7 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         "spikedash": "solid", "spikesnap": "hovered data",
     }  # fmt: skip
     layout = {
-        **LAYOUT, "height": height + EDGE + 26, "xaxis": time, "hovermode": "x",
+        **LAYOUT, "height": height + EDGE + TOP, "xaxis": time, "hovermode": "x",
         "hoverdistance": -1, "spikedistance": -1, "hoversubplots": "axis", "annotations": [],
     }  # fmt: skip
     data: list[dict[str, Any]] = []
@@ -244,7 +245,8 @@ def _view(view: View, title: str) -> dict[str, Any]:
     across = {"title": {"text": f"{view.axes[0]} in m"}, "range": [low[0], high[0]], "nticks": 6}
     up = {"title": {"text": f"{view.axes[1]} in m"}, "range": [low[1], high[1]], "nticks": 6}
     layout = {
-        **LAYOUT, "height": 420, "annotations": [_heading(title, 1.0)], "hovermode": "closest",
+        **LAYOUT, "height": 394 + TOP, "annotations": [_heading(title, 1.0)],
+        "hovermode": "closest",
         "xaxis": {**AXIS, **across, "constrain": "domain"},
         "yaxis": {**AXIS, **up, "scaleanchor": "x", "constrain": "domain"}, "shapes": [],
     }  # fmt: skip

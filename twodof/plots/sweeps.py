@@ -37,6 +37,8 @@ PAIRED = ("settling_time", "overshoot", "peak_effort")
 MOST_PAIRS = 10
 WIDTH, HEIGHT, LEFT, RIGHT, GAP, TOP, BELOW = 2.05, 1.7, 0.7, 0.85, 1.15, 1.2, 0.85
 """Inches: a panel, beside the outer ones, between them, above them, and below each."""
+WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "rad/s2": "rad/s²"}
+"""FMI's units, as other figures have them."""
 WIDE = 10.0  # ratio of largest to smallest from which on colours are logarithmic
 BEST: dict[str, Any] = {
     "marker": "*",
@@ -85,7 +87,7 @@ def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -
 
 
 def _in(unit: str) -> str:
-    return f", {unit.replace('N.m', 'N·m')}" if unit else ""
+    return f", {WRITTEN.get(unit, unit)}" if unit else ""
 
 
 def _settings(provenance: Mapping[str, Any]) -> str:
