@@ -17,12 +17,14 @@ from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
 
-import numpy as np
+import numpy as np  # noqa: E402
+from steps import Figure  # noqa: E402
 
-import twodof
-from twodof.fmu import instantiate
+import twodof  # noqa: E402
+from twodof.fmu import instantiate  # noqa: E402
 
 TURNS = 7
 STEP = 0.01
@@ -40,10 +42,8 @@ def cost(work: Callable[[], object]) -> np.ndarray:
     return spent() - before
 
 
-def main() -> None:
-    """Measure and print."""
-    runs = int(sys.argv[1]) if sys.argv[1:] else 400
-    stop_time = float(sys.argv[2]) if sys.argv[2:] else 5.0
+def main(runs: int = 400, stop_time: float = 5.0) -> list[Figure]:
+    """Measure and print; the figures of which something is wanted."""
     times = {"stop_time": stop_time, "step": STEP}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "TwoDof-native.fmu"
@@ -89,7 +89,12 @@ def main() -> None:
     print(f"  a run in 1 worker against the bare master: {added:.2f}; wanted <= 1.25")
     print(f"  2 workers on two free cores are {shared:.2f} times as fast as 1; wanted >= 1.7")
     print(f"  the coordinator can keep {one[1, 1] / one[1, 0]:.0f} workers busy")
+    run = f"a run more of a sweep, {stop_time:g} s in steps of {STEP:g} s, with metrics and table"
+    return [
+        Figure(f"{run}, by 1 worker / by twodof.simulate alone", f"{added:.2f}", "<= 1.25"),
+        Figure(f"{run}: 2 workers on two free cores / 1, in speed", f"{shared:.2f}", ">= 1.7"),
+    ]
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:2]), *map(float, sys.argv[2:3]))

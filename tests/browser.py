@@ -107,8 +107,7 @@ def opened(
     begin: str = EVERY_OTHER_FRAME,
 ) -> Iterator[Page]:  # fmt: skip
     """A page that is shown, on a screen of so many pixels for one of the page's, and that begins
-    with a script; at its end, no error is in its console but of a server that
-    has ended."""
+    with a script; at its end, no error is in its console but of a server that has ended."""
     with browser.new_context(viewport=VIEWPORT, device_scale_factor=scale) as context:
         context.set_default_timeout(1e3 * PATIENCE)
         page = context.new_page()

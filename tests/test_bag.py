@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Timer
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,12 +51,14 @@ from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.enums import CompressionMode
+from rosbags.rosbag2.storage_mcap import McapWriter
 from ruamel.yaml import YAML
 from sinks import Collector
 
 import twodof
 from twodof.bag.reader import read_ends
-from twodof.bag.storage import BagWriter
+from twodof.bag.storage import BagWriter, McapStorage
 from twodof.errors import BagError, InputError
 from twodof.experiments import Experiment
 from twodof.files import is_being_written
@@ -922,10 +925,29 @@ def test_memory_does_not_grow_with_the_run(fmu_path: Path, tmp_path: Path, stora
 
 
 def test_definitions_are_those_of_humble() -> None:
-    from twodof.ros.messages import DEFINITIONS
-    from twodof.ros.messages import STORE as OURS
+    from twodof.ros.messages import DEFINITIONS, store_of
 
-    for name in DEFINITIONS:
-        assert OURS.fielddefs[name][1] == STORE.fielddefs[name][1]
-        assert OURS.hash_rihs01(name) == STORE.hash_rihs01(name)
-        assert OURS.generate_msgdef(name) == STORE.generate_msgdef(name)
+    for name in reversed(DEFINITIONS):  # what is made of others first
+        ours = store_of(name)
+        assert ours.fielddefs[name][1] == STORE.fielddefs[name][1]
+        assert ours.hash_rihs01(name) == STORE.hash_rihs01(name)
+        assert ours.generate_msgdef(name) == STORE.generate_msgdef(name)
+
+
+def test_a_chunk_and_its_index_are_those_of_rosbags(tmp_path: Path) -> None:
+    written = []
+    for kind in (McapWriter, McapStorage):
+        folder = tmp_path / kind.__name__ / "bag"
+        folder.mkdir(parents=True)
+        storage = kind(folder, CompressionMode.NONE)
+        storage.channel_stats = {1: 0, 2: 0}
+        for chunk in range(2):
+            for k in range(7):
+                topic = SimpleNamespace(id=1 + k % 2)
+                storage.write(topic, START + 100 * chunk + k, b"message" * k)
+            storage.close_chunk()
+        storage.bio.close()
+        indices = [index.getvalue() for index in storage.chunks]
+        written.append((storage.path.read_bytes(), indices))
+        assert [index.tell() for index in storage.chunks] == [*map(len, indices)]
+    assert written[0] == written[1]

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bags import STORE
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 import twodof
 from twodof.cli.main import main
-from twodof.ros.messages import JOINT_STATE, POINT, STORE
+from twodof.ros.messages import JOINT_STATE, POINT
 
 BEGIN = 1_700_000_000_000_000_000
 STEP = 10_000_000  # ns

@@ -21,8 +21,8 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 @pytest.fixture(scope="module")
 def benchmark() -> Iterator[ModuleType]:
-    """benchmarks/run.py by its path: the folder is no package."""
-    spec = importlib.util.spec_from_file_location("benchmarks_run", BENCHMARKS / "run.py")
+    """benchmarks/steps.py by its path: the folder is no package."""
+    spec = importlib.util.spec_from_file_location("benchmarks_steps", BENCHMARKS / "steps.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     before = list(sys.path)
@@ -112,7 +112,7 @@ def test_mujoco_has_the_same_controller(benchmark: ModuleType, mujoco: Callable)
 
 def test_mujoco_is_measured_without_its_python_package() -> None:
     """That has the library ask for the time, at more than the cost of a step."""
-    code = "import sys, run; sys.exit('mujoco' in sys.modules)"
+    code = "import sys, steps; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True)
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from bags import STORE
 
 import twodof
 from twodof.errors import InputError
 from twodof.ros.commands import MAX_COMMAND, RAMP, CommandError, Commands, Watchdog
-from twodof.ros.messages import JOINT_STATE, POINT, STORE
+from twodof.ros.messages import JOINT_STATE, POINT
 
 Build = Callable[..., twodof.Fmu]
 

@@ -331,6 +331,15 @@ def test_an_fmu_that_returns_nan_ends_the_run_with_what_was_good(fmu_path, tmp_p
 
 
 @in_child_process
+def test_values_are_finite_also_where_their_sum_is_not(fmu_path, tmp_path):
+    changed = changed_plant(
+        fmu_path, tmp_path, b"        stops = self._stops()",
+        b"        self.q = [1.5e308] * 2; return\n        stops = self._stops()",
+    )  # fmt: skip
+    assert twodof.simulate(changed, stop_time=0.01).last.q == (1.5e308, 1.5e308)
+
+
+@in_child_process
 def test_an_fmu_that_fails_fatally_ends_the_run(fmu_path, tmp_path):
     changed = changed_plant(
         fmu_path, tmp_path, b"        stops = self._stops()",

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import BagError
 from ..files import is_being_written, shown
 from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
-from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, STORE, TARGET
+from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
 from .contents import read_messages, stated_count, storage_files
 from .outline import Indices, Outline
 from .provenance import read_provenance, robot_in, robots_of
@@ -257,7 +257,7 @@ class _JointStates:
         message = messages[0].tobytes()
         try:
             if self._layout is None:
-                first: Any = STORE.deserialize_cdr(message, JOINT_STATE)
+                first: Any = store_of(JOINT_STATE).deserialize_cdr(message, JOINT_STATE)
                 sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
                 self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
                 self.names = tuple(first.name)

@@ -10,7 +10,10 @@ import errno
 import os
 import sqlite3
 import struct
+from collections import defaultdict
 from collections.abc import Mapping
+from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal
@@ -20,12 +23,12 @@ import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionMode
-from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from ..errors import BagError
 from ..ros.cdr import Rows
-from .mcap import HEAD, MAGIC, MESSAGE
+from .mcap import CHUNK, HEAD, MAGIC, MESSAGE
 from .records import Stamps as Stamps
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
@@ -42,6 +45,7 @@ RECORD = np.dtype(
     ]
 )  # fmt: skip
 """What MCAP has before the data of a message."""
+MESSAGE_INDEX = 7  # opcode
 CHECKSUM = struct.Struct("<I8s")  # of the summary, and the magic: the end of a file
 FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # place of the summary, of its offsets; and these
 
@@ -73,9 +77,23 @@ class McapStorage(McapWriter):
             of.message_end_time = max(of.message_end_time, max(times))
 
     def close_chunk(self) -> None:
-        """Write the pending chunk and its index."""
-        super().close_chunk()
+        """Write the pending chunk and its index, which rosbags would, number by number."""
+        chunk, data, begin = self.chunk, self.chunk.bio.getvalue(), self.bio.tell()
+        times = struct.pack("<QQ", chunk.message_start_time, chunk.message_end_time)
+        self._write(CHUNK, times + struct.pack("<QIIQ", len(data), 0, 0, len(data)), data)
+        end, places = self.bio.tell(), b""
+        for channel, messages in chunk.msgs.items():
+            places += struct.pack("<HQ", channel, self.bio.tell())
+            index = struct.pack(f"<{2 * len(messages)}Q", *chain.from_iterable(messages))
+            self._write(MESSAGE_INDEX, struct.pack("<HI", channel, len(index)), index)
+        self.chunks.append(record := BytesIO())
+        record.write(times + struct.pack("<QQI", begin, end - begin, len(places)) + places)
+        record.write(struct.pack("<QIQQ", self.bio.tell() - end, 0, len(data), len(data)))
+        self.chunk = PendingChunk(2**63 - 1, 0, BytesIO(), defaultdict(list))
         self._end = self.bio.tell()
+
+    def _write(self, opcode: int, *parts: bytes) -> None:
+        self.bio.writelines((HEAD.pack(opcode, sum(map(len, parts))), *parts))
 
     def flush(self, sync: bool) -> None:
         """Hand all messages to the operating system, and with ``sync`` to the disk."""

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import WriterError
 from ..errors import BagError
 from ..files import lock, read_file, sync
 from ..ros.cdr import Rows
-from ..ros.messages import STORE, Topic
+from ..ros.messages import Topic, store_of
 from .contents import MAX_METADATA
 from .provenance import read_provenance, robots_of
 from .storage import REMOVED, STORAGES, BagWriter, Stamps, check_path
@@ -107,11 +107,10 @@ class Store:
 
     def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
         """Numbers of new connections, in the order of the topics."""
+        add = self._writer.add_connection
         return [
-            self._writer.add_connection(
-                name, topic.type, typestore=STORE, offered_qos_profiles=[topic.qos]
-            ).id
-            for name, topic in topics.items()
+            add(name, kind, typestore=store_of(kind), offered_qos_profiles=[qos]).id
+            for name, (kind, qos) in topics.items()
         ]
 
     def count(self, connection: int) -> int:

@@ -8,7 +8,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from ctypes import CFUNCTYPE, Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
+from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
 from itertools import accumulate, chain
 from math import inf
 from pathlib import Path
@@ -29,18 +29,19 @@ logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
 """Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
 WARNING = fmi2.fmi2Warning
+READ = ("documentation/", "sources/")
+"""Folders of an FMU that no library looks into."""
 Values = Array[c_double]
-DO_STEP3 = CFUNCTYPE(c_int, c_void_p, c_double, c_double, c_bool, *[c_void_p] * 4)
-GET2 = CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p)
-GET3 = CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p, c_size_t)
-"""With pointers of no type: a conversion to one of FMPy's typed ones takes a third of a µs."""
 
 
 class Instance:
     """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
 
     FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
-    SimulationError with the FMU's own words. What is called at each step goes past FMPy's checks.
+    SimulationError with the FMU's own words.
+
+    What is called at each step goes past FMPy, by functions of the library that know no types, with
+    arguments that have theirs already: to convert those takes half of a call.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
@@ -48,6 +49,7 @@ class Instance:
         self._said = ""
         self._fatal = False
         self._ends = c_bool()  # what doStep of FMI 3.0 says
+        self._t, self._h = c_double(), c_double()
         identifier = fmu.description.coSimulation.modelIdentifier
         working_folder = os.getcwd()
         try:
@@ -57,7 +59,8 @@ class Instance:
                 modelIdentifier=identifier,
                 instanceName=identifier,
             )
-            self._component = self._slave.component
+            self._component = c_void_p(self._slave.component)
+            self._step_arguments = self._component, self._t, self._h, *self._rest
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
         finally:
@@ -74,8 +77,8 @@ class Instance:
         )
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
-        self._do_step = slave.dll.fmi2DoStep
-        self._step_arguments: tuple[object, ...] = (1,)
+        self._do_step = slave.dll["fmi2DoStep"]
+        self._rest: tuple[object, ...] = (c_int(1),)
         return slave
 
     def initialise(
@@ -106,7 +109,8 @@ class Instance:
     def step(self, t: float, h: float) -> None:
         """One communication step from t to t + h."""
         self._said = ""
-        status = self._do_step(self._component, t, h, *self._step_arguments)
+        self._t.value, self._h.value = t, h
+        status = self._do_step(*self._step_arguments)
         if status > WARNING or self._ends:
             self._refuse(status)
 
@@ -115,17 +119,14 @@ class Instance:
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].reference for name in names))
         values = (c_double * n)()
-        get = GET2(("fmi2GetReal", self._slave.dll))
-        return self._reader(values, get, byref(references), n, byref(values))
+        return self._reader(values, "fmi2GetReal", byref(references), c_size_t(n), byref(values))
 
-    def _reader(
-        self, values: Values, get: Callable[..., int], *arguments: object
-    ) -> Callable[[], Values]:
-        component = self._component
+    def _reader(self, values: Values, name: str, *arguments: object) -> Callable[[], Values]:
+        get, arguments = self._slave.dll[name], (self._component, *arguments)
 
         def read() -> Values:
             self._said = ""
-            if (status := get(component, *arguments)) > WARNING:
+            if (status := get(*arguments)) > WARNING:
                 self._refuse(status)
             return values
 
@@ -186,8 +187,8 @@ class Instance3(Instance):
         slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=self._log_message, loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
-        self._do_step = DO_STEP3(("fmi3DoStep", slave.dll))
-        self._step_arguments = (True, *results)
+        self._do_step = slave.dll["fmi3DoStep"]
+        self._rest = (c_bool(True), *results)
         return slave
 
     def _starts(self) -> dict[int, list[float | bool]]:
@@ -229,8 +230,8 @@ class Instance3(Instance):
         size = sum(self._sizes[reference] for reference in distinct)
         references = (c_uint * len(distinct))(*distinct)
         whole = (c_double * size)()
-        get = GET3(("fmi3GetFloat64", self._slave.dll))
-        read = self._reader(whole, get, byref(references), len(distinct), byref(whole), size)
+        asked = byref(references), c_size_t(len(distinct)), byref(whole), c_size_t(size)
+        read = self._reader(whole, "fmi3GetFloat64", *asked)
         if places == [*range(size)]:
             return read
         values = (c_double * len(places))()
@@ -264,7 +265,9 @@ class Instance3(Instance):
 
 @contextmanager
 def instantiate(fmu: Fmu) -> Iterator[Instance]:
-    """An instance of the FMU, unzipped into a temporary folder; freed at the end.
+    """An instance of the FMU, freed at the end.
+
+    It is unzipped into a temporary folder, but for what is there to be read by people.
 
     Raises:
         FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
@@ -278,7 +281,8 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
     with temporary_folder() as folder:
         try:
             with zipfile.ZipFile(fmu.path) as archive:
-                archive.extractall(folder)
+                names = archive.namelist()
+                archive.extractall(folder, [name for name in names if not name.startswith(READ)])
         except ZIP_ERRORS as error:
             raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
         library = folder / "binaries" / fmu.platform / fmu.library

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from ..errors import InputError
 from ..experiments import NANOSECONDS
 from ..fmu import Fmu
-from .messages import JOINT_STATE, POINT, POSE, STORE
+from .messages import JOINT_STATE, POINT, POSE, store_of
 
 LOG = logging.getLogger(__name__)
 LONGEST_NAME = 80  # of a frame or joint, that is told
@@ -71,7 +71,7 @@ def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
     try:
         if len(cdr) > most:
             raise ValueError(f"it has {len(cdr)} bytes")
-        return STORE.deserialize_cdr(cdr, kind)
+        return store_of(kind).deserialize_cdr(cdr, kind)
     except Exception as error:  # rosbags raises anything
         raise CommandError("bytes", f"cannot be read ({error})") from error
 

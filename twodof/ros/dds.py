@@ -12,7 +12,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from ..errors import PublishError
-from .messages import STORE
+from .messages import store_of
 
 try:
     from cyclonedds import idl, qos, topic
@@ -49,7 +49,7 @@ class Carrier:
 def dds_type(name: str) -> Any:
     """The DDS type of a ROS 2 message type, with the names that rosidl_generator_dds_idl gives."""
     package, _, kind = name.split("/")
-    fields = {f"{field}_": _field_type(*of) for field, of in STORE.fielddefs[name][1]}
+    fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
     struct = idl.make_idl_struct(
         f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False
     )
@@ -77,7 +77,7 @@ def dds_qos(offered: Qos, type_name: str) -> Any:
         qos.Policy.Durability.TransientLocal if latched else qos.Policy.Durability.Volatile,
         qos.Policy.History.KeepLast(offered.depth),
         qos.Policy.DataRepresentation(use_cdrv0_representation=True),
-        qos.Policy.Userdata(f"typehash={STORE.hash_rihs01(type_name)};".encode()),
+        qos.Policy.Userdata(f"typehash={store_of(type_name).hash_rihs01(type_name)};".encode()),
     )
 
 

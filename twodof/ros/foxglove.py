@@ -11,7 +11,7 @@ from ..errors import InputError, PublishError
 from ..experiments import Experiment, Value, resolve
 from ..sample import Sample, Sink
 from .cdr import Rows
-from .messages import GAINS, STORE, Messages
+from .messages import GAINS, Messages, store_of
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -172,4 +172,4 @@ def _numbers(value: Any) -> Any:
 
 def _definition(type_name: str) -> bytes:
     """The text of a message type with those that it is made of, as in MCAP files."""
-    return STORE.generate_msgdef(type_name, ros_version=2)[0].encode()
+    return store_of(type_name).generate_msgdef(type_name, ros_version=2)[0].encode()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from itertools import chain
+from functools import cache
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +19,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from ..errors import BagError, InputError
 from ..experiments import Experiment, Value
@@ -71,10 +72,18 @@ DEFINITIONS = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
 }
 """As Humble has them; rosbags' store of all of Humble's takes longer to import than NumPy."""
-STORE = get_typestore(Stores.EMPTY)
-STORE.register(
-    dict(chain(*(get_types_from_msg(text, name).items() for name, text in DEFINITIONS.items())))
-)
+_STORE = get_typestore(Stores.EMPTY)
+
+
+@cache
+def store_of(kind: str) -> Typestore:
+    """rosbags' store of types, with one and those that it is made of; all of them take time."""
+    for line in DEFINITIONS[kind].splitlines():
+        package, slash, name = line.partition(" ")[0].removesuffix("[]").partition("/")
+        if slash:
+            store_of(f"{package}/msg/{name}")
+    _STORE.register(get_types_from_msg(DEFINITIONS[kind], kind))
+    return _STORE
 
 
 def check_name(argument: str, name: str) -> None:
@@ -157,7 +166,7 @@ class Messages:
                 del self.topics[TARGET], layouts[TARGET]
         if clock:
             self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
-        self._layouts, turns = layouts, 4 * poses
+        self._layouts, self._efforts, turns = layouts, efforts, 4 * poses
         sizes = {"q": n, "v": n, "tau": efforts, "quat": turns, "x_des": m, "quat_des": turns}
         self._numbers = np.dtype([("stamp", "<i8"), *((k, "<f8", (c,)) for k, c in sizes.items())])
         self._pack = Struct(f"<q{sum(sizes.values())}d").pack
@@ -175,7 +184,7 @@ class Messages:
         Raises:
             struct.error: the sample is not of this run.
         """
-        given: tuple[float, ...] = sample.tau if self._numbers["tau"].shape[0] else ()
+        given: tuple[float, ...] = sample.tau if self._efforts else ()
         if self._scene is not None:
             if sample.inputs is not self._inputs:
                 self._inputs = sample.inputs

@@ -21,11 +21,12 @@ def trace(run: Experiment, instance: Instance) -> dict[str, Array]:
     instance.initialise(run.start_time, run.time(run.steps), run.given)
     groups = [run.fmu.vector(group) for group in OUTPUTS]
     ends = [*accumulate(map(len, groups))]
-    rows, read, step, h = bytearray(), instance.reader([*chain(*groups)]), instance.step, run.step
+    rows, read, step = bytearray(), instance.reader([*chain(*groups)]), instance.step
+    start, h = run.start_time, run.step
     rows += read()
     try:
         for k in range(int(run.steps)):
-            step(run.start_time + k * h, h)
+            step(start + k * h, h)
             rows += read()
     except SimulationError as error:
         _check_finite(run, rows, ends[-1])
@@ -35,8 +36,8 @@ def trace(run: Experiment, instance: Instance) -> dict[str, Array]:
 
 
 def _check_finite(run: Experiment, rows: bytearray, width: int) -> Array:
-    table = np.frombuffer(rows, np.float64).reshape(-1, width)
+    table = np.asfortranarray(np.frombuffer(rows, np.float64).reshape(-1, width))  # fast along time
+    if np.isfinite(table).all():
+        return table
     astray = np.flatnonzero(~np.isfinite(table).all(axis=1))
-    if astray.size:
-        raise diverged(int(astray[0]), run.time(int(astray[0])))
-    return table
+    raise diverged(int(astray[0]), run.time(int(astray[0])))
