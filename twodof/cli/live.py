@@ -14,7 +14,7 @@ from .common import (
     print_next,
     quote,
 )  # fmt: skip
-from .options import add_page_options, add_set_option, add_step_option, file_name, page_place
+from .options import add_page_options, add_set_option, add_step_option, not_empty, page_place
 
 
 def add(verbs: Any) -> None:
@@ -24,9 +24,9 @@ def add(verbs: Any) -> None:
         description="Step an FMU in real time behind a page in the browser: drag the target.",
     )  # fmt: skip
     live.add_argument(
-        "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
+        "fmu", nargs="?", type=not_empty, metavar="FMU", help="default: the default arm's"
     )
-    live.add_argument("-o", dest="output", type=file_name, metavar="BAG", help="name of recordings")
+    live.add_argument("-o", dest="output", type=not_empty, metavar="BAG", help="name of recordings")
     add_step_option(live)
     add_set_option(live)
     add_page_options(live)

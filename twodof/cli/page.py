@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import chosen_fmu, parse_settings, print_table
-from .options import add_frame_option, add_set_option, add_step_option, file_name
+from .options import add_frame_option, add_set_option, add_step_option, not_empty
 
 
 def add(verbs: Any) -> None:
@@ -20,12 +20,12 @@ def add(verbs: Any) -> None:
     page.add_argument(
         "fmu",
         nargs="?",
-        type=file_name,
+        type=not_empty,
         metavar="FMU|URDF",
         help="default: the default arm's native FMU",
     )
     page.add_argument(
-        "-o", dest="output", type=file_name, metavar="FILE.html", help="default: <name>.html"
+        "-o", dest="output", type=not_empty, metavar="FILE.html", help="default: <name>.html"
     )
     add_frame_option(page)
     add_step_option(page)

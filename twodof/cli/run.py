@@ -18,7 +18,7 @@ from .common import (
     print_summary,
     quote,
 )
-from .options import add_fmu, add_run_options, add_time_options, file_name
+from .options import add_fmu, add_run_options, add_time_options, not_empty
 
 if TYPE_CHECKING:
     from ..experiments import Experiment
@@ -32,7 +32,7 @@ def add(verbs: Any) -> None:
         description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
     )  # fmt: skip
     run.add_argument(
-        "-o", dest="output", type=file_name, metavar="BAG", help="default: rosbag2_<date and time>"
+        "-o", dest="output", type=not_empty, metavar="BAG", help="default: rosbag2_<date and time>"
     )
     add_time_options(run)
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")

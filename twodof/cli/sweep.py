@@ -28,7 +28,7 @@ from .options import (
     add_set_option,
     add_time_options,
     check_company,
-    file_name,
+    not_empty,
 )
 
 
@@ -40,7 +40,7 @@ def add(verbs: Any) -> None:
         " The native default FMU is built where none is named.",
     )  # fmt: skip
     sweep.add_argument(
-        "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
+        "fmu", nargs="?", type=not_empty, metavar="FMU", help="default: the default arm's"
     )
     sweep.add_argument(
         "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",
@@ -55,7 +55,7 @@ def add(verbs: Any) -> None:
     add_time_options(sweep)
     add_set_option(sweep)
     sweep.add_argument(
-        "-o", dest="output", type=file_name, metavar="OUT", help="default: sweep_<date and time>"
+        "-o", dest="output", type=not_empty, metavar="OUT", help="default: sweep_<date and time>"
     )
     sweep.add_argument(
         "--resume", action="store_true", help="go on with OUT; what is done is not repeated"

@@ -190,7 +190,7 @@ def _with_robot(
     robot = None
     if urdf is not None:
         try:
-            at = frame or run.get("frame") or ""
+            at = run.get("frame", "") if frame is None else frame
             robot = load_robot(urdf, at, run.get("axes") or "xyz", names)
         except RobotError as error:
             raise PlotError(f"{source}: {error}") from error
