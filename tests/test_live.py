@@ -41,7 +41,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
 
 import twodof
-from twodof.errors import PageError
+from twodof.errors import InputError, PageError
 from twodof.experiments import experiment
 from twodof.pages.loop import Loop
 from twodof.pages.serving import Server
@@ -630,3 +630,10 @@ def test_port_that_another_is_about_to_serve() -> None:
         Server(b"", port=port)
     with first:
         assert browser.answer(first.url, ("Host", "localhost")) == 200
+
+
+def test_a_gain_below_0_is_refused_before_it_ends_the_run(native_path: Path) -> None:
+    loop = loop_of(native_path)
+    with pytest.raises(InputError, match=r"Kp\[1\] = -5 is less than 0"):
+        loop.tell("change", {"Kp": -5.0})
+    assert loop.news()["values"]["Kp[1]"] == 50.0
