@@ -55,7 +55,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     text = read_text(path, mesh_dir)
     try:
         text = lock_joints(text, options.lock) if options.lock else text
-        frame = options.frame or end_effector(read_urdf(text))
+        frame = end_effector(read_urdf(text)) if options.frame is None else options.frame
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     options = replace(options, frame=frame)
@@ -156,7 +156,7 @@ def _flavour(
     starts: Mapping[str, Any],
 ) -> Flavour:
     if not options.native:
-        if options.platforms or options.fmi or not options.arrays:
+        if options.platforms or options.fmi not in (None, 2) or not options.arrays:
             raise BuildError(
                 "the platforms, the version of FMI and its arrays can be chosen for the native"
                 " flavour only, `native=True`"
@@ -195,7 +195,7 @@ def _mesh_dir(options: FmuOptions) -> Path | None:
 def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
     """The robot, its variables, and the start values that are not the table's own."""
     shipped = options.urdf is None
-    axes = options.axes or ("xy" if shipped else "xyz")
+    axes = ("xy" if shipped else "xyz") if options.axes is None else options.axes
     try:
         assert options.frame is not None
         robot = load_robot(urdf, options.frame, axes)
@@ -215,6 +215,8 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
             if not all(map(math.isfinite, given)):
                 raise BuildError(f"{key} {given} must be finite numbers")
             starts[key] = tuple(float(value) for value in given)
+    if options.gravity is not None and len(options.gravity) != 3:
+        raise BuildError(f"gravity {options.gravity} must be three numbers")
     if len(starts["q_start"]) != len(robot.joints):
         raise BuildError(
             f"q_start has {len(starts['q_start'])} values, the robot has {len(robot.joints)}"
