@@ -12,8 +12,9 @@ import numpy as np
 from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_outline
 from ..bag.recording import Recording, Schedule
-from ..errors import PlotError
-from ..files import read_file, shown
+from ..errors import BuildError, PlotError
+from ..export.urdf_source import read_text
+from ..files import shown
 from ..plant.urdf import UNBOUNDED, RobotError
 from .closed_form import Array, Held, task_error
 from .robot import Motion, Robot, is_singular, load_robot, motion_of
@@ -21,7 +22,6 @@ from .robot import Motion, Robot, is_singular, load_robot, motion_of
 AT_LIMIT = 1e-9  # of a limit's size
 NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
 MOST = 200_000  # samples of a bag that are drawn
-MAX_URDF = 8 * 1024**2
 UNITS = {
     "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
     "omega_des": "rad/s", "alpha_des": "rad/s²", "Kp_rot": "s⁻²", "Kd_rot": "s⁻¹",
@@ -162,11 +162,9 @@ def _lines(track: Track) -> list[Array]:
 
 def _read_urdf(path: Path) -> str:
     try:
-        return read_file(path, MAX_URDF).decode("utf-8")
-    except OSError as error:
-        raise PlotError(f"cannot read the URDF '{path}': {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise PlotError(f"the URDF '{path}' is not UTF-8 text") from error
+        return read_text(path, None)
+    except BuildError as error:
+        raise PlotError(str(error)) from error
 
 
 def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> Track:
