@@ -14,6 +14,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -461,10 +462,11 @@ def test_bad_input_in_a_process_of_its_own(folder: Path) -> None:
         (["build", "--gravity", "0", "1"], "--gravity"),
         (["info"], "FMU|BAG"),
         *(
-            ([verb, option, ""], f"argument {option}: the name of a file is empty")
+            ([verb, option, ""], f"argument {option}: it is empty")
             for verb, option in (
                 ("run", "-o"), ("publish", "-o"), ("sweep", "-o"), ("page", "-o"), ("live", "-o"),
-                ("view", "--export"),
+                ("view", "--export"), *product(("run", "publish", "layouts", "page"), ["--frame"]),
+                *product(("plot", "view"), ("--frame", "--urdf")), ("build", "--frame"),
             )
         ),
     ],
@@ -768,3 +770,21 @@ def test_help_of_each_verb_says_what_there_is(
         "info": ["FMU|BAG"],
     }  # fmt: skip
     assert [option for option in options[verb] if option not in out] == []
+
+
+def test_a_run_replaces_no_file_that_is_no_fmu(
+    folder: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """By the name that it chooses itself; and tells where it was another FMU."""
+    (folder / "robot.urdf").write_text(urdf())
+    (folder / "robot-native.fmu").write_text("notes")
+    run = ["run", "robot.urdf", "--native", "--stop-time", "0.1", "-o", "bag", "--overwrite"]
+    assert main(run) == 1
+    assert "'robot-native.fmu' is no FMU, and is not replaced" in capfd.readouterr().err
+    assert (folder / "robot-native.fmu").read_text() == "notes"
+    (folder / "robot-native.fmu").unlink()
+    assert main([*run]) == main([*run]) == 0
+    assert "replaced" not in caplog.text
+    (folder / "robot.urdf").write_text(urdf().replace('upper="1"', 'upper="2"'))
+    assert main([*run]) == 0
+    assert "'robot-native.fmu' was another FMU, and is replaced" in caplog.text

@@ -197,7 +197,7 @@ def test_the_command_line_tells_where_it_listens(native_path: Path, number: int)
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("Kp", [-1.0, 2.0], "Kp is less than 0"),
+        ("Kp", [-1.0, 2.0], "Kp[1] = -1 is less than 0"),
         ("Kp", [1.0, 2.0, 3.0], "Kp has 2 elements, 3 were given"),
         ("Kp", "many", "expected a number"),
         ("Kp", None, "expected a number"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import re
 import signal
@@ -9,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -45,7 +47,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
 
 import twodof
-from twodof.errors import PageError
+from twodof.errors import InputError, PageError
 from twodof.experiments import experiment
 from twodof.pages.loop import Loop
 from twodof.pages.serving import Server
@@ -698,3 +700,28 @@ def test_port_that_another_is_about_to_serve() -> None:
         Server(b"", port=port)
     with first:
         assert browser.answer(first.url, ("Host", "localhost")) == 200
+
+
+def test_a_gain_below_0_is_refused_before_it_ends_the_run(native_path: Path) -> None:
+    loop = loop_of(native_path)
+    with pytest.raises(InputError, match=r"Kp\[1\] = -5 is less than 0"):
+        loop.tell("change", {"Kp": -5.0})
+    assert loop.news()["values"]["Kp[1]"] == 50.0
+
+
+@pytest.mark.parametrize("method", ["HEAD", "POST", "DELETE"])
+def test_what_a_page_is_not_asked_for_is_answered(method: str) -> None:
+    """By its own word, as by curl -I."""
+    with Server(b"page", port=0) as server:
+        asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)
+        asking.request(method, "/")
+        answer = asking.getresponse()
+        assert (answer.status, answer.getheader("Allow"), answer.read()) == (405, "GET", b"")
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_a_page_on_all_addresses_is_opened_as_printed(host: str) -> None:
+    with Server(b"page", host, 0) as server:
+        assert f"//{host}:" not in server.url and "[::]" not in server.url
+        with urllib.request.urlopen(server.url, timeout=10) as answer:
+            assert answer.read() == b"page"

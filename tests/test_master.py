@@ -406,3 +406,39 @@ def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
     memory = Memory(5000)
     twodof.simulate(run, twodof.Bag(tmp_path / "bag"), memory)
     assert memory.growth <= 1024**2
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda run: twodof.simulate(run),
+        lambda run: run.fmu.urdf,
+        lambda run: twodof.page(run.fmu, "page.html"),
+        lambda run: twodof.sweep(run.fmu, grid={"Kp": [50.0]}, stop_time=0.1, workers=1),
+    ],
+    ids=["simulate", "urdf", "page", "sweep"],
+)
+def test_what_was_read_of_an_fmu_is_not_said_of_another(tmp_path, native_path, monkeypatch, use):
+    """That of two robots whose URDFs have one name, or one that is built anew meanwhile."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "arm.fmu"
+    path.write_bytes(native_path.read_bytes())
+    run = twodof.experiment(path, stop_time=0.1)
+    path.write_bytes(native_path.read_bytes())  # the same again is the same
+    twodof.simulate(run)
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    content["resources/robot.urdf"] += b"<!-- heavier -->"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+    with pytest.raises(FmuError, match=r"'.*arm\.fmu' was replaced by another FMU"):
+        use(run)
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize("how", [twodof.samples, twodof.simulate])
+def test_options_beside_an_experiment_are_refused(native_path, how):
+    run = twodof.experiment(native_path, stop_time=0.1)
+    with pytest.raises(InputError, match="settings, step beside an experiment would do nothing"):
+        list(how(run, settings={"Kp": 10.0}, step=0.1))

@@ -40,6 +40,7 @@ from sinks import Collector
 import twodof
 from twodof.cli.main import main
 from twodof.errors import PlotError, TwoDofError
+from twodof.pages.replay import replay
 from twodof.plots.figure import file_kind, save
 from twodof.plots.interactive import in_workspace, over_time
 from twodof.plots.panels import with_joints
@@ -856,6 +857,20 @@ def test_a_urdf_may_replace_that_of_the_bag(default: Recording, tmp_path: Path) 
     assert found.error is not None
     distance = np.linalg.norm(path - (0.2, 0.05), axis=1)
     np.testing.assert_allclose(only(found.error, "Kp50")[:, 1], distance, rtol=1e-12)
+
+
+def test_a_xacro_file_may_be_the_robot_of_a_bag(default: Recording, tmp_path: Path) -> None:
+    """Expanded as it is where an FMU is built of it."""
+    urdf = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text()
+    named = urdf.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
+    length = '<xacro:property name="length" value="${0.1 * 3}"/><link name="world"/>'
+    text = named.replace('<link name="world"/>', length).replace('"0.15 0 0"', '"${length} 0 0"')
+    (tmp_path / "longer.urdf.xacro").write_text(text)
+    found = panels(plot(default.bag, urdf=tmp_path / "longer.urdf.xacro"))
+    path = only(found.views[0], "path")
+    np.testing.assert_allclose(path, 2 * oracles.position(default.q), rtol=0.0, atol=1e-14)
+    page, _ = replay(default.bag, urdf=tmp_path / "longer.urdf.xacro")
+    assert b"${length}" not in page
 
 
 def test_for_another_frame_there_is_no_target(default: Recording) -> None:

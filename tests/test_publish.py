@@ -34,6 +34,8 @@ from nodes import (
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import InputError
+from twodof.files import data_file
 from twodof.plots.track import read_tracks
 from twodof.ros.network import LAST_DOMAIN, Network, network
 
@@ -569,3 +571,52 @@ def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
     assert done.returncode == 1 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert "install the package 'cyclonedds' (the extra 'ros')" in line
+
+
+def test_options_beside_an_experiment_are_refused(native_path: Path) -> None:
+    run = twodof.experiment(native_path, stop_time=0.02)
+    with pytest.raises(InputError, match="stop_time beside an experiment would do nothing"):
+        twodof.publish(run, stop_time=1.0)
+
+
+def test_a_publisher_tells_each_run_what_holds_for_it(
+    native_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    """Also the second, whose robot may be another."""
+    wire = twodof.Publisher(network(environment(number)), scene=True)
+    run = twodof.experiment(native_path, stop_time=0.02)
+    twodof.publish(run, wire=wire)
+    node = listen("/robot_description", "/joint_states")
+
+    def heard() -> bool:
+        return bool(node.messages("/robot_description"))
+
+    twodof.publish(twodof.experiment(native_path), wire=wire, stop=heard)
+    node.until(heard)
+
+
+def test_robots_whose_fmus_would_be_one_file_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second was run as both, under the name of the first."""
+    monkeypatch.chdir(tmp_path)
+    shipped = data_file("urdf", "2dof.urdf").read_text()
+    for maker, mass in (("one", "0.18"), ("other", "9.18")):
+        Path(maker).mkdir()
+        Path(maker, "arm.urdf").write_text(
+            shipped.replace('mass value="0.18', f'mass value="{mass}')
+        )
+    robots = ["a=one/arm.urdf", "b=other/arm.urdf"]
+    assert main(["publish", *robots, "--native", "--stop-time", "0.01"]) == 2
+    told = "the FMU of 'other/arm.urdf' would be 'arm-native.fmu' as the robot before it is"
+    assert told in capsys.readouterr().err
+
+
+def test_a_robots_name_is_told_as_it_was_given(
+    native_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["publish", f"1={native_path}", "--stop-time", "0.01"]) == 1
+    assert "NAME=FMU '1' is no name of ROS 2" in capsys.readouterr().err
+    run = twodof.experiment(native_path, stop_time=0.1)
+    with pytest.raises(InputError, match="`robots` '1' is no name of ROS 2"):
+        twodof.publish_together({"1": run})

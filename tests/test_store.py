@@ -18,6 +18,7 @@ from harness import wait_until
 from rosbags.rosbag2 import Reader
 
 import twodof
+from twodof.bag.provenance import robots_of
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.recovery import recover
 from twodof.cli.main import main
@@ -262,3 +263,45 @@ def test_a_bag_of_several_is_replaced_when_asked_to(fmus: dict[str, Path], tmp_p
     (bag / "metadata.yaml").unlink()  # its writer died
     twodof.simulate(runs(fmus)["left"], twodof.Bag(bag, overwrite=True))
     assert sorted(file.name for file in bag.iterdir()) == ["bag.mcap", "metadata.yaml", "run.json"]
+
+
+def test_a_bag_that_is_not_open_takes_no_sample(native_path: Path, tmp_path: Path) -> None:
+    """Nothing would write it."""
+    run = experiment(native_path, stop_time=0.1)
+    bag = twodof.Bag(tmp_path / "bag")
+    bag.begin(run)
+    sample, *rest = twodof.samples(run)
+    with pytest.raises(BagError, match="is not open"):
+        bag.write(sample)
+    with bag:
+        bag.write(sample)
+    with pytest.raises(BagError, match="is not open"):
+        bag.write(rest[0])
+    assert read_bag(tmp_path / "bag").count == bag.count == 1
+
+
+@pytest.mark.parametrize("copy", ["run.left copy.json", "run.left (1).json", "run.left.old.json"])
+def test_a_copy_of_a_robots_provenance_is_no_robot(
+    fmus: dict[str, Path], tmp_path: Path, copy: str
+) -> None:
+    bag = logged(fmus, tmp_path / "bag")
+    (bag / copy).write_bytes((bag / "run.left.json").read_bytes())
+    assert robots_of(bag) == sorted(NAMES)
+
+
+def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(
+    native_path: Path, tmp_path: Path
+) -> None:
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
+    (tmp_path / "bag/run.json").rename(tmp_path / "bag/run.old.json")
+    for read in (read_bag, read_ends):
+        with pytest.raises(BagError, match=r"no joint states of the robot that its run\.old\.json"):
+            read(tmp_path / "bag")
+
+
+def test_a_robots_bag_is_recovered_by_its_folder(fmus: dict[str, Path], tmp_path: Path) -> None:
+    bag = logged(fmus, tmp_path / "bag")
+    with pytest.raises(BagError, match=rf"there is no bag '.*:left'; 'twodof recover {bag}' is of"):
+        recover(f"{bag}:left")
+    with pytest.raises(BagError, match=r"there is no bag '[^']*none'$"):
+        recover(tmp_path / "none")

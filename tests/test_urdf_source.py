@@ -178,9 +178,10 @@ def test_a_urdf_of_several_ends_is_run_by_one_command_too(
     assert twodof.load_fmu("panda-native.fmu").frame == "panda_hand_tcp"
     page = ["page", str(panda_file), "--frame", "panda_hand_tcp", "-o", "panda.html"]
     assert main(page) == 0
-    for fmu in (["panda-native.fmu"], []):
+    for fmu, what in ((["panda-native.fmu"], "an FMU"), ([], "none")):
         assert main(["run", *fmu, "--frame", "panda_hand_tcp", "-o", "none"]) != 0
-        assert "--frame is of a URDF; leave it out beside an FMU" in capsys.readouterr().err
+        told = f"--frame is of a URDF that is given; leave it out beside {what}"
+        assert told in capsys.readouterr().err
 
 
 BALL = """<robot name="top"><link name="base"/><link name="a"/><link name="b"/><link name="top">

@@ -73,8 +73,7 @@ def samples(
         FmuError, InputError: before the first sample.
         SimulationError: the FMU refused or failed a call, or gave a value that is not finite.
     """
-    if not isinstance(run, Experiment):
-        run = experiment(run, **options)
+    run = as_experiment(run, options)
     inputs, due = _inputs(run), deque(run.changes)
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
         instance.initialise(run.start_time, run.time(run.steps), run.given)
@@ -103,6 +102,22 @@ def samples(
                 instance.reset()
                 instance.initialise(since, run.time(run.steps), {**run.given, **inputs, **again})
                 instance.step(since, run.step)
+
+
+def as_experiment(
+    run: Experiment | Fmu | str | Path, options: Mapping[str, Any], **usual: Any
+) -> Experiment:
+    """The experiment, or that of an FMU, with the options of ``experiment`` or else the usual ones.
+
+    Raises:
+        FmuError, InputError: as ``experiment``; or an experiment has options beside it.
+    """
+    if not isinstance(run, Experiment):
+        return experiment(run, **{**usual, **options})
+    if options:
+        beside = ", ".join(options)
+        raise InputError(f"{beside} beside an experiment would do nothing; `experiment` takes them")
+    return run
 
 
 def _inputs(run: Experiment) -> dict[str, Value]:
@@ -195,8 +210,7 @@ def simulate(
     Args:
         steer: asked after each sample for new inputs, which hold from that sample's time on.
     """
-    if not isinstance(run, Experiment):
-        run = experiment(run, **options)
+    run = as_experiment(run, options)
     member = Member(run, sinks, steer, resume, instance)
     return simulate_together([member], pace=pace, stop=stop)[0]
 

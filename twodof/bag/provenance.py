@@ -124,7 +124,8 @@ def robots_of(folder: Path) -> list[str]:
     """Namespaces of the robots whose provenance a bag has, [""] where it is of one or of none."""
     if (folder / FILE).exists():
         return [""]
-    found = (re.fullmatch(r"run\.(.+)\.json", file.name) for file in folder.glob("run.*.json"))
+    names = (file.name for file in folder.glob("run.*.json"))  # "run.left (1).json" is a copy
+    found = (re.fullmatch(r"run\.([\w%]+)\.json", name, re.ASCII) for name in names)
     return sorted(unquote(match[1]) for match in found if match) or [""]
 
 

@@ -19,7 +19,7 @@ from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
 from .contents import read_messages, stated_count, storage_files
 from .outline import Indices, Outline
-from .provenance import read_provenance, robot_in, robots_of
+from .provenance import file_of, read_provenance, robot_in, robots_of
 from .recording import Array, Heard, Recording, TopicCount
 from .records import Allowance, DamageError, Stamps
 from .summary import read_summary
@@ -178,7 +178,9 @@ def _recording(
     targets: _Targets | None,
 ) -> Recording:
     if not counts[chosen, JOINT_STATE]:
-        raise BagError(f"'{path}' has no joint states, no messages of type {JOINT_STATE}")
+        _, robot = robot_in(path)
+        where = f" of the robot that its {file_of(robot)} is of" if robot else ""
+        raise BagError(f"'{path}' has no joint states{where}, no messages of type {JOINT_STATE}")
     stamps, q, v, tau = states.arrays()
     return Recording(
         path=path,

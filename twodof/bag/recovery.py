@@ -96,7 +96,9 @@ def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]
     """
     between = not folder.exists() and (work / folder.name).is_dir()
     if not between and not folder.is_dir():
-        raise BagError(f"there is no bag '{bag}'")
+        whole, _, robot = str(bag).rpartition(":")
+        of_all = f"; 'twodof recover {whole}' is of all its robots" if Path(whole).is_dir() else ""
+        raise BagError(f"there is no bag '{bag}'{of_all if whole and robot else ''}")
     held = lock(original if between else folder)
     try:
         _undo(folder, original, work)

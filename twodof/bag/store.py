@@ -72,6 +72,8 @@ class Store:
         self._parts: list[Part] = []
         self._entered = 0  # of them have not left
         self._names: set[str] = set()  # of the robots in the bag that was closed
+        self._ended = True  # what has not begun takes nothing
+        self._failure: Exception | None = None
         _check_free(path, overwrite)
 
     def enter(self, part: Part) -> None:
@@ -122,10 +124,16 @@ class Store:
         self._writer.write_all(stamps, messages)
 
     def check(self) -> None:
-        """Raise what has ended the thread, if anything has."""
+        """Raise what has ended the thread, if anything has.
+
+        Raises:
+            BagError: so does a bag that is not open.
+        """
         if self._failure is not None:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
+        if self._ended:
+            raise BagError(f"the bag '{self.path}' is not open: it is a context, 'with bag:'")
 
     def flush(self) -> None:
         """Have the thread store what is queued; it begins with the first, when all are there.
@@ -164,7 +172,7 @@ class Store:
         self._due: SimpleQueue[None] = SimpleQueue()
         self._stores = 0
         self._begun = self._closing = self._closed = self._ended = False
-        self._failure: Exception | None = None
+        self._failure = None
         try:
             self._writer.open()
             self._lock = lock(self.path, wait=True)  # before it is a bag that others may overwrite

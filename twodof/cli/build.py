@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import CommandLineError, controlled, print_next, print_table, quote
-from .options import add_output, check_company
+from .options import add_output, check_company, not_empty
 
 
 def add(verbs: Any) -> None:
@@ -27,7 +27,9 @@ def add(verbs: Any) -> None:
     build.add_argument(
         "--no-meshes", action="store_true", help="leave the URDF's meshes out of the FMU"
     )
-    build.add_argument("--frame", help="controlled link (EndEffector, or the only last link)")
+    build.add_argument(
+        "--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)"
+    )
     build.add_argument(
         "--lock", dest="locks", action="append", default=[], metavar="JOINT[=VALUE]",
         help="fix joints, names or shell patterns, at a position (0), rad or m",

@@ -33,7 +33,10 @@ PATIENCE = 5.0  # s for what is under way to end when it was asked to
 
 
 ARGUMENT = re.compile(r"`(\w+)(?:=True)?`")
-OPTIONS = {"path": "-o", "output": "-o", "platforms": "--platform", "changes": "--input"}
+OPTIONS = {
+    "path": "-o", "output": "-o", "platforms": "--platform", "changes": "--input",
+    "robots": "NAME=FMU",
+}  # fmt: skip
 """Options that are not called as the argument of the library which they give."""
 POSE = "control 'pose'"
 """Which is two options."""
@@ -170,7 +173,8 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
     """The FMU that is named, else that of the URDF or of the default arm, built if need be."""
     of_urdf = bool(options.fmu) and Path(options.fmu).suffix in (".urdf", ".xacro")
     if options.frame is not None and not of_urdf:
-        raise CommandLineError("--frame is of a URDF; leave it out beside an FMU")
+        what = "an FMU" if options.fmu else "none"
+        raise CommandLineError(f"--frame is of a URDF that is given; leave it out beside {what}")
     if options.fmu and not of_urdf:
         if options.native:
             raise CommandLineError(

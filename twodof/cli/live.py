@@ -19,7 +19,7 @@ from .options import (
     add_page_options,
     add_set_option,
     add_step_option,
-    file_name,
+    not_empty,
     page_place,
 )
 
@@ -31,7 +31,7 @@ def add(verbs: Any) -> None:
         description="Step an FMU in real time behind a page in the browser: drag the target.",
     )  # fmt: skip
     live.add_argument(
-        "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
+        "fmu", nargs="?", type=not_empty, metavar="FMU", help="default: the default arm's"
     )
     add_output(live, "BAG", "name of recordings")
     add_step_option(live)

@@ -41,16 +41,16 @@ def _given(options: argparse.Namespace, option: str) -> bool:
     return any(value is not None and value is not False and value != [] for value in values)
 
 
-def file_name(text: str) -> str:
-    """A name that is not empty, as one of a variable that a shell does not know is."""
+def not_empty(text: str) -> str:
+    """A text that is not empty, as that of a variable is which a shell does not know."""
     if not text:
-        raise argparse.ArgumentTypeError("the name of a file is empty")
+        raise argparse.ArgumentTypeError("it is empty")
     return text
 
 
 def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
     """Where what is made goes."""
-    parser.add_argument("-o", dest="output", type=file_name, metavar=metavar, help=text)
+    parser.add_argument("-o", dest="output", type=not_empty, metavar=metavar, help=text)
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
@@ -81,7 +81,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 def add_fmu(parser: argparse.ArgumentParser) -> None:
     """What is run."""
     parser.add_argument(
-        "fmu", nargs="?", type=file_name, metavar="FMU|URDF",
+        "fmu", nargs="?", type=not_empty, metavar="FMU|URDF",
         help="default: TwoDof.fmu, built if need be",
     )  # fmt: skip
     add_frame_option(parser)
@@ -89,7 +89,12 @@ def add_fmu(parser: argparse.ArgumentParser) -> None:
 
 def add_frame_option(parser: argparse.ArgumentParser) -> None:
     """Of a URDF that is run, for `chosen_fmu`."""
-    parser.add_argument("--frame", metavar="LINK", help="of a URDF, the controlled link (its end)")
+    parser.add_argument(
+        "--frame",
+        type=not_empty,
+        metavar="LINK",
+        help="of a URDF, the controlled link (its end)",
+    )
 
 
 def add_time_options(parser: argparse.ArgumentParser) -> None:
@@ -120,8 +125,10 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """Robot of a bag from elsewhere."""
-    parser.add_argument("--urdf", metavar="U", help="the robot of a bag that carries none")
-    parser.add_argument("--frame", metavar="LINK", help="its end effector")
+    parser.add_argument(
+        "--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none"
+    )
+    parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import chosen_fmu, parse_settings, print_table
-from .options import add_frame_option, add_output, add_set_option, add_step_option, file_name
+from .options import add_frame_option, add_output, add_set_option, add_step_option, not_empty
 
 
 def add(verbs: Any) -> None:
@@ -18,7 +18,7 @@ def add(verbs: Any) -> None:
         " browser, a target to drag. It needs no network and no server.",
     )  # fmt: skip
     page.add_argument(
-        "fmu", nargs="?", type=file_name, metavar="FMU|URDF",
+        "fmu", nargs="?", type=not_empty, metavar="FMU|URDF",
         help="default: the default arm's native FMU",
     )  # fmt: skip
     add_output(page, "FILE.html", "default: <name>.html")

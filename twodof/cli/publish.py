@@ -147,6 +147,8 @@ def call(options: argparse.Namespace) -> int:
 
 def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
     """What is to be run, by namespace; what is alone needs none."""
+    from ..ros.messages import check_name
+
     robots: dict[str, Experiment] = {}
     stop_time = math.inf if options.stop_time is None else options.stop_time
     for given in options.robots or [""]:
@@ -158,9 +160,14 @@ def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
             raise CommandLineError(f"'{given}' names no robot")
         if not options.fmu and options.robots:
             raise CommandLineError(f"'{given}' names no FMU")
+        check_name("robots", name)
         if name in robots:
             raise CommandLineError(f"two robots are '{name}'; call them NAME={options.fmu}")
-        robots[name] = experiment_of(options, stop_time, 1.0 / options.rate)
+        run = robots[name] = experiment_of(options, stop_time, 1.0 / options.rate)
+        fmus = [robot.fmu for robot in robots.values() if robot.fmu.path == run.fmu.path]
+        if any(fmu.members != run.fmu.members for fmu in fmus):
+            reason = f"would be '{run.fmu.path}' as the robot before it is; rename a URDF"
+            raise CommandLineError(f"the FMU of '{options.fmu}' {reason}")
     if options.foxglove and "" not in robots:
         raise CommandLineError("--foxglove serves one robot")
     return robots

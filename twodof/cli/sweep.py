@@ -29,7 +29,7 @@ from .options import (
     add_set_option,
     add_time_options,
     check_company,
-    file_name,
+    not_empty,
 )
 
 
@@ -41,7 +41,7 @@ def add(verbs: Any) -> None:
         " The native default FMU is built where none is named.",
     )  # fmt: skip
     sweep.add_argument(
-        "fmu", nargs="?", type=file_name, metavar="FMU", help="default: the default arm's"
+        "fmu", nargs="?", type=not_empty, metavar="FMU", help="default: the default arm's"
     )
     sweep.add_argument(
         "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",

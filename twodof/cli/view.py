@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .common import asked_to_stop, in_options, open_page
-from .options import add_page_options, add_robot_options, check_company, file_name, page_place
+from .options import add_page_options, add_robot_options, check_company, not_empty, page_place
 
 
 def add(verbs: Any) -> None:
@@ -19,7 +19,7 @@ def add(verbs: Any) -> None:
     )  # fmt: skip
     view.add_argument("bag", metavar="BAG", type=Path)
     view.add_argument(
-        "--export", type=file_name, metavar="FILE.html",
+        "--export", type=not_empty, metavar="FILE.html",
         help="write one self-contained file instead",
     )  # fmt: skip
     add_robot_options(view)

@@ -56,7 +56,8 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     mesh_dir = _mesh_dir(options)
     text = read_text(path, mesh_dir)
     text = lock_joints(text, options.lock) if options.lock else text
-    options = replace(options, frame=options.frame or end_effector(read_urdf(text)))
+    if options.frame is None:
+        options = replace(options, frame=end_effector(read_urdf(text)))
     if not options.meshes:
         text = without_meshes(text)
     robot, table, starts = _model(options, text)
@@ -120,7 +121,7 @@ def _flavour(
     options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Mapping[str, Any]
 ) -> Flavour:
     if not options.native:
-        if options.platforms or options.fmi or not options.arrays:
+        if options.platforms or options.fmi not in (None, 2) or not options.arrays:
             raise BuildError(
                 "the platforms, the version of FMI and its arrays can be chosen for the native"
                 " flavour only, `native=True`"
@@ -156,7 +157,7 @@ def _mesh_dir(options: FmuOptions) -> Path | None:
 def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
     """The robot, its variables, and the start values that are not the table's own."""
     shipped = options.urdf is None
-    axes = options.axes or ("xy" if shipped else "xyz")
+    axes = ("xy" if shipped else "xyz") if options.axes is None else options.axes
     assert options.frame is not None
     robot = load_robot(urdf, options.frame, axes)
     for warning in robot.warnings:
@@ -173,6 +174,8 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
             if not all(map(math.isfinite, given)):
                 raise BuildError(f"{key} {given} must be finite numbers")
             starts[key] = tuple(float(value) for value in given)
+    if options.gravity is not None and len(options.gravity) != 3:
+        raise BuildError(f"gravity {options.gravity} must be three numbers")
     if len(starts["q_start"]) != len(robot.joints):
         raise BuildError(
             f"q_start has {len(starts['q_start'])} values, the robot has {len(robot.joints)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..version import versions
 from .compiler import compiles_for_the_web, host_platform
 from .options import FmuOptions
 
+LOG = logging.getLogger(__name__)
 MADE_OF = ("fmu_src", "urdf", "meshes", "export", "geometry", "plant")
 """Folders of what is shipped."""
 TOOLS = ("pin", "numpy", "scipy", "coal", "ziglang")
@@ -28,7 +30,7 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
 
     Args:
         output: the file; None: ``<name>.fmu``, or ``<name>-native.fmu``, in the working
-            directory. Written whole or not at all.
+            directory, which replaces an FMU alone. Written whole or not at all.
         options: what to build; None: the shipped planar arm in the Python flavour.
 
     Returns:
@@ -41,6 +43,9 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
     options = options or FmuOptions()
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = Path(output if output is not None else default)
+    there = output is None and path.exists()
+    if there and not _is_fmu(path):
+        raise BuildError(f"'{path}' is no FMU, and is not replaced; move it away")
     made_of = _shipped(options) if options.native and options.urdf is None else b""
     if made_of and _made_of(path) == made_of:
         return path
@@ -50,10 +55,21 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
         flavour, files, finish = compose(options)
         description, platforms = files["modelDescription.xml"], flavour.platforms
         if made_of or not _holds(path, description, platforms, is_live(options)):
+            if there:
+                LOG.warning(f"'{path}' was another FMU, and is replaced")
             _write_zip(path, {**files, **finish()}, made_of)
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     return path
+
+
+def _is_fmu(path: Path) -> bool:
+    try:
+        check_archive(path)
+        with zipfile.ZipFile(path) as archive:
+            return "modelDescription.xml" in archive.namelist()
+    except ZIP_ERRORS:
+        return False
 
 
 def _shipped(options: FmuOptions) -> bytes:

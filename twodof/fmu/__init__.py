@@ -5,7 +5,7 @@ from contextlib import redirect_stdout
 with redirect_stdout(None):  # where FMPy says that for aarch64-linux it has no logger of FMI 2.0
     import fmpy  # noqa: F401
 
-from .description import Fmu, load_fmu, read_resource
+from .description import Fmu, load_fmu, opened, read_resource
 from .instance import Instance, instantiate
 
-__all__ = ["Fmu", "Instance", "instantiate", "load_fmu", "read_resource"]
+__all__ = ["Fmu", "Instance", "instantiate", "load_fmu", "opened", "read_resource"]

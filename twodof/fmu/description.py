@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import count, product, takewhile
 from pathlib import Path
@@ -61,6 +62,7 @@ class Fmu:
         path: the file.
         description: FMPy's model description.
         variables: by name, in the order of the description.
+        members: checksums of all that is in the file, by name.
         platforms: FMI names of the platforms that it has binaries for, e.g. "linux64".
         robot: name of the robot; "" where the FMU does not say.
         joints: joint names, one for each q[i]; "joint1", … where the FMU does not say.
@@ -72,6 +74,7 @@ class Fmu:
     path: Path
     description: ModelDescription
     variables: dict[str, Variable]
+    members: Mapping[str, int]
     platforms: tuple[str, ...]
     robot: str
     joints: tuple[str, ...]
@@ -171,6 +174,7 @@ def load_fmu(path: str | Path) -> Fmu:
             for variable in description.modelVariables
             for scalar in _scalars(variable)
         },
+        members=members,
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
         **_vendor_annotation(root),
     )
@@ -186,19 +190,31 @@ def load_fmu(path: str | Path) -> Fmu:
     return fmu
 
 
-def read_resource(fmu: Fmu, name: str) -> bytes | None:
-    """A file of the FMU's resources/ folder, None where it has no such file."""
+@contextmanager
+def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
+    """The FMU's file, which is still the one whose description was read.
+
+    Raises:
+        FmuError: it is another one by now, or what is done with it fails.
+    """
     try:
         with zipfile.ZipFile(fmu.path) as archive:
-            return read_member(archive, f"resources/{name}", MAX_RESOURCE)
-    except KeyError:
-        return None
+            if _checksums(archive) != fmu.members:
+                raise FmuError(f"'{fmu.path}' was replaced by another FMU after it had been read")
+            yield archive
     except ZIP_ERRORS as error:
-        raise FmuError(f"cannot read resources/{name} of '{fmu.path}': {error}") from error
+        raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
 
 
-def _read(path: Path) -> tuple[bytes, list[str]]:
-    """modelDescription.xml and the members' names, after the checks that make unzipping safe."""
+def read_resource(fmu: Fmu, name: str) -> bytes | None:
+    """A file of the FMU's resources/ folder, None where it has no such file."""
+    with opened(fmu) as archive, suppress(KeyError):
+        return read_member(archive, f"resources/{name}", MAX_RESOURCE)
+    return None
+
+
+def _read(path: Path) -> tuple[bytes, dict[str, int]]:
+    """modelDescription.xml and the members' checksums, once it is sure that unzipping is safe."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -215,10 +231,14 @@ def _read(path: Path) -> tuple[bytes, list[str]]:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
     if not is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
-    return xml, archive.namelist()
+    return xml, _checksums(archive)
 
 
-def _platforms(members: list[str], identifier: str) -> tuple[str, ...]:
+def _checksums(archive: zipfile.ZipFile) -> dict[str, int]:
+    return {member.filename: member.CRC for member in archive.infolist()}
+
+
+def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:
     suffixes = {"linux": ".so", "win": ".dll", "windows": ".dll", "darwin": ".dylib"}
     platforms = set()
     for folder, platform, name in (m.split("/") for m in members if m.count("/") == 2):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -20,10 +19,10 @@ from fmpy import fmi2, fmi3
 from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
-from ..errors import ZIP_ERRORS, FmuError, SimulationError
+from ..errors import FmuError, SimulationError
 from ..export.python_wrapper import check_python_wrapper
 from ..files import temporary_folder
-from .description import Fmu
+from .description import Fmu, opened
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
@@ -270,7 +269,8 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
     It is unzipped into a temporary folder, but for what is there to be read by people.
 
     Raises:
-        FmuError: it has no binary for this platform, or it cannot be unzipped or loaded.
+        FmuError: it has no binary for this platform, was replaced by another, or it cannot be
+            unzipped or loaded.
     """
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
@@ -279,12 +279,9 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
         reason = f"has no binary for this platform ({here}), only for: {there}{remedy}"
         raise FmuError(f"'{fmu.path}' {reason}")
     with temporary_folder() as folder:
-        try:
-            with zipfile.ZipFile(fmu.path) as archive:
-                names = archive.namelist()
-                archive.extractall(folder, [name for name in names if not name.startswith(READ)])
-        except ZIP_ERRORS as error:
-            raise FmuError(f"cannot unzip '{fmu.path}': {error}") from error
+        with opened(fmu) as archive:
+            names = archive.namelist()
+            archive.extractall(folder, [name for name in names if not name.startswith(READ)])
         library = folder / "binaries" / fmu.platform / fmu.library
         check_python_wrapper(fmu.path, library, folder)
         instance = (Instance if fmu.version == 2 else Instance3)(fmu, folder)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from functools import partial
 from math import inf
 from pathlib import Path
 
-from ..errors import ZIP_ERRORS, FmuError, PageError
+from ..errors import PageError
 from ..experiments import Experiment, Setting, experiment
 from ..export.arm_page import CONTAINER, Arm, arm_page, live_part
 from ..files import head_of, read_member, refusing, write_file
-from ..fmu import Fmu, read_resource
+from ..fmu import Fmu, opened, read_resource
 from ..geometry.shapes import link_shapes
 from ..plant.urdf import RobotError, read_urdf
 
@@ -93,12 +92,9 @@ def arm_of(run: Experiment, sources: Mapping[str, bytes] = NO_SOURCES) -> Arm:
 
 def _sources(fmu: Fmu) -> dict[str, bytes]:
     """The C files of sources/ and their headers, by file name."""
-    try:
-        with zipfile.ZipFile(fmu.path) as archive:
-            return {
-                Path(name).name: read_member(archive, name, MAX_SOURCE)
-                for name in archive.namelist()
-                if name.count("/") == 1 and name[:8] == "sources/" and name[-2:] in (".c", ".h")
-            }
-    except ZIP_ERRORS as error:
-        raise FmuError(f"cannot read the sources of '{fmu.path}': {error}") from error
+    with opened(fmu) as archive:
+        return {
+            Path(name).name: read_member(archive, name, MAX_SOURCE)
+            for name in fmu.members
+            if name.count("/") == 1 and name[:8] == "sources/" and name[-2:] in (".c", ".h")
+        }

@@ -22,6 +22,7 @@ from ..experiments import Experiment, Setting, Value, resolve
 from ..files import free_name
 from ..master import at_rest, samples
 from ..pace import RealTime
+from ..ros.messages import check_gains
 from ..sample import Sample
 
 MOST_ROWS = 1000  # that are kept for pages that have not asked yet,
@@ -144,6 +145,7 @@ class Loop:
         with self._lock:
             if order == "change":
                 value = resolve(self._run.fmu, value)
+                check_gains(value)
                 self._values |= value
             elif order in ("play", "step"):
                 self._playing = order == "play" and bool(value)

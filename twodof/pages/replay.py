@@ -14,7 +14,8 @@ from ..bag.recording import Recording
 from ..errors import BuildError, FmuError, PageError
 from ..export.arm_page import RECORDED, Arm, arm_page, replayed_part
 from ..export.meshes import collect_meshes
-from ..files import data_file, read_urdf_text, refusing, write_file
+from ..export.urdf_source import read_text
+from ..files import data_file, refusing, write_file
 from ..fmu import load_fmu, read_resource
 from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
@@ -122,8 +123,8 @@ def _robot(
 ) -> tuple[str, ReadMesh]:
     """The URDF's text, and where its meshes are from."""
     if urdf is not None:
-        text, folder = read_urdf_text(urdf, PageError), Path(urdf).parent
         packages = None if mesh_dir is None else Path(mesh_dir)
+        text, folder = read_text(Path(urdf), packages), Path(urdf).parent
         try:
             renamed, files = collect_meshes(text, folder, packages)
         except BuildError as error:

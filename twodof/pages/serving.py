@@ -41,6 +41,9 @@ HEADERS = {
     "Cache-Control": "no-store",
     "Connection": "close",
 }
+NOT_GET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n"
+ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
+"""Where this machine is found that listens on all of its addresses."""
 Connection = ServerConnection
 Talk = Callable[[Connection], Awaitable[None]]
 
@@ -69,7 +72,7 @@ class Server:
         self._page, self._host, self._talk = page, host, talk
         self._started = Event()
         self._socket, self._address = _listen(host, port)
-        shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
+        shown = ANYWHERE.get(self._address) or (f"[{host}]" if ":" in host else host)
         self.url = f"http://{shown}:{self._socket.getsockname()[1]}"
 
     def __enter__(self) -> Server:
@@ -87,6 +90,7 @@ class Server:
         server = await serve(
             self._talked, sock=self._socket, process_request=self._answer, logger=_silent,
             compression=None, max_size=LARGEST, open_timeout=SLOW, close_timeout=SLOW,
+            create_connection=_Answering,
         )  # fmt: skip
         self._started.set()
         await self._ended.wait()
@@ -108,6 +112,21 @@ class Server:
         headers = Headers(HEADERS)
         headers["Content-Length"] = str(len(self._page))
         return Response(HTTPStatus.OK.value, "OK", headers, self._page)
+
+
+class _Answering(ServerConnection):
+    """A connection that says so where it is asked for what websockets hangs up on."""
+
+    _asked = False
+
+    def data_received(self, data: bytes) -> None:
+        """Take what comes, which begins with a request."""
+        if self._asked or b"GET ".startswith(data[:4]):
+            self._asked = True
+            super().data_received(data)
+        else:
+            self.transport.write(NOT_GET)
+            self.transport.close()
 
 
 def _is_own(request: Request, host: str, address: str) -> bool:

@@ -12,8 +12,9 @@ import numpy as np
 from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_outline
 from ..bag.recording import Recording, Schedule
-from ..errors import PlotError
-from ..files import read_urdf_text, shown
+from ..errors import BuildError, PlotError
+from ..export.urdf_source import read_text
+from ..files import shown
 from ..plant.urdf import UNBOUNDED, RobotError
 from .closed_form import Array, Held, task_error
 from .robot import Motion, Robot, is_singular, load_robot, motion_of
@@ -138,7 +139,7 @@ def read_tracks(
         BagError: a bag cannot be read.
         PlotError: the URDF is at fault, does not fit the bag, or there are no positions.
     """
-    text = None if urdf is None else read_urdf_text(urdf, PlotError)
+    text = None if urdf is None else _read_urdf(Path(urdf))
 
     def track(bag: Recording) -> Track:
         return _track(bag, text, str(urdf), frame)
@@ -157,6 +158,13 @@ def _lines(track: Track) -> list[Array]:
         found = (track.task.error, track.task.closed_form, track.task.off)
         lines += [line for line in found if line is not None]
     return lines
+
+
+def _read_urdf(path: Path) -> str:
+    try:
+        return read_text(path, None)
+    except BuildError as error:
+        raise PlotError(str(error)) from error
 
 
 def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> Track:
@@ -180,7 +188,7 @@ def _with_robot(
     robot = None
     if urdf is not None:
         try:
-            at = frame or run.get("frame") or ""
+            at = run.get("frame", "") if frame is None else frame
             robot = load_robot(urdf, at, run.get("axes") or "xyz", names)
         except RobotError as error:
             raise PlotError(f"{source}: {error}") from error

@@ -11,7 +11,7 @@ from ..errors import InputError, PublishError
 from ..experiments import Experiment, Value, resolve
 from ..sample import Sample, Sink
 from .cdr import Rows
-from .messages import GAINS, Messages, store_of
+from .messages import GAINS, Messages, check_gains, store_of
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -153,8 +153,7 @@ class _Gains(ServerListener):
                 if parameter.name not in self._groups:
                     raise InputError(f"'{parameter.name:.80}' is no gain of this FMU")
                 asked = resolve(self._fmu, {parameter.name: _numbers(parameter.get_value())})
-                if min(asked.values()) < 0.0:
-                    raise InputError(f"{parameter.name} is less than 0")
+                check_gains(asked)
             except InputError as error:
                 LOG.warning("a parameter that Foxglove set is ignored: %s", error)
                 continue

@@ -96,6 +96,17 @@ def check_name(argument: str, name: str) -> None:
         raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
 
 
+def check_gains(values: Mapping[str, Value]) -> None:
+    """Refuse gains below 0, with which an FMU ends its run.
+
+    Raises:
+        InputError: naming it.
+    """
+    for name, value in values.items():
+        if name.partition("[")[0] in GAINS and value < 0.0:
+            raise InputError(f"{name} = {value:g} is less than 0")
+
+
 class Topic(NamedTuple):
     """Message type and offered quality of service of a topic."""
 

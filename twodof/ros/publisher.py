@@ -12,9 +12,9 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError, PublishError, SimulationError
-from ..experiments import NANOSECONDS, Experiment, Setting, experiment
+from ..experiments import NANOSECONDS, Experiment, Setting
 from ..fmu import Fmu
-from ..master import Member, Summary, at_rest, simulate_together
+from ..master import Member, Summary, as_experiment, at_rest, simulate_together
 from ..pace import RealTime
 from ..sample import Sample, Sink
 from .cdr import Rows
@@ -93,7 +93,6 @@ class Publisher(Sink):
         self._prefix = f"/{namespace.strip('/')}" if namespace else ""
         self._state_topic, self._command_topic = state_topic, command_topic
         self._timeout, self._on_timeout = timeout, on_timeout
-        self._begun = self._answered = False
         self._warn = warner(LOG)
 
     def begin(self, run: Experiment) -> Publisher:
@@ -116,6 +115,7 @@ class Publisher(Sink):
         elif self._on_timeout is not None:
             raise InputError("`on_timeout` is for commands of joints that are not in `lockstep`")
         self._heard = {}
+        self._begun = self._answered = False
         if self._follows.type:
             usual = JOINT_COMMANDS if of_joints else TARGET_COMMAND
             self._heard[self._resolved(self._command_topic or usual)] = self._follows.type
@@ -276,8 +276,7 @@ def publish(
         PublishError: in lockstep no command came in time.
         SimulationError: the FMU refused or failed a call.
     """
-    if not isinstance(run, Experiment):
-        run = experiment(run, **{"stop_time": inf, **options})
+    run = as_experiment(run, options, stop_time=inf)
     wire = wire or Publisher()
     if pace is None and not wire.lockstep:
         pace = RealTime()
@@ -315,6 +314,8 @@ def publish_together(
         raise InputError(f"`sinks` has '{name}', and there are the robots {', '.join(robots)}")
     if len(robots) > 1 and str(options.get("state_topic", "")).startswith("/"):
         raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
+    for name in robots:
+        check_name("robots", name)
     shared, now, members = open_domain(place or network()), time.time(), list[Member]()
     for name, run in robots.items():
         wire = Publisher(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..experiments import Setting, experiment
 from ..files import temporary_folder
-from ..fmu import Fmu
+from ..fmu import Fmu, opened
 from ..version import versions
 from .batches import Batches
 from .design import Design, make_design
@@ -82,12 +82,17 @@ def sweep(
     units = [_unit(run.fmu, name) for name in design.names]
     with _folder(output) as path:
         folder = str(path.resolve() / "bags") if bags else None
-        job = Job(run.fmu.path.read_bytes(), run.fmu.path.name, design.names, options, folder)
+        job = Job(_content(run.fmu), run.fmu.path.name, design.names, options, folder)
         provenance = _provenance(run.fmu, design, job, command_line)
         results = Results(path, design.names, units, len(design), provenance, resume=resume)
         runs = _runs(job, design, ~results.done, workers, scheduler, stop)
         _collect(runs, results, lambda: progress(int(results.done.sum()), len(design)))
         return read_sweep(path)[0]
+
+
+def _content(fmu: Fmu) -> bytes:
+    with opened(fmu):
+        return fmu.path.read_bytes()
 
 
 def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
