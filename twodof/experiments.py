@@ -8,7 +8,7 @@ import logging
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
@@ -218,11 +218,7 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
     for name, setting in settings.items():
         elements = [name] if name in fmu.variables else fmu.vector(name)
         if not elements:
-            settable = {**fmu.groups("input"), **fmu.groups("parameter")}
-            known = [*settable, *(element for group in settable.values() for element in group)]
-            raise InputError(
-                f"there is no variable '{name}'{_of_another(fmu, name) or _suggestion(name, known)}"
-            )
+            raise InputError(_no_variable(fmu, name, "input", "parameter"))
         # arrays give their own kind of numbers
         plain = setting.tolist() if hasattr(setting, "tolist") else setting
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
@@ -261,10 +257,15 @@ def _of_another(fmu: Fmu, name: str) -> str:
     return f": it is of {quoted}; this FMU has control '{fmu.control}'"
 
 
-def _suggestion(name: str, known: Iterable[str]) -> str:
-    known = list(known)
+def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
+    """What is said of a name that none of these has: whose it is, or which are like it."""
+    groups = {g: elements for kind in causalities for g, elements in fmu.groups(kind).items()}
+    known = [
+        *dict.fromkeys([*groups, *(name for elements in groups.values() for name in elements)])
+    ]
     near = [f"{name}[1]"] if f"{name}[1]" in known else _nearest(name, known)
-    return f"; did you mean '{near[0]}'?" if near else f"; there are: {', '.join(known)}"
+    like = f"; did you mean '{near[0]}'?" if near else f"; there are: {', '.join(known)}"
+    return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"
 
 
 def _nearest(name: str, known: list[str]) -> list[str]:
@@ -323,9 +324,7 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
     """The inputs that a column sets: one, or all elements of a vector."""
     elements = [name] if name in fmu.variables else fmu.vector(name)
     if not elements:
-        groups = fmu.groups("input")
-        known = [*groups, *(element for group in groups.values() for element in group)]
-        raise InputError(f"'{path}': there is no variable '{name:.50}'{_suggestion(name, known)}")
+        raise InputError(f"'{path}': {_no_variable(fmu, name, 'input')}")
     if any(fmu.variables[element].causality != "input" for element in elements):
         raise InputError(f"'{path}': {name} is not an input")
     return elements
