@@ -353,6 +353,24 @@ def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -
     assert (plant.q, plant.v) == before
 
 
+@pytest.mark.parametrize(
+    ("control", "settings"),
+    [
+        ("pose", {"Kp": [1e308] * 3, "x_des": [1e300] * 3}),  # a J⁺ of what is not finite
+        ("effort", {"f_ext": [-1e38] * 3}),  # a mass matrix of what is not
+    ],
+)
+def test_a_matrix_without_an_inverse_discards_the_step(control, settings):
+    """Of the Panda, whose fingers are coupled; an exception of another kind ends the process of a
+    Python FMU."""
+    plant = model("panda", control).plant()
+    vars(plant).update(settings)
+    before = plant.q, plant.v
+    with pytest.raises(DiscardError, match="singular or not finite: inputs, payload or speeds"):
+        plant.step(0.01)
+    assert (plant.q, plant.v) == before
+
+
 def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
     """Rounding would: TIAGo has a wrist that is light and much damped."""
     plant = model("tiago").plant()

@@ -31,12 +31,18 @@ from twodof.plant.robot import Robot, load_robot
 
 OK, DISCARD, ERROR = 0, 2, 3
 ESCAPED = "gave a value that is not finite"
-OUTPUTS = ("q", "v", "x", "tau")
-INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "Kn")
-PARAMETERS = (
-    "q_start", "v_start", "q_min", "q_max", "gravity",
-    "rcond", "rtol", "atol", "max_step", "limit_effort",
+OUTPUTS = ("q", "v", "x", "xd", "quat", "omega", "tau")
+INPUTS = (
+    "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des", "q_des", "v_des", "a_des",
+    "tau_cmd", "Kp", "Kd", "Kp_rot", "Kd_rot", "Kn", "tau_ext", "f_ext",
 )  # fmt: skip
+BOOLEANS = ("limit_effort", "rigid_stops", "payload_known")
+PARAMETERS = (
+    "q_start", "v_start", "q_min", "q_max", "gravity", "payload", "payload_com",
+    "rcond", "rtol", "atol", "max_step", *BOOLEANS,
+)  # fmt: skip
+"""Of all controls; an FMU has those of its own."""
+TARGETS = {"task": "x_des", "pose": "x_des", "joint": "q_des", "effort": "tau_cmd"}
 
 
 class Program(list):
@@ -88,15 +94,14 @@ class Master:
 
     def read(self, *groups):
         groups = groups or OUTPUTS + INPUTS + PARAMETERS
-        references = {group: self.driver.references(group) for group in groups}
-        truth = references.pop("limit_effort", [])
+        references = {group: vrs for group in groups if (vrs := self.driver.references(group))}
+        truths = {group: references.pop(group) for group in BOOLEANS if group in references}
         values = self.call("getReal", [*chain.from_iterable(references.values())])
-        truths = self.call("getBoolean", truth)
+        booleans = self.call("getBoolean", [*chain.from_iterable(truths.values())])
         if self.complaints():
             return None
-        rest = iter(values)
-        found = {group: [next(rest) for _ in vrs] for group, vrs in references.items()}
-        return {**found, "limit_effort": truths} if truth else found
+        rest = chain(values, booleans)
+        return {group: [next(rest) for _ in vrs] for group, vrs in (references | truths).items()}
 
     def step(self, h, late=0.0):
         """A step that is discarded is tried once more."""
@@ -153,8 +158,9 @@ class Master:
 
     def wreck(self, slot):
         """Set inputs that no step can be taken with, try one, and restore."""
-        for name, huge in (("Kp", 1e308), ("x_des", 1e300)):
-            self.set(name, (huge,) * len(self.driver.references(name)))
+        for name, huge in (("Kp", 1e308), ("x_des", 1e300), ("q_des", 1e300), ("tau_cmd", 1e308)):
+            if vrs := self.driver.references(name):
+                self.set(name, (huge,) * len(vrs))
         self.call("doStep", self.time, 0.01)
         self.read()
         self.restore(slot)
@@ -323,7 +329,7 @@ def compared(arm, python, native, again):
             found.add(history)
         elif before in found and arm.keeps_away(history, python[before], ours):
             found.add(history)
-            for group in OUTPUTS:
+            for group in ours.keys() & set(OUTPUTS):
                 difference = far(theirs, ours, group)
                 sensitivity = 0.0
                 if difference > 1e-9:
@@ -344,29 +350,42 @@ class Arm(NamedTuple):
     """A robot, its FMUs and where its programs move it."""
 
     robot: Robot
+    control: str
     fmus: dict  # flavour: (file, folder where it is unzipped)
     rest: tuple  # joint positions
-    target: tuple  # where the end effector then is
+    x: tuple  # where the end effector then is
+    quat: tuple
 
     def keeps_away(self, history, before, after):
-        """Whether the last operation keeps away from singularities.
+        """Whether the last operation keeps away from singularities, which a J⁺ has.
 
-        σ_min/σ_max of J is at least 0.05 where it ends, and so it is anywhere within the angle of a
-        step at the speeds of its ends, as it changes by about 1 per radian at most.
+        σ_min/σ_max of J is at least 2.5 rcond where it ends, and so it is anywhere within the angle
+        of a step at the speeds of its ends, as it changes by about 1 per radian at most.
         """
+        if "rcond" not in after:
+            return True
         robot, frame = self.robot, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         q, data = np.array(after["q"]), robot.model.createData()
         J = pin.computeFrameJacobian(robot.model, data, q, robot.frame_id, frame)
-        sigma = np.linalg.svd(J[["xyz".index(axis) for axis in robot.axes]], compute_uv=False)
+        rows = ["xyz".index(axis) for axis in robot.axes] + [3, 4, 5] * (self.control == "pose")
+        sigma = np.linalg.svd(J[rows], compute_uv=False)
         name, *arguments = history[-1]
         angle = arguments[0] * max(map(abs, before["v"] + after["v"])) if name == "step" else 0.0
-        return sigma[-1] / sigma[0] - angle >= 0.05
+        return sigma[-1] / sigma[0] - angle >= 2.5 * after["rcond"][0]
 
 
-@pytest.fixture(scope="module", params=["twodof", "panda"])
+ARMS = {
+    "twodof task": (50, 2000), "panda task": (10, 300), "panda pose": (10, 300),
+    "twodof joint": (20, 500), "twodof effort": (20, 500),
+}  # fmt: skip
+"""A robot and a control, and how many programs are run, without --full and with it."""
+
+
+@pytest.fixture(scope="module", params=ARMS)
 def arm(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp(request.param)
-    if request.param == "twodof":
+    robot, control = request.param.split()
+    folder = tmp_path_factory.mktemp(robot)
+    if robot == "twodof":
         urdf, frame, axes = data_file("urdf", "2dof.urdf").read_text(), "EndEffector", "xy"
         rest, options = (0.2, 2.0), {}
     else:
@@ -379,14 +398,16 @@ def arm(request, tmp_path_factory):
         options = {"urdf": path, "frame": frame, "name": "Panda"}
     fmus = {}
     for flavour in ("python", "native"):
-        chosen = FmuOptions(**options, q_start=rest, native=flavour == "native")
+        chosen = FmuOptions(**options, control=control, q_start=rest, native=flavour == "native")
         fmu = build_fmu(folder / f"{flavour}.fmu", chosen)
         fmus[flavour] = str(fmu), fmpy.extract(fmu, str(folder / flavour))
     robot = load_robot(urdf, frame, axes)
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, np.array(rest))
-    position = data.oMf[robot.frame_id].translation
-    return Arm(robot, fmus, rest, tuple(float(position["xyz".index(axis)]) for axis in axes))
+    pose = data.oMf[robot.frame_id]
+    x = tuple(float(pose.translation["xyz".index(axis)]) for axis in axes)
+    quat = tuple(pin.Quaternion(pose.rotation).coeffs().tolist())
+    return Arm(robot, control, fmus, rest, x, quat)
 
 
 # --- random programs ---
@@ -432,24 +453,64 @@ def read_along(draw, phrases):
     return [part for operation in draw(phrases) for part in (operation, *reading)]
 
 
-def programs(arm):
-    """Programs that begin with an initialisation and end by reading all."""
-    n, m = len(arm.rest), len(arm.target)
-    inputs = setting({
-        "x_des": near(arm.target, 0.07),
-        "x_des[1]": number(arm.target[0] - 0.07, arm.target[0] + 0.07),
+def inputs_of_law(arm):
+    """Strategies for the inputs that an arm's control has of its own, by name."""
+    n, m = len(arm.rest), len(arm.x)
+
+    def gains(size, of=""):
+        proportional = st.sampled_from([50.0, 400.0, 8000.0])
+        return {
+            f"Kp{of}": proportional.map(lambda gain: (gain,) * size),
+            f"Kd{of}": near((30.0,) * size, 25.0),
+        }
+
+    if arm.control == "effort":
+        return {"tau_cmd": near((0.0,) * n, 0.3), "tau_cmd[1]": number(-0.3, 0.3)}
+    if arm.control == "joint":
+        return {
+            "q_des": near(arm.rest, 0.3),
+            "q_des[1]": number(arm.rest[0] - 0.3, arm.rest[0] + 0.3),
+            "v_des": near((0.0,) * n, 1.0),
+            "a_des": near((0.0,) * n, 10.0),
+            **gains(n),
+        }
+    position = {
+        "x_des": near(arm.x, 0.07),
+        "x_des[1]": number(arm.x[0] - 0.07, arm.x[0] + 0.07),
         "xd_des": near((0.0,) * m, 0.3),
         "xdd_des": near((0.0,) * m, 3.0),
-        "Kp": st.sampled_from([50.0, 400.0, 8000.0]).map(lambda gain: (gain,) * m),
-        "Kd": near((30.0,) * m, 25.0),
-        "tau_ext": near((0.0,) * n, 0.1),
         "Kn": number(0.0, 20.0),
+        **gains(m),
+    }
+    if arm.control == "task":
+        return position
+    return {
+        **position,
+        "quat_des": near(arm.quat, 0.2),
+        "quat_des[1]": number(arm.quat[0] - 0.2, arm.quat[0] + 0.2),
+        "omega_des": near((0.0,) * 3, 0.5),
+        "alpha_des": near((0.0,) * 3, 3.0),
+        **gains(3, "_rot"),
+    }
+
+
+def programs(arm):
+    """Programs that begin with an initialisation and end by reading all."""
+    n, target = len(arm.rest), TARGETS[arm.control]
+    size = len(arm.x) if target == "x_des" else n
+    inputs = setting({
+        **inputs_of_law(arm),
+        "tau_ext": near((0.0,) * n, 0.1),
+        "f_ext": near((0.0,) * 3, 0.5),
     })  # fmt: skip
     parameters = setting({
         "q_start": near(arm.rest, 0.3),
         "v_start": near((0.0,) * n, 1.0),
         "gravity": near((0.0, -9.81, 0.0), 5.0),
-        "rcond": st.sampled_from([0.005, 0.02]),
+        "payload": number(0.0, 1.0),
+        "payload_com": near((0.0,) * 3, 0.1),
+        **({"payload_known": st.booleans()} if arm.control != "effort" else {}),
+        **({"rcond": st.sampled_from([0.005, 0.02])} if target == "x_des" else {}),
         "rtol": st.sampled_from([1e-6, 1e-2]),
         "atol": st.sampled_from([1e-9, 1e-3]),
         "max_step": st.sampled_from([5e-4, 5e-3, 0.1]),
@@ -458,6 +519,7 @@ def programs(arm):
         "q_min": near([q - 0.1 for q in arm.rest], 0.09),
         "q_max": near([q + 0.1 for q in arm.rest], 0.09),
         "limit_effort": st.just(True),
+        "rigid_stops": st.booleans(),
     })  # fmt: skip
     value = choice(inputs, parameters, limits)
     slot = st.sampled_from("abc")
@@ -480,8 +542,8 @@ def programs(arm):
         phrase(one("fail_to_start", st.just("rtol"), st.just(0.0)), begin),
     )
     refused = choice(
-        one("set", st.just("x_des"), st.sampled_from([(*arm.target[1:], nan), (inf,) * m])),
-        one("set", st.just("x"), st.just((0.1,) * m)),
+        one("set", st.just(target), st.sampled_from([(0.1,) * (size - 1) + (nan,), (inf,) * size])),
+        one("set", st.just("x"), st.just((0.1,) * len(arm.x))),
         parameters,  # in step mode
         one("step", st.sampled_from([0.0, -0.01, nan, inf])),
         one("step", h, st.sampled_from([1e-3, -0.5, nan])),
@@ -540,7 +602,7 @@ def without_empty_slots(program):
 # --- the test, and what its programs are to contain ---
 
 CONTAINED = (
-    "parameter after a reset", "set tau_ext", "set Kp", "set limit_effort", "two states alive",
+    "parameter after a reset", "set tau_ext", "set limit_effort", "two states alive",
     "save at a limit", "save before a discard", "restore after set", "restore after step",
     "restore after reset", "restore after serialise", "move", "wreck", "terminate", "refused set",
     "refused step", "refused damage", "refused fail_to_start",
@@ -595,7 +657,7 @@ def worker():
 @pytest.mark.long
 def test_every_state_is_that_of_its_history_alone(arm, worker, request):
     full = request.config.getoption("full", default=False)
-    few, many = (50, 2000) if len(arm.rest) == 2 else (10, 300)
+    few, many = ARMS[request.node.callspec.params["arm"]]
     seen = Counter()
 
     @settings(
@@ -624,7 +686,8 @@ def test_every_state_is_that_of_its_history_alone(arm, worker, request):
 
     holds()
     print(*seen.most_common(), sep="\n")  # pytest -rP shows it
-    rare = [what for what in CONTAINED if seen[what] < seen["programs"] // 50]
+    own = [f"set {group}" for group in inputs_of_law(arm)]
+    rare = [what for what in (*CONTAINED, *own) if seen[what] < seen["programs"] // 50]
     assert not rare, seen
     assert seen["escapes"] <= seen["programs"] / 100
     assert seen["all histories compared"] > 0.5 * seen["programs"], seen

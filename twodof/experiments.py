@@ -207,8 +207,7 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
     for name, setting in settings.items():
         elements = [name] if name in fmu.variables else fmu.vector(name)
         if not elements:
-            remedy = _of_another(fmu, name) or _suggestion(fmu, name, "input", "parameter")
-            raise InputError(f"there is no variable '{name}'{remedy}")
+            raise InputError(_no_variable(fmu, name, "input", "parameter"))
         # arrays give their own kind of numbers
         plain = setting.tolist() if hasattr(setting, "tolist") else setting
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
@@ -247,13 +246,14 @@ def _of_another(fmu: Fmu, name: str) -> str:
     return f": it is of {quoted}; this FMU has control '{fmu.control}'"
 
 
-def _suggestion(fmu: Fmu, name: str, *causalities: str) -> str:
-    """The variable of these causalities that may be meant; all of them where none is near."""
+def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
+    """What is said of a name that none of these has: whose it is, or which are like it."""
     groups = {g: names for causality in causalities for g, names in fmu.groups(causality).items()}
-    known = [*groups, *chain(*groups.values())]
+    known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
     by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
     near = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.4)
-    return f"; did you mean '{by_lower[near[0]]}'?" if near else f"; there are: {', '.join(known)}"
+    like = f"; did you mean '{by_lower[near[0]]}'?" if near else f"; there are: {', '.join(known)}"
+    return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"
 
 
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
@@ -306,8 +306,7 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
     """The inputs that a column sets: one, or all elements of a vector."""
     elements = [name] if name in fmu.variables else fmu.vector(name)
     if not elements:
-        remedy = _suggestion(fmu, name, "input")
-        raise InputError(f"'{path}': there is no variable '{name:.50}'{remedy}")
+        raise InputError(f"'{path}': {_no_variable(fmu, name, 'input')}")
     if any(fmu.variables[element].causality != "input" for element in elements):
         raise InputError(f"'{path}': {name} is not an input")
     return elements

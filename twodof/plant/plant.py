@@ -11,7 +11,8 @@ Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from operator import mul
 
 import numpy as np
@@ -39,6 +40,18 @@ class ParameterError(ValueError):
 
 class DiscardError(ArithmeticError):
     """A communication step that cannot be done; the message names the culprit and the remedy."""
+
+
+@contextlib.contextmanager
+def refusing(kind: type[Exception]) -> Iterator[None]:
+    """Linear algebra that has no answer is refused by an exception of this kind."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise kind(
+            "a matrix of the equations of motion is singular or not finite:"
+            " inputs, payload or speeds are too large"
+        ) from error
 
 
 class Plant:
@@ -129,7 +142,8 @@ class Plant:
             self.q.append(inside)
             self.v.append(v)
         y = [*self.q, *self.v]
-        self._stops().impact(y, [False] * len(self.q))
+        with refusing(ParameterError):
+            self._stops().impact(y, [False] * len(self.q))
         self.v = y[len(self.q) :]
         return warnings
 
@@ -156,7 +170,8 @@ class Plant:
             )
         stops = self._stops()
         try:
-            with np.errstate(over="ignore", invalid="ignore"):  # an exception tells it
+            # what overflows is refused, without a warning
+            with refusing(DiscardError), np.errstate(over="ignore", invalid="ignore"):
                 self.q, self.v = advance(
                     self._equations_of_motion(), self.q, self.v, h, stops,
                     self.rtol, self.atol, self.max_step,
@@ -221,9 +236,10 @@ class Plant:
             DiscardError: an input that the control law cannot follow.
         """
         self._check_target()
-        acceleration, _ = self._equations_of_motion()(np.array(self.q), np.array(self.v))
-        rates = list(acceleration)
-        self._stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
+        with refusing(DiscardError):
+            acceleration, _ = self._equations_of_motion()(np.array(self.q), np.array(self.v))
+            rates = list(acceleration)
+            self._stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
         return rates
 
     def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
