@@ -22,6 +22,7 @@ from sinks import Memory
 import twodof
 from twodof.errors import FmuError, InputError, SimulationError
 from twodof.files import TEMPORARY, temporary_folder
+from twodof.master import Member, at_rest, simulate_together
 from twodof.pace import RealTime
 
 
@@ -44,6 +45,8 @@ def test_n_steps_give_n_plus_one_samples_at_times_that_are_not_accumulated(fmu_p
     summary = twodof.simulate(fmu_path, recorder, stop_time=0.7, step=0.1)
     assert [s.k for s in recorder.samples] == list(range(8))
     assert [s.t for s in recorder.samples] == [k * 0.1 for k in range(8)]
+    first = recorder.samples[0].stamp
+    assert [s.stamp - first for s in recorder.samples] == [k * 100_000_000 for k in range(8)]
     assert summary.last == recorder.samples[-1]
     assert not summary.stopped
     assert recorder.left is None
@@ -301,6 +304,53 @@ def test_steering_holds_from_the_sample_on_that_it_answers(native_path):
     expected += [run.send(answers.get(k)) for k in range(20)]
     assert recorder.samples == expected
     assert [s.inputs["x_des[1]"] for s in expected[3:5]] == [0.2, 0.1]
+
+
+def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
+    """As a run that starts there, and is meant to be there."""
+    recorder, fmu = Recorder(), twodof.load_fmu(native_path)
+    reasons = []
+
+    def resume(sample, error):
+        reasons.append((sample.k, error.outcome))
+        return at_rest(fmu, sample)
+
+    twodof.simulate(
+        fmu, recorder, stop_time=0.2, step=0.01, resume=resume,
+        steer=lambda: {"x_des": (1e308, 1e308)} if recorder.samples[-1].k == 5 else None,
+    )  # fmt: skip
+    assert reasons == [(5, "discarded")]
+    before, *after = recorder.samples[5:]
+    assert max(map(abs, before.v)) > 0.1
+    settings = {"q_start": before.q, "v_start": (0.0, 0.0), "x_des": before.x}
+    again = [*twodof.samples(fmu, stop_time=0.15, step=0.01, settings=settings)][1:]
+    assert len(after) == len(again) == 15
+    for sample, expected in zip(after, again):
+        assert (sample.inputs["x_des[1]"], sample.inputs["x_des[2]"]) == before.x
+        assert sample.since == before.t
+        assert sample.q + sample.v == pytest.approx(expected.q + expected.v, abs=1e-9)
+
+
+def test_a_loop_of_ones_own_is_paced(native_path, clock):
+    for sample in twodof.samples(native_path, pace=RealTime(), stop_time=0.5, step=0.05):
+        assert clock.now - 1e6 == pytest.approx(sample.t)
+
+
+def test_what_cannot_run_together_opens_no_sink(native_path):
+    recorder = Recorder()
+    recorder.begin = lambda run: pytest.fail("it was opened")
+    options = {"stop_time": 0.1, "stamp_start": 0.0}
+    first = Member(twodof.experiment(native_path, **options), [recorder])
+    for other, error in (
+        ({**options, "stop_time": 0.2}, InputError), ({**options, "start_time": 0.05}, InputError),
+        ({**options, "stamp_start": 1.0}, InputError),
+        ({**options, "settings": {"rtol": -1.0}}, SimulationError),
+    ):  # fmt: skip
+        with pytest.raises(error, match=r"what runs together|rtol = -1 must be"):
+            simulate_together([first, Member(twodof.experiment(native_path, **other), [])])
+    unstamped = Member(twodof.experiment(native_path, stop_time=0.1), [])
+    with pytest.raises(InputError, match="what runs together has one"):
+        simulate_together([unstamped, unstamped])
 
 
 def test_messages_of_the_fmu_go_to_logging(fmu_path, caplog):
