@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 import fmpy
 import numpy as np
-from fmpy import fmi2, fmi3
+from fmpy import fmi1, fmi2, fmi3
 from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
@@ -35,6 +35,23 @@ GET3 = CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p, c_size_t)
 """With pointers of no type: a conversion to one of FMPy's typed ones takes a third of a µs."""
 
 
+class _Staying:
+    """The module os as FMPy has it from here on: it stays in the working directory.
+
+    FMPy goes to a library's folder while it loads that, as Windows needs it, and all threads of the
+    process with it, whose own files are elsewhere then.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(os, name)
+
+    def chdir(self, folder: str) -> None:
+        """Stay."""
+
+
+vars(fmi1)["os"] = _Staying()
+
+
 class Instance:
     """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
 
@@ -48,7 +65,6 @@ class Instance:
         self._fatal = False
         self._ends = c_bool()  # what doStep of FMI 3.0 says
         identifier = fmu.description.coSimulation.modelIdentifier
-        working_folder = os.getcwd()
         try:
             self._slave = self._instantiate(
                 guid=fmu.guid,
@@ -59,8 +75,6 @@ class Instance:
             self._component = self._slave.component
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
-        finally:
-            os.chdir(working_folder)  # FMPy leaves it where a library cannot be loaded
 
     def _instantiate(self, **what: str) -> Any:
         from fmpy.logging import addLoggerProxy  # none for aarch64-linux, which 2.0 has no name for
