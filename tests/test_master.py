@@ -5,6 +5,7 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor
@@ -492,3 +493,25 @@ def test_options_beside_an_experiment_are_refused(native_path, how):
     run = twodof.experiment(native_path, stop_time=0.1)
     with pytest.raises(InputError, match="settings, step beside an experiment would do nothing"):
         list(how(run, settings={"Kp": 10.0}, step=0.1))
+
+
+def test_threads_stay_in_the_working_directory_while_an_fmu_is_loaded(
+    tmp_path, native_path, fmu_path, monkeypatch
+):
+    """It is one for the whole process: files of others would be elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    there, ended = [], threading.Event()
+
+    def look():
+        while not ended.is_set():
+            there.append(os.getcwd())
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        for path in (native_path, fmu_path) * 10:
+            next(twodof.samples(path))
+    finally:
+        ended.set()
+        looking.join()
+    assert set(there) == {str(tmp_path)}

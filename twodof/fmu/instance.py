@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 import fmpy
 import numpy as np
-from fmpy import fmi2, fmi3
+from fmpy import fmi1, fmi2, fmi3
 from fmpy.fmi1 import FMICallException
 from numpy.typing import NDArray
 
@@ -31,6 +31,23 @@ WARNING = fmi2.fmi2Warning
 READ = ("documentation/", "sources/")
 """Folders of an FMU that no library looks into."""
 Values = Array[c_double]
+
+
+class _Staying:
+    """The module os as FMPy has it from here on: it stays in the working directory.
+
+    FMPy goes to a library's folder while it loads that, as Windows needs it, and all threads of the
+    process with it, whose own files are elsewhere then.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(os, name)
+
+    def chdir(self, folder: str) -> None:
+        """Stay."""
+
+
+vars(fmi1)["os"] = _Staying()
 
 
 class Instance:
@@ -50,7 +67,6 @@ class Instance:
         self._ends = c_bool()  # what doStep of FMI 3.0 says
         self._t, self._h = c_double(), c_double()
         identifier = fmu.description.coSimulation.modelIdentifier
-        working_folder = os.getcwd()
         try:
             self._slave = self._instantiate(
                 guid=fmu.guid,
@@ -62,8 +78,6 @@ class Instance:
             self._step_arguments = self._component, self._t, self._h, *self._rest
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
-        finally:
-            os.chdir(working_folder)  # FMPy leaves it where a library cannot be loaded
 
     def _instantiate(self, **what: str) -> Any:
         from fmpy.logging import addLoggerProxy  # none for aarch64-linux, which 2.0 has no name for
