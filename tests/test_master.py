@@ -5,6 +5,7 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import zipfile
@@ -218,6 +219,13 @@ def test_a_folder_that_could_not_be_locked_is_never_taken_for_abandoned(tmp_path
         assert folder.exists()
     held.__exit__(None, None, None)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_place_for_temporary_folders_is_told(monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
+    with pytest.raises(OSError, match=r"'/nowhere'.*; TMPDIR names one"):
+        temporary_folder().__enter__()
 
 
 def test_a_temporary_folder_with_a_space_works(fmu_path, tmp_path, monkeypatch):

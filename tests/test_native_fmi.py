@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import pwd
 import re
 import struct
 import subprocess
@@ -594,64 +595,60 @@ def test_equal_sources_give_equal_libraries():
     assert not any(name in first for name in (b"/tmp", b"/zig", TEMPORARY.encode()))
 
 
-def test_sources_that_are_kept_for_the_compiler_are_those_that_are_compiled(tmp_path, monkeypatch):
-    code = b'__attribute__((visibility("default"))) int answer(void) { return %d; }'
-
-    def compiled(number):
-        return compile_library({"a.c": code % number}, "linux64", "Arm", units=["a.c"])
-
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "cache"))
-    (tmp_path / "cache").symlink_to(cache)  # what zig has built of the C library
-    first, other = compiled(1234), compiled(4321)
-    assert first != other
-    for kept in (tmp_path / "cache" / "twodof").glob("*/a.c"):
-        if kept.read_bytes() == code % 1234:
-            kept.write_bytes(code % 4321)
-    assert compiled(1234) == first
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Folder of what is kept, empty; zig has its C library."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    for name in ("b", "h", "o", "tmp", "z"):
+        (home / name).mkdir(parents=True, exist_ok=True)
+        (cache / name).symlink_to(home / name)
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache))
+    return cache / "twodof"
 
 
-def test_what_the_compiler_has_kept_may_be_damaged(tmp_path, monkeypatch):
-    code = b"int n = %d;" % (time.time_ns() % 2**31)  # that it does not know from before
+def answer(number):
+    code = b'__attribute__((visibility("default"))) int answer(void) { return %d; }' % number
+    return compile_library({"a.c": code}, "linux64", "Arm", units=["a.c"])
 
-    def compiled():
-        return compile_library({"kept.c": code}, "linux64", "Arm", units=["kept.c"])
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "cache"))
-    (tmp_path / "cache").symlink_to(cache)  # what zig has built of the C library
-    first = compiled()
-    kept = [*cache.glob("o/*/kept.o")]
-    assert kept
-    for file in kept:
-        os.truncate(file, 100)
-    assert compiled() == first
+def test_a_library_is_kept_for_its_sources(kept):
+    first = answer(1)
+    (file,) = kept.iterdir()
+    second = answer(2)
+    assert first != second and len([*kept.iterdir()]) == 2
+    file.write_bytes(hashlib.sha256(b"the same").digest() + b"the same")
+    assert answer(1) == b"the same" and answer(2) == second
+    file.write_bytes(file.read_bytes()[:-1])  # damaged
+    assert answer(1) == first == answer(1)
+
+
+def test_libraries_that_are_not_used_are_not_kept(kept):
+    answer(1)
+    (used,) = kept.iterdir()
+    answer(2)
+    (unused,) = {*kept.iterdir()} - {used}
+    month = time.time() - 31 * 86400
+    os.utime(used, (month, month))
+    os.utime(unused, (month, month))
+    answer(1)
+    answer(3)
+    assert used.exists() and not unused.exists()
+
+
+def test_no_home_for_the_cache_is_told(monkeypatch, caplog):
+    for name in ("HOME", "XDG_CACHE_HOME", "ZIG_GLOBAL_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # a user without a name
+    assert compiler._cache() is None
+    assert "ZIG_GLOBAL_CACHE_DIR" in caplog.text
 
 
 def test_a_cache_that_cannot_be_is_named(monkeypatch):
     monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/proc/none")
     with pytest.raises(BuildError, match=r"'/proc/none': .*ZIG_GLOBAL_CACHE_DIR"):
         compile_library({"a.c": b""}, "linux64", "Arm", units=["a.c"])
-
-
-def test_a_cache_whose_kept_sources_are_in_the_way_is_named(tmp_path, monkeypatch):
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path))
-    sources = {"a.c": b"int n;"}
-    digest = hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()[:32]
-    (tmp_path / "twodof" / digest / "a.c").mkdir(parents=True)  # root may write anywhere
-    with pytest.raises(BuildError, match=f"'{tmp_path}': .*; ZIG_GLOBAL_CACHE_DIR"):
-        compile_library(sources, "linux64", "Arm", units=["a.c"])
-
-
-def test_who_has_no_home_compiles(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compiler, "compiles_for_the_web", lambda: False)  # for zig it takes minutes
-    for name in ("HOME", "XDG_CACHE_HOME", "ZIG_GLOBAL_CACHE_DIR"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(os, "getuid", lambda: 987654321)  # of no user that the machine knows
-    assert os.path.expanduser("~") == "~"
-    assert compile_library({"a.c": b"int n;"}, "linux64", "Arm", units=["a.c"])[:4] == b"\x7fELF"
-    assert not any(tmp_path.iterdir())
 
 
 def test_universal_header():

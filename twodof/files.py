@@ -186,7 +186,10 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     Raises:
         OSError: it cannot be made.
     """
-    parent = Path(tempfile.gettempdir() if parent is None else parent)
+    try:
+        parent = Path(tempfile.gettempdir() if parent is None else parent)
+    except FileNotFoundError as error:
+        raise OSError(error.errno, f"{error.strerror}; TMPDIR names one") from error
     for left in parent.glob(f"{TEMPORARY}*"):
         _remove_abandoned(left)
     folder = Path(tempfile.mkdtemp(dir=parent))

@@ -22,7 +22,7 @@ from ..geometry.kinematics import Array, Kinematics, Placement
 from ..geometry.shapes import Shape, sphere
 from ..plant.urdf import UNBOUNDED, Joint, Urdf, read_urdf
 from ..version import versions
-from .compiler import UNITS, compile_web_module
+from .compiler import compile_web_module
 
 SCRIPTS = (
     "engine.js", "samples.js", "session.js", "replay.js", "remote.js", "matrices.js", "robot.js",
@@ -93,7 +93,8 @@ def live_part(arm: Arm) -> LivePart:
         BuildError: the engine cannot be compiled.
     """
     around = data_file("fmu_src", "page", "page.c").read_bytes()
-    module = compile_web_module({**arm.sources, "page.c": around}, (*UNITS, "page.c"), FUNCTIONS)
+    units = ("fmu.c", "page.c")  # a page asks for no derivatives
+    module = compile_web_module({**arm.sources, "page.c": around}, units, FUNCTIONS)
     provenance = {
         "fmu": {"name": arm.name, "guid": arm.guid, "file": arm.file},
         **{key: getattr(arm, key) for key in ("robot", "frame", "root", "axes", "step")},

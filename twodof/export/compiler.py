@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import logging
 import os
 import platform as host
 import shutil
 import struct
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 
 from ..errors import BuildError
 from ..files import temporary_folder, write_file
 
+LOG = logging.getLogger(__name__)
 TARGETS: dict[str, tuple[str, ...]] = {
     "linux64": ("x86_64-linux-gnu.2.17",),
     "win64": ("x86_64-windows-gnu",),
@@ -44,6 +49,11 @@ FLAGS = (
 )  # fmt: skip
 """Multiplications are never fused with additions, so that platforms agree; complex ones are so
 without a thought for infinities. Pairing scalars into vectors takes long and gains nothing."""
+
+KEPT_FOR = 30 * 86400.0
+"""s for which a library is kept that is not used."""
+DIGEST = hashlib.sha256().digest_size
+"""Bytes before the library that is kept."""
 
 
 def compile_library(
@@ -162,33 +172,47 @@ def _link_flags(output: str) -> list[str]:
 
 
 def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) -> bytes:
-    """What a command makes of C files. zig finds what it has compiled before by its place too."""
+    """What a command makes of C files; what zig has made is kept for the next time."""
     with temporary_folder() as folder:
-        environment, place = _environment(folder), folder
-        cache = environment.get("ZIG_GLOBAL_CACHE_DIR")
-        if cache and command[: len(ZIG)] == [*ZIG]:
-            digest = hashlib.sha256(repr(sorted(sources.items())).encode()).hexdigest()[:32]
-            place = Path(cache, "twodof", digest)
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-            for file, content in sources.items():
-                if not (place / file).exists() or (place / file).read_bytes() != content:
-                    write_file(place / file, content)
-        except OSError as error:
-            raise BuildError(
-                f"zig's cache cannot be '{cache}': {error.strerror}; ZIG_GLOBAL_CACHE_DIR"
-                " names its folder"
-            ) from error
-        try:
-            _run([*command, "-o", str(folder / output)], place, environment)
-        except BuildError:
-            if place == folder:
-                raise
-            # what zig has kept may be damaged: it knows nothing of sources in another place
-            for file, content in sources.items():
-                write_file(folder / file, content)
-            _run([*command, "-o", str(folder / output)], folder, environment)
-        return (folder / output).read_bytes()
+        environment, kept = dict(os.environ), None
+        if command[: len(ZIG)] == [*ZIG]:
+            cache = _cache()
+            environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache or folder / "zig-cache")
+            environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # of these sources
+            if cache:
+                made_of = repr((version("ziglang"), *command, output, sorted(sources.items())))
+                kept = cache / "twodof" / hashlib.sha256(made_of.encode()).hexdigest()
+                content = _kept(kept)
+                if content is not None:
+                    return content
+        for file, content in sources.items():
+            write_file(folder / file, content)
+        _run([*command, "-o", str(folder / output)], folder, environment)
+        content = (folder / output).read_bytes()
+        if kept:
+            _keep(kept, content)
+        return content
+
+
+def _kept(file: Path) -> bytes | None:
+    """What is kept in a file, or None: there is none, or it is damaged."""
+    try:
+        content = file.read_bytes()
+        os.utime(file)
+    except OSError:
+        return None
+    digest, content = content[:DIGEST], content[DIGEST:]
+    return content if hashlib.sha256(content).digest() == digest else None
+
+
+def _keep(file: Path, content: bytes) -> None:
+    """Keep it where there is room, and nothing beside it that was not used for long."""
+    with suppress(OSError):
+        file.parent.mkdir(exist_ok=True)
+        write_file(file, hashlib.sha256(content).digest() + content)
+        for other in file.parent.iterdir():
+            if other.is_file() and other.stat().st_mtime < time.time() - KEPT_FOR:
+                other.unlink()
 
 
 def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
@@ -206,15 +230,25 @@ def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -
         )
 
 
-def _environment(folder: Path) -> dict[str, str]:
-    """This process's environment; zig's cache is in the folder where home has no room for it."""
-    environment = dict(os.environ)
-    if os.name == "posix" and not environment.get("ZIG_GLOBAL_CACHE_DIR"):
-        home = environment.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        cache, usable = Path(home, "zig"), False
-        if cache.is_absolute():  # "~" stays where nobody knows of a home
-            with suppress(OSError):
-                cache.mkdir(parents=True, exist_ok=True)
-                usable = os.access(cache, os.W_OK)
-        environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache if usable else folder / "zig-cache")
-    return environment
+def _cache() -> Path | None:
+    """Where zig keeps the C library that it has compiled; None where home has no room for it.
+
+    Raises:
+        BuildError: ``ZIG_GLOBAL_CACHE_DIR`` names a folder that cannot be.
+    """
+    named = os.environ.get("ZIG_GLOBAL_CACHE_DIR")
+    try:
+        home = named or os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+        cache = Path(home) if named else Path(home, "zig")
+        cache.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=cache).close()
+    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
+        if named:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise BuildError(
+                f"zig's cache cannot be '{named}': {reason}; ZIG_GLOBAL_CACHE_DIR names its folder"
+            ) from error
+        LOG.warning("zig compiles the C library each time: it has no folder for its cache, which"
+                    " ZIG_GLOBAL_CACHE_DIR names (%s)", error)  # fmt: skip
+        return None
+    return cache
