@@ -322,11 +322,17 @@ def test_the_target_is_dragged_in_the_plane(browser, arm) -> None:
         page.mouse.up()
         x, y = np.array(page.evaluate("arm.held('x_des')")) - before
         assert x < -0.01 and abs(y / x + 0.5) < 0.02  # twice as far to the left as upwards
+        off = np.hypot(*(np.add(before, (x, y)) - page.evaluate("[...arm.at('x')]")))
+        until(page, lambda text: text == f"{off:.4g} m", error)  # before any step
         page.mouse.move(box["x"] + 40, box["y"] + 40)
         page.mouse.down()
         page.mouse.move(box["x"] + 90, box["y"] + 90, steps=3)  # beside it: the target stays
         page.mouse.up()
         assert page.evaluate("arm.held('x_des')") == [before[0] + x, before[1] + y]
+
+
+def error(page: Page) -> str:
+    return str(page.locator("[data-value=error]").text_content())
 
 
 def download(page: Page, folder: Path) -> Path:

@@ -222,7 +222,7 @@ class Samples {
   /** Distance of the end effector from its target, m, or of the joints from theirs; NaN without. */
   error(k = this.now) {
     if (!this.follows) return NaN;
-    const [now, target] = this.follows.map((group) => this.at(group, k));
-    return Math.hypot(...target.map((value, i) => value - now[i]));
+    const [now, wanted] = this.follows, place = this.at(now, k);
+    return Math.hypot(...this.target(wanted, k).map((value, i) => value - place[i]));
   }
 }
