@@ -7,8 +7,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import numpy as np
@@ -305,3 +307,25 @@ def test_a_robots_bag_is_recovered_by_its_folder(fmus: dict[str, Path], tmp_path
         recover(f"{bag}:left")
     with pytest.raises(BagError, match=r"there is no bag '[^']*none'$"):
         recover(tmp_path / "none")
+
+
+def test_each_robot_may_have_its_own_thread(native_path: Path, tmp_path: Path) -> None:
+    """They come, begin and leave at one instant."""
+    run, names = runs({"robot": native_path}, 0.1)["robot"], ("left", "right")
+    samples = list(twodof.samples(run))
+    for trial in range(5):
+        bag, turn = twodof.Bag(tmp_path / f"{trial}"), Barrier(len(names))
+
+        def log(name: str, bag: twodof.Bag = bag, turn: Barrier = turn) -> None:
+            robot = bag.of(name).begin(run)
+            turn.wait()
+            with robot:
+                turn.wait(20)
+                for sample in samples:
+                    robot.write(sample)
+                turn.wait(20)
+
+        with ThreadPoolExecutor(len(names)) as threads:
+            list(threads.map(log, names))
+        for name in names:
+            assert read_bag(f"{bag.path}:{name}").q.tolist() == [list(s.q) for s in samples]

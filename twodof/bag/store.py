@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from threading import Thread
+from threading import Lock, Thread
 from typing import Protocol
 
 from rosbags.rosbag2 import WriterError
@@ -71,6 +71,7 @@ class Store:
         self._storage, self._overwrite = storage, overwrite
         self._parts: list[Part] = []
         self._entered = 0  # of them have not left
+        self._turn = Lock()  # of threads, as each robot may have its own
         self._names: set[str] = set()  # of the robots in the bag that was closed
         self._ended = True  # what has not begun takes nothing
         self._failure: Exception | None = None
@@ -82,6 +83,10 @@ class Store:
         Raises:
             BagError: it cannot be written, or has samples already.
         """
+        with self._turn:
+            self._enter(part)
+
+    def _enter(self, part: Part) -> None:
         if self._begun if self._entered else self._names and part.namespace not in self._names:
             raise BagError(f"the bag '{self.path}' has begun, and takes no robot any more")
         names = [part.namespace for part in (*self._parts, part)]
@@ -153,9 +158,10 @@ class Store:
             BagError: the disk is full or the folder is gone, unless such an exception is on its
                 way already.
         """
-        self._entered -= 1
-        if self._entered:
-            return
+        with self._turn:
+            self._entered -= 1
+            if self._entered:
+                return
         self._closing = True
         self._due.put(None)
         self._begin()
@@ -194,9 +200,10 @@ class Store:
             os.close(self._lock)
 
     def _begin(self) -> None:
-        if not self._begun:
-            self._begun = True
-            Thread(target=self._keep_storing, name="bag writer").start()
+        with self._turn:
+            if not self._begun:
+                self._begun = True
+                Thread(target=self._keep_storing, name="bag writer").start()
 
     def _wait(self, done: Callable[[], bool]) -> None:
         """Wait until something is done, or the thread has ended.
