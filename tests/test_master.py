@@ -24,6 +24,7 @@ from sinks import Memory
 import twodof
 from twodof.errors import FmuError, InputError, SimulationError
 from twodof.files import TEMPORARY, temporary_folder
+from twodof.fmu import instantiate
 from twodof.master import Member, at_rest, simulate_together
 from twodof.pace import RealTime
 
@@ -338,6 +339,27 @@ def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
         assert (sample.inputs["x_des[1]"], sample.inputs["x_des[2]"]) == before.x
         assert sample.since == before.t
         assert sample.q + sample.v == pytest.approx(expected.q + expected.v, abs=1e-9)
+
+
+def test_what_a_run_goes_on_with_holds_since_then(native_path):
+    """Where nothing was set before the step that is discarded."""
+    fmu, broken = twodof.load_fmu(native_path), []
+    with instantiate(fmu) as instance:
+        step = instance.step
+
+        def breaks(t, h):
+            if t > 0.055 and not broken:
+                broken.append(t)
+                raise SimulationError("too fast", outcome="discarded")
+            step(t, h)
+
+        instance.step = breaks
+        run = twodof.samples(
+            fmu, stop_time=0.1, step=0.01, instance=instance,
+            resume=lambda sample, error: at_rest(fmu, sample),
+        )  # fmt: skip
+        since = [sample.since for sample in run]
+    assert since == [0.0] * 7 + [0.06] * 4
 
 
 def test_a_loop_of_ones_own_is_paced(native_path, clock):
