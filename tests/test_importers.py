@@ -8,6 +8,7 @@ import fmpy
 import numpy as np
 import pytest
 from harness import in_child_process
+from native_models import model
 
 import twodof
 from twodof import FmuOptions
@@ -24,7 +25,8 @@ END = 0.4  # s, before the bare arm has fallen onto a stop
 
 
 def built(control: str, folder: Path, fmi: int = 2) -> tuple[str, list[float]]:
-    """An FMU, without arrays, and where FMPy's co-simulation ends."""
+    """An FMU, without arrays, and where FMPy's co-simulation ends, which is where its law leads in
+    Python."""
     fmu = twodof.build_fmu(
         folder / "Arm.fmu", FmuOptions(control=control, native=True, fmi=fmi, arrays=fmi == 2)
     )
@@ -34,6 +36,13 @@ def built(control: str, folder: Path, fmi: int = 2) -> tuple[str, list[float]]:
     )  # fmt: skip
     end = [float(result[name][-1]) for name in Q]
     assert np.abs(np.subtract(end, (0.5, 0.35))).max() > 0.1  # it has moved
+    plant = model("twodof", control).plant()
+    plant.rtol, plant.atol = TIGHT["rtol"], TIGHT["atol"]
+    for name, value in COMMANDS[control].items():
+        getattr(plant, name[:-3])[int(name[-2]) - 1] = value
+    for _ in range(round(END / 0.01)):
+        plant.step(0.01)
+    np.testing.assert_allclose(end, plant.q, rtol=0.0, atol=1e-9)
     return str(fmu), end
 
 
