@@ -29,6 +29,18 @@ def test_robots_cover_trees_prismatic_joints_and_every_axis():
     assert kinds >= {"RX", "RY", "RZ", "PZ", "RevoluteUnaligned"}
 
 
+@pytest.mark.parametrize("largest", [1e-8, 1.0, 10.0, 999999.0, 1e12])
+def test_cosine_and_sine_are_right_to_rounding(largest):
+    quarters = np.pi / 4 * np.arange(-9, 10)
+    angle = np.append(np.random.default_rng(6).uniform(-largest, largest, 100_000), quarters)
+    c, s = np.empty((2, len(angle)))
+    engine("twodof").call("turn", angle, float(len(angle)), c, s)
+    exact = angle.astype(np.longdouble)
+    bound = 2.0**-52 if largest <= 1e6 else 2.0**-51
+    assert np.abs(c - np.cos(exact)).max() <= bound
+    assert np.abs(s - np.sin(exact)).max() <= bound
+
+
 @pytest.mark.parametrize("control", ["task", "pose"])
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_kinematics_equal_pinocchio(name, control):

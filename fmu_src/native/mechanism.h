@@ -29,6 +29,9 @@ typedef struct {
     double mass, moment[3], inertia[6];
 } Carrier;
 
+/* The position of a joint that turns. */
+INTERNAL JointPosition turn(double angle);
+
 INTERNAL void place_joints(const double q[N_JOINTS], JointPosition joint[N_BODIES]);
 
 /* The task frame at the velocity v. */

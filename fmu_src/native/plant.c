@@ -89,12 +89,14 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
 {
     const double *value = plant->value, *force = &value[F_EXT];
     JointPosition joint[N_BODIES];
-    double given[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
+    double effort[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
+    double *given = COMMANDS_ACCELERATION ? a : effort;
     int acts = 0;
     place_joints(q, joint);
     const int rank = command(value, joint, q, v, given);
     for (int i = 0; i < N_JOINTS; i++) {
-        a[i] = COMMANDS_ACCELERATION ? given[i] : 0.0;
+        if (!COMMANDS_ACCELERATION)
+            a[i] = 0.0;
         excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
     }
     if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {

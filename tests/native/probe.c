@@ -15,6 +15,15 @@ FMI2_Export void probe_task(const double q[], const double v[], double x[], doub
     memcpy(drift, task.drift, sizeof task.drift);
 }
 
+FMI2_Export void probe_turn(const double angle[], double count, double c[], double s[])
+{
+    for (int i = 0; i < count; i++) {
+        const JointPosition position = turn(angle[i]);
+        c[i] = position.c;
+        s[i] = position.s;
+    }
+}
+
 FMI2_Export void probe_effort_of_force(const double q[], const double force[], double tau[])
 {
     JointPosition joint[N_BODIES];
