@@ -50,6 +50,11 @@ INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const Carrie
                                const double v[N_JOINTS], const double a[N_JOINTS],
                                const double gravity[3], double tau[N_JOINTS]);
 
+/* What no |τ| of these exceeds, but for rounding, in fewer operations from a few joints on. */
+INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const Carrier *carrier,
+                            const double v[N_JOINTS], const double a[N_JOINTS],
+                            const double gravity[3], double bound[N_JOINTS]);
+
 /* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */
 INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const Carrier *carrier,
                                      const double tau[N_JOINTS], double a[N_JOINTS]);

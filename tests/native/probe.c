@@ -41,6 +41,16 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
     inverse_dynamics(joint, &carrier, v, a, gravity, tau);
 }
 
+FMI2_Export void probe_effort_bounds(const double q[], const double v[], const double a[],
+                                     const double gravity[], double bound[])
+{
+    JointPosition joint[N_BODIES];
+    Carrier carrier;
+    place_joints(q, joint);
+    load_carrier(0.0, v, &carrier);
+    effort_bounds(joint, &carrier, v, a, gravity, bound);
+}
+
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])
 {
     JointPosition joint[N_BODIES];

@@ -10,6 +10,7 @@ from ..plant.robot import Robot
 from ..plant.variables import Variable
 from .bodies import Array, Body, Mechanism, mechanism
 from .recursions import (
+    effort_bounds,
     inverse_dynamics,
     mass_matrix,
     solve_by_factors,
@@ -41,6 +42,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     bodies, load = _loaded(constants)
     gravity = _variables("gravity", 3)
     effort = inverse_dynamics(constants, bodies, joint, v, a, gravity)
+    bounds = np.abs(effort), effort_bounds(constants, bodies, joint, v, a, gravity)
     ways = [solve_by_factors(mass_matrix(constants, bodies, joint), tau)]
     if robot.coupling is None:
         ways.append(solve_by_recursion(constants, bodies, joint, tau))
@@ -65,6 +67,9 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     )
     alike = {
         f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
+        f"effort_bounds({motion}, double bound[N_JOINTS])": _elements(
+            "bound", min(bounds, key=operations)
+        ),
     }
     texts = [c_function(f"void {head}", results) for head, results in alike.items()]
     texts += [
@@ -81,6 +86,8 @@ MECHANISM = """\
 /* The robot's kinematics and dynamics, generated from its URDF: recursions over its joints,
    done with expressions, so that what its constants make 0 or 1 costs nothing. */
 #include "mechanism.h"
+
+#include <math.h>
 """
 HELD = ("carrier->", "gravity[", "payload", "place[")
 """Parameters, along which there are no derivatives."""

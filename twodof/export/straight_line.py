@@ -63,6 +63,13 @@ class Expression:
     def __rtruediv__(self, other: float) -> Value:
         return Expression("/", (other, self)) if other else 0.0
 
+    def __abs__(self) -> Value:
+        return Expression("fabs", (self,))
+
+    def sqrt(self) -> Value:
+        """NumPy calls it."""
+        return Expression("sqrt", (self,))
+
     __radd__ = __add__
     __rmul__ = __mul__
 
