@@ -7,6 +7,9 @@ import pinocchio as pin
 import pytest
 from native_models import ROBOTS, Engine, coupling, engine, from_urdf, model
 
+from twodof.export.bodies import mechanism
+from twodof.export.recursions import effort_bounds
+
 # trees, prismatic joints, axes along x, y, z and none of them, joints that mimic others
 EVERY_ROBOT = ("twodof", *ROBOTS)
 STATES = 1000
@@ -27,6 +30,18 @@ def test_robots_cover_trees_prismatic_joints_and_every_axis():
     assert sum(len(set(robot.model.parents[1:])) < len(robot.joints) for robot in robots) >= 2
     kinds = {joint.shortname()[10:] for robot in robots for joint in list(robot.model.joints)[1:]}
     assert kinds >= {"RX", "RY", "RZ", "PZ", "RevoluteUnaligned"}
+
+
+@pytest.mark.parametrize("largest", [1e-8, 1.0, 10.0, 999999.0, 1e12])
+def test_cosine_and_sine_are_right_to_rounding(largest):
+    quarters = np.pi / 4 * np.arange(-9, 10)
+    angle = np.append(np.random.default_rng(6).uniform(-largest, largest, 100_000), quarters)
+    c, s = np.empty((2, len(angle)))
+    engine("twodof").call("turn", angle, float(len(angle)), c, s)
+    exact = angle.astype(np.longdouble)
+    bound = 2.0**-52 if largest <= 1e6 else 2.0**-51
+    assert np.abs(c - np.cos(exact)).max() <= bound
+    assert np.abs(s - np.sin(exact)).max() <= bound
 
 
 @pytest.mark.parametrize("control", ["task", "pose"])
@@ -68,6 +83,33 @@ def test_dynamics_equal_pinocchio(name):
         tau = G.T @ pin.rnea(reference, data, Q, G @ v, G @ a)
         assert deviation(native.inverse_dynamics(q, v, a, gravity), tau) <= 1e-11
         assert deviation(M @ native.acceleration_of_effort(q, a), a) <= 1e-11
+
+
+@pytest.mark.parametrize("name", EVERY_ROBOT)
+def test_no_effort_exceeds_its_bound(name):
+    native, robot, (G, c) = engine(name), model(name).robot, coupling(name)
+    reference, gravity, bound = robot.model.copy(), np.array([3.0, -9.81, 1.0]), np.empty(native.n)
+    data, rng = reference.createData(), np.random.default_rng(3)
+    reference.gravity.linear = gravity
+    for q, v, a in random_states(rng, native.n):
+        v, a = v * rng.integers(2), a * rng.integers(2)
+        tau = G.T @ pin.rnea(reference, data, G @ q + c, G @ v, G @ a)
+        native.call("effort_bounds", q, v, a, gravity, bound)
+        assert (np.abs(tau) <= bound * (1.0 + 1e-9)).all()
+
+
+def test_effort_bound_is_what_holds_a_stretched_arm():
+    robot, still = model("twodof").robot, np.zeros(2)
+    constants, gravity = mechanism(robot), np.array([0.0, -9.81, 0.0])
+    reference = robot.model.copy()
+    reference.gravity.linear = gravity
+    data = reference.createData()
+    angles = np.linspace(-np.pi, np.pi, 361)
+    largest = max(
+        abs(pin.rnea(reference, data, np.array([q, 0.0]), still, still)[0]) for q in angles
+    )
+    bound = effort_bounds(constants, constants.body, np.eye(2), still, still, gravity)
+    assert largest <= bound[0] <= 1.02 * largest  # centres of mass lie a little off the line
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)

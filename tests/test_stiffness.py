@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pinocchio as pin
 import pytest
-from native_models import ROOT, Engine, from_urdf, robots_folder
+from native_models import ROOT, Engine, engine, from_urdf, robots_folder
 from scipy.integrate import solve_ivp
 
 from twodof.plant.plant import DiscardError, Plant
@@ -162,3 +162,14 @@ def test_a_hand_of_small_inertias_and_strong_damping_moves_as_an_implicit_solver
     found = advanced(of, plant, 3)
     assert np.abs(found - plant.q).max() > 1e-7  # it moves
     assert np.abs(found - expected).max() <= 1e-6
+
+
+@pytest.mark.parametrize("name", ["tiago", "panda", "twodof"])
+def test_rounding_of_the_target_moves_no_joint(name):
+    native = engine(name)
+    plant = native.model.plant()
+    plant.x_des = [x + ulp for x, ulp in zip(plant.x, (4e-16, -4e-16, 4e-16))]
+    values = native.values(plant)
+    assert native.call("advance", values, STEP) == 1
+    assert not native.group(values, "v").any()
+    assert (native.group(values, "q") == plant.q).all()

@@ -1,5 +1,6 @@
 /* The equations of motion under the control law. Compiled twice: with real numbers, and with complex ones
    for derivatives. */
+#include "turn.c"
 #include "mechanism.c"
 #include "plant.c"
 #include "stops.c"

@@ -29,6 +29,9 @@ typedef struct {
     double mass, moment[3], inertia[6];
 } Carrier;
 
+/* The position of a joint that turns. */
+INTERNAL JointPosition turn(double angle);
+
 INTERNAL void place_joints(const double q[N_JOINTS], JointPosition joint[N_BODIES]);
 
 /* The task frame at the velocity v. */
@@ -46,6 +49,11 @@ INTERNAL void load_carrier(double payload, const double place[3], Carrier *carri
 INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const Carrier *carrier,
                                const double v[N_JOINTS], const double a[N_JOINTS],
                                const double gravity[3], double tau[N_JOINTS]);
+
+/* What no |τ| of these exceeds, but for rounding, in fewer operations from a few joints on. */
+INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const Carrier *carrier,
+                            const double v[N_JOINTS], const double a[N_JOINTS],
+                            const double gravity[3], double bound[N_JOINTS]);
 
 /* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */
 INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const Carrier *carrier,

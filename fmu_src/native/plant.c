@@ -66,6 +66,21 @@ static void limit_effort(const double value[N_VARIABLES], double tau[N_JOINTS])
         tau[i] = saturated(tau[i], EFFORT[i]);
 }
 
+/* Whether a torque that has been commanded may be beyond its limit, without computing it. */
+static int may_saturate(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                        const double v[N_JOINTS], const double a[N_JOINTS])
+{
+    const double with_rounding = 1.0 + 1e-9;
+    double bound[N_JOINTS];
+    Carrier known;
+    body(value, 1, &known);
+    effort_bounds(joint, &known, v, a, &value[GRAVITY], bound);
+    for (int i = 0; i < N_JOINTS; i++)
+        if (!(RE(bound[i] * with_rounding) < RE(EFFORT[i])))
+            return 1;
+    return 0;
+}
+
 /* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 where a was commanded and is what comes. */
 static void add_excess(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                        const double v[N_JOINTS], const double given[N_JOINTS],
@@ -89,12 +104,14 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
 {
     const double *value = plant->value, *force = &value[F_EXT];
     JointPosition joint[N_BODIES];
-    double given[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
+    double effort[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
+    double *given = COMMANDS_ACCELERATION ? a : effort;
     int acts = 0;
     place_joints(q, joint);
     const int rank = command(value, joint, q, v, given);
     for (int i = 0; i < N_JOINTS; i++) {
-        a[i] = COMMANDS_ACCELERATION ? given[i] : 0.0;
+        if (!COMMANDS_ACCELERATION)
+            a[i] = 0.0;
         excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
     }
     if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
@@ -102,7 +119,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
         for (int i = 0; i < N_JOINTS; i++)
             excess[i] += further[i];
     }
-    if (value[LIMIT_EFFORT] != 0.0 || !knows_all(value))
+    if (!knows_all(value) || (value[LIMIT_EFFORT] != 0.0 && may_saturate(value, joint, v, a)))
         add_excess(value, joint, v, given, a, excess);
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;

@@ -2,7 +2,6 @@
 #include "pseudo_inverse.h"
 
 #include <math.h>
-#include <string.h>
 
 /* Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12. */
 static const double WELL_CONDITIONED = 1e-3;
@@ -135,10 +134,11 @@ int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rc
         for (int k = 0; k < N_ROWS; k++)
             y[k] = kept[k] ? b[k] / square[k] : 0.0;
     }
-    memset(result, 0, N_JOINTS * sizeof *result);
-    for (int k = 0; k < N_ROWS; k++)
-        for (int i = 0; i < N_JOINTS; i++)
+    for (int i = 0; i < N_JOINTS; i++) {
+        result[i] = y[0] * J[0][i];
+        for (int k = 1; k < N_ROWS; k++)
             result[i] += y[k] * J[k][i];
+    }
     return rank;
 }
 

@@ -7,6 +7,8 @@
    Source: Luh, Walker & Paul, IEEE TAC 25(3), 1980; Khatib, IEEE J-RA 3(1), 1987. */
 #include "control.h"
 
+#include <math.h>
+
 #include "pseudo_inverse.h"
 #if N_ROWS > N_AXES
 #include "orientation.h"
@@ -35,6 +37,9 @@ static void law(const double value[N_VARIABLES], TaskFrame *task, Row row[N_ROWS
 #endif
 }
 
+/* m and rad, 2⁻⁴⁸: a smaller error is rounding's, which would set stiff joints at rest in motion. */
+static const double ROUNDING = 1.0 / 281474976710656.0;
+
 int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
             const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
 {
@@ -46,6 +51,8 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
     task_frame(joint, v, &task);
     law(value, &task, row);
     for (int k = 0; k < N_ROWS; k++) {
+        if (RE(fabs(row[k].error)) < RE(ROUNDING))
+            row[k].error -= RE(row[k].error);
         wanted[k] = value[row[k].xdd_des] + value[row[k].Kd] * (value[row[k].xd_des] - task.xd[k])
                     + value[row[k].Kp] * row[k].error - task.drift[k] + Kn * task.xd[k];
     }

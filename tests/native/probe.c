@@ -15,6 +15,15 @@ FMI2_Export void probe_task(const double q[], const double v[], double x[], doub
     memcpy(drift, task.drift, sizeof task.drift);
 }
 
+FMI2_Export void probe_turn(const double angle[], double count, double c[], double s[])
+{
+    for (int i = 0; i < count; i++) {
+        const JointPosition position = turn(angle[i]);
+        c[i] = position.c;
+        s[i] = position.s;
+    }
+}
+
 FMI2_Export void probe_effort_of_force(const double q[], const double force[], double tau[])
 {
     JointPosition joint[N_BODIES];
@@ -30,6 +39,16 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
     place_joints(q, joint);
     load_carrier(0.0, v, &carrier);
     inverse_dynamics(joint, &carrier, v, a, gravity, tau);
+}
+
+FMI2_Export void probe_effort_bounds(const double q[], const double v[], const double a[],
+                                     const double gravity[], double bound[])
+{
+    JointPosition joint[N_BODIES];
+    Carrier carrier;
+    place_joints(q, joint);
+    load_carrier(0.0, v, &carrier);
+    effort_bounds(joint, &carrier, v, a, gravity, bound);
 }
 
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])

@@ -10,13 +10,14 @@ from ..plant.robot import Robot
 from ..plant.variables import Variable
 from .bodies import Array, Body, Mechanism, mechanism
 from .recursions import (
+    effort_bounds,
     inverse_dynamics,
     mass_matrix,
     solve_by_factors,
     solve_by_recursion,
     task_frame,
 )
-from .straight_line import Expression, Value, Varied, c_function, cosine, operations, sine, varied
+from .straight_line import Expression, Value, Varied, c_function, operations, varied
 
 
 def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
@@ -39,22 +40,24 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     frame |= _elements("task->J", J[rows]) | _elements("task->drift", drift[rows])
     frame |= _elements("task->xd", J[rows].dot(v))
     bodies, load = _loaded(constants)
-    effort = inverse_dynamics(constants, bodies, joint, v, a, _variables("gravity", 3))
+    gravity = _variables("gravity", 3)
+    effort = inverse_dynamics(constants, bodies, joint, v, a, gravity)
+    bounds = np.abs(effort), effort_bounds(constants, bodies, joint, v, a, gravity)
     ways = [solve_by_factors(mass_matrix(constants, bodies, joint), tau)]
     if robot.coupling is None:
         ways.append(solve_by_recursion(constants, bodies, joint, tau))
     in_all = "const JointPosition joint[N_BODIES]"
+    motion = (
+        f"{in_all}, const Carrier *carrier, const double v[N_JOINTS], const double a[N_JOINTS],"
+        " const double gravity[3]"
+    )
     functions = {
-        f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
         f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements(
             "tau", J[:3].T.dot(force)
         ),
         "load_carrier(double payload, const double place[3], Carrier *carrier)": load,
-        f"inverse_dynamics({in_all}, const Carrier *carrier, const double v[N_JOINTS],"
-        " const double a[N_JOINTS], const double gravity[3], double tau[N_JOINTS])": _elements(
-            "tau", effort
-        ),
+        f"inverse_dynamics({motion}, double tau[N_JOINTS])": _elements("tau", effort),
     }
     solution = min(ways, key=operations)
     inertial = inverse_dynamics(constants, bodies, joint, np.zeros(n), a, np.zeros(3))
@@ -62,7 +65,14 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         f"acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
         " double a[N_JOINTS])"
     )
-    texts = [
+    alike = {
+        f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
+        f"effort_bounds({motion}, double bound[N_JOINTS])": _elements(
+            "bound", min(bounds, key=operations)
+        ),
+    }
+    texts = [c_function(f"void {head}", results) for head, results in alike.items()]
+    texts += [
         c_function(f"void {head}", results, varied(results.values(), held=HELD))
         for head, results in functions.items()
     ]
@@ -106,8 +116,10 @@ def _places(robot: Mechanism) -> dict[str, Value]:
     angles = robot.G.dot(_variables("q", robot.G.shape[1])) + robot.c
     places: dict[str, Value] = {}
     for i, (angle, slides) in enumerate(zip(angles, robot.prismatic)):
-        places[f"joint[{i}].c"] = angle if slides else cosine(angle)
-        places[f"joint[{i}].s"] = 0.0 if slides else sine(angle)
+        if slides:
+            places[f"joint[{i}].c"] = angle
+        else:
+            places[f"joint[{i}]"] = Expression("turn", (angle,))
     return places
 
 

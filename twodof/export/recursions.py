@@ -8,6 +8,7 @@ of its joint, whose axis is z.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -111,6 +112,46 @@ def inverse_dynamics(
             moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + cross(origins[i], f)
     effort: Array = robot.G.T.dot(tau)
     return effort
+
+
+def effort_bounds(
+    robot: Mechanism, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
+) -> Array:
+    """What no |τ| of ``inverse_dynamics`` exceeds: its recursion with lengths in place of vectors.
+
+    |x × y| ≤ |x| |y|, |I x| ≤ ‖I‖ |x| with Frobenius' norm, |x + y| ≤ |x| + |y|.
+    """
+    rates, accelerations = np.abs(robot.G.dot(v)), np.abs(robot.G.dot(a))
+    reach = [
+        _length(p) + (abs(c) if slides else 0.0)
+        for p, slides, (c, _) in zip(robot.p, robot.prismatic, joint)
+    ]
+    motions: list[tuple[Any, Any, Any]] = []
+    force, moment = [], []
+    for i, parent in enumerate(robot.parent):
+        omega, alpha, linear = motions[parent] if parent >= 0 else (0.0, 0.0, _length(gravity))
+        linear = linear + (alpha + omega * omega) * reach[i]
+        if robot.prismatic[i]:
+            linear = linear + 2.0 * omega * rates[i] + accelerations[i]
+        else:
+            alpha = alpha + omega * rates[i] + accelerations[i]
+            omega = omega + rates[i]
+        motions.append((omega, alpha, linear))
+        turning, lever = alpha + omega * omega, _length(body[i].moment)
+        force.append(linear * abs(body[i].mass) + turning * lever)
+        moment.append(turning * _length(body[i].inertia.ravel()) + linear * lever)
+    for i in reversed(range(len(robot.parent))):
+        parent = robot.parent[i]
+        if parent >= 0:
+            force[parent] = force[parent] + force[i]
+            moment[parent] = moment[parent] + moment[i] + force[i] * reach[i]
+    tau = np.where(robot.prismatic, force, moment)
+    bound: Array = np.abs(robot.G).T.dot(tau)
+    return bound
+
+
+def _length(a: Array) -> Any:
+    return np.sqrt(a.dot(a))
 
 
 def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:

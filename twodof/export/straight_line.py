@@ -63,21 +63,18 @@ class Expression:
     def __rtruediv__(self, other: float) -> Value:
         return Expression("/", (other, self)) if other else 0.0
 
+    def __abs__(self) -> Value:
+        return Expression("fabs", (self,))
+
+    def sqrt(self) -> Value:
+        """NumPy calls it."""
+        return Expression("sqrt", (self,))
+
     __radd__ = __add__
     __rmul__ = __mul__
 
 
 Value = Expression | float
-
-
-def cosine(angle: Value) -> Value:
-    """Of an angle, rad."""
-    return Expression("cos", (angle,))
-
-
-def sine(angle: Value) -> Value:
-    """Of an angle, rad."""
-    return Expression("sin", (angle,))
 
 
 def operations(results: Iterable[Value]) -> int:
@@ -118,10 +115,6 @@ def varied(
             pair = quotient, (da - quotient * db) / b
         elif operation == "neg":
             pair = -a, -da
-        elif operation == "cos":
-            pair = cosine(a), -(sine(a) * da)
-        elif operation == "sin":
-            pair = sine(a), cosine(a) * da
         elif _is_number(operation):
             pair = float(operation), 0.0
         elif parts and operation in parts:
@@ -134,23 +127,30 @@ def varied(
     return [pairs[place] for place in places]
 
 
-def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Varied]) -> str:
+def c_function(
+    head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None
+) -> str:
     """A function that assigns each result to the variable of its name, real or complex.
 
     Args:
         head: of the function.
         results: values by lvalue; no lvalue may be a variable of one of the values.
-        complexes: of each result, if numbers are complex, the real part and how it varies.
+        complexes: of each result, if numbers are complex, the real part and how it varies; by
+            default what is assigned is the same.
     """
-    separate: dict[str, Value] = {}
-    for value, variation in complexes:
-        separate[f"const Real re{len(separate)}"] = value
-        separate[f"const Real im{len(separate)}"] = variation
-    combined = "".join(
-        f"\n    assign(&{target}, re{2 * i}, im{2 * i + 1});" for i, target in enumerate(results)
-    )
-    body = f"#ifdef IS_COMPLEX\n{_statements(separate, 'Real')}{combined}\n#else\n"
-    body += f"{_statements(results, 'double')}\n#endif"
+    body = _statements(results, "double")
+    if complexes is not None:
+        separate: dict[str, Value] = {}
+        for value, variation in complexes:
+            separate[f"const Real re{len(separate)}"] = value
+            separate[f"const Real im{len(separate)}"] = variation
+        combined = "".join(
+            f"\n    assign(&{target}, re{2 * i}, im{2 * i + 1});"
+            for i, target in enumerate(results)
+        )
+        body = (
+            f"#ifdef IS_COMPLEX\n{_statements(separate, 'Real')}{combined}\n#else\n{body}\n#endif"
+        )
     parameters = re.findall(r"(\w+)(?:\[\w+\])?[,)]", head)
     unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
     ignored = "".join(f"    (void){name};\n" for name in unused)
