@@ -129,7 +129,9 @@ def with_rival(arm: Arm, way: str | None) -> Callable[[dict[str, bytes]], None]:
 def rivals(arm: Arm, folder: Path, general: bool) -> dict[str, Callable[[], float]]:
     """Times runs of each build of the rival in C, by its settings; see native_cost."""
     return {
-        " ".join((compiler, way or "", *flags)): cost(arm, folder, with_rival(arm, way), flags)
+        " ".join(filter(None, (compiler, way, *flags))): cost(
+            arm, folder, with_rival(arm, way), flags
+        )
         for compiler, cost in {"zig": native_cost, "cc": by_own_compiler}.items()
         for way in (WAYS if general else [None])
         for flags in FLAGS

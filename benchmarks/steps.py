@@ -568,7 +568,7 @@ def main() -> list[Figure]:
         print_logs(log_times(folder, fmu))
         print_once(help_time(), run_time(folder, fmu))
     print(f"\n{time.perf_counter() - begin:.0f} s in all")
-    listing = "the listing (SciPy's RK45, Pinocchio) / "
+    listing = "the listing, as written, / "
     return [
         Figure(f"{listing}{row.name}, {row.about}", f"{times[0] / t:.1f}", f">= {row.bar:g}")
         for row, t in zip(rows, times)
