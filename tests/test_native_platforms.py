@@ -24,7 +24,7 @@ import twodof
 from twodof import FmuOptions, build_fmu
 from twodof.cli.main import main
 from twodof.errors import BuildError
-from twodof.export.compiler import TARGETS, UNITS, host_platform
+from twodof.export.compiler import FLAGS, TARGETS, UNITS, host_platform
 
 HOST = Path(__file__).parent / "native" / "host.c"
 PLATFORMS = ("linux64", "win64", "darwin64")
@@ -238,8 +238,9 @@ def drive(unzipped: Path, platform: str, folder: Path, settings: dict[str, float
     importer = folder / ("host.exe" if windows else "host")
     if not importer.exists():
         zig = [sys.executable, "-m", needs("ziglang"), "cc", "-target", *TARGETS[platform]]
-        flags = ["-std=c99", "-O2", "-I", unzipped / "sources", "-o", importer, HOST]
-        # -O2 and a folder apart from zig's: else it compiles Windows' C runtime once more
+        # the libraries' flags and a folder apart from zig's: else zig compiles Windows' C runtime
+        # once more
+        flags = [*FLAGS, "-s", "-I", unzipped / "sources", "-o", importer, HOST]
         subprocess.run([*zig, *flags, *([] if windows else ["-ldl"])], cwd=folder, check=True)
     library = shutil.copy(unzipped / BINARIES[platform], folder)
     guid, references = variables(unzipped)
@@ -262,15 +263,44 @@ def drive(unzipped: Path, platform: str, folder: Path, settings: dict[str, float
     return np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
 
 
-def test_windows_library_runs_as_linux_library(unzipped, tmp_path):
+TURNED = {"quat_des[3]": 0.5, "quat_des[4]": 0.8, "omega_des[3]": 0.1}
+RUNS = {
+    "task": ({}, LIMITED),
+    "pose": (TURNED, {**TURNED, "q_min[1]": 0.3}),
+    "joint": (
+        {"q_des[1]": 0.9, "q_des[2]": -0.6, "f_ext[2]": -0.5},
+        {"q_min[1]": 0.3, "q_min[2]": -1.0, "q_des[1]": 0.0, "q_des[2]": 1.5, "payload": 0.5},
+    ),
+    "effort": (
+        {"tau_cmd[1]": 0.4, "tau_cmd[2]": 0.1, "q_max[2]": 0.5},
+        {"q_min[1]": 0.3, "q_max[2]": 1.2, "tau_cmd[2]": 0.5},
+    ),
+}  # fmt: skip
+"""By control, the last one with stops."""
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory):
+    """A folder for the importer of each platform, and for wine."""
+    return tmp_path_factory.mktemp("machines")
+
+
+@pytest.mark.parametrize("control", RUNS)
+def test_windows_library_runs_as_linux_library(control, machines, tmp_path):
     needs("wine64", "wine", "/usr/lib/wine/wine64")
-    for settings in ({}, LIMITED):
-        linux = drive(unzipped, "linux64", tmp_path, settings)
-        windows = drive(unzipped, "win64", tmp_path, settings)
-        assert linux.shape == windows.shape == (51, 10)
+    needs("ziglang")
+    chosen = FmuOptions(
+        native=True, control=control, platforms=("linux64", "win64"), live_documentation=False
+    )
+    unzipped = Path(fmpy.extract(build_fmu(tmp_path / "TwoDof.fmu", chosen), tmp_path / "fmu"))
+    for settings in RUNS[control]:
+        linux = drive(unzipped, "linux64", machines, settings)
+        windows = drive(unzipped, "win64", machines, settings)
+        assert linux.shape == windows.shape and len(linux) == 51
         assert np.abs(windows - linux).max() <= 1e-12
-        assert np.ptp(linux, axis=0).min() > 0.0
-    assert linux[:, 0].min() == 0.3 and linux[:, 1].max() == 1.2  # limits were met
+        assert np.ptp(linux[:, :2], axis=0).min() > 0.0
+    limits = [value for name, value in settings.items() if name[:5] in ("q_min", "q_max")]
+    assert np.isin(limits, linux[:, :2]).all()  # they were met
 
 
 def outputs(fmu: Path, **named) -> np.ndarray:
