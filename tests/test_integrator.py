@@ -204,3 +204,11 @@ def test_a_smallest_step_stretched_to_the_end_is_still_taken_as_it_is(h):
     for k in range(20):
         calls = 0
         advance(jumping, [0.0], [0.0], h * (1 + 0.013 * k), FREE, 1e-9, 1e-12, 1.0)
+
+
+def test_an_impact_that_another_undoes_leaves_its_joint_free():
+    """Two joints hit their limits; the first one's impact alone throws the second back."""
+    W = np.array([[1.0, 0.9], [0.9, 1.0]])
+    y = [0.0, 0.0, -1.0, -0.5]
+    Stops([(0.0, 1.0)] * 2, lambda q: W).impact(y, [False, False])
+    assert y == pytest.approx([0.0, 0.0, 0.0, 0.4], abs=1e-15)  # -0.5 + 0.9 · 1
