@@ -75,7 +75,12 @@ def difference(first: Track, other: Track) -> str:
     most = -1.0
     for joint in first.joints:
         if joint.name in places and both.any():
-            off = np.abs(joint.q[both] - np.interp(first.t[both], other.t, places[joint.name]))
+            with np.errstate(invalid="ignore"):  # of two infinities
+                off = np.abs(joint.q[both] - np.interp(first.t[both], other.t, places[joint.name]))
+            lost = ~np.isfinite(off)
+            if lost.any():
+                since = number(float(first.t[both][lost.argmax()]))
+                return f"cannot be told from '{first.name}': {joint.name} is not finite at {since} s"
             if off.max() > most:
                 most, at = float(off.max()), float(first.t[both][off.argmax()])
                 spread = float(np.sqrt(np.mean(off**2)))
