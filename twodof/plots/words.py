@@ -79,8 +79,9 @@ def difference(first: Track, other: Track) -> str:
                 off = np.abs(joint.q[both] - np.interp(first.t[both], other.t, places[joint.name]))
             lost = ~np.isfinite(off)
             if lost.any():
-                since = number(float(first.t[both][lost.argmax()]))
-                return f"cannot be told from '{first.name}': {joint.name} is not finite at {since} s"
+                at = float(first.t[both][lost.argmax()])
+                lost_at = f"{joint.name} is not finite at {number(at)} s"
+                return f"cannot be told from '{first.name}': {lost_at}"
             if off.max() > most:
                 most, at = float(off.max()), float(first.t[both][off.argmax()])
                 spread = float(np.sqrt(np.mean(off**2)))
