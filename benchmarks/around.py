@@ -23,12 +23,10 @@ from statistics import median
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
-from steps import STEP, Figure, processor, shipped_arm  # noqa: E402
+from steps import STEP, Figure, engine_files, processor, shipped_arm  # noqa: E402
 
 import twodof  # noqa: E402
 from twodof.export.compiler import compile_library, host_platform  # noqa: E402
-from twodof.export.flavours import native_flavour  # noqa: E402
-from twodof.plant.variables import variable_table  # noqa: E402
 from twodof.sweeps.runner import Job, Runner  # noqa: E402
 
 TURNS, SAMPLES, RUNS, STEPS = 5, 50_000, 20, 500
@@ -39,10 +37,7 @@ TWODOF = [sys.executable, "-m", "twodof"]
 def floor(folder: Path) -> Callable[[int, bool], float]:
     """Processor time of a step in C, s, of a run of so many, logged or bare."""
     arm, path = shipped_arm(), folder / "logged"
-    flavour = native_flavour(
-        arm.robot, "task", variable_table(arm.robot, arm.starts), "logged", (), 2, arrays=False
-    )
-    sources = {Path(name).name: content for name, content in flavour.files.items()}
+    sources = engine_files(arm, "logged")
     sources["logged_step.c"] = (HERE / "logged_step.c").read_bytes()
     units = ("directional.c", "logged_step.c")
     path.write_bytes(compile_library(sources, host_platform(), "logged", units=units))

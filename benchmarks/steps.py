@@ -357,6 +357,13 @@ def without_shapes(urdf: str) -> ET.Element:
     return tree
 
 
+def engine_files(arm: Arm, name: str) -> dict[str, bytes]:
+    """C files of an arm's native FMU, by name."""
+    options, table = twodof.FmuOptions(name=name), variable_table(arm.robot, arm.starts)
+    files = native_flavour(options, arm.robot, table, 2, ()).files
+    return {Path(path).name: content for path, content in files.items()}
+
+
 def native_cost(
     arm: Arm,
     folder: Path,
@@ -365,10 +372,7 @@ def native_cost(
 ) -> Callable[[], float]:
     """Times a run of the native engine in C, compiled as in its FMU, or with changed sources."""
     name = f"step{len(list(folder.glob('step*')))}"
-    flavour = native_flavour(
-        arm.robot, "task", variable_table(arm.robot, arm.starts), name, (), 2, arrays=False
-    )
-    sources = {Path(path).name: content for path, content in flavour.files.items()}
+    sources = engine_files(arm, name)
     sources["native_step.c"] = (HERE / "native_step.c").read_bytes()
     if change is not None:
         change(sources)
