@@ -44,6 +44,17 @@ def test_cosine_and_sine_are_right_to_rounding(largest):
     assert np.abs(s - np.sin(exact)).max() <= bound
 
 
+@pytest.mark.parametrize("flag", ["-ffast-math", "-mfpmath=387"])
+def test_cosine_and_sine_are_right_where_arithmetic_is_not_the_standards(flag):
+    """Sources may be compiled in any way by those who import them."""
+    angle = np.random.default_rng(6).uniform(-10.0, 10.0, 10_000)
+    c, s = np.empty((2, len(angle)))
+    Engine(model("twodof"), (flag,)).call("turn", angle, float(len(angle)), c, s)
+    exact = angle.astype(np.longdouble)
+    assert np.abs(c - np.cos(exact)).max() <= 2.0**-49
+    assert np.abs(s - np.sin(exact)).max() <= 2.0**-49
+
+
 @pytest.mark.parametrize("control", ["task", "pose"])
 @pytest.mark.parametrize("name", EVERY_ROBOT)
 def test_kinematics_equal_pinocchio(name, control):

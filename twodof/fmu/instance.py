@@ -11,6 +11,7 @@ from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_vo
 from itertools import accumulate, chain
 from math import inf
 from pathlib import Path
+from threading import Lock
 from typing import Any, NoReturn
 
 import fmpy
@@ -30,15 +31,12 @@ LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERRO
 WARNING = fmi2.fmi2Warning
 READ = ("documentation/", "sources/")
 """Folders of an FMU that no library looks into."""
+LOADING = Lock()
 Values = Array[c_double]
 
 
 class _Staying:
-    """The module os as FMPy has it from here on: it stays in the working directory.
-
-    FMPy goes to a library's folder while it loads that, as Windows needs it, and all threads of the
-    process with it, whose own files are elsewhere then.
-    """
+    """The module os, but that it stays in the working directory."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(os, name)
@@ -47,7 +45,19 @@ class _Staying:
         """Stay."""
 
 
-vars(fmi1)["os"] = _Staying()
+@contextmanager
+def _loading() -> Iterator[None]:
+    """While FMPy loads a library.
+
+    It goes to the library's folder meanwhile, as Windows needs it, and all threads of the process
+    with it, whose own files are elsewhere then.
+    """
+    with LOADING:
+        vars(fmi1)["os"] = _Staying()
+        try:
+            yield
+        finally:
+            vars(fmi1)["os"] = os
 
 
 class Instance:
@@ -82,7 +92,8 @@ class Instance:
     def _instantiate(self, **what: str) -> Any:
         from fmpy.logging import addLoggerProxy  # none for aarch64-linux, which 2.0 has no name for
 
-        slave = fmi2.FMU2Slave(**what)
+        with _loading():
+            slave = fmi2.FMU2Slave(**what)
         self._callbacks = fmi2.fmi2CallbackFunctions(
             logger=fmi2.fmi2CallbackLoggerTYPE(self._log),
             allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc),
@@ -197,7 +208,8 @@ class Instance3(Instance):
         self._arrays = self._starts()
 
     def _instantiate(self, **what: str) -> Any:
-        slave = fmi3.FMU3Slave(**what)
+        with _loading():
+            slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=self._log_message, loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
         self._do_step = slave.dll["fmi3DoStep"]
