@@ -4,8 +4,8 @@
 
 The parts, which can be run alone too, are ``steps.py``, ``engine.py``, ``around.py`` and
 ``sweep.py``; each says at its top how it measures, and prints more than the table has. All is
-processor time but where it says otherwise, and what is compared takes turns. Takes a quarter of an
-hour, 1.3 GB of disk, the packages of the extra "test" and a C compiler.
+processor time but where it says otherwise, and what is compared takes turns. Takes six minutes
+or more, 1.3 GB of disk, the packages of the extra "test" and a C compiler.
 """
 
 from __future__ import annotations
