@@ -29,7 +29,7 @@ STEP = 0.01
 
 def bare_loop(seconds: float) -> None:
     """Print how many deadlines a loop missed that does nothing else, and the worst in s."""
-    from twodof.pace import RealTime
+    from twodof.simulation.pace import RealTime
 
     print("begins", flush=True)
     pace = RealTime()
@@ -61,9 +61,9 @@ def main() -> None:
         return browse(sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, build_fmu
-    from twodof.experiments import experiment
     from twodof.pages.live import page_of
     from twodof.pages.loop import Loop
+    from twodof.simulation.experiments import experiment
 
     with tempfile.TemporaryDirectory() as folder:
         native = sys.argv[2:3] != ["python"]

@@ -41,7 +41,7 @@ def account(name: str, times: list[float]) -> None:
 
 def bare_loop(count: int) -> None:
     """A loop that does nothing else."""
-    from twodof.pace import RealTime
+    from twodof.simulation.pace import RealTime
 
     pace, times = RealTime(), []
     for k in range(count):
@@ -94,8 +94,8 @@ def main() -> None:
         return receive()
     seconds = float(sys.argv[1]) if sys.argv[1:] else 60.0
     from twodof import FmuOptions, Publisher, build_fmu, experiment, simulate
-    from twodof.pace import RealTime
     from twodof.ros.network import Network
+    from twodof.simulation.pace import RealTime
 
     with tempfile.TemporaryDirectory() as folder:
         native = sys.argv[2:3] != ["python"]

@@ -22,8 +22,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from twodof.experiments import Experiment
-from twodof.sample import Sample
+from twodof.simulation.experiments import Experiment
+from twodof.simulation.sample import Sample
 
 STORAGES = ("mcap", "sqlite3")
 START = 1_700_000_000  # s since the epoch

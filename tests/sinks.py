@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 from pathlib import Path
 
-from twodof.sample import Sample, Sink
+from twodof.simulation.sample import Sample, Sink
 
 
 class Collector(list[Sample], Sink):

@@ -60,9 +60,9 @@ import twodof
 from twodof.bag.reader import read_ends
 from twodof.bag.storage import BagWriter, McapStorage
 from twodof.errors import BagError, InputError
-from twodof.experiments import Experiment
 from twodof.files import is_being_written
-from twodof.sample import Sample
+from twodof.simulation.experiments import Experiment
+from twodof.simulation.sample import Sample
 
 KIB, MIB = 1024, 1024**2
 
@@ -897,7 +897,7 @@ MEMORY = """
 import sys
 import twodof
 from sinks import Memory
-from twodof.sample import Sample
+from twodof.simulation.sample import Sample
 
 fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu)

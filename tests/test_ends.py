@@ -96,7 +96,7 @@ def test_signals_leave_a_complete_bag(
 LOOP = """
 import sys
 import twodof
-from twodof.sample import Sample
+from twodof.simulation.sample import Sample
 fmu, path, storage = sys.argv[1:]
 run = twodof.experiment(fmu, stop_time=1e4)
 inputs = dict(run.start_values)

@@ -11,9 +11,9 @@ import pytest
 import twodof
 from twodof.cli.common import parse_settings
 from twodof.errors import InputError
-from twodof.experiments import Setting, read_changes, resolve
 from twodof.fmu import Fmu
-from twodof.sample import Sample
+from twodof.simulation.experiments import Setting, read_changes, resolve
+from twodof.simulation.sample import Sample
 
 
 @pytest.fixture(scope="module")

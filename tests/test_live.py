@@ -48,9 +48,9 @@ from websockets.sync.client import connect as open_socket
 
 import twodof
 from twodof.errors import InputError, PageError
-from twodof.experiments import experiment
 from twodof.pages.loop import Loop
 from twodof.pages.serving import Server
+from twodof.simulation.experiments import experiment
 
 Q_START = np.array([0.5, 0.35])
 KP, KD = 50.0, 40.0  # those of the default FMU

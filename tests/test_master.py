@@ -25,8 +25,8 @@ import twodof
 from twodof.errors import FmuError, InputError, SimulationError
 from twodof.files import TEMPORARY, temporary_folder
 from twodof.fmu import instantiate
-from twodof.master import Member, at_rest, simulate_together
-from twodof.pace import RealTime
+from twodof.simulation.master import Member, at_rest, simulate_together
+from twodof.simulation.pace import RealTime
 
 
 class Recorder(twodof.Sink):
@@ -264,8 +264,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr("twodof.master.time", clock)
-    monkeypatch.setattr("twodof.pace.time", clock)
+    monkeypatch.setattr("twodof.simulation.master.time", clock)
+    monkeypatch.setattr("twodof.simulation.pace.time", clock)
     return clock
 
 

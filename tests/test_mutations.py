@@ -120,7 +120,7 @@ MODULES = (
     "twodof.bag.reader",
     "twodof.bag.recovery",
     "twodof.export.package",
-    "twodof.master",
+    "twodof.simulation.master",
     "twodof.ros.scene",
     "lxml.etree",
     "tqdm",

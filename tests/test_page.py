@@ -40,11 +40,11 @@ from rosbags.rosbag2 import Reader
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError, PageError
-from twodof.experiments import resolve
 from twodof.export.arm_page import FUNCTIONS, SCRIPTS
 from twodof.export.compiler import UNITS, compile_web_module
 from twodof.fmu import instantiate
 from twodof.plots.track import read_tracks
+from twodof.simulation.experiments import resolve
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "fmu_src" / "page"

@@ -47,7 +47,7 @@ from twodof.plots.panels import with_joints
 from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
 from twodof.plots.words import labels
-from twodof.sample import Sample
+from twodof.simulation.sample import Sample
 
 START = 1_700_000_000  # s since the epoch
 STORE = get_typestore(Stores.ROS2_HUMBLE)

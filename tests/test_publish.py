@@ -460,7 +460,7 @@ MEMORY = """
 import sys
 import twodof
 from sinks import Memory
-from twodof.pace import RealTime
+from twodof.simulation.pace import RealTime
 from twodof.ros.publisher import Publisher
 
 steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"

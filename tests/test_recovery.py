@@ -40,7 +40,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError
-from twodof.experiments import Experiment
+from twodof.simulation.experiments import Experiment
 
 TWODOF = [sys.executable, "-m", "twodof"]
 BATCH = 40  # samples between two flushes
@@ -641,7 +641,7 @@ def test_fsync_waits_for_the_disk_at_each_flush(
     script = """
 import sys
 import twodof
-from twodof.sample import Sample
+from twodof.simulation.sample import Sample
 fmu, path, storage, fsync = sys.argv[1:]
 run = twodof.experiment(fmu)
 inputs = dict(run.start_values)

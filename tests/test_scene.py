@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 import twodof
 from twodof.plant.urdf import Joint, RobotError
 from twodof.ros.scene import Scene
-from twodof.sample import Sample
+from twodof.simulation.sample import Sample
 
 START = 1_700_000_000  # s since the epoch
 SECOND = 1_000_000_000  # ns

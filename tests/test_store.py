@@ -25,8 +25,8 @@ from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.recovery import recover
 from twodof.cli.main import main
 from twodof.errors import BagError, InputError
-from twodof.experiments import Experiment, experiment
-from twodof.master import Member, simulate_together
+from twodof.simulation.experiments import Experiment, experiment
+from twodof.simulation.master import Member, simulate_together
 
 NAMES = {"left": "effort", "fleet/right": "task", "fleet_right": "pose"}
 
@@ -220,8 +220,8 @@ def test_a_robot_that_comes_after_the_others_replaces_none(
 LOGGER = """
 import sys
 import twodof
-from twodof.experiments import experiment
-from twodof.master import Member, simulate_together
+from twodof.simulation.experiments import experiment
+from twodof.simulation.master import Member, simulate_together
 
 path, storage, *fmus = sys.argv[1:]
 bag = twodof.Bag(path, storage=storage)

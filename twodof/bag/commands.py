@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BagError, InputError
-from ..experiments import NANOSECONDS, Changes, Setting, Value, default, resolve
 from ..files import shown
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import CONTROLS
@@ -20,6 +19,7 @@ from ..ros.cdr import Rows
 from ..ros.commands import LONGEST_NAME, CommandError, Commands
 from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY
 from ..ros.trajectories import follow, read_trajectory
+from ..simulation.experiments import NANOSECONDS, Changes, Setting, Value, default, resolve
 from .contents import read_messages
 from .provenance import KNOWN_UNTIL, read_provenance, robot_in
 from .reader import whole_bag

@@ -13,8 +13,8 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from ..errors import BagError
-from ..experiments import Changes, Experiment
 from ..files import read_file
+from ..simulation.experiments import Changes, Experiment
 from ..version import versions
 from .mcap import read_metadata
 from .records import DamageError

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
-from ..experiments import NANOSECONDS, TIME_TOLERANCE
 from ..plant.urdf import RobotError, Urdf, read_urdf
+from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE
 from .provenance import KNOWN_UNTIL
 from .records import Stamps
 

@@ -8,11 +8,11 @@ from copy import copy
 from pathlib import Path
 
 from ..errors import BagError
-from ..experiments import Experiment, Value
 from ..files import sync
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, Messages, check_name
-from ..sample import Sample, Sink
+from ..simulation.experiments import Experiment, Value
+from ..simulation.sample import Sample, Sink
 from .provenance import ProvenanceFile
 from .storage import BATCH_SIZE, OVERHEAD, Stamps
 from .store import Store

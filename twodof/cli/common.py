@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from ..bag.writer import Bag
-    from ..experiments import Experiment, Setting
     from ..fmu import Fmu
-    from ..master import Summary
-    from ..pace import RealTime
+    from ..simulation.experiments import Experiment, Setting
+    from ..simulation.master import Summary
+    from ..simulation.pace import RealTime
 
 INTERRUPTED = 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
@@ -112,8 +112,8 @@ def experiment_of(
     options: argparse.Namespace, stop_time: float | None, step: float | None
 ) -> Experiment:
     """The experiment that the options ask for."""
-    from ..experiments import experiment
     from ..fmu import load_fmu
+    from ..simulation.experiments import experiment
 
     fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
     settings = parse_settings(options.settings)

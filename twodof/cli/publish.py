@@ -27,9 +27,9 @@ from .common import (
 from .options import add_frame_option, add_output, add_run_options, check_company
 
 if TYPE_CHECKING:
-    from ..experiments import Experiment
     from ..ros.foxglove import Foxglove
     from ..ros.publisher import Publisher
+    from ..simulation.experiments import Experiment
 
 
 def add(verbs: Any) -> None:
@@ -96,9 +96,9 @@ def _add_loop_options(publish: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
-    from ..pace import RealTime
     from ..ros.network import network
     from ..ros.publisher import Publisher, publish, publish_together
+    from ..simulation.pace import RealTime
 
     if not 0.0 < options.rate < math.inf:
         raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")

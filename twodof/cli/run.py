@@ -21,8 +21,8 @@ from .common import (
 from .options import add_fmu, add_output, add_run_options, add_time_options
 
 if TYPE_CHECKING:
-    from ..experiments import Experiment
-    from ..sample import Sample, Sink
+    from ..simulation.experiments import Experiment
+    from ..simulation.sample import Sample, Sink
 
 
 def add(verbs: Any) -> None:
@@ -41,8 +41,8 @@ def add(verbs: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
-    from ..master import simulate
-    from ..pace import RealTime
+    from ..simulation.master import simulate
+    from ..simulation.pace import RealTime
 
     if options.stop_time == math.inf:
         raise CommandLineError(
@@ -69,7 +69,7 @@ def progress() -> list[Sink]:
         return []
     from tqdm import tqdm
 
-    from ..sample import Sink
+    from ..simulation.sample import Sink
 
     class Progress(Sink):
         def begin(self, run: Experiment) -> Progress:

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, SimulationError
-from ..experiments import Setting, Value, resolve
 from ..fmu import Fmu, Instance, instantiate, load_fmu
+from ..simulation.experiments import Setting, Value, resolve
 
 Array = NDArray[np.float64]
 

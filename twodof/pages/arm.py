@@ -8,12 +8,12 @@ from math import inf
 from pathlib import Path
 
 from ..errors import PageError
-from ..experiments import Experiment, Setting, experiment
 from ..export.arm_page import CONTAINER, Arm, arm_page, live_part
 from ..files import head_of, read_member, refusing, write_file
 from ..fmu import Fmu, opened, read_resource
 from ..geometry.shapes import link_shapes
 from ..plant.urdf import RobotError, read_urdf
+from ..simulation.experiments import Experiment, Setting, experiment
 
 MAX_SOURCE = 16 * 1024**2  # bytes of a file
 NO_SOURCES: Mapping[str, bytes] = {}

@@ -10,9 +10,9 @@ from math import inf
 from pathlib import Path
 
 from ..errors import InputError
-from ..experiments import Experiment, Setting, experiment
 from ..export.arm_page import arm_page, served_part
 from ..fmu import Fmu
+from ..simulation.experiments import Experiment, Setting, experiment
 from .arm import arm_of
 from .loop import Loop
 from .serving import HOST, PORT, Connection, Server

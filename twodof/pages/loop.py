@@ -18,12 +18,12 @@ from typing import Any
 
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
-from ..experiments import Experiment, Setting, Value, resolve
 from ..files import free_name
-from ..master import at_rest, samples
-from ..pace import RealTime
 from ..ros.messages import check_gains
-from ..sample import Sample
+from ..simulation.experiments import Experiment, Setting, Value, resolve
+from ..simulation.master import at_rest, samples
+from ..simulation.pace import RealTime
+from ..simulation.sample import Sample
 
 MOST_ROWS = 1000  # that are kept for pages that have not asked yet,
 MOST_AT_ONCE = 200  # and are told at a time

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..experiments import NANOSECONDS
+from ..simulation.experiments import NANOSECONDS
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.uint8]

@@ -12,8 +12,8 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from ..errors import InputError
-from ..experiments import NANOSECONDS
 from ..fmu import Fmu
+from ..simulation.experiments import NANOSECONDS
 from .messages import JOINT_STATE, POINT, POSE, store_of
 
 LOG = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ from threading import Lock
 from typing import Any
 
 from ..errors import InputError, PublishError
-from ..experiments import Experiment, Value, resolve
-from ..sample import Sample, Sink
+from ..simulation.experiments import Experiment, Value, resolve
+from ..simulation.sample import Sample, Sink
 from .cdr import Rows
 from .messages import GAINS, Messages, check_gains, store_of
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..experiments import experiment
 from ..files import write_file
 from ..fmu import Fmu, load_fmu
+from ..simulation.experiments import experiment
 from .messages import GAINS, JOINT_STATES, POSE, Messages, check_name
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")

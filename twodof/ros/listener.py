@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
-from ..experiments import NANOSECONDS
-from ..pace import RealTime
-from ..sample import Sample
+from ..simulation.experiments import NANOSECONDS
+from ..simulation.pace import RealTime
+from ..simulation.sample import Sample
 from .commands import LONGEST_NAME, Command, CommandError, Commands, deserialise, warner
 from .dds import dds_qos, dds_topic
 from .messages import JOINT_STATE, POINT, POSE, STREAM

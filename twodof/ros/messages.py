@@ -22,10 +22,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ..errors import BagError, InputError
-from ..experiments import Experiment, Value
 from ..fmu import read_resource
 from ..plant.urdf import Joint, RobotError
-from ..sample import Sample
+from ..simulation.experiments import Experiment, Value
+from ..simulation.sample import Sample
 from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
 
 if TYPE_CHECKING:

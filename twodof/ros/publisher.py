@@ -12,11 +12,11 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError, PublishError, SimulationError
-from ..experiments import NANOSECONDS, Experiment, Setting
 from ..fmu import Fmu
-from ..master import Member, Summary, as_experiment, at_rest, simulate_together
-from ..pace import RealTime
-from ..sample import Sample, Sink
+from ..simulation.experiments import NANOSECONDS, Experiment, Setting
+from ..simulation.master import Member, Summary, as_experiment, at_rest, simulate_together
+from ..simulation.pace import RealTime
+from ..simulation.sample import Sample, Sink
 from .cdr import Rows
 from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic

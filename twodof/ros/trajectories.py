@@ -24,7 +24,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.polynomial.polynomial import polyder, polyval
 
-from ..experiments import NANOSECONDS
+from ..simulation.experiments import NANOSECONDS
 from .cdr import Array
 from .commands import CommandError, deserialise, known_joints, sized
 from .messages import JOINT_TRAJECTORY

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..experiments import Setting, experiment
 from ..files import temporary_folder
 from ..fmu import Fmu, opened
+from ..simulation.experiments import Setting, experiment
 from ..version import versions
 from .batches import Batches
 from .design import Design, make_design

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..experiments import Setting, resolve
 from ..fmu import Fmu
+from ..simulation.experiments import Setting, resolve
 
 MAX_RUNS = 1_000_000
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import SimulationError
-from ..experiments import Experiment, Value, experiment, resolve
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
-from ..master import OUTPUTS, simulate
-from ..sample import Sample, Sink
+from ..simulation.experiments import Experiment, Value, experiment, resolve
+from ..simulation.master import OUTPUTS, simulate
+from ..simulation.sample import Sample, Sink
 from .metrics import METRICS, Array, measure
 from .trace import trace
 

@@ -7,9 +7,9 @@ from itertools import accumulate, chain
 import numpy as np
 
 from ..errors import SimulationError, diverged, step_failure
-from ..experiments import Experiment
 from ..fmu import Instance
-from ..master import OUTPUTS
+from ..simulation.experiments import Experiment
+from ..simulation.master import OUTPUTS
 from .metrics import Array
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from math import inf
 
-from .errors import InputError
+from ..errors import InputError
 
 LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
 

@@ -16,11 +16,11 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError
-from .files import check_file
-from .fmu import Fmu, load_fmu
-from .plant.variables import CONTROLS
-from .plant.variables import Value as Value
+from ..errors import InputError
+from ..files import check_file
+from ..fmu import Fmu, load_fmu
+from ..plant.variables import CONTROLS
+from ..plant.variables import Value as Value
 
 Setting = Any
 """A number, a Boolean, or a sequence or array of numbers; checked by ``resolve``."""

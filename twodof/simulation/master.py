@@ -19,7 +19,8 @@ from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple
 
-from .errors import InputError, SimulationError, diverged, step_failure
+from ..errors import InputError, SimulationError, diverged, step_failure
+from ..fmu import Fmu, Instance, instantiate
 from .experiments import (
     NANOSECONDS,
     TIME_TOLERANCE,
@@ -30,7 +31,6 @@ from .experiments import (
     pop_until,
     resolve,
 )
-from .fmu import Fmu, Instance, instantiate
 from .pace import RealTime
 from .sample import Sample, Sink
 

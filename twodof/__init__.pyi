@@ -1,0 +1,34 @@
+"""The public names, and where each is."""
+
+from .bag.commands import read_commands as read_commands
+from .bag.reader import read_bag as read_bag
+from .bag.recording import Recording as Recording
+from .bag.recovery import recover as recover
+from .bag.writer import Bag as Bag
+from .errors import TwoDofError as TwoDofError
+from .export.options import FmuOptions as FmuOptions
+from .export.package import build_fmu as build_fmu
+from .fmu import Fmu as Fmu
+from .fmu import load_fmu as load_fmu
+from .linear import LinearModel as LinearModel
+from .linear import linearise as linearise
+from .pages.arm import page as page
+from .pages.live import live as live
+from .pages.replay import view as view
+from .plots.runs import plot as plot
+from .ros.foxglove import Foxglove as Foxglove
+from .ros.layouts import layouts as layouts
+from .ros.publisher import Publisher as Publisher
+from .ros.publisher import publish as publish
+from .ros.publisher import publish_together as publish_together
+from .simulation.experiments import Experiment as Experiment
+from .simulation.experiments import experiment as experiment
+from .simulation.master import Summary as Summary
+from .simulation.master import samples as samples
+from .simulation.master import simulate as simulate
+from .simulation.pace import RealTime as RealTime
+from .simulation.sample import Sample as Sample
+from .simulation.sample import Sink as Sink
+from .sweeps.coordinator import sweep as sweep
+from .sweeps.results import read_sweep as read_sweep
+from .version import __version__ as __version__
