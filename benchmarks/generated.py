@@ -16,7 +16,7 @@ import casadi
 import numpy as np
 from steps import Arm, by_own_compiler, native_cost
 
-from twodof.export.bodies import Array, mechanism
+from twodof.export.bodies import Array, joint_tree
 from twodof.export.recursions import (
     mass_matrix,
     solve_by_factors,
@@ -83,7 +83,7 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
         robot: without joints that mimic others.
         way: to what damping and tau_ext cause, a key of WAYS; None: they are 0.
     """
-    constants, n, axes = mechanism(robot), len(robot.joints), len(robot.axes)
+    constants, n, axes = joint_tree(robot), len(robot.joints), len(robot.axes)
     sizes = {"q": n, "v": n, **dict.fromkeys(INPUTS, axes), "Kn": 1, "tau_ext": n}
     made = {name: _vector(name, size) for name, size in sizes.items()}
     of = {name: vector for name, (_, vector) in made.items()}

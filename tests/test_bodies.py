@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from native_models import model
 
-from twodof.export.bodies import mechanism
+from twodof.export.bodies import joint_tree
 from twodof.export.recursions import inverse_dynamics, mass_matrix, task_frame
 from twodof.plant.robot import load_robot
 
@@ -44,7 +44,7 @@ def random_tree(rng):
 def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
     rng = np.random.default_rng(seed)
     robot = load_robot(random_tree(rng), "end", "xyz")
-    constants, n = mechanism(robot), len(robot.joints)
+    constants, n = joint_tree(robot), len(robot.joints)
     q, v, a = rng.normal(size=(3, n))
     joint = np.array(
         [
@@ -77,7 +77,7 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
 
 def test_frames_and_bodies_leave_few_constants():
     """What rounding in a URDF (1.57079632679) makes of a right angle does not fill all of them."""
-    constants = mechanism(model("panda").robot)
+    constants = joint_tree(model("panda").robot)
     carrier = constants.path[-1]
     for i, body in enumerate(constants.body):
         if constants.prismatic[i]:

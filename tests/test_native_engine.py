@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from native_models import ROBOTS, Engine, coupling, engine, from_urdf, model
 
-from twodof.export.bodies import mechanism
+from twodof.export.bodies import joint_tree
 from twodof.export.recursions import effort_bounds
 
 # trees, prismatic joints, axes along x, y, z and none of them, joints that mimic others
@@ -111,7 +111,7 @@ def test_no_effort_exceeds_its_bound(name):
 
 def test_effort_bound_is_what_holds_a_stretched_arm():
     robot, still = model("twodof").robot, np.zeros(2)
-    constants, gravity = mechanism(robot), np.array([0.0, -9.81, 0.0])
+    constants, gravity = joint_tree(robot), np.array([0.0, -9.81, 0.0])
     reference = robot.model.copy()
     reference.gravity.linear = gravity
     data = reference.createData()

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from native_models import model
 
-from twodof.export.bodies import mechanism
+from twodof.export.bodies import joint_tree
 from twodof.export.recursions import mass_matrix, solve_by_factors, solve_by_recursion
 from twodof.export.straight_line import Expression, c_function, operations, varied
 
@@ -46,7 +46,7 @@ def test_text_computes_the_expression_and_how_it_varies():
 @pytest.mark.parametrize("name", ["ur5", "anymal_c", "tiago"])
 def test_both_ways_to_an_acceleration_are_pinocchios(name):
     robot = model(name).robot
-    constants, rng, n = mechanism(robot), np.random.default_rng(5), len(robot.joints)
+    constants, rng, n = joint_tree(robot), np.random.default_rng(5), len(robot.joints)
     q, tau = rng.normal(size=(2, n))
     joint = np.array(
         [

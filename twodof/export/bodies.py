@@ -17,8 +17,8 @@ from ..plant.robot import Robot
 
 Array = NDArray[Any]
 """Of numbers, or of numbers and expressions."""
-Placement = tuple[Array, Array]
-"""R and p of a frame: a = R b + p."""
+Frame = tuple[Array, Array]
+"""R and p: a = R b + p."""
 
 
 @dataclass(frozen=True)
@@ -50,20 +50,20 @@ class Body:
     def moved(self, R: Array, p: Array) -> Body:
         """The same in the frame in which its own is placed at (R, p)."""
         d = R.dot(self.moment)
-        T = R.dot(self.inertia)
         # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
         half = d + p * (0.5 * self.mass)
-        spread = 2.0 * half.dot(p)
-        inertia = np.zeros((3, 3), dtype=object)
-        for r in range(3):
-            for k in range(r + 1):
-                entry = T[r].dot(R[k]) - half[r] * p[k] - p[r] * half[k]
-                inertia[r, k] = inertia[k, r] = entry + spread if r == k else entry
-        return Body(self.mass, d + p * self.mass, inertia)
+        turned = R.dot(self.inertia).dot(R.T)
+        inertia = turned - np.outer(half, p) - np.outer(p, half) + np.eye(3) * (2.0 * half.dot(p))
+        return Body(self.mass, d + p * self.mass, symmetric(inertia))
+
+
+def symmetric(S: Array) -> Array:
+    """S, whose upper triangle is taken to be its lower one."""
+    return np.where(np.tri(3, dtype=bool), S, S.T)
 
 
 @dataclass(frozen=True)
-class Mechanism:
+class JointTree:
     """The constants of a robot whose N joints have axes along z; n of them move on their own.
 
     Attributes:
@@ -88,7 +88,7 @@ class Mechanism:
     c: Array
 
 
-def mechanism(robot: Robot) -> Mechanism:
+def joint_tree(robot: Robot) -> JointTree:
     """The constants of a robot, read by Pinocchio, in frames and bodies that leave few of them."""
     model = robot.model
     subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
@@ -109,7 +109,7 @@ def mechanism(robot: Robot) -> Mechanism:
         centred = Body(0.0, np.zeros(3), own.T @ inertia.inertia @ own)
         bodies.append(centred.with_point(inertia.mass, own.T @ (inertia.lever - origin)))
     base, zero = frames[path[-1]]
-    constants = Mechanism(
+    constants = JointTree(
         parent=parents,
         prismatic=slides,
         R=np.array(rotations),
@@ -129,8 +129,8 @@ SKEW = 0.1
 
 
 def _frames(
-    axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Placement], path: Sequence[int]
-) -> list[Placement]:
+    axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]
+) -> list[Frame]:
     """A frame for each joint, in that of Pinocchio, and at last the root's.
 
     z is the joint's axis, x its common normal with the next one's, from which the origin is taken;
@@ -180,7 +180,7 @@ def _without_rounding(values: Array) -> Array:
     return np.where(np.abs(values - whole) < 1e-15, whole, values)
 
 
-def _regrouped(robot: Mechanism) -> tuple[Body, ...]:
+def _regrouped(robot: JointTree) -> tuple[Body, ...]:
     """The bodies without what a joint cannot tell from a part of its parent's.
 
     That is a rod along the axis of a joint that turns: m, z and I_yy of its body, which become 0.

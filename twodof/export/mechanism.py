@@ -8,7 +8,7 @@ import numpy as np
 
 from ..plant.robot import Robot
 from ..plant.variables import Variable
-from .bodies import Array, Body, Mechanism, mechanism
+from .bodies import Array, Body, JointTree, joint_tree
 from .recursions import (
     effort_bounds,
     inverse_dynamics,
@@ -22,7 +22,7 @@ from .straight_line import Expression, Value, Varied, c_function, operations, va
 
 def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     """The text of ``mechanism.c``: the robot's kinematics and dynamics, without loops."""
-    n, constants = len(robot.joints), mechanism(robot)
+    n, constants = len(robot.joints), joint_tree(robot)
     joint = np.array(
         [
             (Expression(f"joint[{i}].c"), 0.0 if slides else Expression(f"joint[{i}].s"))
@@ -112,7 +112,7 @@ def _solution(solution: Array, inertial: Array) -> list[Varied]:
     return [(a, change) for a, (change, _) in zip(value, varied(solution, rest, HELD))]
 
 
-def _places(robot: Mechanism) -> dict[str, Value]:
+def _places(robot: JointTree) -> dict[str, Value]:
     angles = robot.G.dot(_variables("q", robot.G.shape[1])) + robot.c
     places: dict[str, Value] = {}
     for i, (angle, slides) in enumerate(zip(angles, robot.prismatic)):
@@ -123,7 +123,7 @@ def _places(robot: Mechanism) -> dict[str, Value]:
     return places
 
 
-def _loaded(robot: Mechanism) -> tuple[list[Body], dict[str, Value]]:
+def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
     """The bodies, that with the payload as variables; and what these are."""
     carrier, place = robot.path[-1], _variables("place", 3)
     loaded = robot.body[carrier].with_point(

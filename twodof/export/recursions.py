@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from .bodies import Array, Body, Mechanism
+from .bodies import Array, Body, JointTree, symmetric
 
 
-def placements(robot: Mechanism, joint: Array) -> tuple[list[Array], list[Array]]:
+def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]]:
     """R(q), p(q) of each joint's frame in its parent's: a = R b + p.
 
     Args:
-        robot: the mechanism.
+        robot: its joints.
         joint: N × 2, cosine and sine of a joint's angle, or the displacement of one that slides.
     """
     rotations, origins = [], []
@@ -34,7 +34,7 @@ def placements(robot: Mechanism, joint: Array) -> tuple[list[Array], list[Array]
     return rotations, origins
 
 
-def task_frame(robot: Mechanism, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
     """The task frame in the root's axes: position, rotation, Jacobian and drift.
 
         J_i = z_i × (x − o_i), or z_i of a sliding joint;   ω_i = ω_p + z_i v_i of one that turns
@@ -63,14 +63,14 @@ def task_frame(robot: Mechanism, joint: Array, v: Array) -> tuple[Array, Array, 
         if robot.prismatic[i]:
             columns[i, :3] = z
         else:
-            columns[i] = [*cross(z, x - o), *z]
-            alpha, omega = alpha + cross(omega, turning), omega + turning
-        a = a + cross(before + omega, columns[i, :3] * rates[i])
+            columns[i] = [*np.cross(z, x - o), *z]
+            alpha, omega = alpha + np.cross(omega, turning), omega + turning
+        a = a + np.cross(before + omega, columns[i, :3] * rates[i])
     return x, R.dot(robot.frame_R), columns.T.dot(robot.G), np.array([*a, *alpha])
 
 
 def inverse_dynamics(
-    robot: Mechanism, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
+    robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
 ) -> Array:
     """τ = M(q) a + h(q, v): outwards the motion, inwards the forces.
 
@@ -87,7 +87,7 @@ def inverse_dynamics(
     for i, parent in enumerate(robot.parent):
         omega, alpha, linear = motions[parent] if parent >= 0 else (zero, zero, -gravity)
         R, p = rotations[i], origins[i]
-        linear = linear + cross(alpha, p) + cross(omega, cross(omega, p))
+        linear = linear + np.cross(alpha, p) + np.cross(omega, np.cross(omega, p))
         omega, alpha, linear = (R.T.dot(each) for each in (omega, alpha, linear))
         coriolis = np.array([omega[1] * rates[i], -omega[0] * rates[i], 0.0])
         along = np.array([0.0, 0.0, 1.0])
@@ -98,8 +98,12 @@ def inverse_dynamics(
             omega = omega + along * rates[i]
         motions.append((omega, alpha, linear))
         b = body[i]
-        f = linear * b.mass + cross(alpha, b.moment) + cross(omega, cross(omega, b.moment))
-        n = b.inertia.dot(alpha) + cross(omega, b.inertia.dot(omega)) + cross(b.moment, linear)
+        f = linear * b.mass + np.cross(alpha, b.moment) + np.cross(omega, np.cross(omega, b.moment))
+        n = (
+            b.inertia.dot(alpha)
+            + np.cross(omega, b.inertia.dot(omega))
+            + np.cross(b.moment, linear)
+        )
         force.append(f)
         moment.append(n)
     tau = np.zeros(len(robot.parent), dtype=object)
@@ -109,13 +113,13 @@ def inverse_dynamics(
         if parent >= 0:
             f = rotations[i].dot(force[i])
             force[parent] = force[parent] + f
-            moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + cross(origins[i], f)
+            moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + np.cross(origins[i], f)
     effort: Array = robot.G.T.dot(tau)
     return effort
 
 
 def effort_bounds(
-    robot: Mechanism, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
+    robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
 ) -> Array:
     """What no |τ| of ``inverse_dynamics`` exceeds: its recursion with lengths in place of vectors.
 
@@ -154,7 +158,7 @@ def _length(a: Array) -> Any:
     return np.sqrt(a.dot(a))
 
 
-def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:
+def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array) -> Array:
     """M(q), n × n, by composite bodies: what each joint and all behind it weigh.
 
     Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2.
@@ -172,7 +176,7 @@ def mass_matrix(robot: Mechanism, body: Sequence[Body], joint: Array) -> Array:
             if robot.parent[k] < 0:
                 break
             f, t = rotations[k].dot(f), rotations[k].dot(t)
-            t = t + cross(origins[k], f)
+            t = t + np.cross(origins[k], f)
             k = robot.parent[k]
         if robot.parent[i] >= 0:
             composite[robot.parent[i]] += b.moved(rotations[i], origins[i])
@@ -203,7 +207,7 @@ def solve_by_factors(M: Array, tau: Array) -> Array:
     return a
 
 
-def solve_by_recursion(robot: Mechanism, body: Sequence[Body], joint: Array, tau: Array) -> Array:
+def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, tau: Array) -> Array:
     """M⁻¹τ by articulated bodies, without velocities and gravity; no joint mimics another.
 
         n = A α + B a,  f = Bᵀ α + C a                    what a joint feels, inwards
@@ -240,7 +244,7 @@ def solve_by_recursion(robot: Mechanism, body: Sequence[Body], joint: Array, tau
             left[0][:, 2] = left[0][2] = left[1][2] = 0.0
         b_angular, b_linear = bias[i]
         f = rotations[i].dot(b_linear + per_linear * u[i])
-        t = rotations[i].dot(b_angular + per_angular * u[i]) + cross(origins[i], f)
+        t = rotations[i].dot(b_angular + per_angular * u[i]) + np.cross(origins[i], f)
         bias[parent] = bias[parent][0] + t, bias[parent][1] + f
         moved = _moved_articulated(left, rotations[i], origins[i])
         A[parent], B[parent], C[parent] = (
@@ -250,7 +254,7 @@ def solve_by_recursion(robot: Mechanism, body: Sequence[Body], joint: Array, tau
     motion: list[tuple[Array, Array]] = []
     for i, parent in enumerate(robot.parent):
         alpha, linear = motion[parent] if parent >= 0 else (np.zeros(3), np.zeros(3))
-        linear = rotations[i].T.dot(linear + cross(alpha, origins[i]))
+        linear = rotations[i].T.dot(linear + np.cross(alpha, origins[i]))
         alpha = rotations[i].T.dot(alpha)
         a[i] = (u[i] - U[i][0].dot(alpha) - U[i][1].dot(linear)) * inverse[i]
         along = np.array([0.0, 0.0, 1.0]) * a[i]
@@ -258,35 +262,13 @@ def solve_by_recursion(robot: Mechanism, body: Sequence[Body], joint: Array, tau
     return a
 
 
-def cross(a: Array, b: Array) -> Array:
-    """a × b"""
-    return np.array(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-
-
 def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -> list[Array]:
     """A, B, C in the frame in which their own is placed at (R, p)."""
     A, B, C = blocks
-    A, C = _rotated(A, R), _rotated(C, R)
-    B = R.dot(B).dot(R.T)
-    P = _skew(p)
+    A, B, C = (R.dot(block).dot(R.T) for block in (A, B, C))
+    A, C, P = symmetric(A), symmetric(C), _skew(p)
     G = B + P.dot(C)
-    return [_symmetric(A + P.dot(B.T) - G.dot(P)), G, C]
-
-
-def _rotated(S: Array, R: Array) -> Array:
-    """R S Rᵀ of a symmetric S."""
-    return _symmetric(R.dot(S).dot(R.T))
-
-
-def _symmetric(S: Array) -> Array:
-    """S, whose upper triangle is taken to be its lower one."""
-    S = S.copy()
-    for r in range(3):
-        for k in range(r):
-            S[k, r] = S[r, k]
-    return S
+    return [symmetric(A + P.dot(B.T) - G.dot(P)), G, C]
 
 
 def _skew(a: Array) -> Array:

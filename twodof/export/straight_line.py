@@ -115,7 +115,7 @@ def varied(
             pair = quotient, (da - quotient * db) / b
         elif operation == "neg":
             pair = -a, -da
-        elif _is_number(operation):
+        elif operation[0] in "-.0123456789":  # a number
             pair = float(operation), 0.0
         elif parts and operation in parts:
             pair = parts[operation]
@@ -176,10 +176,6 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
     return "\n".join(lines)
 
 
-def _is_number(operation: str) -> bool:
-    return operation[0] in "-.0123456789"
-
-
 def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]], list[int]]:
     """Operations in an order in which they can be done, equal ones once; the results' places."""
     nodes: list[tuple[str, tuple[int, ...]]] = []
@@ -228,11 +224,4 @@ def _c(operation: str, operands: list[str]) -> str:
 
 def _bare(text: str) -> str:
     """Without the parentheses around all of it."""
-    if not text.startswith("("):
-        return text
-    depth = 0
-    for place, letter in enumerate(text):
-        depth += (letter == "(") - (letter == ")")
-        if depth == 0:
-            return text[1:-1] if place == len(text) - 1 else text
-    return text
+    return text[1:-1] if text.startswith("(") else text
