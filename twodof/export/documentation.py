@@ -32,6 +32,8 @@ q̈_cmd = J⁺ ((a_cmd, α_cmd) − J̇ v) − Kn (I − J⁺J) v   J⁺ drops s
     "effort": "τ     = tau_cmd",
 }
 """The equations of the control laws."""
+NO_DEPENDENCIES = b"None: the binaries need the C library and its mathematics only.\n"
+"""Of a native FMU."""
 
 
 def documentation(
@@ -42,7 +44,7 @@ def documentation(
 
     Args:
         options, robot, table, guid: as of the model description.
-        flavour: says what the FMU depends on, cannot do, and whose code it contains.
+        flavour: says what the FMU can do, what it depends on, and whose code it contains.
         urdf: text of resources/robot.urdf.
         live: the arm itself, or nothing.
     """
@@ -51,8 +53,7 @@ def documentation(
         "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in _row(variable)) + "</tr>"
         for variable in table
     )
-    template = data_file("fmu_src", "documentation.html").read_text("utf-8")
-    page = Template(template).substitute(
+    page = Template(_shipped("documentation.html").decode()).substitute(
         head=live.head,
         live=live.body,
         name=options.name,
@@ -63,26 +64,28 @@ def documentation(
         law=LAWS[options.control].replace("$frame", frame),
         root=html.escape(robot.root),
         variables=rows,
-        kinds="co-simulation and Model Exchange" if flavour.exchanges else "co-simulation",
-        limitations=flavour.limitations,
+        kinds="co-simulation and Model Exchange" if flavour.native else "co-simulation",
+        limitations="" if flavour.native else _shipped("limitations.html").decode(),
         version=__version__,
         guid=guid,
         urdf_digest=hashlib.sha256(urdf.encode()).hexdigest(),
     )
-    return {
-        "documentation/index.html": page.encode(),
-        "documentation/externalDependencies.txt": flavour.dependencies,
-        "documentation/licenses/license.txt": data_file("LICENSE").read_bytes(),
-        **{
-            f"documentation/licenses/{distribution}.txt": _licence_of(distribution)
-            for distribution in flavour.licences
-        },
-    }
+    files = {"index.html": page.encode(), "licenses/license.txt": data_file("LICENSE").read_bytes()}
+    if flavour.native:
+        files["externalDependencies.txt"] = NO_DEPENDENCIES
+    else:
+        files["externalDependencies.txt"] = _shipped("externalDependencies.txt")
+        files["licenses/pythonfmu.txt"] = _licence_of("pythonfmu")
+    return {f"documentation/{name}": content for name, content in files.items()}
 
 
 def _row(variable: Variable) -> tuple[str, str, str, str, str]:
     start = "" if variable.start is None else str(variable.start)
     return variable.name, variable.causality, variable.unit, start, variable.description
+
+
+def _shipped(name: str) -> bytes:
+    return data_file("fmu_src", name).read_bytes()
 
 
 def _licence_of(distribution: str) -> bytes:

@@ -31,6 +31,7 @@ LOG = logging.getLogger(__name__)
 Files = dict[str, bytes]
 """Contents by path inside the FMU."""
 
+PYTHONFMU = Path(pythonfmu.__file__).parent
 PYTHONFMU_FILES = (
     "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
 )  # fmt: skip
@@ -46,32 +47,22 @@ class Flavour:
     """What one flavour adds.
 
     Attributes:
-        attributes: of <CoSimulation> in the model description, and of <ModelExchange>.
-        exchanges: whether it has Model Exchange too.
+        native: whether it is in C: with sources, Model Exchange and derivatives.
+        files: resources and sources; the GUID is a digest of them.
+        platforms: FMI platforms of the binaries.
+        binaries: given the GUID, the compiled libraries.
+        signed: given the GUID, the sources that contain it.
         fmi: version of FMI, 2 or 3.
         arrays: whether its vectors are arrays of FMI 3.
-        files: resources and sources; the GUID is a digest of them.
-        source_files: names under sources/ that a tool compiles.
-        platforms: FMI platforms of the binaries.
-        signed: given the GUID, the sources that contain it.
-        binaries: given the GUID, the compiled libraries.
-        dependencies: text of documentation/externalDependencies.txt.
-        limitations: what it cannot do, a section of documentation/index.html; "" where nothing.
-        licences: of others' code that the FMU contains, by name of the distribution.
     """
 
-    attributes: Mapping[str, str]
-    exchanges: bool
-    fmi: int
-    arrays: bool
+    native: bool
     files: Files
-    source_files: Sequence[str]
     platforms: Sequence[str]
-    signed: Callable[[str], Files]
     binaries: Callable[[str], Files]
-    dependencies: bytes
-    limitations: str
-    licences: Sequence[str]
+    signed: Callable[[str], Files] = lambda guid: {}
+    fmi: int = 2
+    arrays: bool = False
 
 
 def python_flavour(
@@ -92,20 +83,12 @@ def python_flavour(
         "plant.json": (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
         "requirements.txt": data_file("fmu_src", "requirements.txt").read_bytes(),
     }
-    wrapper = _pythonfmu() / "resources/binaries/linux64/libpythonfmu-export.so"
+    wrapper = PYTHONFMU / "resources/binaries/linux64/libpythonfmu-export.so"
     return Flavour(
-        attributes={"needsExecutionTool": "true"},
-        exchanges=False,
-        fmi=2,
-        arrays=False,
+        native=False,
         files={f"resources/{path}": content for path, content in resources.items()},
-        source_files=(),
         platforms=("linux64",),
-        signed=lambda guid: {},
         binaries=lambda guid: {f"binaries/linux64/{options.name}.so": wrapper.read_bytes()},
-        dependencies=data_file("fmu_src", "externalDependencies.txt").read_bytes(),
-        limitations=data_file("fmu_src", "limitations.html").read_text("utf-8"),
-        licences=("pythonfmu",),
     )
 
 
@@ -134,10 +117,6 @@ def native_flavour(
     sources = engine_sources(control, fmi)
     sources["mechanism.c"] = mechanism_source(robot, table).encode()
     sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS[fmi]})
-    described = {}
-    if fmi == 3:
-        described["sources/buildDescription.xml"] = build_description(name, UNITS)
-        described["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table, arrays)
 
     def header(guid: str) -> bytes:
         return model_header(robot, table, control, guid, fmi, arrays).encode()
@@ -156,23 +135,19 @@ def native_flavour(
                 for platform, content in zip(platforms, libraries)
             }
 
+    files = {f"sources/{path}": content for path, content in sources.items()}
+    files["sources/model.h"] = header("")
+    if fmi == 3:
+        files["sources/buildDescription.xml"] = build_description(name, UNITS)
+        files["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table, arrays)
     return Flavour(
-        attributes={"needsExecutionTool": "false", "providesDirectionalDerivative": "true"},
-        exchanges=True,
+        native=True,
+        files=files,
+        platforms=platforms,
+        binaries=binaries,
+        signed=lambda guid: {"sources/model.h": header(guid)},
         fmi=fmi,
         arrays=arrays,
-        files={
-            **{f"sources/{path}": content for path, content in sources.items()},
-            "sources/model.h": header(""),
-            **described,
-        },
-        source_files=UNITS,
-        platforms=platforms,
-        signed=lambda guid: {"sources/model.h": header(guid)},
-        binaries=binaries,
-        dependencies=b"None: the binaries need the C library and its mathematics only.\n",
-        limitations="",
-        licences=(),
     )
 
 
@@ -181,7 +156,7 @@ def _slave_sources() -> Files:
     plant = Path(__file__).parents[1] / "plant"
     package = {f"plant/{path.name}": path.read_bytes() for path in plant.glob("*.py")}
     for name in PYTHONFMU_FILES:
-        package[f"pythonfmu/{name}"] = (_pythonfmu() / name).read_bytes()
+        package[f"pythonfmu/{name}"] = (PYTHONFMU / name).read_bytes()
     package["pythonfmu/__init__.py"] = package["__init__.py"] = b""
     slave = data_file("fmu_src", "slave.py").read_bytes()
     digest = hashlib.sha256(slave)
@@ -192,10 +167,6 @@ def _slave_sources() -> Files:
     files[f"slave_{tag}.py"] = slave
     files["slavemodule.txt"] = f"slave_{tag}\n".encode()
     return files
-
-
-def _pythonfmu() -> Path:
-    return Path(pythonfmu.__file__).parent
 
 
 def _site_packages() -> list[str]:

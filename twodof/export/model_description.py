@@ -19,11 +19,12 @@ from ..plant.variables import (
     count_event_indicators,
 )
 from ..version import __version__
+from .compiler import UNITS
 from .flavours import Flavour
 from .model_description3 import xml_text
 from .options import FmuOptions
 
-UNITS: dict[str, dict[str, int]] = {
+DIMENSIONS: dict[str, dict[str, int]] = {
     "m": {"m": 1},
     "m/s": {"m": 1, "s": -1},
     "m/s2": {"m": 1, "s": -2},
@@ -89,7 +90,7 @@ def model_description(
     Args:
         options: with the model's name and control law.
         robot, table: the robot and its variables.
-        flavour: says which interfaces there are, what they can do, and their source files.
+        flavour: says which interfaces there are, and what they can do.
         guid: as it shall stand in the file; "" while it is being computed.
     """
     law = CONTROLS[options.control]
@@ -107,43 +108,41 @@ def model_description(
         generationTool=f"{VENDOR} {__version__}",
         variableNamingConvention="structured",
     )
-    capabilities = {"modelIdentifier": options.name, **CAPABILITIES, **flavour.attributes}
-    if flavour.exchanges:
+    interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
+    needs = {"needsExecutionTool": "true"}
+    if flavour.native:
         indicators = count_event_indicators(robot, options.control)
         root.set("numberOfEventIndicators", str(indicators))
-        exchange = {**capabilities, "completedIntegratorStepNotNeeded": "true"}
-        _source_files(ET.SubElement(root, "ModelExchange", exchange), flavour.source_files)
-    stepping = {**capabilities, "canHandleVariableCommunicationStepSize": "true"}
-    _source_files(ET.SubElement(root, "CoSimulation", stepping), flavour.source_files)
+        interfaces = {"ModelExchange": {"completedIntegratorStepNotNeeded": "true"}, **interfaces}
+        needs = {"needsExecutionTool": "false", "providesDirectionalDerivative": "true"}
+    for interface, own in interfaces.items():
+        attributes = {"modelIdentifier": options.name, **CAPABILITIES, **needs, **own}
+        element = ET.SubElement(root, interface, attributes)
+        if flavour.native:
+            files = ET.SubElement(element, "SourceFiles")
+            for name in UNITS:
+                ET.SubElement(files, "File", name=name)
     used = {variable.unit for variable in table}
     _units(root, used)
     _types(root, used)
     categories = ET.SubElement(root, "LogCategories")
     for category, description in LOG_CATEGORIES.items():
         ET.SubElement(categories, "Category", name=category, description=description)
-    ET.SubElement(
-        root,
-        "DefaultExperiment",
-        startTime="0.0",
-        stopTime=repr(DEFAULT_STOP_TIME),
-        stepSize=repr(DEFAULT_STEP),
-    )
+    times = {
+        "startTime": "0.0",
+        "stopTime": repr(DEFAULT_STOP_TIME),
+        "stepSize": repr(DEFAULT_STEP),
+    }
+    ET.SubElement(root, "DefaultExperiment", times)
     _vendor_annotation(root, robot, options.control)
-    _variables(root, robot, table, flavour.exchanges)
+    _variables(root, robot, table, flavour.native)
     _structure(root, robot, table, law)
     return xml_text(root)
 
 
-def _source_files(interface: ET.Element, names: Sequence[str]) -> None:
-    if names:
-        files = ET.SubElement(interface, "SourceFiles")
-        for name in names:
-            ET.SubElement(files, "File", name=name)
-
-
 def _units(root: ET.Element, used: Collection[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
-    for name, exponents in UNITS.items():
+    for name, exponents in DIMENSIONS.items():
         if name in used:
             unit = ET.SubElement(definitions, "Unit", name=name)
             base = {key: str(exponent) for key, exponent in exponents.items()}

@@ -6,7 +6,7 @@ import hashlib
 import io
 import logging
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError
@@ -44,32 +44,23 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = Path(output if output is not None else default)
     there = output is None and path.exists()
-    if there and not _is_fmu(path):
+    if there and not _fits(path, lambda zipped: "modelDescription.xml" in zipped.namelist()):
         raise BuildError(f"'{path}' is no FMU, and is not replaced; move it away")
     made_of = _shipped(options) if options.native and options.urdf is None else b""
-    if made_of and _made_of(path) == made_of:
+    if made_of and _fits(path, lambda zipped: zipped.comment == made_of):
         return path
     from .composition import compose, is_live  # Pinocchio and SciPy take most of a run's time
 
     try:
         flavour, files, finish = compose(options)
-        description, platforms = files["modelDescription.xml"], flavour.platforms
-        if made_of or not _holds(path, description, platforms, is_live(options)):
+        built = files["modelDescription.xml"], flavour.platforms, is_live(options)
+        if made_of or not _fits(path, lambda zipped: _holds(zipped, *built)):
             if there:
                 LOG.warning(f"'{path}' was another FMU, and is replaced")
             _write_zip(path, {**files, **finish()}, made_of)
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     return path
-
-
-def _is_fmu(path: Path) -> bool:
-    try:
-        check_archive(path)
-        with zipfile.ZipFile(path) as archive:
-            return "modelDescription.xml" in archive.namelist()
-    except ZIP_ERRORS:
-        return False
 
 
 def _shipped(options: FmuOptions) -> bytes:
@@ -85,30 +76,27 @@ def _shipped(options: FmuOptions) -> bytes:
     return digest.hexdigest().encode()
 
 
-def _made_of(path: Path) -> bytes:
-    """The digest that an FMU has as the comment of its zip."""
+def _fits(path: Path, fits: Callable[[zipfile.ZipFile], bool]) -> bool:
+    """Whether a file is a sound zip archive of which something holds."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
-            return archive.comment
-    except ZIP_ERRORS:
-        return b""
-
-
-def _holds(path: Path, description: bytes, platforms: Sequence[str], live: bool) -> bool:
-    """Whether the file is already this FMU; its guid is a digest of all that matters."""
-    from .arm_page import CONTAINER
-
-    try:
-        check_archive(path)
-        with zipfile.ZipFile(path) as archive:
-            found = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
-            with archive.open("modelDescription.xml") as file:
-                same = file.read(len(description) + 1) == description
-            page = read_member(archive, "documentation/index.html", MAX_PAGE)
-            return same and found == set(platforms) and (CONTAINER in page) == live
+            return fits(archive)
     except (*ZIP_ERRORS, KeyError):
         return False
+
+
+def _holds(
+    archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str], live: bool
+) -> bool:
+    """Whether it is already this FMU; its guid is a digest of all that matters."""
+    from .arm_page import CONTAINER
+
+    built_for = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
+    with archive.open("modelDescription.xml") as file:
+        same = file.read(len(description) + 1) == description
+    page = read_member(archive, "documentation/index.html", MAX_PAGE)
+    return same and built_for == set(platforms) and (CONTAINER in page) == live
 
 
 def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
