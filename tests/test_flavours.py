@@ -88,18 +88,11 @@ def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
     assert "TwoDof-native.fmu" in captured.out
 
 
-def test_a_machine_that_is_no_fmi_platform_needs_to_be_told_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("twodof.export.composition.host_platform", lambda fmi=2: "")
-    with pytest.raises(twodof.TwoDofError, match="choose one with `platforms`"):
-        build_fmu(tmp_path / "A.fmu", FmuOptions(native=True))
-
-
 @pytest.mark.parametrize(
     "options, message",
     [
         (FmuOptions(platforms=("win64",)), "for the native flavour only"),
         (FmuOptions(native=True, link_environment=True), "needs no environment to link"),
-        (FmuOptions(native=True, platforms=("amiga",)), "no platform 'amiga'"),
     ],
 )
 def test_options_that_do_not_fit_a_flavour_are_refused(options, message, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import zipfile
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import twodof
 from twodof.cli.main import main
 from twodof.export.options import FmuOptions
 from twodof.export.package import build_fmu
-from twodof.export.urdf_source import end_effector, lock_joints
+from twodof.export.urdf_source import end_effector, lock_joints, without_meshes
 from twodof.files import data_file
 from twodof.plant.robot import load_robot
 from twodof.plant.urdf import RobotError, read_urdf
@@ -36,7 +37,6 @@ def test_locked_joints_are_pinocchios_reduced_model(
     """M, h and the frame's place; the fingers, one of which mimics the other, are always locked."""
     text = panda_file.read_text()
     full = pin.buildModelFromXML(text)
-    free = {"*": [], "panda_joint4": ["panda_joint4"]}
     positions = {"panda_finger_joint?": 0.02}
     if "*" in locks:
         positions |= {f"panda_joint{i}": 0.0 for i in (1, 2, 3, 5, 6)}
@@ -50,7 +50,7 @@ def test_locked_joints_are_pinocchios_reduced_model(
         (value,) = {v for pattern, v in positions.items() if Path(name).match(pattern)}
         q0[full.joints[full.getJointId(name)].idx_q] = value
     reduced = pin.buildReducedModel(full, [full.getJointId(name) for name in held], q0)
-    assert robot.joints == tuple(reduced.names)[1:] and free
+    assert robot.joints == tuple(reduced.names)[1:]
     data, ours = reduced.createData(), robot.model.createData()
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -63,24 +63,18 @@ def test_locked_joints_are_pinocchios_reduced_model(
         np.testing.assert_allclose(ours.oMf[robot.frame_id].translation, place, atol=1e-12)
 
 
-def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
-    text = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
-    <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
-    <limit lower="-1" upper="1"/></joint><joint name="k" type="prismatic"><parent link="b"/>
-    <child link="c"/><axis xyz="1 0 0"/><limit lower="-1" upper="1"/>
-    <mimic joint="j" multiplier="0.5" offset="0.1"/></joint></robot>"""
-    joints = read_urdf(lock_joints(text, {"j": 0.4})).joints
-    assert {joint.type for joint in joints.values()} == {"fixed"}
-    assert joints["j"].rpy == pytest.approx((0, 0, 0.4), abs=1e-15) and joints[
-        "k"
-    ].xyz == pytest.approx((0.3, 0.0, 0.0))
-
-
 MIMIC = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
 <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
-<limit lower="-1" upper="1"/></joint><joint name="k" type="revolute"><parent link="b"/>
+<limit lower="-1" upper="1"/></joint><joint name="k" type="prismatic"><parent link="b"/>
 <child link="c"/><axis xyz="1 0 0"/><limit lower="-1" upper="1"/>
-<mimic joint="j" multiplier="{factor}"/></joint></robot>"""
+<mimic joint="j" multiplier="{factor}" offset="0.1"/></joint></robot>"""
+
+
+def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
+    joints = read_urdf(lock_joints(MIMIC.format(factor=0.5), {"j": 0.4})).joints
+    assert {joint.type for joint in joints.values()} == {"fixed"}
+    assert joints["j"].rpy == pytest.approx((0, 0, 0.4), abs=1e-15)
+    assert joints["k"].xyz == pytest.approx((0.3, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -106,13 +100,6 @@ def test_a_mimic_that_cannot_be_followed_is_refused(factor: str, lock: str, mess
 def test_a_lock_that_cannot_be_is_refused(locks: dict[str, float], message: str) -> None:
     with pytest.raises(twodof.TwoDofError, match=message):
         build_fmu(None, FmuOptions(lock=locks))
-
-
-def test_the_only_last_link_is_controlled(robots: Path, tmp_path: Path) -> None:
-    xarm = robots / "xarm_description/urdf/xarm7.urdf"
-    path = build_fmu(tmp_path / "k.fmu", FmuOptions(urdf=xarm, native=True, meshes=False))
-    fmu = twodof.load_fmu(path)
-    assert fmu.frame == end_effector(read_urdf(xarm.read_text())) == "link_eef"
 
 
 def test_of_several_last_links_one_must_be_named(panda_file: Path) -> None:
@@ -142,46 +129,46 @@ def test_meshes_can_be_left_out(tmp_path: Path) -> None:
 
 
 def test_inertias_that_no_body_has_are_named_in_one_line() -> None:
-    shipped = data_file("urdf", "2dof.urdf")
-    tree = shipped.read_text()
-    import re
-
-    odd = re.sub(r'izz="[^"]*"', 'izz="1.0"', tree)
-    robot = load_robot(odd, "EndEffector", "xy")
+    shipped = data_file("urdf", "2dof.urdf").read_text()
+    robot = load_robot(re.sub(r'izz="[^"]*"', 'izz="1.0"', shipped), "EndEffector", "xy")
     (line,) = robot.warnings
     assert "'link1', 'link2'" in line and "taken as they are" in line
 
 
 def test_a_urdf_is_run_by_one_command(
-    panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    robots: Path, panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of one end, which is controlled; what one needs to say of others, `build` takes."""
     monkeypatch.chdir(tmp_path)
-    options = ["--native", "--no-meshes", "--frame", "panda_hand_tcp", "--lock", "panda_finger*"]
+    xarm = robots / "xarm_description/urdf/xarm7.urdf"
+    assert main(["run", str(xarm), "-o", "bag", "--stop-time", "0.1"]) == 0
+    assert twodof.load_fmu("xarm7.fmu").frame == "link_eef"
+    options = ["--no-meshes", "--frame", "panda_hand_tcp", "--lock", "panda_finger*"]
     assert main(["build", str(panda_file), *options, "-o", "panda.fmu"]) == 0
-    assert main(["run", "panda.fmu", "-o", "bag", "--stop-time", "0.1"]) == 0
-    assert len(twodof.read_bag("bag").joints) == 7
-    xarm = panda_file.parents[2] / "xarm_description/urdf/xarm7.urdf"
-    assert main(["run", str(xarm), "--native", "-o", "bag2", "--stop-time", "0.1"]) == 0
-    assert (tmp_path / "xarm7-native.fmu").exists()
+    assert main(["run", "panda.fmu", "-o", "bag2", "--stop-time", "0.1"]) == 0
+    assert len(twodof.read_bag("bag2").joints) == 7
 
 
 def test_a_urdf_of_several_ends_is_run_by_one_command_too(
-    panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The remedy of its refusal is an option that there is."""
     monkeypatch.chdir(tmp_path)
-    command = ["run", str(panda_file), "--native", "-o", "bag", "--stop-time", "0.1"]
+    arm = without_meshes(data_file("urdf", "2dof.urdf").read_text()).replace("EndEffector", "tip")
+    side = '<link name="side"/><joint name="fork" type="fixed"><parent link="link1"/>'
+    Path("fork.urdf").write_text(
+        arm.replace("</robot>", f'{side}<child link="side"/></joint></robot>')
+    )
+    command = ["run", "fork.urdf", "--native", "-o", "bag", "--stop-time", "0.1"]
     assert main(command) == 1
     assert "name the controlled link with --frame" in capsys.readouterr().err
-    assert main([*command, "--frame", "panda_hand_tcp"]) == 0
-    assert twodof.load_fmu("panda-native.fmu").frame == "panda_hand_tcp"
-    page = ["page", str(panda_file), "--frame", "panda_hand_tcp", "-o", "panda.html"]
-    assert main(page) == 0
-    for fmu, what in ((["panda-native.fmu"], "an FMU"), ([], "none")):
-        assert main(["run", *fmu, "--frame", "panda_hand_tcp", "-o", "none"]) != 0
-        told = f"--frame is of a URDF that is given; leave it out beside {what}"
-        assert told in capsys.readouterr().err
+    assert main([*command, "--frame", "tip"]) == 0
+    assert twodof.load_fmu("fork-native.fmu").frame == "tip"
+    assert main(["page", "fork.urdf", "--frame", "tip", "-o", "fork.html"]) == 0
+    for fmu, what in ((["fork-native.fmu"], "an FMU"), ([], "none")):
+        assert main(["run", *fmu, "--frame", "tip", "-o", "none"]) != 0
+        refusal = f"--frame is of a URDF that is given; leave it out beside {what}"
+        assert refusal in capsys.readouterr().err
 
 
 BALL = """<robot name="top"><link name="base"/><link name="a"/><link name="b"/><link name="top">
