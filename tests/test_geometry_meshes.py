@@ -12,7 +12,7 @@ import pytest
 
 import twodof
 from twodof.cli.main import main
-from twodof.geometry.meshes import load_mesh, mesh_parts
+from twodof.geometry.meshes import load_mesh, surfaces
 from twodof.geometry.shapes import link_shapes
 from twodof.plant.urdf import read_urdf
 
@@ -45,7 +45,7 @@ def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) 
         for listed in tree.iter(f"{DAE}{kind}"):
             colour = diffuse[effects[symbols[listed.get("material")]]]
             expected[colour] += int(listed.get("count"))
-    parts = mesh_parts(f"{name}.dae", {f"{name}.dae": content}.get, 2.0 * ONE)
+    parts = surfaces(f"{name}.dae", {f"{name}.dae": content}.get, 2.0 * ONE)
     found: Counter[tuple[float, ...]] = Counter()
     for part in parts:
         nearest = min(diffuse.values(), key=lambda c: np.abs(np.subtract(c, part.colour)).max())
@@ -82,13 +82,13 @@ COLOURS = "newmtl red\nKd 0.9 0.05 0.05\nmap_Kd /etc/passwd\nnewmtl green\nKd 0.
 
 def test_an_obj_has_the_colours_of_its_library() -> None:
     files = {"meshes/cube.obj": CUBE.encode(), "meshes/cube.obj.mtl": COLOURS.encode()}
-    parts = mesh_parts("meshes/cube.obj", files.get, np.array([1.0, 2.0, 3.0]))
+    parts = surfaces("meshes/cube.obj", files.get, np.array([1.0, 2.0, 3.0]))
     assert {tuple(np.round(part.colour, 2)): len(part.triangles) for part in parts} == {
         (0.9, 0.05, 0.05): 6, (0.05, 0.8, 0.05): 6,
     }  # fmt: skip
     assert np.abs(parts[0].vertices).max(axis=0).tolist() == [1.0, 2.0, 3.0]
     del files["meshes/cube.obj.mtl"]
-    plain = mesh_parts("meshes/cube.obj", files.get, ONE)
+    plain = surfaces("meshes/cube.obj", files.get, ONE)
     assert {part.colour for part in plain} == {None}
     assert sum(len(part.triangles) for part in plain) == 12
 
@@ -98,9 +98,9 @@ def test_what_has_no_colours_or_cannot_be_read() -> None:
         b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
     )
     files = {"a.stl": triangle + b"endloop\nendfacet\nendsolid a\n", "b.dae": b"<a", "c.obj": b"v"}
-    (part,) = mesh_parts("a.stl", files.get, ONE)
+    (part,) = surfaces("a.stl", files.get, ONE)
     assert part.colour is None and part.triangles.tolist() == [[0, 1, 2]]
-    assert [mesh_parts(name, files.get, ONE) for name in ("b.dae", "c.obj", "d.dae")] == [[]] * 3
+    assert [surfaces(name, files.get, ONE) for name in ("b.dae", "c.obj", "d.dae")] == [[]] * 3
 
 
 URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/></material>

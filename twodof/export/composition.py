@@ -67,8 +67,10 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     files = {f"resources/{name}": content for name, content in resources.items()}
     files.update(flavour.files)
 
+    variables = engine_variables(robot, table, options.control, flavour.fmi)
+
     def describe(guid: str) -> bytes:
-        description = model_description(options, robot, table, flavour, guid)
+        description = model_description(options, robot, variables, flavour, guid)
         return model_description3(description, flavour.arrays) if flavour.fmi == 3 else description
 
     digest = hashlib.sha256(describe(""))
@@ -84,7 +86,6 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
             binaries = compiling.submit(flavour.binaries, guid)
             signed, live = flavour.signed(guid), LivePart("", "")
             if is_live(options):
-                variables = engine_variables(robot, table, options.control, flavour.fmi)
                 live = _live_part(options, robot, variables, guid, {**files, **signed})
             described = documentation(options, robot, table, flavour, guid, urdf, live)
             return {**signed, **binaries.result(), **described}
@@ -102,7 +103,7 @@ def _live_part(
             "unit": variable.unit, "start": variable.start, "description": variable.description,
         }
         for reference, variable in enumerate(table)
-        if variable.causality != "local"
+        if variable.causality not in ("local", "independent")
     ]  # fmt: skip
     folder, urdf = "sources/", files["resources/robot.urdf"].decode()
     shapes, _ = link_shapes(read_urdf(urdf), lambda name: files.get(f"resources/{name}"))

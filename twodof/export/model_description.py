@@ -89,7 +89,7 @@ def model_description(
 
     Args:
         options: with the model's name and control law.
-        robot, table: the robot and its variables.
+        robot, table: the robot and its variables, by value reference.
         flavour: says which interfaces there are, and what they can do.
         guid: as it shall stand in the file; "" while it is being computed.
     """
@@ -272,7 +272,7 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
     derivatives = ET.SubElement(structure, "Derivatives")
     initial = ET.SubElement(structure, "InitialUnknowns")
     for i, variable in enumerate(table, start=1):
-        if variable.causality in ("output", "local"):
+        if variable.group in during:
             kind = outputs if variable.causality == "output" else derivatives
             for parent, rule in ((kind, during), (initial, at_the_start)):
                 dependencies = known(variable, *rule[variable.group])

@@ -6,12 +6,13 @@ Source: FMI 3.0.2, sections 2.4 to 2.6.
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 
 from ..plant.variables import DISTURBANCES, Variable
+from .native import INDICATORS
 
-INDICATORS, TIME = "event_indicators", "time"
 ATTRIBUTES = {
     "guid": "instantiationToken",
     "canGetAndSetFMUstate": "canGetAndSetFMUState",
@@ -21,6 +22,7 @@ ATTRIBUTES = {
 """What has another name in 3.0; others that are not there any more are in GONE."""
 GONE = ("numberOfEventIndicators", "canNotUseMemoryManagementFunctions",
         "completedIntegratorStepNotNeeded")  # fmt: skip
+PARTS = "ModelVariables", "ModelStructure", "VendorAnnotations"
 TERMINALS = {
     "targets": "where the robot is meant to be, or the effort of a controller",
     "joints": "positions, velocities and efforts of the joints",
@@ -30,9 +32,8 @@ TYPES = {"Real": "Float64", "Boolean": "Boolean"}
 
 
 def model_description3(description: bytes, arrays: bool) -> bytes:
-    """The XML text, of that of FMI 2.0; with event indicators and the time, variables in 3.0."""
+    """The XML text, of that of FMI 2.0, in which event indicators and the time are variables."""
     root = ET.fromstring(description)
-    indicators = int(root.get("numberOfEventIndicators", ""))
     root.set("fmiVersion", "3.0")
     for element in (root, *root.findall("ModelExchange"), *root.findall("CoSimulation")):
         attributes = {ATTRIBUTES.get(k, k): v for k, v in element.items() if k not in GONE}
@@ -48,23 +49,24 @@ def model_description3(description: bytes, arrays: bool) -> bytes:
         simple.remove(simple[0])
     scalars = list(root.iter("ScalarVariable"))
     names = [_name(scalar, arrays) for scalar in scalars]
-    first = next(i for i, scalar in enumerate(scalars) if scalar.get("causality") == "parameter")
-    references: dict[str, int] = {}  # of the first element; what 3.0 adds is before the parameters
-    for i, name in enumerate(names):
-        references.setdefault(name, i + (indicators + 1 if i >= first else 0))
-    added = _added(first, indicators, arrays)
-    variables = root.find("ModelVariables")
-    structure = root.find("ModelStructure")
-    assert variables is not None and structure is not None
-    own = _variables(scalars, names, references)
-    variables[:] = sorted([*own, *added], key=lambda v: int(v.get("valueReference", "")))
+    references: dict[str, str] = {}  # of the first element
+    for scalar, name in zip(scalars, names):
+        references.setdefault(name, scalar.get("valueReference", ""))
+    variables, structure, vendor = map(root.find, PARTS)
+    assert variables is not None and structure is not None and vendor is not None
+    variables[:] = _variables(scalars, names, references)
     structure[:] = _unknowns(structure, names, references)
     structure.extend(
-        ET.Element("EventIndicator", valueReference=variable.get("valueReference", ""))
-        for variable in added
-        if variable.get("causality") == "local"
+        ET.Element("EventIndicator", valueReference=reference)
+        for name, reference in references.items()
+        if name.startswith(INDICATORS)
     )
-    _annotations(root)
+    vendor.tag = "Annotations"
+    for tool in vendor:
+        tool.tag = "Annotation"
+        tool.set("type", tool.attrib.pop("name"))
+    root.remove(vendor)
+    root.append(vendor)  # where 3.0 has it
     return xml_text(root)
 
 
@@ -78,34 +80,11 @@ def xml_text(root: ET.Element) -> bytes:
 def _name(scalar: ET.Element, arrays: bool) -> str:
     """Its own, or that of its vector: "x" of "x[1]", "der(q)" of "der(q[1])"."""
     name = scalar.get("name", "")
-    before, bracket, after = name.partition("[")
-    return before + after.partition("]")[2] if bracket and arrays else name
-
-
-def _added(first: int, indicators: int, arrays: bool) -> list[ET.Element]:
-    """Variables that 2.0 has calls for, from a value reference on."""
-    local = {
-        "causality": "local", "variability": "continuous", "initial": "calculated",
-        "description": "change their sign where a joint meets or leaves a stop, or J⁺ its rank",
-    }  # fmt: skip
-    places = [(f"{INDICATORS}[{i + 1}]", first + i) for i in range(indicators)]
-    if arrays:
-        places = [(INDICATORS, first)]
-    added = [
-        ET.Element("Float64", {"name": name, "valueReference": str(place), **local})
-        for name, place in places
-    ]
-    if arrays:
-        ET.SubElement(added[0], "Dimension", start=str(indicators))
-    time = ET.Element(
-        "Float64", name=TIME, valueReference=str(first + indicators), causality="independent",
-        variability="continuous", description="time", unit="s",
-    )  # fmt: skip
-    return [*added, time]
+    return re.sub(r"\[\d+\]", "", name) if arrays else name
 
 
 def _variables(
-    scalars: Sequence[ET.Element], names: Sequence[str], references: dict[str, int]
+    scalars: Sequence[ET.Element], names: Sequence[str], references: dict[str, str]
 ) -> list[ET.Element]:
     vectors: dict[str, list[int]] = {}  # places of the elements, in order
     for i, name in enumerate(names):
@@ -119,10 +98,10 @@ def _variables(
             for key, value in elements[0].items()
             if key != "name" and all(element.get(key) == value for element in elements)
         }
-        attributes["valueReference"] = str(references[name])
+        attributes["valueReference"] = references[name]
         attributes["description"] = _description(elements)
         if "derivative" in elements[0]:
-            attributes["derivative"] = str(references[names[int(elements[0]["derivative"]) - 1]])
+            attributes["derivative"] = references[names[int(elements[0]["derivative"]) - 1]]
         if "start" in elements[0]:
             attributes["start"] = " ".join(element["start"] for element in elements)
         variable = ET.Element(TYPES[scalars[places[0]][0].tag], attributes)
@@ -135,7 +114,7 @@ def _variables(
 def _description(elements: Sequence[dict[str, str]]) -> str:
     """What the vector is, and what each of its elements is, with its unit where that differs."""
     texts = [element["description"] for element in elements]
-    if len(texts) == 1:
+    if len({*texts}) == 1:
         return texts[0]
     parts = [text.split(", ") for text in texts]
     same = next(i for i, column in enumerate(zip(*parts)) if len(set(column)) > 1)
@@ -147,7 +126,7 @@ def _description(elements: Sequence[dict[str, str]]) -> str:
 
 
 def _unknowns(
-    structure: ET.Element, names: Sequence[str], references: dict[str, int]
+    structure: ET.Element, names: Sequence[str], references: dict[str, str]
 ) -> list[ET.Element]:
     unknowns: list[ET.Element] = []
     for tag, group in (
@@ -161,21 +140,10 @@ def _unknowns(
             places = unknown.get("dependencies", "").split()
             known.update(dict.fromkeys(names[int(place) - 1] for place in places))
         for name, known in dependencies.items():
-            text = " ".join(str(references[k]) for k in known)
-            attributes = {"valueReference": str(references[name]), "dependencies": text}
+            text = " ".join(references[k] for k in known)
+            attributes = {"valueReference": references[name], "dependencies": text}
             unknowns.append(ET.Element(tag, attributes))
     return unknowns
-
-
-def _annotations(root: ET.Element) -> None:
-    vendor = root.find("VendorAnnotations")
-    assert vendor is not None
-    root.remove(vendor)
-    vendor.tag = "Annotations"
-    for tool in vendor:
-        tool.tag = "Annotation"
-        tool.set("type", tool.attrib.pop("name"))
-    root.append(vendor)
 
 
 def build_description(identifier: str, units: Sequence[str]) -> bytes:

@@ -19,6 +19,8 @@ MAX_JOINTS = 128
 """The engine's working memory is on the stack: 0.2 MB at this number."""
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "limit_effort"}
 """Where the table's parts begin: inputs, outputs, parameters, truth values among these."""
+INDICATORS = "event_indicators"
+SIGNS = "change their sign where a joint meets or leaves a stop, or J⁺ its rank"
 
 
 def model_header(
@@ -82,9 +84,9 @@ def engine_variables(
         return table
     first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
     count = count_event_indicators(robot, control)
-    places = [*(("event_indicators", i) for i in range(count)), ("time", None)]
-    added = [Variable(group, i, "local", "", None, "") for group, i in places]
-    return [*table[:first], *added, *table[first:]]
+    indicators = [Variable(INDICATORS, i, "local", "", None, SIGNS) for i in range(count)]
+    time = Variable("time", None, "independent", "s", None, "time")
+    return [*table[:first], *indicators, time, *table[first:]]
 
 
 def _value_references(groups: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ MAX_RESOURCE = 256 * 1024**2
 
 
 @dataclass(frozen=True)
-class Variable:
+class Scalar:
     """A scalar variable, or one element of an array of FMI 3.0.
 
     Attributes:
@@ -73,7 +73,7 @@ class Fmu:
 
     path: Path
     description: ModelDescription
-    variables: dict[str, Variable]
+    variables: dict[str, Scalar]
     members: Mapping[str, int]
     platforms: tuple[str, ...]
     robot: str
@@ -260,13 +260,13 @@ def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
     }
 
 
-def _scalars(variable: ModelVariable) -> Iterator[Variable]:
+def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
     """A scalar variable itself, or the elements of an array."""
     kind = "Real" if variable.type == "Float64" else variable.type
     rest = (variable.causality, kind, variable.unit)
     text = variable.description or ""
     if not variable.dimensions:
-        yield Variable(variable.name, *rest, variable.start, text, variable.valueReference)
+        yield Scalar(variable.name, *rest, variable.start, text, variable.valueReference)
         return
     starts: list[str | None] = list((variable.start or "").split())
     starts = starts or [None]
@@ -275,4 +275,4 @@ def _scalars(variable: ModelVariable) -> Iterator[Variable]:
         index = f"[{','.join(map(str, place))}]"
         name = f"der({inner[1]}{index})" if inner else variable.name + index
         start = starts[i % len(starts)]
-        yield Variable(name, *rest, start, text, variable.valueReference, i)
+        yield Scalar(name, *rest, start, text, variable.valueReference, i)

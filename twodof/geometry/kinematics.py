@@ -73,8 +73,8 @@ class Kinematics:
             return self._columns[joint.name], 1.0, 0.0
         return self._columns.get(joint.leader), joint.ratio, joint.offset
 
-    def in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
-        """Where a joint's child is in its parent; q is N × joints, rad or m; one where it rests."""
+    def _in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
+        """Where a joint's child is in its parent; one where it rests."""
         origin, along = self._origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
             return Placement(joint.xyz + turned(origin, along), origin[None])
@@ -82,7 +82,10 @@ class Kinematics:
         return Placement(np.asarray(joint.xyz, dtype=np.float64)[None], origin @ turn)
 
     def pose(self, joint: Joint, q: ArrayLike) -> Array:
-        """The same as N × 7, or 1 × 7: m, and a unit quaternion x, y, z, w."""
+        """Where a joint's child is in its parent; q is N × joints, rad or m.
+
+        N × 7, or 1 × 7 where it rests: m, and a unit quaternion x, y, z, w.
+        """
         moved, still = self._moved(joint, q), Rotation.from_matrix(self._origins[joint.name])
         if joint.prismatic:
             place = joint.xyz + moved * still.apply(joint.axis)
@@ -103,7 +106,7 @@ class Kinematics:
         n = len(np.asarray(q))
         places = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
         for joint in chain:
-            places.append(places[-1] * self.in_parent(joint, q))
+            places.append(places[-1] * self._in_parent(joint, q))
         return places
 
     def path(self, link: str, q: ArrayLike) -> Array:
@@ -127,13 +130,9 @@ class Kinematics:
         if joint.prismatic:
             return np.asarray(joint.xyz + (point + moved * axis) @ origin)
         along, across = np.outer(axis, axis), np.cross(np.eye(3), axis)
-        turned = np.cos(moved) * (point @ ((np.eye(3) - along) @ origin))
-        turned += np.sin(moved) * (point @ (-across @ origin))
-        return np.asarray(joint.xyz + point @ (along @ origin) + turned)
-
-    def links(self, q: ArrayLike) -> dict[str, Placement]:
-        """Where all links are in the root frame."""
-        return {link: self.along(self.urdf.chain(link), q)[-1] for link in self.urdf.links}
+        beside = np.cos(moved) * (point @ ((np.eye(3) - along) @ origin))
+        beside += np.sin(moved) * (point @ (-across @ origin))
+        return np.asarray(joint.xyz + point @ (along @ origin) + beside)
 
     def jacobian(self, link: str, q: ArrayLike) -> Array:
         """Of the link in the root's axes, N × 6 × joints: linear, then angular velocity is J v."""

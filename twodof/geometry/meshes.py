@@ -1,4 +1,4 @@
-"""Meshes as they are drawn: triangles, in parts of one colour each."""
+"""Meshes as they are drawn: triangles, in surfaces of one colour each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
 """Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
 
 
-class Part(NamedTuple):
+class Surface(NamedTuple):
     """Vertices V × 3 in m and triangles T × 3, with their colour where the file says one."""
 
     vertices: Array
@@ -34,8 +34,8 @@ class Part(NamedTuple):
     colour: Colour | None
 
 
-def mesh_parts(name: str, read: ReadMesh, scale: Array) -> list[Part]:
-    """The parts of a mesh, none where it is not at hand or cannot be read.
+def surfaces(name: str, read: ReadMesh, scale: Array) -> list[Surface]:
+    """The surfaces of a mesh, none where it is not at hand or cannot be read.
 
     Textures are not shown. An OBJ's colours are those of the file beside it that a build gives
     its name and ``.mtl``.
@@ -53,20 +53,19 @@ def mesh_parts(name: str, read: ReadMesh, scale: Array) -> list[Part]:
         mesh = load_mesh(name, content, scale)
     except ValueError:
         return []
-    corners = (mesh.tri_indices(i) for i in range(mesh.num_tris))
-    triangles = [(corner[0], corner[1], corner[2]) for corner in corners]
-    return [Part(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32), None)]
+    triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
+    return [Surface(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32), None)]
 
 
-def _coloured(suffix: str, content: bytes, library: bytes | None, scale: Array) -> list[Part]:
-    """By trimesh, which places the parts in the file's scene."""
+def _coloured(suffix: str, content: bytes, library: bytes | None, scale: Array) -> list[Surface]:
+    """By trimesh, which places them in the file's scene."""
     import trimesh
 
     files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # whatever it is called
     scene = trimesh.load_scene(
         io.BytesIO(content), file_type=suffix[1:], resolver=files, process=False
     )
-    parts = []
+    coloured = []
     for mesh in scene.dump():
         material = getattr(mesh.visual, "material", None)
         colour = None
@@ -74,10 +73,10 @@ def _coloured(suffix: str, content: bytes, library: bytes | None, scale: Array) 
             r, g, b = (float(value) / 255.0 for value in material.main_color[:3])
             colour = r, g, b
         vertices = np.array(mesh.vertices) * scale
-        parts.append(Part(vertices, np.array(mesh.faces, dtype=np.uint32), colour))
-    if not parts:
+        coloured.append(Surface(vertices, np.array(mesh.faces, dtype=np.uint32), colour))
+    if not coloured:
         raise ValueError("the file has no triangles")
-    return parts
+    return coloured
 
 
 def load_mesh(name: str, content: bytes, scale: Array | Sequence[float]) -> Any:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..plant.urdf import RobotError, Urdf
 from .kinematics import Array, Placement
-from .meshes import Colour, Part, ReadMesh, mesh_parts
+from .meshes import Colour, ReadMesh, Surface, surfaces
 
 Indices = NDArray[np.uint32]
 
@@ -54,16 +54,16 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
             element = geometry[0]
             try:
                 place, colour = origin(visual.find("origin")), _colour(robot.tree, visual)
-                parts = _parts(element, read)
+                drawn = _surfaces(element, read)
             except ValueError as error:
                 raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
-            shapes += [Shape(name, place, p.colour or colour, *p[:2]) for p in parts]
-            if element.tag == "mesh" and not parts:
+            shapes += [Shape(name, place, s.colour or colour, *s[:2]) for s in drawn]
+            if element.tag == "mesh" and not drawn:
                 missing.append(element.get("filename", "").removeprefix("package://"))
     return shapes or _sticks(robot), missing
 
 
-def _parts(element: ET.Element, read: ReadMesh) -> list[Part]:
+def _surfaces(element: ET.Element, read: ReadMesh) -> list[Surface]:
     """Of a URDF's geometry; none where it is of an unknown kind or its mesh is of no use."""
 
     def number(key: str) -> float:
@@ -72,15 +72,15 @@ def _parts(element: ET.Element, read: ReadMesh) -> list[Part]:
 
     if element.tag == "mesh":
         name = element.get("filename", "").removeprefix("package://")
-        parts = mesh_parts(name, read, floats(element, "scale", "1 1 1"))
-        return [part for part in parts if np.isfinite(part.vertices).all()]
+        scale = floats(element, "scale", "1 1 1")
+        return [s for s in surfaces(name, read, scale) if np.isfinite(s.vertices).all()]
     if element.tag == "box":
         corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
-        return [Part(corners * floats(element, "size", "1 1 1"), BOX, None)]
+        return [Surface(corners * floats(element, "size", "1 1 1"), BOX, None)]
     if element.tag == "sphere":
-        return [Part(*sphere(number("radius")), None)]
+        return [Surface(*sphere(number("radius")), None)]
     if element.tag == "cylinder":
-        return [Part(*cylinder(number("radius"), number("length")), None)]
+        return [Surface(*cylinder(number("radius"), number("length")), None)]
     return []
 
 
