@@ -188,10 +188,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
     kinematics = Kinematics(urdf, joints)
     number = {urdf.root: 0}
     links: list[dict[str, Any]] = [{"parent": -1}]
-    waiting = list(urdf.joints.values())
-    while waiting:
-        joint = next(joint for joint in waiting if joint.parent in number)
-        waiting.remove(joint)
+    for joint in sorted(urdf.joints.values(), key=lambda joint: len(urdf.chain(joint.child))):
         number[joint.child] = len(links)
         column, ratio, offset = kinematics.column(joint)
         turn = Rotation.from_euler("xyz", joint.rpy).as_matrix()

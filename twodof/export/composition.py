@@ -53,7 +53,9 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     if options.control not in CONTROLS:
         raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
     path = Path(options.urdf or data_file("urdf", "2dof.urdf"))
-    mesh_dir = _mesh_dir(options)
+    mesh_dir = options.mesh_dir if options.urdf else data_file("meshes")
+    if options.mesh_dir is not None and not options.mesh_dir.is_dir():
+        raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
     text = read_text(path, mesh_dir)
     text = lock_joints(text, options.lock) if options.lock else text
     if options.frame is None:
@@ -66,7 +68,6 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     resources = {"robot.urdf": urdf.encode(), **meshes}
     files = {f"resources/{name}": content for name, content in resources.items()}
     files.update(flavour.files)
-
     variables = engine_variables(robot, table, options.control, flavour.fmi)
 
     def describe(guid: str) -> bytes:
@@ -110,7 +111,7 @@ def _live_part(
     return live_part(
         Arm(
             name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
-            joints=robot.joints, frame=robot.frame, root=robot.root, axes="".join(robot.axes),
+            joints=robot.joints, frame=robot.frame, root=robot.root, axes=robot.axes,
             control=options.control, variables=variables, step=DEFAULT_STEP, urdf=urdf,
             shapes=shapes,
             sources={p[len(folder) :]: c for p, c in files.items() if p.startswith(folder)},
@@ -147,12 +148,6 @@ def _flavour(
     if fmi == 2 and not options.arrays:
         raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` goes with `fmi=3`")
     return native_flavour(options, robot, table, fmi, platforms)
-
-
-def _mesh_dir(options: FmuOptions) -> Path | None:
-    if options.mesh_dir is not None and not options.mesh_dir.is_dir():
-        raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
-    return options.mesh_dir if options.urdf else data_file("meshes")
 
 
 def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:

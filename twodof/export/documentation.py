@@ -49,10 +49,10 @@ def documentation(
         live: the arm itself, or nothing.
     """
     frame = html.escape(robot.frame)
-    rows = "\n".join(
-        "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in _row(variable)) + "</tr>"
-        for variable in table
-    )
+    rows = []
+    for v in table:
+        cells = v.name, v.causality, v.unit, "" if v.start is None else v.start, v.description
+        rows.append("".join(["<tr>", *(f"<td>{html.escape(str(c))}</td>" for c in cells), "</tr>"]))
     page = Template(_shipped("documentation.html").decode()).substitute(
         head=live.head,
         live=live.body,
@@ -63,7 +63,7 @@ def documentation(
         control=CONTROLS[options.control].title.format(frame=frame),
         law=LAWS[options.control].replace("$frame", frame),
         root=html.escape(robot.root),
-        variables=rows,
+        variables="\n".join(rows),
         kinds="co-simulation and Model Exchange" if flavour.native else "co-simulation",
         limitations="" if flavour.native else _shipped("limitations.html").decode(),
         version=__version__,
@@ -75,19 +75,11 @@ def documentation(
         files["externalDependencies.txt"] = NO_DEPENDENCIES
     else:
         files["externalDependencies.txt"] = _shipped("externalDependencies.txt")
-        files["licenses/pythonfmu.txt"] = _licence_of("pythonfmu")
+        theirs = importlib.metadata.files("pythonfmu") or []
+        licence = next(file for file in theirs if file.name.upper().startswith("LICEN"))
+        files["licenses/pythonfmu.txt"] = licence.read_binary()
     return {f"documentation/{name}": content for name, content in files.items()}
-
-
-def _row(variable: Variable) -> tuple[str, str, str, str, str]:
-    start = "" if variable.start is None else str(variable.start)
-    return variable.name, variable.causality, variable.unit, start, variable.description
 
 
 def _shipped(name: str) -> bytes:
     return data_file("fmu_src", name).read_bytes()
-
-
-def _licence_of(distribution: str) -> bytes:
-    files = importlib.metadata.files(distribution) or []
-    return next(f for f in files if f.name.upper().startswith("LICEN")).read_binary()

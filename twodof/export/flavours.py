@@ -35,11 +35,6 @@ PYTHONFMU = Path(pythonfmu.__file__).parent
 PYTHONFMU_FILES = (
     "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
 )  # fmt: skip
-FMI_HEADERS = {
-    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
-}
-"""By version of FMI."""
 
 
 @dataclass(frozen=True)
@@ -113,10 +108,10 @@ def native_flavour(
     name, control, arrays = options.name, options.control, options.arrays and fmi == 3
     fmpy = find_spec("fmpy")  # it comes with the headers of the standard
     assert fmpy is not None and fmpy.origin is not None
-    headers = Path(fmpy.origin).parent / "c-code"
+    headers = (Path(fmpy.origin).parent / "c-code").glob(f"fmi{fmi}*.h")
     sources = engine_sources(control, fmi)
     sources["mechanism.c"] = mechanism_source(robot, table).encode()
-    sources.update({header: (headers / header).read_bytes() for header in FMI_HEADERS[fmi]})
+    sources.update({header.name: header.read_bytes() for header in headers})
 
     def header(guid: str) -> bytes:
         return model_header(robot, table, control, guid, fmi, arrays).encode()

@@ -11,12 +11,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ..errors import BuildError
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
-MAX_JOINTS = 128
-"""The engine's working memory is on the stack: 0.2 MB at this number."""
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "limit_effort"}
 """Where the table's parts begin: inputs, outputs, parameters, truth values among these."""
 INDICATORS = "event_indicators"
@@ -36,26 +33,22 @@ def model_header(
     Names from the URDF, which may be anybody's, are string literals and nothing else.
 
     Args:
-        robot: the robot, n joints in Pinocchio's order.
+        robot: the robot, n joints in Pinocchio's order; at as many as a URDF may have the engine's
+            working memory, which is on the stack, is 0.2 MB.
         table: its variables; a variable's place is its value reference.
         control: what drives it, a key of ``CONTROLS``.
         guid: as the modelDescription has it.
         fmi: version of FMI.
         arrays: whether 3 has vectors where 2 has their elements.
-
-    Raises:
-        BuildError: more joints than the engine's working memory has room for.
     """
-    n, m = len(robot.joints), len(robot.axes)
-    if n > MAX_JOINTS:
-        raise BuildError(f"the robot has {n} joints; the native flavour has room for {MAX_JOINTS}")
+    m = len(robot.axes)
     table = engine_variables(robot, table, control, fmi)
     groups = [variable.group for variable in table]
     sections = [
         "/* Constants of a robot, generated from its URDF. SI units. */\n"
         "#ifndef MODEL_H\n#define MODEL_H\n\n#include <math.h>\n",
         f"#define FMI {fmi}\n#define MODEL_GUID {_quoted(guid)}\n"
-        f"#define N_JOINTS {n} /* that move on their own */\n"
+        f"#define N_JOINTS {len(robot.joints)} /* that move on their own */\n"
         f"#define N_BODIES {robot.model.njoints - 1} /* of which some may follow others */\n"
         f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n",
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
