@@ -8,7 +8,13 @@ import pytest
 from native_models import model
 
 from twodof.export.bodies import joint_tree
-from twodof.export.recursions import inverse_dynamics, mass_matrix, task_frame
+from twodof.export.recursions import (
+    inverse_dynamics,
+    mass_matrix,
+    solve_by_factors,
+    solve_by_recursion,
+    task_frame,
+)
 from twodof.plant.robot import load_robot
 
 TILTS = (0.0, 1e-12, 1e-7, 1e-3, 0.09, 0.11, 1.0, np.pi / 2, np.pi - 1e-9, np.pi)
@@ -62,8 +68,12 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
 
     tau = inverse_dynamics(constants, constants.body, joint, v, a, gravity)
     assert_close(tau, pin.rnea(reference, data, q, v, a))
-    M = pin.crba(reference, data, q)
-    assert_close(mass_matrix(constants, constants.body, joint), np.triu(M) + np.triu(M, 1).T)
+    M = mass_matrix(constants, constants.body, joint)
+    expected = np.triu(pin.crba(reference, data, q))
+    expected += np.triu(expected, 1).T
+    assert_close(M, expected)
+    for a in (solve_by_factors(M, v), solve_by_recursion(constants, constants.body, joint, v)):
+        np.testing.assert_allclose(expected @ a.astype(float), v, rtol=0, atol=1e-11)
     x, R, J, drift = task_frame(constants, joint, v)
     pin.forwardKinematics(reference, data, q, v, np.zeros(n))
     frame, axes = robot.frame_id, pin.LOCAL_WORLD_ALIGNED

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,8 +72,7 @@ def in_libcosim(control: str, fmu: str, expected: list[float]) -> None:
     from libcosimpy.CosimObserver import CosimObserver
     from libcosimpy.CosimSlave import CosimLocalSlave
 
-    known = {v.name: v.valueReference for v in fmpy.read_model_description(fmu).modelVariables}
-    execution = CosimExecution.from_step_size(10_000_000)
+    known, execution = references(fmu), CosimExecution.from_step_size(10_000_000)
     arm = execution.add_local_slave(CosimLocalSlave(fmu, "arm"))
     for name, value in {**COMMANDS[control], **TIGHT}.items():
         execution.real_initial_value(arm, known[name], value)
@@ -80,6 +81,10 @@ def in_libcosim(control: str, fmu: str, expected: list[float]) -> None:
     execution.step(40)
     values = observer.last_real_values(arm, [known[name] for name in Q])
     np.testing.assert_allclose(values, expected, rtol=0.0, atol=1e-12)
+
+
+def references(fmu: str | Path) -> dict[str, int]:
+    return {v.name: v.valueReference for v in fmpy.read_model_description(str(fmu)).modelVariables}
 
 
 @pytest.mark.parametrize("control, fmi", [("pose", 2), ("pose", 3), ("effort", 2)])
@@ -109,3 +114,79 @@ def in_casadi(control: str, fmu: str, expected: list[float], folder: Path) -> No
         x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     end = dict(zip(dae.x(), x))
     np.testing.assert_allclose([end[name] for name in Q], expected, rtol=0.0, atol=1e-8)
+
+
+# --- a controller that is an FMU of its own ---
+
+GOAL, KP, KD = (0.9, -0.6), 400.0, 40.0
+CONTROLLER = '''
+import numpy as np
+import pinocchio as pin
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+
+class Controller(Fmi2Slave):
+    """Torques by inverse dynamics, from what is measured at the beginning of a step."""
+
+    def __init__(self, **arguments):
+        super().__init__(**arguments)
+        self.model = pin.buildModelFromXML({urdf!r})
+        self.model.gravity.linear = np.array([0.0, -9.81, 0.0])
+        self.data = self.model.createData()
+        for name in ("q1", "q2", "v1", "v2", "tau1", "tau2"):
+            setattr(self, name, 0.0)
+            kind, start = (Fmi2Causality.output, {{}}) if "tau" in name else (
+                Fmi2Causality.input, {{"start": 0.0}}
+            )
+            self.register_variable(Real(name, causality=kind, **start))
+
+    def exit_initialization_mode(self):
+        self.do_step(0.0, 0.0)
+
+    def do_step(self, current_time, step_size):
+        q, v = np.array([self.q1, self.q2]), np.array([self.v1, self.v2])
+        a = {kp} * (np.array({goal}) - q) - {kd} * v
+        self.tau1, self.tau2 = map(float, pin.rnea(self.model, self.data, q, v, a))
+        return True
+'''
+
+
+def test_a_second_fmu_holds_the_arm_in_libcosim(built: Build, tmp_path: Path) -> None:
+    """It comes as near the target as the loop inside, by a way that a step of 1 ms leaves near."""
+    plant, _ = built("effort", 2)
+    options = FmuOptions(control="joint", native=True, live_documentation=False)
+    inside = twodof.build_fmu(tmp_path / "in.fmu", options)
+    script = tmp_path / "controller.py"
+    script.write_text(CONTROLLER.format(urdf=twodof.load_fmu(plant).urdf, kp=KP, kd=KD, goal=GOAL))
+    command = [sys.executable, "-m", "pythonfmu", "build", "-f", str(script), "-d", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
+    settings = {"q_des": GOAL, "Kp": KP, "Kd": KD, **TIGHT}
+    samples = twodof.samples(inside, stop_time=1.0, settings=settings)
+    couple(plant, str(tmp_path / "Controller.fmu"), np.array([sample.q for sample in samples])[1:])
+
+
+@in_child_process
+def couple(plant: str, controller: str, expected: np.ndarray) -> None:
+    from libcosimpy.CosimExecution import CosimExecution
+    from libcosimpy.CosimObserver import CosimObserver
+    from libcosimpy.CosimSlave import CosimLocalSlave
+
+    execution = CosimExecution.from_step_size(1_000_000)
+    arm = execution.add_local_slave(CosimLocalSlave(plant, "arm"))
+    law = execution.add_local_slave(CosimLocalSlave(controller, "law"))
+    ours, theirs = references(plant), references(controller)
+    for i in (1, 2):
+        execution.connect_real_variables(law, theirs[f"tau{i}"], arm, ours[f"tau_cmd[{i}]"])
+        execution.connect_real_variables(arm, ours[f"q[{i}]"], law, theirs[f"q{i}"])
+        execution.connect_real_variables(arm, ours[f"v[{i}]"], law, theirs[f"v{i}"])
+    for name, value in TIGHT.items():
+        execution.real_initial_value(arm, ours[name], value)
+    observer = CosimObserver.create_last_value()
+    execution.add_observer(observer)
+    rows = []
+    for _ in expected:
+        execution.step(10)
+        rows.append(observer.last_real_values(arm, [ours[name] for name in Q]))
+    assert np.abs(np.array(rows) - expected).max() < 0.025
+    np.testing.assert_allclose(rows[-1], GOAL, atol=1e-4)
+    np.testing.assert_allclose(rows[-1], rows[-10], atol=1e-5)

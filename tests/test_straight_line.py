@@ -1,16 +1,12 @@
-"""C without loops from recursions, beside the same recursions over numbers and Pinocchio."""
+"""C without loops from calculations, beside the same calculations over numbers."""
 
 from __future__ import annotations
 
 import re
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from native_models import model
 
-from twodof.export.bodies import joint_tree
-from twodof.export.recursions import mass_matrix, solve_by_factors, solve_by_recursion
 from twodof.export.straight_line import Expression, c_function, operations, varied
 
 
@@ -41,25 +37,3 @@ def test_text_computes_the_expression_and_how_it_varies():
             exec(line, scope)
         assert scope["z"] == pytest.approx(f(*arguments), rel=1e-14)
         assert np.imag(scope["z"]) == pytest.approx(np.imag(f(*arguments)), rel=1e-12)
-
-
-@pytest.mark.parametrize("name", ["ur5", "anymal_c", "tiago"])
-def test_both_ways_to_an_acceleration_are_pinocchios(name):
-    robot = model(name).robot
-    constants, rng, n = joint_tree(robot), np.random.default_rng(5), len(robot.joints)
-    q, tau = rng.normal(size=(2, n))
-    joint = np.array(
-        [
-            (x, 0.0) if slides else (np.cos(x), np.sin(x))
-            for x, slides in zip(q + constants.c, constants.prismatic)
-        ]
-    )
-    M = mass_matrix(constants, constants.body, joint)
-    expected = pin.crba(robot.model, robot.model.createData(), q)
-    expected = np.triu(expected) + np.triu(expected, 1).T
-    np.testing.assert_allclose(M.astype(float), expected, atol=1e-13 * expected.max())
-    for a in (
-        solve_by_factors(M, tau),
-        solve_by_recursion(constants, constants.body, joint, tau),
-    ):
-        np.testing.assert_allclose(expected @ a.astype(float), tau, atol=1e-11)
