@@ -65,12 +65,12 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
             "rigid_stops": "false", "payload_known": "false",
         },
     }  # fmt: skip
-    found: dict = {}
+    by_unit: dict = {}
     for v in variables.values():
-        found.setdefault((v.causality, v.unit), {})[v.name] = v.start
+        by_unit.setdefault((v.causality, v.unit), {})[v.name] = v.start
         assert v.description
         assert v.variability == ("fixed" if v.causality == "parameter" else "continuous")
-    assert found == expected
+    assert by_unit == expected
 
 
 def test_units_are_given_in_si_base_units(description):
@@ -355,7 +355,7 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
     """Amid its range and at limits, moving to and fro, saturated and not."""
     with zipfile.ZipFile(fmu_path) as archive:
         description = etree.fromstring(archive.read("modelDescription.xml"))
-    found: dict = {name: set() for name in declared(description, "InitialUnknowns")}
+    causes: dict = {name: set() for name in declared(description, "InitialUnknowns")}
     generic = {"v_start[1]": 0.7, "v_start[2]": -0.4, "xd_des[1]": 0.1, "xd_des[2]": 0.2}
     generic |= {"payload": 0.3, "payload_known": True}
     back = {**generic, "v_start[1]": -0.7, "v_start[2]": 0.4}
@@ -381,7 +381,7 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
                 for changed in candidates(name, start):
                     put(driver, name, changed)
                     for output in moved(before, outputs(driver)):
-                        found[output].add(name)
+                        causes[output].add(name)
                 put(driver, name, value)
             assert outputs(driver) == before
             driver.free()
@@ -389,7 +389,7 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
     # of no effect on this arm, but on others: gravity along the joints' axes, and null-space
     # damping where there is no null space
     idle = {"gravity[3]", "payload_com[3]", "Kn", "f_ext[3]"}
-    for output, names in found.items():
+    for output, names in causes.items():
         assert names | idle == expected[output] | idle, (output, names ^ expected[output])
         assert not names & {"rtol", "atol", "max_step"}
 
@@ -417,18 +417,18 @@ def test_outputs_depend_on_exactly_what_is_declared(fmu_path):
     driver = Driver(fmu_path).initialise(v_start=(0.7, -0.4), rcond=0.5)  # one direction dropped
     driver.run(5)
     before = outputs(driver)
-    found: dict = {name: set() for name in expected}
+    causes: dict = {name: set() for name in expected}
     inputs = [v.name for v in driver.description.modelVariables if v.causality == "input"]
     start = start_values(driver)
     for name in inputs:
         put(driver, name, start[name] + PERTURBATION[name.partition("[")[0]])
         for output in moved(before, outputs(driver)):
-            found[output].add(name)
+            causes[output].add(name)
         put(driver, name, start[name])
     assert outputs(driver) == before
     idle = {"f_ext[3]"}  # of no effect on this arm, across the plane in which it moves
     for name, others in expected.items():
-        assert found[name] | (idle & others) == others & {*inputs}, name
+        assert causes[name] | (idle & others) == others & {*inputs}, name
 
 
 # --- sizes, ranges and types ---

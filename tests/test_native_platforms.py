@@ -147,7 +147,7 @@ def test_mac_library(unzipped):
     data = (unzipped / BINARIES["darwin64"]).read_bytes()
     magic, count = struct.unpack_from(">II", data)
     assert (magic, count) == (0xCAFEBABE, 2)
-    found = []
+    processors = []
     for i in range(count):
         cpu, _, offset, size, align = struct.unpack_from(">5I", data, 8 + 20 * i)
         assert offset % 2**align == 0 and size < 200_000
@@ -155,7 +155,7 @@ def test_mac_library(unzipped):
         assert len(thin) == size
         header, own_cpu, kind, commands = struct.unpack_from("<II4xII", thin)
         assert (header, own_cpu, kind) == (0xFEEDFACF, cpu, 6)  # 64 bit, a dynamic library
-        found.append(cpu)
+        processors.append(cpu)
         place, seen = 32, {}
         for _ in range(commands):
             command, length = struct.unpack_from("<II", thin, place)
@@ -177,7 +177,7 @@ def test_mac_library(unzipped):
         exported = {text(strings + row[0]) for row in rows if row[1] & 1 and row[1] & 0xE}
         exported -= {"___dso_handle", "__mh_dylib_header"}  # zig's linker exports them always
         assert exported == {f"_{function}" for function in fmi_functions()}
-    assert found == [0x1000007, 0x100000C]  # x86_64, arm64
+    assert processors == [0x1000007, 0x100000C]  # x86_64, arm64
 
 
 # --- runs ---

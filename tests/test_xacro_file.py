@@ -68,9 +68,9 @@ def test_what_comes_out_is_xacros_own(package: Path) -> None:
     free.write_text(ROBOT.replace("$(find my_robot)", str(package)), "utf-8")
     command = [sys.executable, "-c", "import xacro; xacro.main()", str(free)]
     expected = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    found = canonicalize(read_text(path, None), strip_text=True)
-    assert found == canonicalize(expected, strip_text=True)
-    assert found.count("<joint ") == 3 and "secret" not in found
+    ours = canonicalize(read_text(path, None), strip_text=True)
+    assert ours == canonicalize(expected, strip_text=True)
+    assert ours.count("<joint ") == 3 and "secret" not in ours
 
 
 def test_xacro_files_are_built_and_run(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,14 +103,14 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
 
 def _colours(path: Path, content: bytes, mesh_dir: Path | None) -> bytes:
     """The material libraries of an OBJ file that are there."""
-    found = b""
+    libraries = b""
     if path.suffix.lower() != ".obj":
-        return found
+        return libraries
     for line in re.findall(rb"^mtllib[ \t]+([^\r\n]+)", content, re.MULTILINE):
         with suppress(FileNotFoundError):
             library = _find(os.fsdecode(line.strip()), path.parent, mesh_dir)
-            found += read_file(library, MAX_MESHES) + b"\n"
-    return found
+            libraries += read_file(library, MAX_MESHES) + b"\n"
+    return libraries
 
 
 def _inside(path: Path, files: dict[str, bytes]) -> str:

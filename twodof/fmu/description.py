@@ -251,8 +251,8 @@ def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:
 def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
     """What our own FMUs say of the robot; nothing, and no joints, where others made the FMU."""
     places = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
-    found = (root.find(f"{place}/Robot") for place in places)
-    robot = next((robot for robot in found if robot is not None), ET.Element("Robot"))
+    robots = (root.find(f"{place}/Robot") for place in places)
+    robot = next((robot for robot in robots if robot is not None), ET.Element("Robot"))
     return {
         "robot": robot.get("name", ""),
         "joints": tuple(joint.get("name", "") for joint in robot.iter("Joint")),
