@@ -18,10 +18,11 @@ import twodof
 from twodof import FmuOptions
 
 COMMANDS = {
+    "task": {"x_des[1]": 0.1, "x_des[2]": 0.2},
     "pose": {"x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5, "quat_des[4]": 0.8},
+    "joint": {"q_des[1]": 0.9, "q_des[2]": -0.6},
     "effort": {"tau_cmd[1]": 0.05, "tau_cmd[2]": -0.02},
 }
-"""By control: that with all of the engine's files and that with the fewest."""
 Q = ("q[1]", "q[2]")
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 END = 0.4  # s, before the bare arm has fallen onto a stop
@@ -31,9 +32,7 @@ Build = Callable[[str, int], tuple[str, list[float]]]
 
 
 @pytest.fixture(scope="module")
-def built(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Callable[[str, int], tuple[str, list[float]]]:
+def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
     """An FMU, without arrays, and where FMPy's co-simulation ends, which is where its law leads in
     Python."""
 
@@ -87,7 +86,7 @@ def references(fmu: str | Path) -> dict[str, int]:
     return {v.name: v.valueReference for v in fmpy.read_model_description(str(fmu)).modelVariables}
 
 
-@pytest.mark.parametrize("control, fmi", [("pose", 2), ("pose", 3), ("effort", 2)])
+@pytest.mark.parametrize("control, fmi", [*((control, 2) for control in COMMANDS), ("pose", 3)])
 def test_casadi(control: str, fmi: int, built: Build, tmp_path: Path) -> None:
     in_casadi(control, *built(control, fmi), tmp_path)
 

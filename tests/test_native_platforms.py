@@ -220,13 +220,18 @@ def drive(
 
 TURNED = {"quat_des[3]": 0.5, "quat_des[4]": 0.8, "omega_des[3]": 0.1}
 RUNS = {
+    "task": ({}, LIMITED),
     "pose": (TURNED, {**TURNED, "q_min[1]": 0.3}),
     "joint": (
         {"q_des[1]": 0.9, "q_des[2]": -0.6, "f_ext[2]": -0.5},
         {"q_min[1]": 0.3, "q_min[2]": -1.0, "q_des[1]": 0.0, "q_des[2]": 1.5, "payload": 0.5},
     ),
+    "effort": (
+        {"tau_cmd[1]": 0.4, "tau_cmd[2]": 0.1, "q_max[2]": 0.5},
+        {"q_min[1]": 0.3, "q_max[2]": 1.2, "tau_cmd[2]": 0.5},
+    ),
 }  # fmt: skip
-"""By control, the last one with stops: between them they need all of the engine's files."""
+"""By control, the last one with stops."""
 
 
 @pytest.fixture(scope="module")
