@@ -46,7 +46,7 @@ from twodof.plots.interactive import in_workspace, over_time
 from twodof.plots.panels import with_joints
 from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
-from twodof.plots.words import labels
+from twodof.plots.words import labels, outcome
 from twodof.simulation.sample import Sample
 
 START = 1_700_000_000  # s since the epoch
@@ -432,7 +432,6 @@ DISTURBED: dict[str, tuple[str, dict[str, Any], str]] = {
         chain_urdf("zz"), {"limit_effort": True}, "closed form without effort limits",
     ),
     "singularities": (chain_urdf("zz"), {"x_des": (1.0, 0.2)}, "closed form without singularities"),
-    "one joint for two axes": (chain_urdf("z"), {}, "closed form without singularities"),
     "joint limits": (chain_urdf("zz"), {"q_max": (2.0, 0.6)}, "closed form without joint limits"),
     "two of them": (
         DAMPED, {"limit_effort": True}, "closed form without effort limits,\ndamping",
@@ -444,8 +443,7 @@ DISTURBED: dict[str, tuple[str, dict[str, Any], str]] = {
 def test_the_closed_form_says_what_it_leaves_out(
     urdf: str, settings: dict[str, Any], label: str, tmp_path: Path
 ) -> None:
-    start = (0.3, 0.5)[: urdf.count('type="revolute"')]
-    fmu = build(tmp_path, urdf, axes="xy", q_start=start, native=len(start) == 1)
+    fmu = build(tmp_path, urdf, axes="xy", q_start=(0.3, 0.5))
     settings = {"x_des": (0.3, 0.6), **settings}
     recording = record(tmp_path / "bag", fmu, stop_time=0.5, settings=settings)
     error = panels(plot(recording.bag)).error
@@ -455,6 +453,49 @@ def test_the_closed_form_says_what_it_leaves_out(
     expected = oracles.task_error(away, 50.0, 40.0, recording.t)
     np.testing.assert_allclose(closed[:, 1], np.linalg.norm(expected, axis=1), rtol=1e-10)
     assert [text.get_text() for text in error.get_legend().get_texts()] == [label]
+
+
+@pytest.mark.parametrize(("joints", "control"), [("z", "task"), ("zz", "pose")])
+def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(
+    joints: str, control: str, tmp_path: Path
+) -> None:
+    """One joint for two axes; two joints for these and an orientation."""
+    start = (0.3, 0.5)[: len(joints)]
+    fmu = build(
+        tmp_path, chain_urdf(joints), axes="xy", q_start=start, control=control, native=True
+    )
+    recording = record(tmp_path / "bag", fmu, stop_time=0.5, settings={"x_des": (0.3, 0.3)})
+    (track,) = read_tracks([recording.bag])
+    error = panels(plot(recording.bag)).error
+    assert error is not None and not lines(error, "closed form without singularities")
+    assert error.get_legend() is None and notes(error) == [""]
+    away = np.linalg.norm(recording.x - (0.3, 0.3), axis=1)
+    np.testing.assert_allclose(only(error, "bag")[:, 1], away, rtol=1e-12)
+    assert re.fullmatch(r"\S+ m from its target at the end", outcome(track))
+
+
+def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
+    """Of each bag its own, in view, told, and legible beside limits and efforts; on a page too."""
+    fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint", native=True)
+    (tmp_path / "in.csv").write_text("time,q_des[1],q_des[2]\n0,0.8,1\n0.2,1.2,-0.1\n")
+    bags = [tmp_path / "one", tmp_path / "two"]
+    first, second = Collector(), Collector()
+    run = twodof.experiment(fmu, stop_time=0.4, input_file=tmp_path / "in.csv")
+    twodof.simulate(run, first, twodof.Bag(bags[0], effort=True))
+    still = {"q_des": (0.6, 0.0)}
+    twodof.simulate(fmu, second, twodof.Bag(bags[1]), stop_time=0.4, settings=still)
+    alone, both = plot(bags[0]), plot(*bags)
+    for figure in (alone, both):
+        assert_legible(figure)
+        position = [axes for axes in figure.axes if lines(axes, "target")]
+        for i, axes in enumerate(position):
+            drawn = [points(line)[:, 1] for line in lines(axes, "target")]
+            expected = [[s.inputs[f"q_des[{i + 1}]"] for s in each] for each in (first, second)]
+            np.testing.assert_array_equal(drawn, expected[: len(drawn)])
+    over = over_time(read_tracks(bags))
+    assert "Position in rad; thin dashes: target" in [
+        a["text"] for a in over["layout"]["annotations"]
+    ]
 
 
 @pytest.mark.filterwarnings("error")
