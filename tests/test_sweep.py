@@ -40,8 +40,7 @@ from twodof.plots.sweeps import drawing
 from twodof.sweeps import runner as runner_module
 from twodof.sweeps.metrics import METRICS
 from twodof.sweeps.results import read_sweep
-from twodof.sweeps.runner import Job, Runner
-from twodof.sweeps.trace import trace
+from twodof.sweeps.runner import Job, Runner, trace
 
 Q0, TARGET = np.array([0.5, 0.35]), np.array([0.2, 0.05])
 STEP, STOP = 0.01, 5.0
