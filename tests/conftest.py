@@ -39,9 +39,9 @@ def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
 
 
 LONGEST = (
-    "native_platforms", "live", "sweep", "view", "publish", "page", "mutations", "docs",
-    "plot_files", "plot", "listener", "ends", "native_fmi", "recovery", "states", "slave", "bag", "control", "plant",
-    "master", "scene",
+    "native_platforms", "live", "sweep_workers", "sweep", "view", "publish", "page", "mutations",
+    "docs", "plot_files", "plot", "listener", "ends", "native_fmi", "recovery", "states", "slave",
+    "bag", "control", "plant", "master", "scene",
 )  # fmt: skip
 
 
