@@ -16,6 +16,7 @@ import pinocchio as pin
 import pytest
 from figures import lines, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from recordings import (
     LINK,
     UR5_JOINTS,
@@ -34,6 +35,15 @@ from twodof.pages.replay import replay
 from twodof.plots.runs import plot
 
 ARM = Path(__file__).parents[1] / "urdf/2dof.urdf"
+
+
+def seen(
+    folder: Path, urdf: str, names: Sequence[str], *motion: Any, frame: str | None = None
+) -> Figure:
+    """A bag from elsewhere, drawn with a robot."""
+    (folder / "robot.urdf").write_text(urdf)
+    bag = elsewhere(folder / "bag", names, *motion)
+    return plot(bag, urdf=folder / "robot.urdf", frame=frame)
 
 
 def kinematics(urdf: str, frame: str, names: Sequence[str], q: np.ndarray) -> np.ndarray:
@@ -55,8 +65,11 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_pat
     fmu = build(tmp_path, bare(ur5), frame="tool0", q_start=oracles.REST["ur5"])
     recording = record(tmp_path / "bag", fmu, stop_time=0.3, settings={"x_des": (0.3, 0.35, 0.5)})
     found = panels(plot(recording.bag))
-    names = list(pin.buildModelFromXML(bare(ur5)).names)[1:]
-    path = kinematics(bare(ur5), "tool0", names, recording.q)
+    model = pin.buildModelFromXML(bare(ur5))
+    path = kinematics(bare(ur5), "tool0", list(model.names)[1:], recording.q)
+    data = model.createData()
+    pin.forwardKinematics(model, data, recording.q[-1])
+    places = np.array([*(place.translation for place in data.oMi), path[-1]])  # root, joints, end
     assert [(v.get_xlabel(), v.get_ylabel()) for v in found.views] == [
         ("x in m", "y in m"), ("x in m", "z in m"),
     ]  # fmt: skip
@@ -65,8 +78,7 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_pat
         target = np.array([0.3, 0.35, 0.5])[columns]
         np.testing.assert_array_equal(only(view, "target"), [target])
         arm = only(view, "arm at the end")
-        assert len(arm) == 8  # root, six joints, end effector
-        np.testing.assert_allclose(arm[-1], path[-1, columns], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(arm, places[:, columns], rtol=0.0, atol=1e-12)
         assert not [line for line in view.get_lines() if "reach" in str(line.get_label())]
     assert found.error is not None
     start = recording.x[0] - (0.3, 0.35, 0.5)
@@ -75,24 +87,6 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_pat
     assert len(found.q) == len(found.v) == 6
     elbow = [line.get_ydata()[0] for line in lines(found.q[2], "limit")]
     assert sorted(elbow) == pytest.approx([-math.pi, math.pi], rel=1e-3)
-
-
-def test_links_of_an_arm_are_as_long_as_they_are(panda: str, tmp_path: Path) -> None:
-    """Joints' places by Pinocchio; distances in space from the two views together."""
-    (tmp_path / "panda.urdf").write_text(panda)
-    model = pin.buildModelFromXML(panda)
-    q = np.array([oracles.REST["panda"], np.zeros(7)])
-    bag = elsewhere(tmp_path / "bag", list(model.names)[1:], np.arange(2), q, None)
-    options = {"urdf": tmp_path / "panda.urdf", "frame": "panda_hand_tcp"}
-    above, beside = panels(plot(bag, **options)).views
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, q[0])
-    tip = data.oMf[model.getFrameId("panda_hand_tcp")].translation
-    expected = np.array([*(placement.translation for placement in data.oMi), tip])
-    first = only(above, "arm at the start"), only(beside, "arm at the start")
-    np.testing.assert_allclose(first[0], expected[:, [0, 1]], rtol=0.0, atol=1e-12)
-    columns = ["xyz".index(beside.get_xlabel()[0]), 2]
-    np.testing.assert_allclose(first[1], expected[:, columns], rtol=0.0, atol=1e-12)
 
 
 def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> None:
@@ -118,9 +112,7 @@ def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> N
 
 
 def test_joints_that_slide_have_metres(tmp_path: Path) -> None:
-    (tmp_path / "robot.urdf").write_text(chain_urdf("zX"))
-    bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
-    figure = plot(bag, urdf=tmp_path / "robot.urdf")
+    figure = seen(tmp_path, chain_urdf("zX"), ["j1", "j2"], *waves(2))
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad or m"
     assert found.v[0].get_title("left") == "Velocity in rad/s or m/s"
@@ -139,11 +131,8 @@ def test_motion_in_a_plane_is_seen_in_that_plane(
     axes: str, expected: tuple[str, float | None], tmp_path: Path
 ) -> None:
     """With the circle that it cannot leave, if all of its joints turn."""
-    (tmp_path / "robot.urdf").write_text(chain_urdf(axes))
-    t, q, v = waves(len(axes))
     names = [f"j{i + 1}" for i in range(len(axes))]
-    bag = elsewhere(tmp_path / "bag", names, t, q, v)
-    (view,) = panels(plot(bag, urdf=tmp_path / "robot.urdf")).views
+    (view,) = panels(seen(tmp_path, chain_urdf(axes), names, *waves(len(axes)))).views
     plane, reach = expected
     assert view.get_xlabel()[0] + view.get_ylabel()[0] == plane
     circles = [line for line in view.get_lines() if "reach" in str(line.get_label())]
@@ -157,9 +146,7 @@ def test_motion_in_a_plane_is_seen_in_that_plane(
 def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path: Path) -> None:
     """Links of 0.24 × 0.32 × 0.1 m whose joints turn about z: it is seen from above alone."""
     urdf = chain_urdf("zz").replace('<origin xyz="0.4 0 0"/>', '<origin xyz="0.24 0.32 0.1"/>')
-    (tmp_path / "robot.urdf").write_text(urdf)
-    bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
-    above, beside = panels(plot(bag, urdf=tmp_path / "robot.urdf")).views
+    above, beside = panels(seen(tmp_path, urdf, ["j1", "j2"], *waves(2))).views
     np.testing.assert_allclose(np.hypot(*only(above, "reach 0.8 m").T), 0.8)
     assert not lines(beside, "reach 0.8 m")
     assert "reach 0.8 m" in [text.get_text() for text in beside.get_legend().get_texts()]
@@ -167,9 +154,7 @@ def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path: Path) -> None
 
 def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path: Path) -> None:
     urdf = chain_urdf("zz").replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0.1 1"/>', 1)
-    (tmp_path / "robot.urdf").write_text(urdf)
-    bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
-    figure = plot(bag, urdf=tmp_path / "robot.urdf")
+    figure = seen(tmp_path, urdf, ["j1", "j2"], *waves(2))
     assert len(panels(figure).views) == 2
     assert not [text for text in texts(figure) if "reach" in text]
 
@@ -177,9 +162,8 @@ def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path: Path) -> None
 @pytest.mark.parametrize(("count", "low", "high"), [(16, 0.67, 1.41), (30, 0.67, 1.5)])
 def test_many_joints_fit_on_a_page(count: int, low: float, high: float, tmp_path: Path) -> None:
     """Sixteen in one column on one of A4, thirty on a screen."""
-    (tmp_path / "robot.urdf").write_text(chain_urdf("zy" * (count // 2), length=0.1))
     names = [f"j{i + 1}" for i in range(count)]
-    figure = plot(elsewhere(tmp_path / "bag", names, *waves(count)), urdf=tmp_path / "robot.urdf")
+    figure = seen(tmp_path, chain_urdf("zy" * (count // 2), length=0.1), names, *waves(count))
     width, height = figure.get_size_inches()
     assert low < height / width < high
     assert len(panels(figure).q) == len(panels(figure).v) == count
@@ -223,9 +207,7 @@ def test_another_frame_needs_only_the_joints_that_move_it(
 ) -> None:
     t, q, v = waves(6)
     names = UR5_JOINTS[:4]  # those up to the forearm and one more
-    bag = elsewhere(tmp_path / "bag", names, t, q[:, :4], v[:, :4])
-    (tmp_path / "ur5.urdf").write_text(ur5)
-    figure = plot(bag, urdf=tmp_path / "ur5.urdf", frame="forearm_link")
+    figure = seen(tmp_path, ur5, names, t, q[:, :4], v[:, :4], frame="forearm_link")
     path = kinematics(bare(ur5), "forearm_link", names, q[:, :4])
     view = panels(figure).views[0]
     np.testing.assert_allclose(only(view, "path"), path[:, :2], rtol=0.0, atol=1e-12)
@@ -234,15 +216,11 @@ def test_another_frame_needs_only_the_joints_that_move_it(
 def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots: Path, tmp_path: Path) -> None:
     """The Panda as it is: a finger mimics the other; and here its links have no masses."""
     urdf = bare((robots / "panda_description/urdf/panda.urdf").read_text())
-    (tmp_path / "panda.urdf").write_text(re.sub("<inertial>.*?</inertial>", "", urdf, flags=re.S))
-    names = [
-        "panda_finger_joint1",
-        "panda_finger_joint2",
-        *(f"panda_joint{i}" for i in range(1, 8)),
-    ]
+    massless = re.sub("<inertial>.*?</inertial>", "", urdf, flags=re.S)
+    names = [f"panda_{name}" for name in ("finger_joint1", "finger_joint2")]
+    names += [f"panda_joint{i}" for i in range(1, 8)]
     t, q, v = waves(9)
-    bag = elsewhere(tmp_path / "bag", names, t, q, v)
-    figure = plot(bag, urdf=tmp_path / "panda.urdf", frame="panda_rightfinger")
+    figure = seen(tmp_path, massless, names, t, q, v, frame="panda_rightfinger")
     alone = re.sub("<mimic[^>]*/>", "", urdf)
     path = kinematics(alone, "panda_rightfinger", names, q)
     np.testing.assert_allclose(
@@ -265,9 +243,7 @@ def test_bags_without_velocities_or_with_gaps(tmp_path: Path) -> None:
 
 def test_a_bag_of_one_sample_is_a_point(foreign: Path, ur5: str, tmp_path: Path) -> None:
     t, q, v = waves(6, 2)
-    bag = elsewhere(tmp_path / "bag", UR5_JOINTS, t[:1], q[:1], v[:1])
-    (tmp_path / "ur5.urdf").write_text(ur5)
-    figure = plot(bag, urdf=tmp_path / "ur5.urdf")
+    figure = seen(tmp_path, ur5, UR5_JOINTS, t[:1], q[:1], v[:1])
     (line,) = lines(panels(figure).q[0], "bag")
     assert line.get_marker() == "o"
     FigureCanvasAgg(figure).draw()

@@ -316,15 +316,6 @@ def test_a_run_that_kills_is_given_up_alone(
     assert max(begun[kp] for kp in begun if kp % 300) <= 2
 
 
-def test_flavours_agree(fmu_path: Path, native_path: Path) -> None:
-    grid = {"Kp": [20.0, 90.0], "Kd": [15.0, 30.0]}
-    python, native = (sweep(path, grid=grid, stop_time=1.0) for path in (fmu_path, native_path))
-    for name in METRICS:
-        assert python[name].to_numpy() == pytest.approx(
-            native[name].to_numpy(), rel=1e-9, abs=1e-9, nan_ok=True
-        )
-
-
 def test_bags_hold_the_runs(native_path: Path, tmp_path: Path) -> None:
     table = sweep(native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", bags=True)
     for run in table.to_dict("records"):

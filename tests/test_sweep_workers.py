@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import asked, changed_plant, children_of, lay_traps, lives, needs, wait_until
+from harness import asked, changed_plant, children_of, lives, needs, wait_until
 from tables import BEGUN, COMMAND, same, table_of
 
 import twodof
@@ -93,19 +93,6 @@ def test_workers_import_nothing_from_the_working_directory(
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "numpy.py").exists() and not list(tmp_path.glob("*.sprung"))
-
-
-def test_the_command_imports_nothing_from_the_working_directory(
-    native_path: Path, tmp_path: Path
-) -> None:
-    lay_traps(tmp_path)
-    done = subprocess.run(
-        [sys.executable, "-I", *COMMAND[1:], "sweep", str(native_path), "--grid", "Kp=20:60:3"],
-        cwd=tmp_path, env={**os.environ, "PYTHONPATH": ":."}, capture_output=True, text=True,
-        check=False, timeout=120,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "3 of 3 runs: 3 finished" in done.stdout and not list(tmp_path.glob("*.sprung"))
 
 
 def test_workers_run_the_package_that_the_program_runs(native_path: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -114,7 +115,7 @@ def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[s
             "file": fmu.path.name, "name": fmu.name, "guid": fmu.guid,
             "sha256": hashlib.sha256(job.content).hexdigest(),
         },
-        "design": design.record(),
+        "design": asdict(design),
         "options": job.options,
         "bags": job.bags is not None,
         "versions": versions(*PACKAGES),

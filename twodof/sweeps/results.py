@@ -296,6 +296,7 @@ def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
 
 
 def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
+    wanted = json.loads(json.dumps(wanted))
     for key in COMPARED:
         if there[key] != wanted[key]:
             other = {
