@@ -95,6 +95,7 @@ def test_a_metre_is_as_long_up_as_across(default: Recording) -> None:
         xs, ys = only(view, label).T
         assert left < xs.min() <= xs.max() < right
         assert low < ys.min() <= ys.max() < high
+    assert left > -LINK  # of the circle of reach a part
 
 
 def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(
@@ -204,6 +205,8 @@ def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
             drawn = [points(line)[:, 1] for line in lines(axes, "target")]
             expected = [[s.inputs[f"q_des[{i + 1}]"] for s in each] for each in (first, second)]
             np.testing.assert_array_equal(drawn, expected[: len(drawn)])
+            low, high = axes.get_ylim()
+            assert low < np.min(drawn) <= np.max(drawn) < high
     over = over_time(read_tracks(bags))
     assert "Position in rad; thin dashes: target" in [
         a["text"] for a in over["layout"]["annotations"]
