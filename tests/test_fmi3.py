@@ -432,11 +432,10 @@ def test_instances_in_threads_share_nothing(length):
 FMUS = (("A_", "task", 3), ("B_", "joint", 3), ("C_", "effort", 2))
 
 
-def embedded(pair, folder, target, suffix=""):
+def embedded(pair, folder, *compiler, suffix=""):
     """The program of embedded.c, and what it is told: three FMUs' tokens and references of q."""
-    compiler, objects, arguments = [*ZIG, target, *FLAGS, "-w"], [], []
+    compiler, objects, arguments = [*compiler, *FLAGS, "-w"], [], []
     folder.mkdir(exist_ok=True)
-    needs("ziglang")
     for prefix, control, fmi in FMUS:
         fmu = pair("twodof", control)[fmi - 2]
         home = folder / prefix
@@ -461,8 +460,9 @@ def embedded(pair, folder, target, suffix=""):
 @pytest.fixture(scope="module")
 def here(pair, tmp_path_factory):
     """embedded.c for Linux x86-64: what it prints, 50 rows of three arms' joints; its objects."""
+    needs("ziglang")
     folder = tmp_path_factory.mktemp("embedded")
-    program, arguments, objects = embedded(pair, folder, *TARGETS["x86_64-linux"])
+    program, arguments, objects = embedded(pair, folder, *ZIG, *TARGETS["x86_64-linux"])
     return printed([program, *arguments]), objects
 
 
@@ -491,7 +491,7 @@ def test_aarch64_equals_x86_64(pair, here, tmp_path):
     whose motion is chaotic, makes 4e-11 in 5 s.
     """
     emulator = needs("qemu-aarch64", "qemu-aarch64-static"), "-L", "/usr/aarch64-linux-gnu"
-    program, arguments, _ = embedded(pair, tmp_path, *TARGETS["aarch64-linux"])
+    program, arguments, _ = embedded(pair, tmp_path, *ZIG, *TARGETS["aarch64-linux"])
     assert program.read_bytes()[18:20] == b"\xb7\x00"  # EM_AARCH64
     assert np.abs(printed([*emulator, program, *arguments]) - here[0]).max() <= 1e-12
 
@@ -499,7 +499,8 @@ def test_aarch64_equals_x86_64(pair, here, tmp_path):
 def test_windows_equals_linux(pair, here, tmp_path):
     """In wine; the bare arm's chaos over 2 s only, for Windows' sin and cos are others."""
     wine = needs("wine64", "wine", "/usr/lib/wine/wine64")
-    program, arguments, _ = embedded(pair, tmp_path, *TARGETS["x86_64-windows"], suffix=".exe")
+    compiler = needs("x86_64-w64-mingw32-gcc")
+    program, arguments, _ = embedded(pair, tmp_path, compiler, suffix=".exe")
     there = printed(
         [wine, program, *arguments],
         WINEPREFIX=str(tmp_path / "wine"), WINEDEBUG="-all", WINEDLLOVERRIDES="mscoree,mshtml=",

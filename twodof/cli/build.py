@@ -117,7 +117,7 @@ def call(options: argparse.Namespace) -> int:
         live_documentation=not options.no_live_documentation,
         platforms=_platforms(options.platforms, options.fmi or 2),
     )
-    logging.getLogger("twodof.export").setLevel(logging.INFO)  # other platforms take minutes
+    logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     path = build_fmu(options.output, chosen)
     from ..fmu import load_fmu
 

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from ..errors import BuildError
-from ..files import temporary_folder, write_file
+from ..files import data_file, temporary_folder, write_file
 
 LOG = logging.getLogger(__name__)
 TARGETS: dict[str, tuple[str, ...]] = {
@@ -51,6 +51,10 @@ FLAGS = (
 without a thought for infinities. Pairing scalars into vectors takes long and gains nothing; short
 loops over joints are written out and vectorised at -O3 only by gcc, at -O2 already by zig."""
 
+WINDOWS = "windows.c"
+"""The C file that a library for Windows has beside the units."""
+WINDOWS_RUNTIME = ("math", "heap", "stdio", "string", "private")
+"""Parts of the "Universal C Runtime", which every Windows has had since 10."""
 KEPT_FOR = 30 * 86400.0
 """s for which a library is kept that is not used."""
 DIGEST = hashlib.sha256().digest_size
@@ -82,6 +86,9 @@ def compile_library(
     if platform not in TARGETS:
         raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")
     output = name + EXTENSIONS[platform]
+    if output.endswith(".dll"):
+        sources = {**sources, WINDOWS: data_file("fmu_src", WINDOWS).read_bytes()}
+        units = [*units, WINDOWS]
     built = [
         _compile(sources, [*compiler, *FLAGS, *flags, *_link_flags(output), *units], output)
         for compiler in _compilers(platform)
@@ -169,7 +176,13 @@ def _link_flags(output: str) -> list[str]:
         return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
     if output.endswith(".dylib"):
         return [*flags, f"-Wl,-install_name,@rpath/{output}"]
-    return flags
+    # the system's own C runtime alone: mingw's, which a library needs none of, takes zig a minute
+    ziglang = importlib.util.find_spec("ziglang")
+    assert ziglang is not None and ziglang.origin is not None
+    headers = Path(ziglang.origin).parent / "lib" / "libc" / "include" / "any-windows-any"
+    flags += ["-isystem", str(headers), "-U__CRT__NO_INLINE", "-D__USE_MINGW_ANSI_STDIO=0"]
+    flags += ["-fno-builtin-sin", "-nostdlib", "-Wl,--no-entry"]
+    return [*flags, *(f"-lapi-ms-win-crt-{part}-l1-1-0" for part in WINDOWS_RUNTIME)]
 
 
 def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) -> bytes:
