@@ -213,6 +213,13 @@ def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
     ]
 
 
+def test_a_bag_may_have_the_name_of_a_limit(default: Recording) -> None:
+    run = replace(twodof.read_bag(default.bag), path=Path("limit"))
+    figure = plot(run)
+    curves = [line for line in lines(panels(figure).q[0], "limit") if len(line.get_xdata()) > 2]
+    assert [line.get_color() for line in curves] == [looks(["limit"])[0].colour]
+
+
 # --- inputs over time ---
 
 

@@ -169,15 +169,13 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         **LAYOUT, "height": height + EDGE + TOP, "xaxis": time, "hovermode": "x",
         "hoverdistance": -1, "spikedistance": -1, "hoversubplots": "axis", "annotations": [],
     }  # fmt: skip
-    most = POINTS // sum(
-        s.label != "limit" for each in rows.values() for p in each for s in p.strokes
-    )
+    most = POINTS // sum(not s.is_limit for each in rows.values() for p in each for s in p.strokes)
     data = []
     for row, (heading, panels) in enumerate(rows.items(), start=1):
         top = 1.0 - (row - 1) * (ROW + GAP) / height
         layout[f"yaxis{row}"] = _value_axis(panels, top, top - ROW / height)
         strokes = [stroke for panel in panels for stroke in panel.strokes]
-        if any(stroke.label == "target" for stroke in strokes):
+        if any(stroke.label == "target" and not stroke.kind for stroke in strokes):
             heading += f"; {TARGET}"
         layout["annotations"].append(_heading(heading, top))
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):

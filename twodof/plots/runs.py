@@ -252,8 +252,8 @@ def _wrapped(name: str, height: float) -> str:
 
 
 def _draw_joint(axes: Axes, panel: Panel) -> None:
-    own = [stroke.thinned(POINTS) for stroke in panel.strokes if stroke.label != "limit"]
-    limits = {stroke.y[0]: stroke for stroke in panel.strokes if stroke.label == "limit"}
+    own = [stroke.thinned(POINTS) for stroke in panel.strokes if not stroke.is_limit]
+    limits = {stroke.y[0]: stroke for stroke in panel.strokes if stroke.is_limit}
     draw(axes, [*own, *(limit._replace(colour=INK) for limit in limits.values())])
     _tell(axes, panel.told)
     axes.set_ylim(*panel.range)

@@ -63,6 +63,11 @@ class Stroke(NamedTuple):
     framed: bool = True
 
     @property
+    def is_limit(self) -> bool:
+        """Whether it is a limit, and not a curve that is called so."""
+        return self.label == "limit" and not self.kind
+
+    @property
     def is_whole(self) -> bool:
         """Whether it is whole lines."""
         return len(self.x) != len(self.y)
