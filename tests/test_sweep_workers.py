@@ -363,9 +363,6 @@ def test_workers_without_the_package_are_named(native_path: Path, tmp_path: Path
         sweep(native_path, grid={"Kp": [1.0]}, scheduler=address)
 
 
-def test_a_scheduler_without_workers_is_named(
-    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("twodof.sweeps.cluster.PATIENCE", 2.0)
+def test_a_scheduler_without_workers_is_named(native_path: Path, tmp_path: Path) -> None:
     with cluster(tmp_path, 0) as (address, _), pytest.raises(TwoDofError, match="has no workers"):
         sweep(native_path, grid={"Kp": [1.0]}, scheduler=address)
