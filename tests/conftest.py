@@ -15,6 +15,10 @@ from harness import cannot_run
 from nodes import listen as listen
 from nodes import number as number
 from nodes import program as program
+from recordings import changing as changing
+from recordings import default as default
+from recordings import foreign as foreign
+from recordings import gains as gains
 
 import twodof
 
@@ -35,9 +39,9 @@ def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
 
 
 LONGEST = (
-    "native_platforms", "live", "sweep", "view", "publish", "page", "mutations", "docs", "plot",
-    "listener", "ends", "native_fmi", "recovery", "states", "slave", "bag", "control", "plant",
-    "master", "scene",
+    "native_platforms", "live", "sweep_workers", "sweep", "view", "publish", "page", "mutations",
+    "docs", "plot_files", "plot", "listener", "ends", "native_fmi", "recovery", "states", "slave",
+    "bag", "control", "plant", "master", "scene",
 )  # fmt: skip
 
 

@@ -163,14 +163,13 @@ def test_geometry_of_many_samples_is_that_of_the_plant(robots: Path) -> None:
 def test_pictures_of_a_bag_follow_the_leader_unless_the_bag_says_otherwise(
     robots: Path, known: str
 ) -> None:
-    from twodof.plots.robot import load_robot as drawn
-    from twodof.plots.robot import motion_of
+    from twodof.plots.linkage import load_linkage
 
     text, frame = (robots / PANDA).read_text(), "panda_rightfinger"
     names = ["panda_finger_joint1", *(["panda_finger_joint2"] if known == "both" else [])]
-    robot = drawn(text, frame, "xyz", names)
-    q = np.zeros((3, len(robot.moving)))
-    index = [joint.name for joint in robot.moving].index(names[-1])
+    linkage = load_linkage(text, frame, "xyz", names)
+    q = np.zeros((3, len(linkage.moving)))
+    index = [joint.name for joint in linkage.moving].index(names[-1])
     q[:, index] = (0.0, 0.01, 0.02)
-    path = motion_of(robot, q).path
+    path = linkage.motion(q).path
     np.testing.assert_allclose(np.linalg.norm(path - path[0], axis=1), (0, 0.01, 0.02), atol=1e-15)

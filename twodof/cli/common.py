@@ -293,11 +293,14 @@ def best_runs(table: DataFrame) -> DataFrame:
 def print_best(table: DataFrame) -> None:
     """The best runs, with units."""
     from ..sweeps.metrics import METRICS
+    from ..sweeps.results import RANKED
 
     best = best_runs(table)
     units = [METRICS[name].unit if name in METRICS else "" for name in best.columns]
     rows = [[f"{value:.4g}" for value in row] for row in best.to_numpy()]
-    print("\nbest: settled first, with least effort" if rows else "\nno run was finished")
+    ranks = [RANKED[name] for name in RANKED if name in best.columns][:2]
+    title = f"best: {', '.join(ranks) or 'no metric ranks them'}"
+    print(f"\n{title}" if rows else "\nno run was finished")
     if rows:
         print_table(best.columns, units, *rows, align=str.rjust, before="  ")
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from ..errors import PlotError
 from ..files import free_name, head_of, refusing, write_file
 from ..version import __version__
-from .scales import GREY, HAIR, INK
+from .strokes import GREY, HAIR, INK
 
 try:
     import matplotlib.style

@@ -1,47 +1,38 @@
-"""What the panels of a run hold, whoever draws them: curves over time, limits, ranges and looks."""
+"""What the panels of a run hold, whoever draws them: strokes over time, limits and ranges."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import ceil, floor, log10
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..bag.outline import extremes
 from ..errors import PlotError
 from .closed_form import Array
-from .scales import COLOURS, SMALLEST_EFFORT, SMALLEST_ERROR, SMALLEST_PART, SMALLEST_RANGE
-from .track import JointTrack, Track, number
-from .words import labels
+from .settings import number
+from .strokes import (
+    PALE,
+    SMALLEST_EFFORT,
+    SMALLEST_ERROR,
+    SMALLEST_PART,
+    SMALLEST_RANGE,
+    Look,
+    Stroke,
+)
+from .track import JointTrack, Track
 
 KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort"}
 UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "tau": ("N·m", "N")}
 """Of joints that turn and of those that slide."""
-DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))
-"""On and off, in widths of the line. With the colours, whose number this does not divide, 28
-curves look different."""
-CHUNKS = 1000
-"""Parts of a long line over time that each keep their extremes; panels are fewer pixels wide."""
-
-
-class Look(NamedTuple):
-    """What tells a curve from the others: a colour and one of DASHES."""
-
-    label: str
-    colour: str
-    dashes: tuple[float, ...]
-
-
-class Curve(NamedTuple):
-    """Values y over times t, s, of the track of that number."""
-
-    track: int
-    t: Array
-    y: Array
+CURVE, THIN, THICK = 1.4, 0.9, 4.0
+"""Widths: of curves, of limits and targets, of closed forms behind curves."""
+TARGET = "thin dashes: target"
+Looks = Mapping[tuple[int, str], Look]
+"""Of each track's joints, and of the track itself, whose joint is ""."""
 
 
 class Panel(NamedTuple):
@@ -51,35 +42,18 @@ class Panel(NamedTuple):
         kind: of KINDS, or "error", the distance from the target.
         joint: its name; "" of the error.
         unit: "rad or m" where no robot tells which.
-        curves: of each track that has it.
-        limits: values that it is held between, ascending.
-        told: limits, or what ``closed_forms`` leave out, in words; of an error that is below the
-            range, that it is.
+        strokes: curves of each track that has it, which have a kind; behind them targets, limits,
+            and what the error is in closed form, where that is in the range.
+        told: targets and limits in words; of an error that is below the range, that it is.
         range: that shows the curves, and the limits that are near.
-        closed_forms: what the error is in closed form, where it is in the range.
     """
 
     kind: str
     joint: str
     unit: str
-    curves: tuple[Curve, ...]
-    limits: tuple[float, ...]
+    strokes: tuple[Stroke, ...]
     told: str
     range: tuple[float, float]
-    closed_forms: tuple[Curve, ...] = ()
-
-
-def looks(names: Iterable[str]) -> list[Look]:
-    """A look for each name."""
-    return [
-        Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)])
-        for i, name in enumerate(names)
-    ]
-
-
-def track_looks(tracks: Sequence[Track]) -> list[Look]:
-    """A look for each track, named by what tells it from the others."""
-    return looks(labels(tracks))
 
 
 def title(tracks: Sequence[Track]) -> str:
@@ -113,33 +87,55 @@ def duration(tracks: Sequence[Track]) -> float:
     return max(float(track.t[-1]) for track in tracks) or 1.0
 
 
-def joint_panels(tracks: Sequence[Track]) -> list[Panel]:
+def joint_panels(tracks: Sequence[Track], looks: Looks) -> list[Panel]:
     """Of each joint in turn: those of KINDS that any joint has."""
-    found = [(i, track.t, joint) for i, track in enumerate(tracks) for joint in track.joints]
-    kinds = [kind for kind in KINDS if any(getattr(joint, kind).size for _, _, joint in found)]
+    joints = [joint for track in tracks for joint in track.joints]
+    kinds = [kind for kind in KINDS if any(getattr(joint, kind).size for joint in joints)]
     return [
-        _joint_panel(kind, [each for each in found if each[2].name == name])
-        for name in joint_names(tracks)
-        for kind in kinds
+        _joint_panel(kind, name, tracks, looks) for name in joint_names(tracks) for kind in kinds
     ]
 
 
-def _joint_panel(kind: str, found: Sequence[tuple[int, Array, JointTrack]]) -> Panel:
-    joints = [joint for _, _, joint in found]
-    turning, sliding = UNITS[kind]
-    unit = {"rad": turning, "m": sliding}.get(joints[0].unit, f"{turning} or {sliding}")
-    curves = [Curve(i, t, getattr(joint, kind)) for i, t, joint in found]
-    shown = tuple(curve for curve in curves if curve.y.size)
-    pairs = list(dict.fromkeys(_limits(kind, joint) for joint in joints))
-    limits = sorted({limit for limit in chain(*pairs) if limit is not None})
-    low, high = _range(
-        [curve.y for curve in shown], SMALLEST_EFFORT if kind == "tau" else SMALLEST_RANGE
-    )
+def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) -> Panel:
+    own = [(i, t, joint) for i, t in enumerate(tracks) for joint in t.joints if joint.name == name]
+    curves, targets, lines, limits, words = [], [], [], [], []
+    for i, track, joint in own:
+        look = looks[i, name]
+        values = getattr(joint, kind)
+        if not values.size:
+            continue
+        curves.append(_curve(look.label, i, track.t, values, look, joint=name, kind=kind))
+        if kind == "q" and joint.target.size:
+            thin = Look("target", look.colour, (3, 2))
+            targets.append(_curve("target", i, track.t, joint.target, thin, THIN, 1.95, joint=name))
+            words.append(TARGET)
+        pair = _limits(kind, joint)
+        for limit in pair:
+            if limit is not None:
+                limits.append(limit)
+                ends, level = np.array([0.0, duration(tracks)]), np.array([limit, limit])
+                dashed = Look("limit", look.colour, (7, 2, 1.5, 2))
+                lines.append(_curve("limit", i, ends, level, dashed, THIN, 1.9, joint=name))
+        words.append(_told(*pair))
+    smallest = SMALLEST_EFFORT if kind == "tau" else SMALLEST_RANGE
+    low, high = _range([stroke.y for stroke in (*curves, *targets)], smallest)
     near = [x for x in limits if abs(2 * x - low - high) < 1.8 * (high - low)]
     low, high = min([low, *near]), max([high, *near])
     pad = 0.06 * (high - low)
-    told = "; ".join(filter(None, (_told(*pair) for pair in pairs)))
-    return Panel(kind, joints[0].name, unit, shown, tuple(limits), told, (low - pad, high + pad))
+    turning, sliding = UNITS[kind]
+    unit = {"rad": turning, "m": sliding}.get(own[0][2].unit, f"{turning} or {sliding}")
+    told = "; ".join(filter(None, dict.fromkeys(words)))
+    return Panel(kind, name, unit, (*lines, *targets, *curves), told, (low - pad, high + pad))
+
+
+def _curve(
+    label: str, track: int, t: Array, y: Array, look: Look, width: float = CURVE,
+    depth: float = 2.0, *, joint: str = "", kind: str = "",
+) -> Stroke:  # fmt: skip
+    mark = "." * (len(t) == 1)
+    return Stroke(
+        label, track, t, y, look.colour, width, look.dashes, mark, depth, joint=joint, kind=kind
+    )
 
 
 def _limits(kind: str, joint: JointTrack) -> tuple[float | None, float | None]:
@@ -159,16 +155,14 @@ def _told(low: float | None, high: float | None) -> str:
 
 def _range(values: Sequence[Array], smallest: float) -> tuple[float, float]:
     """Smallest and largest value, at least so far apart."""
-    found = [y[np.isfinite(y)] for y in values]
-    found = [y for y in found if y.size]
-    low = min((float(y.min()) for y in found), default=0.0)
-    high = max((float(y.max()) for y in found), default=0.0)
+    finite = np.concatenate([y[np.isfinite(y)] for y in values] or [np.empty(0)])
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     smallest = max(smallest, SMALLEST_PART * max(abs(low), abs(high)))
     short = max(0.0, smallest - (high - low))
     return low - 0.5 * short, high + 0.5 * short
 
 
-def error_panel(tracks: Sequence[Track]) -> Panel | None:
+def error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
     """Distance from the target, and what it is in closed form; whole decades for an axis that is
     logarithmic. None where no target is known.
     """
@@ -178,40 +172,15 @@ def error_panel(tracks: Sequence[Track]) -> Panel | None:
     error = np.concatenate([task.error for _, _, task in tasks])
     low = floor(log10(max(float(error.min()), SMALLEST_ERROR)))
     high = max(low + 1, ceil(log10(max(float(error.max()), SMALLEST_ERROR))))
-    disturbances = dict.fromkeys(chain(*(task.disturbances for _, _, task in tasks)))
-    exact = [Curve(i, t, k.closed_form) for i, t, k in tasks if k.closed_form is not None]
-    shown = tuple(curve for curve in exact if curve.y.max() >= 10.0**low)
     told = "" if error.max() >= 10.0**low else f"less than {10.0**low:g} m throughout"
-    if shown:
-        told = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
-    return Panel(
-        "error", "", "m", tuple(Curve(i, t, task.error) for i, t, task in tasks), (),
-        "\n".join(textwrap.wrap(told, 36)), (10.0**low, 10.0**high), shown,
-    )  # fmt: skip
-
-
-def outline(values: Array) -> Any:
-    """Indices of the samples with which a line over time looks as it does with all of them.
-
-    Of each of CHUNKS parts the first, last, smallest and largest.
-    """
-    n = len(values)
-    if n <= 4 * CHUNKS:
-        return slice(None)
-    return extremes(np.arange(n) // ceil(n / CHUNKS), [values])
-
-
-def close_outline(values: Array, most: int) -> Any:
-    """So many at most, with which it does so from near by too, so that a jump is one.
-
-    Of parts as short as may be the same four, and both sides of the greatest rise and fall.
-    """
-    n, rise = len(values), np.diff(values)
-    kept: Any = slice(None)
-    size = 1
-    while n > most:
-        size = max(2 * size, 2 * n // most)
-        lines = [values, np.append(rise, np.nan), np.append(np.nan, rise)]
-        kept = extremes(np.arange(len(values)) // size, lines)
-        n = len(kept)
-    return kept
+    disturbances = dict.fromkeys(chain(*(task.disturbances for _, _, task in tasks)))
+    name = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
+    exact = Look("\n".join(textwrap.wrap(name, 36)), PALE, ())
+    strokes = [
+        _curve(exact.label, i, t, task.closed_form, exact, THICK, 1.5)
+        for i, t, task in tasks
+        if task.closed_form is not None and task.closed_form.max() >= 10.0**low
+    ]
+    for i, t, task in tasks:
+        strokes.append(_curve(looks[i, ""].label, i, t, task.error, looks[i, ""], kind="error"))
+    return Panel("error", "", "m", tuple(strokes), told, (10.0**low, 10.0**high))

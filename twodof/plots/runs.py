@@ -10,38 +10,34 @@ import textwrap
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain
-from math import ceil, log10
+from math import ceil
 from pathlib import Path
-from typing import Any
 
 from ..bag.provenance import each_robot
 from ..bag.recording import Recording
-from .figure import TICK_STYLE, Drawing, drawn
+from .artists import add_axes, draw, key, line, set_decades, set_ticks
+from .figure import Drawing, drawn
 from .interactive import body
 from .panels import (
     KINDS,
     UNITS,
-    Curve,
-    Look,
+    Looks,
     Panel,
     duration,
     error_panel,
+    joint_names,
     joint_panels,
-    outline,
     title,
-    track_looks,
 )  # fmt: skip
-from .scales import GREY, INK, PALE
-from .strokes import draw_view, key, line, set_ticks
+from .strokes import GREY, INK, Look, looks
 from .track import Track, read_tracks
-from .words import common_settings, outcome, summary
-from .workspace import SIDE, views, workspace_title
+from .words import common_settings, labels, outcome, summary
+from .workspace import SIDE, View, views, workspace_title
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 ROWS = 16  # of joints; more stand in columns beside each other
 NAMES, TICKS, GAP, MARGIN = 0.65, 0.5, 0.55, 0.15
@@ -56,6 +52,7 @@ VIEWS = {1: (3.0, 5.0), 2: (1.8, 3.4)}
 """Least and most height of a view of the workspace, by the number of views."""
 LETTER = 0.058  # mean width
 ABOVE = 13.0  # points from a panel to its title, with room for the limits between
+POINTS = 4000  # of a curve; panels are fewer pixels wide
 
 
 def plot(
@@ -94,10 +91,12 @@ class _Page:
     them, the workspace is beside them, in one view above the other.
     """
 
-    def __init__(self, figure: Figure, tracks: Sequence[Track], looks: Sequence[Look]) -> None:
+    def __init__(self, figure: Figure, tracks: Sequence[Track], bags: Sequence[Look]) -> None:
         self.figure = figure
-        self.panels = joint_panels(tracks)
-        self.error = error_panel(tracks)
+        names = ["", *joint_names(tracks)]
+        looks: Looks = {(i, name): look for i, look in enumerate(bags) for name in names}
+        self.panels = joint_panels(tracks, looks)
+        self.error = error_panel(tracks, looks)
         self.views = views(tracks, looks)
 
         kinds = len({panel.kind for panel in self.panels})
@@ -130,8 +129,8 @@ class _Page:
         self.settings = textwrap.wrap(common_settings(tracks), letters)
         if len(tracks) == 1 and tracks[0].task:
             self.settings += textwrap.wrap(outcome(tracks[0]), letters)
-        self.keys = max(1, letters // (12 + max(len(look.label) for look in looks)))
-        lines = len(self.settings) + (ceil(len(looks) / self.keys) if len(looks) > 1 else 0)
+        self.keys = max(1, letters // (12 + max(len(look.label) for look in bags)))
+        lines = len(self.settings) + (ceil(len(bags) / self.keys) if len(bags) > 1 else 0)
         self.top = 0.8 + LINE * lines
         self.bottom = self.top + body
         figure.set_size_inches(self.width, self.bottom + BELOW)
@@ -139,48 +138,42 @@ class _Page:
     def at(self, left: float, top: float) -> tuple[float, float]:
         return left / self.width, 1.0 - top / (self.bottom + BELOW)
 
-    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
-        x, y = self.at(left, top + height)
-        box = (x, y, width / self.width, height / (self.bottom + BELOW))
-        axes = self.figure.add_axes(box)
-        axes.tick_params(which="both", **TICK_STYLE)
-        return axes
-
 
 def _draw(tracks: Sequence[Track], figure: Figure) -> None:
-    looks = track_looks(tracks)
-    page = _Page(figure, tracks, looks)
-    _draw_head(page, tracks, looks)
+    bags = looks(labels(tracks))
+    page = _Page(figure, tracks, bags)
+    _draw_head(page, tracks, bags)
     end = duration(tracks)
-    _draw_joints(page, looks, end)
+    _draw_joints(page, end)
     if page.error:
-        axes = page.axes(page.left, page.bottom - ERROR, page.across, ERROR)
-        _draw_error(axes, page.error, looks)
+        axes = add_axes(page.figure, page.left, page.bottom - ERROR, page.across, ERROR)
+        _draw_error(axes, page.error)
         _time_axis(axes, end)
     below = []
     for i, view in enumerate(page.views):
-        axes = page.axes(page.side, page.top + i * (page.view + BELOW), SIDE, page.view)
-        draw_view(axes, view, aspect=page.view / SIDE)
+        axes = add_axes(page.figure, page.side, page.top + i * (page.view + BELOW), SIDE, page.view)
+        _draw_view(axes, view, page.view / SIDE)
         below.append(axes)
     if below:
         below[0].set_title(workspace_title(tracks), pad=ABOVE)
         below[-1].legend(
-            handles=key(page.views), loc="upper left", ncols=3, handlelength=1.7,
+            handles=key(stroke for view in page.views for stroke in view.strokes),
+            loc="upper left", ncols=3, handlelength=1.7,
             columnspacing=1.0, bbox_to_anchor=(0.0, -BELOW / page.view),
         )  # fmt: skip
 
 
-def _draw_head(page: _Page, tracks: Sequence[Track], looks: Sequence[Look]) -> None:
+def _draw_head(page: _Page, tracks: Sequence[Track], bags: Sequence[Look]) -> None:
     """What was run, and where there are several bags the key that tells them apart."""
     name = _end(title(tracks), page.letters // 2)
     page.figure.text(*page.at(MARGIN, 0.28), name, fontsize=11, fontweight="bold")
     for i, words in enumerate(page.settings):
         page.figure.text(*page.at(MARGIN, 0.48 + i * LINE), words, color=GREY)
-    if len(looks) > 1:
+    if len(bags) > 1:
         letters = int(0.8 * page.letters) - 10
         handles = [
             Line2D([], [], label=_end(look.label, letters), **line(look.colour, look.dashes))
-            for look in looks
+            for look in bags
         ]
         page.figure.legend(
             handles=handles,
@@ -203,15 +196,21 @@ def _time_axis(axes: Axes, end: float, *, labelled: bool = True) -> None:
         axes.tick_params(labelbottom=False)
 
 
-def _draw_curve(axes: Axes, curve: Curve, label: str, **look: Any) -> None:
-    kept = outline(curve.y)
-    axes.plot(curve.t[kept], curve.y[kept], label=label, **look)
+def _draw_view(axes: Axes, view: View, aspect: float) -> None:
+    """Draw it; aspect is height : width."""
+    low, high = view.box(aspect)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), autoscale_on=False)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel=f"{view.axes[0]} in m", ylabel=f"{view.axes[1]} in m")
+    set_ticks(axes.xaxis, 5)
+    set_ticks(axes.yaxis, 5)
+    draw(axes, view.strokes)
 
 
 # --- joints ---
 
 
-def _draw_joints(page: _Page, looks: Sequence[Look], end: float) -> None:
+def _draw_joints(page: _Page, end: float) -> None:
     units: dict[str, list[str]] = {}
     for panel in page.panels:
         units.setdefault(panel.kind, []).append(panel.unit)
@@ -220,8 +219,8 @@ def _draw_joints(page: _Page, looks: Sequence[Look], end: float) -> None:
         block, row = divmod(place, page.rows)
         left = page.left + block * page.block + column * (page.cell + GAP)
         top = page.top + row * page.pitch
-        axes = page.axes(left, top, page.cell, page.pitch - page.gap)
-        _draw_joint(axes, panel, looks)
+        axes = add_axes(page.figure, left, top, page.cell, page.pitch - page.gap)
+        _draw_joint(axes, panel)
         last = row == page.rows - 1 or i + page.columns >= len(page.panels)
         _time_axis(axes, end, labelled=last)
         parts = {part for unit in units[panel.kind] for part in unit.split(" or ")}
@@ -252,17 +251,10 @@ def _wrapped(name: str, height: float) -> str:
     return "\n".join(lines)
 
 
-def _draw_joint(axes: Axes, panel: Panel, looks: Sequence[Look]) -> None:
-    for curve in panel.curves:
-        look = looks[curve.track]
-        marker = "o" if len(curve.t) == 1 else ""
-        _draw_curve(
-            axes, curve, look.label, marker=marker, markersize=3, **line(look.colour, look.dashes)
-        )
-    for limit in panel.limits:
-        axes.axhline(
-            limit, color=INK, linewidth=0.9, dashes=(7, 2, 1.5, 2), zorder=1.9, label="limit"
-        )
+def _draw_joint(axes: Axes, panel: Panel) -> None:
+    own = [stroke.thinned(POINTS) for stroke in panel.strokes if not stroke.is_limit]
+    limits = {stroke.y[0]: stroke for stroke in panel.strokes if stroke.is_limit}
+    draw(axes, [*own, *(limit._replace(colour=INK) for limit in limits.values())])
     _tell(axes, panel.told)
     axes.set_ylim(*panel.range)
     set_ticks(axes.yaxis, 4)
@@ -276,34 +268,12 @@ def _tell(axes: Axes, text: str) -> None:
 # --- the error ---
 
 
-def _draw_error(axes: Axes, panel: Panel, looks: Sequence[Look]) -> None:
+def _draw_error(axes: Axes, panel: Panel) -> None:
     axes.set_yscale("log", nonpositive="mask")
-    _decades(axes, *panel.range)
-    for curve in panel.closed_forms:
-        _draw_curve(
-            axes, curve, panel.told, color=PALE, linewidth=4.0, solid_capstyle="butt", zorder=1.5
-        )
-    handles = axes.get_lines()[:1]  # one tells of all closed forms
-    for curve in panel.curves:
-        look = looks[curve.track]
-        _draw_curve(axes, curve, look.label, **line(look.colour, look.dashes))
+    set_decades(axes, *panel.range)
+    draw(axes, [stroke.thinned(POINTS) for stroke in panel.strokes])
     axes.set_title(f"Distance from the target in {panel.unit}")
-    if handles:
-        axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.02))
+    if any(not stroke.kind for stroke in panel.strokes):  # one tells of all closed forms
+        axes.legend(handles=axes.get_lines()[:1], loc="lower right", bbox_to_anchor=(1.0, 1.02))
     else:
         _tell(axes, panel.told)
-
-
-def _decades(axes: Axes, low: float, high: float) -> None:
-    """Whole decades and their ticks."""
-    axes.set_ylim(low, high)
-    axes.yaxis.set_major_locator(LogLocator(numticks=6))
-    few = high < 5000.0 * low
-    axes.yaxis.set_minor_locator(LogLocator(subs=range(2, 10)) if few else NullLocator())
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_major_formatter(FuncFormatter(_power_of_ten))
-
-
-def _power_of_ten(value: float, _position: int | None = None) -> str:
-    digits = str(round(log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"10{digits}"

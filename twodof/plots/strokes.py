@@ -1,80 +1,103 @@
-"""Strokes of the workspace, and the looks of lines and ticks, as matplotlib has them."""
+"""Strokes, of which pictures consist whoever draws them; colours, and the smallest sizes shown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import chain
-from typing import Any
+from collections.abc import Iterable
+from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 
-from .scales import GREY
-from .track import number
-from .workspace import Stroke, View
+from ..bag.outline import Indices, extremes
+from .closed_form import Array
 
-# isort: split
-from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
-from matplotlib.axis import Axis
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Of Okabe & Ito, "Color universal design", 2008, without their yellow, too pale on paper."""
+INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
+DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))
+"""On and off, in widths of the line. With the colours, whose number this does not divide, 28
+curves look different."""
 
-STEPS = (1, 2, 2.5, 5, 10)  # of ticks
-
-
-def line(colour: str, dashes: Sequence[float]) -> dict[str, Any]:
-    """A look as matplotlib's lines have it."""
-    return {"color": colour, "linestyle": (0, tuple(dashes)) if dashes else "-"}
+SMALLEST_RANGE = 1e-3  # rad, m, rad/s, m/s: what moves less is shown at rest
+SMALLEST_EFFORT = 1e-6  # N·m, N
+SMALLEST_PART = 1e-4  # of a value: ticks, of six digits, differ
+SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
-def set_ticks(axis: Axis, most: int) -> None:
-    """Round numbers, at most so many steps between them."""
-    axis.set_major_locator(MaxNLocator(most, steps=STEPS))
-    axis.set_major_formatter(FuncFormatter(lambda value, _position: number(value)))
+class Look(NamedTuple):
+    """What tells a curve from the others: a colour and one of DASHES."""
+
+    label: str
+    colour: str
+    dashes: tuple[float, ...]
 
 
-def draw_view(axes: Axes, view: View, aspect: float) -> None:
-    """Draw it; aspect is height : width."""
-    low, high = view.box(aspect)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), autoscale_on=False)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel=f"{view.axes[0]} in m", ylabel=f"{view.axes[1]} in m")
-    set_ticks(axes.xaxis, 5)
-    set_ticks(axes.yaxis, 5)
-    for stroke in view.strokes:
-        look = {**line(stroke.colour, stroke.dashes), "label": stroke.label}
-        look |= {"linewidth": stroke.width, "zorder": stroke.depth}
-        x, y = stroke.points.T
-        if np.isfinite(stroke.points).all():
-            axes.plot(x, y, **{**look, **_marks(stroke)})
-        for value in x[np.isnan(y) & np.isfinite(x)]:
-            axes.axvline(value, **look)
-        for value in y[np.isnan(x) & np.isfinite(y)]:
-            axes.axhline(value, **look)
+class Stroke(NamedTuple):
+    """A line in a picture, or marks.
+
+    Attributes:
+        label: what it is.
+        track: whose, or None.
+        x, y: across and up; empty where the other alone is meant, along a whole line each.
+        colour: as in HTML.
+        width: of the line in points; 0: none.
+        dashes: as in DASHES.
+        mark: "o" at all points but the last, "+" or "." at all, or "".
+        depth: what is higher is drawn over what is lower.
+        joint: whose of the track; "": the track's own.
+        kind: the quantity whose values it has, of those that a page tells; "": of none.
+        framed: whether the picture must show it.
+    """
+
+    label: str
+    track: int | None
+    x: Array
+    y: Array
+    colour: str
+    width: float
+    dashes: tuple[float, ...] = ()
+    mark: str = ""
+    depth: float = 4.0
+    joint: str = ""
+    kind: str = ""
+    framed: bool = True
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether it is a limit, and not a curve that is called so."""
+        return self.label == "limit" and not self.kind
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is whole lines."""
+        return len(self.x) != len(self.y)
+
+    def thinned(self, most: int) -> Stroke:
+        """The same with an outline of y over x, in so many points."""
+        if len(self.x) <= most:
+            return self
+        kept = outline(self.y, most)
+        return self._replace(x=self.x[kept], y=self.y[kept])
 
 
-def _marks(stroke: Stroke) -> dict[str, Any]:
-    if stroke.mark == "+":
-        return {"marker": "+", "markersize": 11, "markeredgewidth": 1.3, "linestyle": "none"}
-    if stroke.mark:
-        return {
-            "marker": "o", "markersize": stroke.width + 1.5, "markerfacecolor": "white",
-            "markeredgecolor": stroke.colour, "markeredgewidth": 0.3 * stroke.width,
-            "solid_joinstyle": "round", "solid_capstyle": "round", "markevery": slice(0, -1),
-        }  # fmt: skip
-    return {}
-
-
-def key(views: Sequence[View]) -> list[Line2D]:
-    """One handle for each label; those of several tracks in grey."""
-    handles: dict[str, Stroke] = {}
-    for stroke in chain.from_iterable(view.strokes for view in views):
-        first = handles.setdefault(stroke.label, stroke)
-        if first.colour != stroke.colour:
-            handles[stroke.label] = first._replace(colour=GREY, dashes=())
+def looks(names: Iterable[str]) -> list[Look]:
+    """A look for each name."""
     return [
-        Line2D(
-            [0, 1], [0, 1], label=stroke.label, linewidth=stroke.width,
-            **{**line(stroke.colour, stroke.dashes), **_marks(stroke)},
-        )
-        for stroke in handles.values()
-    ]  # fmt: skip
+        Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)])
+        for i, name in enumerate(names)
+    ]
+
+
+def outline(values: Array, most: int) -> Indices:
+    """Indices of so many samples at most, with which a line looks as it does with all of them.
+
+    From near by too, so that a jump is one: of parts as short as may be the first, last, smallest
+    and largest, and both sides of the greatest rise and fall.
+    """
+    kept: Indices = np.arange(len(values))
+    rise, size = np.diff(values), 1
+    lines = [values, np.append(rise, np.nan), np.append(np.nan, rise)]
+    while len(kept) > most:
+        size = max(2 * size, ceil(2 * len(kept) / most))
+        kept = extremes(np.arange(len(values)) // size, lines)
+    return kept

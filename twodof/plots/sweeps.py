@@ -18,9 +18,10 @@ import numpy as np
 from ..errors import PlotError
 from ..sweeps.metrics import METRICS
 from ..sweeps.results import RANKED, ranked
+from .artists import add_axes
 from .closed_form import Array
-from .figure import TICK_STYLE, Drawing
-from .scales import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
+from .figure import Drawing
+from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
@@ -120,10 +121,8 @@ def _draw(
     for i, panel in enumerate(panels):
         row, column = divmod(i, across)
         left, top = LEFT + column * (WIDTH + GAP), TOP + row * (HEIGHT + BELOW)
-        box = (left / width, 1 - (top + HEIGHT) / height, WIDTH / width, HEIGHT / height)
-        axes = figure.add_axes(box)
+        axes = add_axes(figure, left, top, WIDTH, HEIGHT)
         axes.set_label(f"{panel.metric} over {panel.x}" + (f" and {panel.y}" if panel.y else ""))
-        axes.tick_params(which="both", **TICK_STYLE)
         if panel.y is None:
             _draw_curve(axes, table, panel)
         else:

@@ -11,23 +11,18 @@ import numpy as np
 
 from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_outline
-from ..bag.recording import Recording, Schedule
+from ..bag.recording import Recording
 from ..errors import BuildError, PlotError
 from ..export.urdf_source import read_text
 from ..files import shown
 from ..plant.urdf import UNBOUNDED, RobotError
 from .closed_form import Array, Held, task_error
-from .robot import Motion, Robot, is_singular, load_robot, motion_of
+from .linkage import Linkage, Motion, load_linkage
+from .settings import settings_of
 
 AT_LIMIT = 1e-9  # of a limit's size
 NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
 MOST = 200_000  # samples of a bag that are drawn
-UNITS = {
-    "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
-    "omega_des": "rad/s", "alpha_des": "rad/s²", "Kp_rot": "s⁻²", "Kd_rot": "s⁻¹",
-    "gravity": "m/s²", "max_step": "s", "payload": "kg", "payload_com": "m", "f_ext": "N",
-}  # fmt: skip
-"""Units of variables, where they do not depend on the joint."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +37,7 @@ class JointTrack:
         effort: limit of the URDF, N·m or N; None likewise.
         q, v, tau: positions, velocities and efforts, N values each; v and tau are empty where they
             are not known.
+        target: position that it is to have, in effect up to each sample, N values; empty likewise.
     """
 
     name: str
@@ -52,6 +48,7 @@ class JointTrack:
     q: Array
     v: Array
     tau: Array
+    target: Array
 
     @property
     def at_limit(self) -> bool:
@@ -71,7 +68,8 @@ class Task:
         axes: the task axes, of "xyz".
         target: position in effect up to each sample, N × m; not a number where none was known yet.
         error: distance from the target, m, N values; likewise.
-        closed_form: the same for the closed form; None where the gains are not known.
+        closed_form: the same for the closed form; None where the gains are not known, or the robot
+            has fewer joints than the task has coordinates.
         off: distance between the two positions, m, N values; None likewise.
         disturbances: what was at work that the closed form does not have.
     """
@@ -184,73 +182,68 @@ def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> 
 def _with_robot(
     bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None
 ) -> Track:
-    run = bag.provenance
-    robot = None
-    if urdf is not None:
-        try:
-            at = run.get("frame", "") if frame is None else frame
-            robot = load_robot(urdf, at, run.get("axes") or "xyz", names)
-        except RobotError as error:
-            raise PlotError(f"{source}: {error}") from error
-    joints = _joints(bag, names, robot)
-    motion = task = None
-    if robot is not None:
-        q = _in_robot_order(bag, robot, names, bag.q)
-        motion = motion_of(robot, q)
-        if run.get("frame", robot.frame) == robot.frame and _has_target(bag, robot):
-            v = _in_robot_order(bag, robot, names, bag.v)
-            task = _task(bag, robot, joints, q, v[0], motion.path)
-    return Track(bag, _settings(bag), bag.t, joints, motion, task)
+    run, settings = bag.provenance, settings_of(bag)
+    if urdf is None:
+        return Track(bag, settings, bag.t, _joints(bag, names, None), None, None)
+    try:
+        at = run.get("frame", "") if frame is None else frame
+        linkage = load_linkage(urdf, at, run.get("axes") or "xyz", names)
+    except RobotError as error:
+        raise PlotError(f"{source}: {error}") from error
+    joints, q = _joints(bag, names, linkage), _of_linkage(bag, linkage, names, bag.q)
+    motion, task = linkage.motion(q), None
+    if run.get("frame", linkage.frame) == linkage.frame and _has_target(bag, linkage):
+        v = _of_linkage(bag, linkage, names, bag.v)
+        task = _task(bag, linkage, joints, q, v[0], motion.path)
+    return Track(bag, settings, bag.t, joints, motion, task)
 
 
-def _joints(bag: Recording, names: Sequence[str], robot: Robot | None) -> tuple[JointTrack, ...]:
-    starts = bag.provenance.get("start_values", {})
+def _joints(
+    bag: Recording, names: Sequence[str], linkage: Linkage | None
+) -> tuple[JointTrack, ...]:
+    n, starts = len(names), bag.provenance.get("start_values", {})
+    first = bag.schedule[0][1]
+    efforts, targets = bag.tau, bag.held("q_des", n)
+    if not efforts.size and f"tau_cmd[{n}]" in first:  # of a bare plant: what it is to apply
+        efforts = bag.held("tau_cmd", n)
     joints = []
-    efforts = _efforts(bag)
-    limited = bool(bag.provenance) and bool(bag.schedule[0][1].get("limit_effort"))
     for i, name in enumerate(names):
         unit, effort = "", None
         low, high = starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]")
-        if robot is not None and name in robot.urdf.joints:
-            joint = robot.urdf.joints[name]
+        if linkage is not None and name in linkage.urdf.joints:
+            joint = linkage.urdf.joints[name]
             unit = "m" if joint.prismatic else "rad"
             low = joint.low if low is None else low
             high = joint.high if high is None else high
             effort = joint.effort if joint.effort < UNBOUNDED else None
         low = None if low is None or low <= -UNBOUNDED else low
         high = None if high is None or high >= UNBOUNDED else high
-        v = bag.v[:, i] if bag.v.shape == bag.q.shape else np.empty(0)
-        tau = efforts[:, i] if efforts.shape == bag.q.shape else np.empty(0)
-        if limited and effort is not None:  # of commands; efforts in a bag are within it
+        q, v, tau, target = (
+            values[:, i] if values.shape == bag.q.shape else np.empty(0)
+            for values in (bag.q, bag.v, efforts, targets)
+        )
+        if effort is not None and first.get("limit_effort"):  # of commands; a bag's are within it
             tau = np.clip(tau, -effort, effort)
-        joints.append(JointTrack(name, unit, low, high, effort, bag.q[:, i], v, tau))
+        joints.append(JointTrack(name, unit, low, high, effort, q, v, tau, target))
     return tuple(joints)
 
 
-def _efforts(bag: Recording) -> Array:
-    """Those of the bag; of a bare plant, what it was told to apply, N × n; N × 0 where unknown."""
-    n = len(bag.joints)
-    if bag.tau.size or not bag.provenance or f"tau_cmd[{n}]" not in bag.schedule[0][1]:
-        return bag.tau
-    return bag.held("tau_cmd", n)
-
-
-def _in_robot_order(bag: Recording, robot: Robot, names: Sequence[str], values: Array) -> Array:
-    """Columns of a bag's q or v for the robot's joints; 0 for those that do not move the frame.
+def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: Array) -> Array:
+    """Columns of a bag's q or v for the linkage's joints; 0 for those that do not move the frame.
 
     Raises:
         PlotError: a joint that moves the frame is not in the bag.
     """
-    ordered = np.zeros((len(values), len(robot.moving)))
-    needed = {j.name if j.name in names else j.leader for j in robot.chain}
-    for j, joint in enumerate(robot.moving):
+    ordered = np.zeros((len(values), len(linkage.moving)))
+    needed = {j.name if j.name in names else j.leader for j in linkage.chain}
+    for j, joint in enumerate(linkage.moving):
         if joint.name in names:
             if values.shape == bag.q.shape:
                 ordered[:, j] = values[:, names.index(joint.name)]
         elif joint.name in needed:
             raise PlotError(
-                f"'{bag.path}' has no joint '{joint.name}', which the robot '{robot.urdf.name}'"
-                f" needs to move '{robot.frame}'; its joints are: {', '.join(names)}"
+                f"'{bag.path}' has no joint '{joint.name}', which the robot '{linkage.urdf.name}'"
+                f" needs to move '{linkage.frame}'; its joints are: {', '.join(names)}"
             )
     return ordered
 
@@ -258,88 +251,45 @@ def _in_robot_order(bag: Recording, robot: Robot, names: Sequence[str], values: 
 # --- the task ---
 
 
-def _has_target(bag: Recording, robot: Robot) -> bool:
+def _has_target(bag: Recording, linkage: Linkage) -> bool:
     """Whether the target is known, at the end at least, in the robot's root frame."""
     if not bag.target.size or np.isnan(bag.target[-1]).any():
         return False
-    return bool(bag.provenance) or (bag.heard is not None and bag.heard.frame == robot.urdf.root)
+    return bool(bag.provenance) or (bag.heard is not None and bag.heard.frame == linkage.urdf.root)
 
 
 def _task(
-    bag: Recording, robot: Robot, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array
+    bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array
 ) -> Task:
-    axes = ["xyz".index(axis) for axis in robot.axes]
+    axes = ["xyz".index(axis) for axis in linkage.axes]
     x, target = path[:, axes], bag.target
 
     def vector(values: Mapping[str, Any], group: str) -> tuple[float, ...]:
         return tuple(float(values[f"{group}[{i + 1}]"]) for i in range(len(axes)))
 
-    closed_form = off = None
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.linalg.norm(x - target, axis=1)
         if not np.isfinite(x).all() or np.isinf(error).any():
             raise ValueError("positions or targets are beyond all bounds")
+        first = bag.schedule[0][1]
+        turns = "quat_des[1]" in first
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
-        if inputs_known and all(f"{g}[1]" in bag.schedule[0][1] for g in Held._fields):
-            held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
-            xd0 = (robot.kinematics.jacobian(robot.frame, q[:1])[0] @ v0)[axes]
-            e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
-            closed_form = np.linalg.norm(e, axis=1)
-            off = np.linalg.norm(x - target - e, axis=1)
-    astray = off is not None and bool(off.max() > NOTABLE)
-    disturbances = _disturbances(bag.schedule, robot, joints, q, astray)
-    return Task(robot.axes, target, error, closed_form, off, disturbances)
-
-
-def _disturbances(
-    schedule: Schedule, robot: Robot, joints: Sequence[JointTrack], q: Array, astray: bool
-) -> tuple[str, ...]:
-    """What moves, brakes or stops the arm and is not in the closed form, which it is off or not."""
-    first = schedule[0][1]
+        followed = len(axes) + 3 * turns <= linkage.freedoms  # in all that is asked for at a time
+        if not (inputs_known and followed and all(f"{g}[1]" in first for g in Held._fields)):
+            return Task(linkage.axes, target, error, None, None, ())
+        held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
+        xd0 = (linkage.kinematics.jacobian(linkage.frame, q[:1])[0] @ v0)[axes]
+        e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
+        off = np.linalg.norm(x - target - e, axis=1)
     external = [name for name in first if name.startswith(("tau_ext[", "f_ext["))]
+    astray = bool(off.max() > NOTABLE)
     at_work = {
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
-        "singularities": astray
-        and is_singular(robot, q, float(first.get("rcond", 0.0)), "quat_des[1]" in first),
-        "damping": any(joint.damping for joint in robot.urdf.joints.values() if joint.moves),
+        "singularities": astray and linkage.is_singular(q, float(first.get("rcond", 0.0)), turns),
+        "damping": any(joint.damping for joint in linkage.urdf.joints.values() if joint.moves),
         "unknown payload": bool(first.get("payload")) and not first.get("payload_known"),
-        "external torque": any(values[name] for _, values in schedule for name in external),
+        "external torque": any(values[name] for _, values in bag.schedule for name in external),
     }
-    return tuple(name for name, present in at_work.items() if present)
-
-
-def _settings(bag: Recording) -> dict[str, str]:
-    """What the run was told, vectors and scalars by group."""
-    run = bag.provenance
-    if not run:
-        return {}
-    step = f"{1e3 * run['step']:g} ms"
-    settings = {"FMU": run["fmu"]["file"], "robot": run["robot"], "step": step}
-    (_, first), *later = bag.schedule
-    given = {name for _, values in run["input_changes"] for name in values}
-    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
-    groups: dict[str, list[Any]] = {}
-    for name, value in first.items():
-        groups.setdefault(_group(name), []).append(value)
-    for group, values in groups.items():
-        unit = f" {UNITS[group]}" if group in UNITS else ""
-        settings[group] = "varied" if group in varied else _text(values) + unit
-    return settings
-
-
-def _group(name: str) -> str:
-    return name.partition("[")[0]
-
-
-def _text(values: Sequence[Any]) -> str:
-    """One value where all are equal, as gains often are, else all of them."""
-    texts = [str(v).lower() if isinstance(v, bool) else number(v) for v in values]
-    return texts[0] if len(set(texts)) == 1 else f"({', '.join(texts)})"
-
-
-def number(value: float) -> str:
-    """Six digits, with the minus sign of typography; the largest double means none."""
-    if abs(value) >= UNBOUNDED:
-        return "none"
-    return f"{value + 0.0:.6g}".replace("-", "\N{MINUS SIGN}")  # + 0.0: no negative zero
+    disturbances = tuple(name for name, present in at_work.items() if present)
+    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances)

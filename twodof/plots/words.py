@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..files import shown
-from .track import Track, number
+from .settings import number
+from .track import Track
 
 TOLD = {
     "x_des": "", "q_des": "", "tau_cmd": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²",

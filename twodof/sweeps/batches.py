@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from itertools import islice
 from math import nan
 
-from .metrics import METRICS
-from .runner import Point, Row
+from .runner import Point, Row, lost
 
 BATCH_TIME = 0.25  # s, of one batch
 MAX_BATCH = 256
 MOST_DEATHS = 3  # of a run's worker, two of them while it ran alone
+GIVEN_UP = "the process that ran it died, repeatedly"
 LOOK = 0.2  # s between two looks at whether to go on
 
 
@@ -50,9 +50,5 @@ class Batches:
         """Rows of those runs of a batch that are given up, now that its worker has died."""
         self._deaths.update(number for number, _ in batch)
         self._suspects.extend(p for p in batch if self._deaths[p[0]] < MOST_DEATHS)
-        return self.done([_crashed(*p) for p in batch if self._deaths[p[0]] >= MOST_DEATHS], 0.0)
-
-
-def _crashed(number: int, values: tuple[float, ...]) -> Row:
-    metrics = [nan] * len(METRICS)
-    return (number, *values, *metrics, nan, "crashed", "the process that ran it died, repeatedly")
+        given_up = [p for p in batch if self._deaths[p[0]] >= MOST_DEATHS]
+        return self.done([lost(p, nan, "crashed", GIVEN_UP) for p in given_up], 0.0)

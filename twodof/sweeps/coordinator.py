@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,19 +81,32 @@ def sweep(
     options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
     units = [_unit(run.fmu, name) for name in design.names]
-    with _folder(output) as path:
-        folder = str(path.resolve() / "bags") if bags else None
-        job = Job(_content(run.fmu), run.fmu.path.name, design.names, options, folder)
+    with temporary_folder() as spare:
+        path = spare / "sweep" if output is None else Path(output)
+        job = _job(run.fmu, design.names, options, path.resolve() / "bags" if bags else None)
         provenance = _provenance(run.fmu, design, job, command_line)
         results = Results(path, design.names, units, len(design), provenance, resume=resume)
-        runs = _runs(job, design, ~results.done, workers, scheduler, stop)
-        _collect(runs, results, lambda: progress(int(results.done.sum()), len(design)))
+        staff = _workers(job, design, ~results.done, workers, scheduler, stop)
+        _collect(staff, results, progress)
         return read_sweep(path)[0]
 
 
-def _content(fmu: Fmu) -> bytes:
+def _collect(
+    staff: AbstractContextManager[Iterable[list[Row]]],
+    results: Results,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Store rows as they come; nothing is written before the workers are there."""
+    progress(int(results.done.sum()), len(results.done))
+    with staff as news, results:
+        for rows in news:
+            results.add(rows)
+            progress(int(results.done.sum()), len(results.done))
+
+
+def _job(fmu: Fmu, names: tuple[str, ...], options: dict[str, Any], bags: Path | None) -> Job:
     with opened(fmu):
-        return fmu.path.read_bytes()
+        return Job(fmu.path.read_bytes(), fmu.path.name, names, options, bags)
 
 
 def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
@@ -101,7 +115,7 @@ def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[s
             "file": fmu.path.name, "name": fmu.name, "guid": fmu.guid,
             "sha256": hashlib.sha256(job.content).hexdigest(),
         },
-        "design": design.record(),
+        "design": asdict(design),
         "options": job.options,
         "bags": job.bags is not None,
         "versions": versions(*PACKAGES),
@@ -109,24 +123,11 @@ def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[s
     }  # fmt: skip
 
 
-def _collect(
-    runs: AbstractContextManager[Iterable[list[Row]]],
-    results: Results,
-    progress: Callable[[], None],
-) -> None:
-    """Store rows as they come; nothing is written before the workers are there."""
-    progress()
-    with runs as news, results:
-        for rows in news:
-            results.add(rows)
-            progress()
-
-
-def _runs(
+def _workers(
     job: Job, design: Design, missing: NDArray[np.bool_],
     count: int | None, scheduler: str | None, stop: Callable[[], bool],
 ) -> AbstractContextManager[Iterable[list[Row]]]:  # fmt: skip
-    """Workers, as a context of the rows that come from them."""
+    """A context of the rows that come from them."""
     numbers, values = np.flatnonzero(missing).tolist(), design.points()
     if not numbers:
         return nullcontext(())
@@ -141,12 +142,3 @@ def _runs(
 def _unit(fmu: Fmu, name: str) -> str:
     elements = [name] if name in fmu.variables else fmu.vector(name)
     return " or ".join(dict.fromkeys(fmu.variables[element].unit or "" for element in elements))
-
-
-@contextmanager
-def _folder(output: str | Path | None) -> Iterator[Path]:
-    if output is not None:
-        yield Path(output)
-        return
-    with temporary_folder() as folder:
-        yield folder / "sweep"

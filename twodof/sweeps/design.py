@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import isfinite, prod
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,15 +50,6 @@ class Design:
         return np.hstack(
             [np.repeat(combinations, self.draws, axis=0), np.tile(drawn, (len(combinations), 1))]
         )
-
-    def record(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return {
-            "grids": {name: list(values) for name, values in self.grids.items()},
-            "ranges": {name: list(limits) for name, limits in self.ranges.items()},
-            "draws": self.draws,
-            "seed": self.seed,
-        }
 
 
 def make_design(

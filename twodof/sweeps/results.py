@@ -55,8 +55,12 @@ MAX_SIZE = 512 * 1024**2
 """Bytes of a table in memory: a million runs with a message each."""
 TEXTS = ["outcome", "message"]
 
-RANKED = ("settling_time", "peak_effort", "final_error")
-"""The best run has settled first; of those that settle at the same sample, that of least effort."""
+RANKED = {
+    "settling_time": "settled first",
+    "peak_effort": "with least effort",
+    "final_error": "with least error at the end",
+}
+"""By what the best run is chosen, each where those before are equal or not known; in words."""
 
 
 class Results:
@@ -145,19 +149,15 @@ class Results:
             self._store()
 
     def _store(self) -> None:
-        rows, self._rows = self._rows, []
-        if rows:
-            self._write_part(rows)
+        if self._rows:
+            self._write_part(self._rows)
+        self._rows = []
         self._stored = time.monotonic()
 
     def _write_part(self, rows: Sequence[Row]) -> None:
-        columns = list(zip(*rows)) or [()] * len(self._schema)
-        arrays = [
-            pa.array(column, field.type, from_pandas=True)  # NaN is null
-            for column, field in zip(columns, self._schema, strict=True)
-        ]
-        table = pa.table(arrays, schema=self._schema)
-        _write(self.path / f"part-{self._part:06d}.parquet", table)
+        frame = pandas.DataFrame(rows, columns=self._schema.names)  # whose NaN become null
+        table = pa.Table.from_pandas(frame, self._schema, preserve_index=False)
+        _write(self.path / f"part-{self._part:06d}.parquet", table.cast(self._schema))
         self._part += 1
 
     def _unite(self) -> None:
@@ -296,6 +296,7 @@ def _provenance(file: Path, schema: pa.Schema) -> dict[str, Any]:
 
 
 def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> None:
+    wanted = json.loads(json.dumps(wanted))
     for key in COMPARED:
         if there[key] != wanted[key]:
             other = {

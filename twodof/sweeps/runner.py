@@ -6,20 +6,20 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import accumulate, chain
 from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import SimulationError
+from ..errors import SimulationError, diverged, step_failure
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
 from ..simulation.experiments import Experiment, Value, experiment, resolve
 from ..simulation.master import OUTPUTS, simulate
 from ..simulation.sample import Sample, Sink
 from .metrics import METRICS, Array, measure
-from .trace import trace
 
 Point = tuple[int, tuple[float, ...]]
 """Number of a run, and the values of the variables that are varied."""
@@ -43,7 +43,7 @@ class Job:
     file: str
     names: tuple[str, ...]
     options: dict[str, Any]
-    bags: str | None
+    bags: Path | None
 
 
 class Runner:
@@ -86,8 +86,7 @@ class Runner:
             outputs = self._outputs(run, number)
         except SimulationError as error:
             self._drop()  # whatever state it is in
-            nothing = [nan] * len(METRICS)
-            return (number, *values, *nothing, run.time(error.k), error.outcome, str(error))
+            return lost(point, run.time(error.k), error.outcome, str(error))
         metrics = _metrics(run, outputs).values()  # in the order of METRICS
         return (number, *values, *metrics, run.time(run.steps), "finished", None)
 
@@ -98,7 +97,7 @@ class Runner:
         from ..bag.writer import Bag  # rosbags takes half a second to import
 
         kept = _Kept()
-        bag = Bag(Path(self._job.bags) / f"{number:06d}", overwrite=True)
+        bag = Bag(self._job.bags / f"{number:06d}", overwrite=True)
         simulate(run, kept, bag, instance=self._fresh())
         return {name: np.array([getattr(s, name) for s in kept.samples]) for name in OUTPUTS}
 
@@ -118,6 +117,42 @@ class Runner:
     def _drop(self) -> None:
         self._instance = None
         self._used.close()
+
+
+def lost(point: Point, end: float, outcome: str, message: str) -> Row:
+    """The row of a run that was not finished."""
+    number, values = point
+    return (number, *values, *[nan] * len(METRICS), end, outcome, message)
+
+
+def trace(run: Experiment, instance: Instance) -> dict[str, Array]:
+    """The outputs q, v, x, tau and quat at all samples of a run without changes, N + 1 × values.
+
+    For whoever needs the numbers alone, without a ``Sample`` for each; errors as of ``samples``.
+    """
+    instance.initialise(run.start_time, run.time(run.steps), run.given)
+    groups = [run.fmu.vector(group) for group in OUTPUTS]
+    ends = [*accumulate(map(len, groups))]
+    rows, read, step = bytearray(), instance.reader([*chain(*groups)]), instance.step
+    start, h = run.start_time, run.step
+    rows += read()
+    try:
+        for k in range(int(run.steps)):
+            step(start + k * h, h)
+            rows += read()
+    except SimulationError as error:
+        _finite(run, rows, ends[-1])
+        raise step_failure(k, run.time(k), error) from error
+    table = _finite(run, rows, ends[-1])
+    return dict(zip(OUTPUTS, np.split(table, ends[:-1], axis=1)))
+
+
+def _finite(run: Experiment, rows: bytearray, width: int) -> Array:
+    table = np.asfortranarray(np.frombuffer(rows, np.float64).reshape(-1, width))  # fast along time
+    if np.isfinite(table).all():
+        return table
+    astray = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    raise diverged(int(astray[0]), run.time(int(astray[0])))
 
 
 class _Kept(Sink):

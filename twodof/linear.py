@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, SimulationError
-from ..fmu import Fmu, Instance, instantiate, load_fmu
-from ..simulation.experiments import Setting, Value, resolve
+from .errors import InputError, SimulationError
+from .fmu import Fmu, Instance, instantiate, load_fmu
+from .simulation.experiments import Setting, Value, resolve
 
 Array = NDArray[np.float64]
 

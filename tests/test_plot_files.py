@@ -1,0 +1,386 @@
+"""Plots in files, windows and notebooks, what a reader sees there, and the command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import oracles
+import pytest
+from figures import assert_legible, only, panels
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import Image
+from recordings import LINK, Recording, chain_urdf, elsewhere, long_run, waves
+
+import twodof
+from twodof.cli.main import main
+from twodof.errors import PlotError, TwoDofError
+from twodof.plots.figure import file_kind, save
+from twodof.plots.panels import with_joints
+from twodof.plots.runs import drawing, plot
+from twodof.plots.track import read_tracks
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+# --- what a reader sees ---
+
+
+def test_figures_are_legible(
+    gains: dict[int, Recording], changing: Recording, foreign: Path, ur5: str, tmp_path: Path
+) -> None:
+    (tmp_path / "ur5.urdf").write_text(ur5)
+    (tmp_path / "chain.urdf").write_text(chain_urdf("zyX" * 5 + "z", 0.1, low=-3.07, high=2.35))
+    names = [f"j{i + 1}" for i in range(16)]
+    chain = elsewhere(tmp_path / "chain", names, *waves(16))
+    long = [f"left_front_{part}_of_the_gripper_joint" for part in ("upper", "lower", "middle")]
+    for figure in (
+        plot(*(recording.bag for recording in gains.values())),
+        plot(changing.bag, gains[50].bag),
+        plot(foreign, urdf=tmp_path / "ur5.urdf"),
+        plot(chain, urdf=tmp_path / "chain.urdf"),
+        plot(elsewhere(tmp_path / "long", long, *waves(3))),
+        plot(*[foreign] * 9),
+        plot(*(elsewhere(tmp_path / (c * 140), ["a"], *waves(1)) for c in "abc")),
+        plot(elsewhere(tmp_path / ("d" * 200), ["a"], *waves(1))),
+    ):
+        assert_legible(figure)
+
+
+def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
+    """A dollar sign would begin a formula."""
+    bag = elsewhere(tmp_path / "a$b$_c^", ["$q$", "x_{1}"], *waves(2))
+    figure = plot(bag)
+    FigureCanvasAgg(figure).draw()
+    named = [text for text in figure.findobj(Text) if "$" in text.get_text()]
+    assert {text.get_text() for text in named} == {"a$b$_c^", "$q$"}
+    assert not any(text.get_parse_math() for text in named)
+
+
+def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Path) -> None:
+    expected = save(drawing(read_tracks([default.bag])), tmp_path / "a.svg").read_bytes()
+    with matplotlib.rc_context(
+        {"lines.linewidth": 9.0, "axes.grid": False, "font.size": 30, "svg.fonttype": "none"}
+    ):
+        found = save(drawing(read_tracks([default.bag])), tmp_path / "b.svg").read_bytes()
+        assert matplotlib.rcParams["lines.linewidth"] == 9.0
+        figure = plot(default.bag)
+        FigureCanvasAgg(figure).draw()  # as windows and notebooks do
+    assert found == expected
+    assert max(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) == 11.0
+
+
+def test_notebooks_show_it(default: Recording) -> None:
+    figure = plot(twodof.read_bag(default.bag))
+    assert isinstance(figure, Figure)
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+# --- long bags ---
+
+
+def test_noise_in_a_long_bag_keeps_its_extremes(default: Recording, tmp_path: Path) -> None:
+    """In each of 500 pixels across; and files stay small."""
+    n = 120_000
+    noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))
+    noise[41_152] = 0.3, -0.2  # a spike of one sample
+    q = np.array([0.5, 0.35]) + noise
+    run = long_run(default, q)
+    run.v[[777, 778, 50_000], 1] = math.inf, 0.9, math.nan
+    tracks = read_tracks([run])
+    found = panels(plot(run))
+    for axes, values in ((found.q[0], q[:, 0]), (found.v[1], run.v[:, 1])):
+        line = only(axes, "Kp50")
+        assert len(line) <= 4000
+        at = np.rint(line[:, 0] * 1000).astype(int)
+        np.testing.assert_array_equal(values[at], line[:, 1])  # nothing is made up
+        for part in np.array_split(np.arange(n), 500):
+            every = values[part][np.isfinite(values[part])]
+            kept = line[(at >= part[0]) & (at <= part[-1]) & np.isfinite(line[:, 1]), 1]
+            assert (kept.min(), kept.max()) == (every.min(), every.max())
+    path = only(found.views[0], "path")
+    exact = oracles.position(q)
+    assert len(path) < 10_000
+    np.testing.assert_allclose(np.ptp(path, axis=0), np.ptp(exact, axis=0), rtol=1e-12)
+    for kind, most in (("svg", 1.5e6), ("png", 1.5e6)):
+        assert save(drawing(tracks), tmp_path / f"long.{kind}").stat().st_size < most
+
+
+def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> None:
+    """A square in which the end effector rests long: no corner is cut."""
+    corners = np.array([(0.1, 0.1), (0.2, 0.1), (0.2, 0.15), (0.1, 0.15), (0.1, 0.1)])
+    side = np.linspace(0.0, 1.0, 1250)[:, None]
+    legs = [a + (b - a) * side for a, b in itertools.pairwise(corners)]
+    rests = [np.repeat(corner[None], 17_000, axis=0) for corner in corners[1:]]
+    x = np.concatenate(list(itertools.chain.from_iterable(zip(legs, rests, strict=True))))
+    distance = np.hypot(*x.T)
+    elbow = np.arccos(distance**2 / (2 * LINK**2) - 1.0)
+    q = np.column_stack([np.arctan2(x[:, 1], x[:, 0]) - elbow / 2, elbow])
+    run = long_run(default, q)
+    path = only(panels(plot(run)).views[0], "path")
+    for corner in corners:
+        assert np.hypot(*(path - corner).T).min() < 1e-12
+    svg = save(drawing(read_tracks([run])), tmp_path / "long.svg")
+    assert svg.stat().st_size < 500_000
+
+
+# --- files ---
+
+
+def test_each_kind_of_file_opens(gains: dict[int, Recording], tmp_path: Path) -> None:
+    tracks = read_tracks([recording.bag for recording in gains.values()])
+    png, svg, pdf, page = (
+        save(drawing(tracks), tmp_path / f"a.{k}") for k in ("PNG", "svg", "pdf", "html")
+    )
+    with Image.open(png) as image:
+        image.load()
+        assert image.format == "PNG"
+        across = plot(gains[50].bag, gains[20].bag).get_size_inches()[0]
+        assert image.size[0] == pytest.approx(200 * across, abs=1)
+    root = ET.parse(svg).getroot()
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    assert pdf.read_bytes().startswith(b"%PDF-1.")
+    assert pdf.read_bytes().rstrip().endswith(b"%%EOF")
+    assert b"/Type3" not in pdf.read_bytes()  # which journals refuse
+    text = page.read_text("utf-8")
+    assert text.startswith("<!DOCTYPE html>")
+    table = ET.fromstring(text[text.index('<table class="runs">') : text.rindex("</body>")])
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in table.findall("tr")}
+    assert rows["bag"] == ["Kp20", "Kp50", "Kp400"]
+    assert rows["Kp"] == ["20 s⁻²", "50 s⁻²", "400 s⁻²"]
+    assert rows["x_des"] == ["(0.2, 0.05) m"] * 3
+    assert rows["duration"] == ["1 s, 101 samples", "5 s, 501 samples", "1 s, 101 samples"]
+    assert rows["at a limit"] == ["no joint"] * 3
+    assert [float(str(cell).split()[0]) for cell in rows["result"]] == pytest.approx(
+        [np.linalg.norm(r.x[-1] - (0.2, 0.05)) for r in gains.values()], rel=2e-3, abs=1e-14
+    )
+
+
+PLOT = """
+import sys
+from pathlib import Path
+from twodof.plots.figure import save
+from twodof.plots.runs import drawing
+from twodof.plots.track import read_tracks
+drawn = drawing(read_tracks([sys.argv[1]]))
+for kind in ("png", "svg", "pdf", "html"):
+    if kind == "html":
+        print({*sys.modules} & {"matplotlib.pyplot", "pandas", "pinocchio", "plotly", "trimesh"})
+    save(drawn, f"a.{kind}")
+"""
+
+
+def test_equal_bags_give_equal_files(gains: dict[int, Recording], tmp_path: Path) -> None:
+    """In another process, with other hashes, at another time; in which a figure is quick.
+
+    That is: nothing is imported for it that takes long.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", PLOT, gains[20].bag], cwd=tmp_path, check=True,
+        env={**ENVIRONMENT, "PYTHONHASHSEED": "1", "SOURCE_DATE_EPOCH": "1"}, timeout=60,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout == "set()\n"
+    drawn = drawing(read_tracks([gains[20].bag]))
+    for kind in ("png", "svg", "pdf", "html"):
+        here = save(drawn, tmp_path / f"b.{kind}")
+        assert (tmp_path / f"a.{kind}").read_bytes() == here.read_bytes()
+
+
+def test_without_a_name_the_plot_has_that_of_the_bag(
+    gains: dict[int, Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plot of ours is replaced, and nothing else is."""
+    monkeypatch.chdir(tmp_path)
+    tracks = read_tracks([gains[50].bag])
+    assert save(drawing(tracks)) == Path("Kp50.png")
+    first = Path("Kp50.png").read_bytes()
+    Path("Kp50.png").write_bytes(first + b"older")
+    assert save(drawing(tracks)) == Path("Kp50.png")
+    assert Path("Kp50.png").read_bytes() == first
+    Image.new("RGB", (9, 9)).save("Kp50.png")
+    theirs = Path("Kp50.png").read_bytes()
+    Path("Kp50-2.png").symlink_to("nowhere")
+    assert save(drawing(tracks)) == Path("Kp50-3.png")
+    assert Path("Kp50.png").read_bytes() == theirs
+    assert Path("Kp50-2.png").is_symlink()
+    assert save(drawing(read_tracks([gains[50].bag, gains[20].bag]))) == Path("Kp50-and-1-more.png")
+    monkeypatch.chdir(gains[50].bag)
+    assert read_tracks(["."])[0].name == "Kp50"
+
+
+def test_a_file_is_written_whole_or_not_at_all(
+    default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"before")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(PlotError, match=r"cannot write '.*a\.png': No space left on device"):
+        save(drawing(read_tracks([default.bag])), tmp_path / "a.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    assert (tmp_path / "a.png").read_bytes() == b"before"
+
+
+# --- windows ---
+
+
+BACKEND = """
+from matplotlib.backend_bases import FigureManagerBase
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+class Manager(FigureManagerBase):
+    @classmethod
+    def pyplot_show(cls, *, block=None):
+        from matplotlib._pylab_helpers import Gcf
+        for manager in Gcf.get_all_fig_managers():
+            print("window", len(manager.canvas.figure.axes), "panels")
+
+class FigureCanvas(FigureCanvasAgg):
+    required_interactive_framework = {framework!r}
+    manager_class = Manager
+"""
+
+
+SHOW = """
+import json, os, sys
+import matplotlib.cbook
+from twodof.plots.figure import show
+from twodof.plots.runs import drawing
+from twodof.plots.track import read_tracks
+drawn = drawing(read_tracks([sys.argv[1]]))
+matplotlib.cbook._get_running_interactive_framework = lambda: None  # stands for a display
+for environment, backend in json.loads(sys.argv[2]):
+    if os.fork() == 0:
+        os.environ.update(environment)
+        matplotlib.use(f"module://{backend}")
+        print(show(drawn), "matplotlib.pyplot" in sys.modules, flush=True)
+        os._exit(0)
+    os.wait()
+"""
+
+
+def test_a_window_opens_where_there_is_a_display(default: Recording, tmp_path: Path) -> None:
+    """An X or a Wayland one; and not by a backend for files, or one that is not there."""
+    (tmp_path / "windows.py").write_text(BACKEND.format(framework="test"))
+    (tmp_path / "files.py").write_text(BACKEND.format(framework=None))
+    cases = [
+        ({}, "windows", "False False"),
+        ({"DISPLAY": ":7"}, "windows", "window 6 panels\nTrue True"),
+        ({"WAYLAND_DISPLAY": "w"}, "windows", "window 6 panels\nTrue True"),
+        ({"DISPLAY": ":7"}, "files", "False True"),
+        ({"DISPLAY": ":7"}, "missing", "False True"),
+    ]
+    given = [(display, backend) for display, backend, _ in cases]
+    environment = {k: v for k, v in ENVIRONMENT.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW, default.bag, json.dumps(given)],
+        capture_output=True, text=True, timeout=60, env=environment,
+    )  # fmt: skip
+    assert done.stdout == "".join(f"{said}\n" for *_, said in cases), done.stderr
+
+
+# --- what is wrong ---
+
+
+def test_what_else_is_wrong_is_named(
+    default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    drawn = drawing(read_tracks([default.bag]))
+    Path("folder.png").mkdir()
+    Path("file").touch()
+    for output, message in {
+        "a.jpg": "'a.jpg': the name of a plot ends in .png, .svg, .pdf or .html",
+        "a": "'a': the name of a plot ends in",
+        ".png": "'.png': the name of a plot ends in",
+        "gone/a.png": "cannot write 'gone/a.png': No such file or directory",
+        "file/a.png": "cannot write 'file/a.png': Not a directory",
+        "folder.png": "cannot write 'folder.png': Is a directory",
+    }.items():
+        with pytest.raises(PlotError, match=f"^{re.escape(message)}"):
+            save(drawn, output)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
+    with pytest.raises(PlotError, match=r"^cannot read the URDF 'gone\.urdf': No such file"):
+        plot(default.bag, urdf="gone.urdf")
+    none = elsewhere(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
+    with pytest.raises(PlotError, match=r"'.*bag' has 0 positions for 1 joints"):
+        plot(none)
+    with pytest.raises(TwoDofError, match="gone"):
+        plot("gone")
+    assert file_kind("x/y.HTML") == "html"
+
+
+def test_without_matplotlib_it_says_what_to_install() -> None:
+    code = "import sys; sys.modules['matplotlib'] = None; import twodof.plots.runs"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, timeout=60
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("twodof.errors.PlotError: cannot plot: ")
+    assert last.endswith("install the package 'matplotlib' (the extra 'view')")
+
+
+# --- the command ---
+
+
+def test_joints_are_chosen(default: Recording, tmp_path: Path, capsys: Any) -> None:
+    (track,) = with_joints(read_tracks([default.bag]), ["joint2"])
+    assert [joint.name for joint in track.joints] == ["joint2"]
+    output = ["-o", str(tmp_path / "a.svg")]
+    assert main(["plot", str(default.bag), "--joints", "joint2,elbow", *output]) == 1
+    assert "no joint 'elbow'; there are: joint1, joint2" in capsys.readouterr().err
+    assert main(["plot", str(default.bag), "--joints", "joint2,joint1", *output]) == 0
+
+
+def test_the_command_says_where_the_plot_is_and_what_came_out(
+    gains: dict[int, Recording], foreign: Path, ur5: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: Any,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ur5.urdf").write_text(ur5)
+    options = ["--urdf", "ur5.urdf", "--frame", "forearm_link"]
+    assert main(["plot", str(foreign), *options, "-o", "a.svg"]) == 0
+    assert capsys.readouterr().out.startswith("plot  a.svg (")
+    assert main(["plot", str(gains[50].bag)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"plot  Kp50\.png \(\d+ KB\)", printed[0])
+    assert re.fullmatch(r"Kp50  0\.000224 m from its target at the end; .*", printed[1])
+    assert main(["plot", str(gains[20].bag), str(gains[50].bag), "-o", "both.html"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in printed] == ["plot", "Kp = 20 s⁻²", "Kp = 50 s⁻²"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "Kp50.png", "a.svg", "both.html", "ur5.urdf"
+    ]  # fmt: skip
+
+
+def test_the_command_fails_in_one_line(
+    default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for arguments, message in (
+        (["gone", "-o", "a.jpg"], "'a.jpg': the name of a plot ends in"),  # before bags are read
+        ([str(default.bag), "-o", "gone/a.png"], "cannot write 'gone/a.png'"),
+        ([str(default.bag), "--urdf", "gone"], "cannot read the URDF 'gone'"),
+        (["gone"], "'gone'"),
+    ):
+        assert main(["plot", *arguments]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("twodof: error: ")
+        assert message in line
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,152 @@
+"""The map of a sweep by what it draws, and what is said of its best runs."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import browser
+import numpy as np
+import pytest
+from PIL import Image
+from tables import SMALL, table_of
+
+from twodof import sweep
+from twodof.cli.main import main
+from twodof.plots.figure import drawn, save
+from twodof.plots.sweeps import drawing
+from twodof.sweeps.metrics import METRICS
+from twodof.sweeps.results import read_sweep
+
+
+@pytest.fixture(scope="module")
+def grid_sweep(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sweep") / "whole"
+    grid = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
+    sweep(native_path, grid=grid, stop_time=10, output=path)
+    return path
+
+
+def panels(path: Path) -> dict[str, object]:
+    table, provenance = read_sweep(path)
+    figure = drawn(drawing(table, provenance, "a"))
+    return {axes.get_label(): axes for axes in figure.axes if " over " in axes.get_label()}
+
+
+LINES = """() => [...document.querySelectorAll(".runs td")].map(cell => {
+    const words = document.createRange();
+    words.selectNodeContents(cell);
+    return new Set([...words.getClientRects()].map(box => box.top)).size;
+})"""
+
+
+def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_phone(
+    grid_sweep: Path, tmp_path: Path
+) -> None:
+    page = save(drawing(*read_sweep(grid_sweep), "a"), tmp_path / "a.html")
+    seen = []
+    with browser.chromium() as chromium:
+        for scheme in ("light", "dark"):
+            with chromium.new_context(color_scheme=scheme, offline=True) as context:
+                shown = context.new_page()
+                shown.set_viewport_size({"width": 390, "height": 844})
+                shown.goto(page.as_uri())
+                seen.append(shown.locator("body > svg").screenshot())
+                ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+                assert max(shown.evaluate(LINES)) == 1
+                assert shown.evaluate("document.documentElement.scrollWidth") == 390
+    assert ground == "rgb(20, 20, 20)"
+    light, dark = (np.asarray(Image.open(io.BytesIO(picture))) for picture in seen)
+    np.testing.assert_array_equal(light[2:-2, 2:-2], dark[2:-2, 2:-2])  # the edge is mixed
+
+
+def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Path) -> None:
+    table = table_of(grid_sweep)
+    found = panels(grid_sweep)
+    assert list(found) == [
+        f"{metric} over Kp and Kd" for metric in METRICS if metric != "time_at_limits"
+    ]
+    for label, axes in found.items():
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, s⁻²", "Kd, s⁻¹")
+        metric = label.split()[0]
+        (mesh,) = (c for c in axes.collections if hasattr(c, "get_coordinates"))
+        cells = np.ma.filled(mesh.get_array(), np.nan).reshape(16, 20)
+        assert np.asarray(cells).T.ravel() == pytest.approx(
+            table[metric].to_numpy(), nan_ok=True, abs=0
+        )
+        (best,) = axes.collections[-1].get_offsets()
+        least = table[metric].min()
+        chosen = table[(table["Kp"] == best[0]) & (table["Kd"] == best[1])]
+        assert chosen[metric].item() == least
+        edges = np.asarray(mesh.get_coordinates())
+        x, y = edges[0, :, 0], edges[:, 0, 1]
+        assert (x[:-1] + x[1:]) / 2 == pytest.approx(np.linspace(10, 200, 20))
+        assert (y[:-1] + y[1:]) / 2 == pytest.approx(np.linspace(5, 80, 16))
+        critical = axes.get_lines()[0].get_xydata()
+        assert critical[:, 1] ** 2 == pytest.approx(4 * critical[:, 0])
+
+
+def test_map_of_one_variable_is_curves(native_path: Path, tmp_path: Path) -> None:
+    table = sweep(native_path, grid={"Kp": np.linspace(10, 90, 9)}, output=tmp_path / "s")
+    for label, axes in panels(tmp_path / "s").items():
+        metric = label.split()[0]
+        x, y = axes.get_lines()[0].get_data()
+        assert np.array(x) == pytest.approx(np.linspace(10, 90, 9))
+        assert np.array(y) == pytest.approx(table[metric].to_numpy(), nan_ok=True, abs=0)
+
+
+def test_map_of_three_variables_is_the_best_over_the_third(
+    native_path: Path, tmp_path: Path
+) -> None:
+    grid = {**SMALL, "tau_ext[1]": [-0.05, 0.0, 0.05]}
+    table = sweep(native_path, grid=grid, stop_time=2.0, output=tmp_path / "s")
+    found = panels(tmp_path / "s")
+    assert len(found) == 9
+    (mesh,) = (
+        c for c in found["overshoot over Kp and Kd"].collections if hasattr(c, "get_coordinates")
+    )
+    cells = mesh.get_array().reshape(2, 3)
+    for i, kd in enumerate(SMALL["Kd"]):
+        for j, kp in enumerate(SMALL["Kp"]):
+            runs = table[(table["Kp"] == kp) & (table["Kd"] == kd)]
+            assert len(runs) == 3 and cells[i, j] == runs["overshoot"].min()
+
+
+def test_map_of_random_values_is_dots(native_path: Path, tmp_path: Path) -> None:
+    ranges = {"Kp": (10, 90), "Kd": (10, 30)}
+    table = sweep(native_path, ranges=ranges, random=25, stop_time=2.0, output=tmp_path / "s")
+    axes = panels(tmp_path / "s")["peak_effort over Kp and Kd"]
+    dots = axes.collections[1]
+    assert np.asarray(dots.get_offsets()) == pytest.approx(table[["Kp", "Kd"]].to_numpy(), abs=0)
+    assert np.asarray(dots.get_array()) == pytest.approx(table["peak_effort"].to_numpy(), abs=0)
+
+
+def test_plot_of_a_sweep_prints_the_best_runs(
+    grid_sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert main(["plot", str(grid_sweep)]) == 0
+    out = capsys.readouterr().out
+    assert "plot  whole.png" in out and (tmp_path / "whole.png").stat().st_size > 20_000
+    table = table_of(grid_sweep)
+    best = table.sort_values(["settling_time", "peak_effort"]).iloc[0]
+    assert "best: settled first, with least effort" in out
+    row = out.splitlines()[5].split()
+    assert [float(cell) for cell in row[:4]] == pytest.approx(
+        [best["run"], best["Kp"], best["Kd"], best["settling_time"]]
+    )
+    assert main(["plot", str(grid_sweep), str(grid_sweep)]) == 2
+    assert "is a sweep; it is drawn alone" in capsys.readouterr().err
+    found = drawing(*read_sweep(grid_sweep), "a")
+    assert f"{best['Kp']:g}" in save(found, tmp_path / "a.html").read_text("utf-8")
+
+
+def test_where_no_run_settles_the_best_is_another(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sweep(native_path, grid={"Kp": [20.0, 60.0]}, stop_time=0.05, output=tmp_path / "s")
+    assert main(["info", str(tmp_path / "s")]) == 0
+    out = capsys.readouterr().out
+    assert "best: with least effort, with least error at the end\n" in out
+    assert "settl" not in out.partition("best:")[2]

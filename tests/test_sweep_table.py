@@ -1,0 +1,281 @@
+"""The table of a sweep: what is in it, what is resumed, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+
+import duckdb
+import numpy as np
+import pandas
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tables import COMMAND, SMALL, same, table_of
+
+import twodof
+from twodof import TwoDofError, sweep
+from twodof.sweeps.metrics import METRICS
+from twodof.sweeps.results import read_sweep
+
+
+def test_table_is_parquet_with_units_and_provenance(native_path: Path, tmp_path: Path) -> None:
+    table = sweep(
+        native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", command_line="by hand"
+    )
+    (file,) = (tmp_path / "s").iterdir()
+    assert file.name == "runs.parquet"
+    same(table_of(tmp_path / "s"), table)
+    unsettled = f"select count(*) from '{file}' where settling_time is null"
+    ((count,),) = duckdb.sql(unsettled).fetchall()
+    assert count == table["settling_time"].isna().sum() > 0
+    pairs = duckdb.sql(f"select key, value from parquet_kv_metadata('{file}')").fetchall()
+    provenance = json.loads(dict(pairs)[b"twodof"])
+    assert provenance["fmu"]["guid"] == twodof.load_fmu(native_path).guid
+    assert provenance["command_line"] == "by hand"
+    assert provenance["design"]["grids"] == {name: list(SMALL[name]) for name in SMALL}
+    assert provenance["versions"]["twodof"] == twodof.__version__
+    described = duckdb.sql(f"describe select * from '{file}'").fetchall()
+    types = {name: str(kind) for name, kind, *_ in described}
+    assert types["run"] == "BIGINT" and types["outcome"] == types["message"] == "VARCHAR"
+    assert {types[name] for name in ("Kp", "Kd", *METRICS, "end_time")} == {"DOUBLE"}
+    assert table.attrs["units"]["Kp"] == "1/s2" and table.attrs["units"]["overshoot"] == ""
+
+
+GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "10"]
+
+
+def begin(fmu: Path, output: Path, *options: str) -> subprocess.Popen[str]:
+    command = [*COMMAND, "sweep", str(fmu), *GRIDS, "-o", str(output), *options]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+@pytest.fixture(scope="module")
+def undisturbed(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of 320 runs that nothing disturbs."""
+    path = tmp_path_factory.mktemp("sweep") / "whole"
+    done = begin(native_path, path)
+    out, err = done.communicate(timeout=120)
+    assert (done.returncode, err) == (0, "")
+    assert "320 of 320 runs: 320 finished" in out and f"twodof plot {path}" in out
+    return path
+
+
+@pytest.mark.long
+def test_what_is_interrupted_is_resumed(
+    native_path: Path, undisturbed: Path, tmp_path: Path, length: Callable[[int, int], int]
+) -> None:
+    """By Ctrl-C to all processes of the terminal, or by the death of the sweep's own."""
+    rng = random.Random(3)
+    expected = table_of(undisturbed)
+    kept = []
+    for i in range(length(20, 2)):
+        path = tmp_path / f"s{i}"
+        process = begin(native_path, path)
+        while not any(path.glob("part-000001*")):
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0.0, 0.5))
+        if i % 2:
+            process.kill()
+            process.communicate()
+        else:
+            os.killpg(process.pid, signal.SIGINT)
+            out, err = process.communicate(timeout=120)
+            assert err == "", err
+            if len(table_of(path)) < 320:
+                assert process.returncode == 130
+                assert re.search(r"^  twodof sweep .* --resume$", out, re.M)
+        kept.append(len(table_of(path)))
+        os.utime(path)
+        again = begin(native_path, path, "--resume")
+        out, err = again.communicate(timeout=120)
+        assert (again.returncode, err) == (0, ""), err
+        same(table_of(path), expected)
+        assert [file.name for file in path.iterdir()] == ["runs.parquet"]
+    print(f"rows kept of 320 when interrupted: {kept}")
+    assert 0 < min(kept) < 320
+
+
+def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
+    stop = Event()
+    path, done = tmp_path / "s", []
+
+    def progress(count: int, runs: int) -> None:
+        done.append(count)
+        if count >= 3:
+            stop.set()
+
+    options = {"grid": {"Kp": np.linspace(10, 90, 40)}, "stop_time": 20.0, "output": path}
+    table = sweep(native_path, workers=1, progress=progress, stop=stop.is_set, **options)
+    assert 3 <= len(table) < 40
+    parts = {file: file.read_bytes() for file in path.iterdir()}
+    counts: list[int] = []
+    resumed = sweep(
+        native_path, resume=True, progress=lambda count, runs: counts.append(count), **options
+    )
+    assert counts[0] == len(table) and len(parts) > 1
+    same(resumed, sweep(native_path, **{**options, "output": None}))
+    made = {file.name: file.read_bytes() for file in path.iterdir()}
+    sweep(native_path, resume=True, **options)  # is finished: nothing is run, nothing changes
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == made
+
+
+def test_what_is_another_sweep_is_not_resumed(
+    native_path: Path, tmp_path: Path, fmu_path: Path
+) -> None:
+    path = tmp_path / "s"
+    options = {"grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True}
+    sweep(native_path, **{**options, "resume": False})
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    for change, said in (
+        ({"grid": {"Kp": [1.0, 3.0]}}, r'was begun with grids {"Kp": \[1.0, 2.0\]};'),
+        (
+            {"stop_time": 0.06},
+            "was begun with stop time 0.05; begin this sweep in another `output`",
+        ),
+        ({"bags": True}, "was begun with `bags=False`;"),
+        ({"resume": False}, "exists; resume it with `resume=True`, or choose another `output`"),
+    ):
+        with pytest.raises(TwoDofError, match=said):
+            sweep(native_path, **{**options, **change})
+    with pytest.raises(TwoDofError, match=r"was begun with another FMU, TwoDof-native.fmu \("):
+        sweep(fmu_path, **options)
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
+
+
+def test_damaged_and_foreign_tables_get_one_line(native_path: Path, tmp_path: Path) -> None:
+    for name, content in (("cut", None), ("empty", b""), ("other", b"PAR1 no")):
+        path = tmp_path / name
+        sweep(native_path, grid={"Kp": [1.0]}, stop_time=0.02, output=path)
+        file = path / "runs.parquet"
+        file.write_bytes(file.read_bytes()[:-100] if content is None else content)
+        with pytest.raises(TwoDofError, match=f"cannot read '.*{name}/runs.parquet'"):
+            read_sweep(path)
+    pandas.DataFrame({"run": [1]}).to_parquet(tmp_path / "cut/runs.parquet")
+    with pytest.raises(TwoDofError, match="was not written by twodof"):
+        read_sweep(tmp_path / "cut")
+    with pytest.raises(TwoDofError, match="is no sweep"):
+        read_sweep(tmp_path)
+    with pytest.raises(TwoDofError, match=r"cannot read '.*none': No such file or directory"):
+        read_sweep(tmp_path / "none")
+
+
+def endless(table: pa.Table) -> pa.Table:
+    """Two million rows in some kilobytes."""
+    return table.take(pa.array(np.zeros(2_000_000, dtype=np.int64)))
+
+
+def of_one_text(table: pa.Table) -> pa.Table:
+    """A text of a megabyte, stored once, in each of a thousand rows."""
+    provenance = json.loads(table.schema.metadata[b"twodof"])
+    provenance["design"]["draws"] = 1000
+    rows = table.take(pa.array(np.zeros(1000, dtype=np.int64)))
+    rows = changed(rows, "run", pa.array(range(1000)))
+    text = pa.array(["x" * 1024**2])
+    rows = changed(rows, "message", pa.DictionaryArray.from_arrays(np.zeros(1000, np.int32), text))
+    return rows.replace_schema_metadata({b"twodof": json.dumps(provenance)})
+
+
+def store(table: pa.Table, path: Path) -> None:
+    """As another writer does, which knows no dictionaries of Arrow's."""
+    with pq.ParquetWriter(path, table.schema, store_schema=False) as writer:
+        writer.add_key_value_metadata(table.schema.metadata)
+        writer.write_table(table)
+
+
+def changed(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
+    place = table.schema.get_field_index(name)
+    field = table.schema.field(name)
+    return table.set_column(place, field.with_type(values.type), values)
+
+
+def described(table: pa.Table, key: str, value: object) -> pa.Table:
+    provenance = {**json.loads(table.schema.metadata[b"twodof"]), key: value}
+    return table.replace_schema_metadata({b"twodof": json.dumps(provenance)})
+
+
+HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
+    "without outcomes": lambda table: table.drop(["outcome"]),
+    "without runs": lambda table: table.drop(["run"]),
+    "runs beyond the design": lambda table: changed(table, "run", pa.array([0, 10**9])),
+    "runs before the first": lambda table: changed(table, "run", pa.array([0, -1])),
+    "a run twice": lambda table: changed(table, "run", pa.array([1, 1])),
+    "text for numbers": lambda table: changed(table, "settling_time", pa.array(["a", "b"])),
+    "not finite": lambda table: changed(table, "Kp", pa.array([1.0, np.inf])),
+    "no design": lambda table: described(table, "design", []),
+    "no FMU": lambda table: described(table, "fmu", {}),
+    "a long number": lambda table: described(
+        table, "options", {"stop_time": 10**400, "step": 1, "settings": {}}
+    ),
+    "endless": endless,
+    "one text for all": of_one_text,
+}
+
+
+READING = pa.proxy_memory_pool(pa.default_memory_pool())  # which outlives what lies in it
+
+
+@pytest.fixture(scope="module")
+def sound(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sound") / "s"
+    sweep(native_path, grid={"Kp": [1.0, 2.0]}, stop_time=0.02, output=path, workers=1)
+    return path / "runs.parquet"
+
+
+@pytest.mark.parametrize("make", HOSTILE_TABLES.values(), ids=HOSTILE_TABLES)
+def test_hostile_table_gets_one_line_in_little_memory(
+    sound: Path, tmp_path: Path, make: Callable[[pa.Table], pa.Table]
+) -> None:
+    store(pq.read_table(sound), tmp_path / "runs.parquet")
+    assert len(read_sweep(tmp_path)[0]) == 2
+    store(make(pq.read_table(sound)), tmp_path / "runs.parquet")
+    usual = pa.default_memory_pool()
+    pa.set_memory_pool(READING)
+    try:
+        with pytest.raises(TwoDofError, match=r"runs\.parquet' was not written|it is damaged"):
+            read_sweep(tmp_path)
+    finally:
+        pa.set_memory_pool(usual)
+    assert READING.max_memory() < 64 * 1024**2
+
+
+@pytest.mark.long
+def test_memory_of_the_coordinator_is_flat(
+    native_path: Path, tmp_path: Path, length: Callable[[int, int], int]
+) -> None:
+    """Once pyarrow has written its first rows, for which it takes some 15 MiB."""
+    code = """
+import sys, twodof
+from pathlib import Path
+from sinks import resident
+def look(done, runs):
+    seen.append((len(list(Path(output).glob("part-*"))), done, resident() / 2**20))
+if __name__ == "__main__":
+    fmu, output, runs = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    seen = []
+    twodof.sweep(fmu, ranges={"Kp": (10, 90)}, random=runs, stop_time=0.5, output=output,
+                 progress=look)
+    late = [row for row in seen if row[0] >= 2]
+    print(late[0][1], max(row[2] for row in late) - late[0][2], seen[-1][2] - seen[1][2])
+"""
+    runs = length(10_000, 3_000)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(native_path), str(tmp_path / "s"), str(runs)],
+        cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=500,
+    )  # fmt: skip
+    first, growth, all_growth = map(float, done.stdout.split())
+    print(f"coordinator: {growth:.1f} MiB from run {first:.0f} to {runs}; {all_growth:.1f} in all")
+    assert first < 0.9 * runs
+    assert growth < 8.0  # it goes up and down by 5

@@ -1,0 +1,161 @@
+"""A robot as pictures need it: where its links are, what it can reach, where it is singular."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+from ..export.urdf_source import DEFAULT_FRAME
+from ..geometry.kinematics import Array, Kinematics, turned
+from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
+
+LOOKS = 2000  # for singularities, along the way
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The circle that a planar arm cannot leave: centre (3 values) and radius, m, and its normal.
+
+    ``normal`` is 0, 1 or 2 for the root's x, y or z.
+    """
+
+    centre: Array
+    radius: float
+    normal: int
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the robot's geometry makes of the joints' motion; points in the root frame, m.
+
+    Attributes:
+        robot: the robot's name.
+        frame, root: the end effector's link, and the link that points are expressed in.
+        path: the end effector's, N × 3.
+        start, end: the arm at the first and the last sample: root, joints and end effector, × 3.
+        reach: None where the arm does not move in a plane of two of the root's axes.
+    """
+
+    robot: str
+    frame: str
+    root: str
+    path: Array
+    start: Array
+    end: Array
+    reach: Reach | None
+
+
+class Linkage(NamedTuple):
+    """What a picture needs of a robot: geometry, limits and damping.
+
+    Attributes:
+        urdf: the robot; its masses need not make sense.
+        kinematics: of the joints in ``moving``.
+        moving: joints that move on their own; those that mimic one too where a bag has them.
+        frame: the end effector's link.
+        axes: the task's, of "xyz".
+    """
+
+    urdf: Urdf
+    kinematics: Kinematics
+    moving: tuple[Joint, ...]
+    frame: str
+    axes: str
+
+    @property
+    def chain(self) -> list[Joint]:
+        """The joints that move the frame, from the root on."""
+        return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
+
+    @property
+    def freedoms(self) -> int:
+        """How many joints move the frame, without those that mimic another."""
+        return len({joint.leader for joint in self.chain})
+
+    def motion(self, q: Array) -> Motion:
+        """What q, N × ``moving``, rad or m, moves."""
+        start, end = self._skeletons(q[[0, -1]])
+        return Motion(
+            robot=self.urdf.name,
+            frame=self.frame,
+            root=self.urdf.root,
+            path=self.kinematics.path(self.frame, q),
+            start=start,
+            end=end,
+            reach=self._reach(),
+        )
+
+    def _skeletons(self, q: Array) -> Array:
+        """Origins of the root, of joints that move the frame, and of the frame; N × points × 3."""
+        chain = self.urdf.chain(self.frame)
+        places = self.kinematics.along(chain, q)
+        shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), -1]
+        return np.stack([places[i].translation for i in shown], axis=1)
+
+    def _reach(self) -> Reach | None:
+        """The circle, where all joints turn about one of the root's axes.
+
+        Distances between neighbouring joints do not change, so no point is farther than their sum;
+        in a plane the stretched arm is that long. For arms in space the sum would be too large.
+        """
+        at_zero = np.zeros((1, len(self.moving)))
+        chain = self.urdf.chain(self.frame)
+        turns = np.abs(
+            [
+                turned(place.rotation, joint.axis)[0] * (not joint.prismatic)
+                for joint, place in zip(chain, self.kinematics.along(chain, at_zero)[1:])
+                if joint.moves
+            ]
+        )
+        normal = int(np.argmax(turns[0]))
+        if (turns[:, normal] < 1.0 - 1e-9).any():
+            return None
+        points = self._skeletons(at_zero)[0, 1:]
+        links = np.delete(np.diff(points, axis=0), normal, axis=1)
+        return Reach(points[0], float(np.linalg.norm(links, axis=1).sum()), normal)
+
+    def is_singular(self, q: Array, rcond: float, turns: bool) -> bool:
+        """Whether it has been where it cannot follow any command: σ_min ≤ rcond·σ_max of J.
+
+        That has the rows of the task axes, and where an orientation is followed three of turning.
+        """
+        axes = ["xyz".index(axis) for axis in self.axes] + [3, 4, 5] * turns
+        J = self.kinematics.jacobian(self.frame, q[:: ceil(len(q) / LOOKS)])[:, axes]
+        sigma = np.linalg.svd(J, compute_uv=False)
+        return bool((sigma[:, -1] <= rcond * sigma[:, 0]).any())
+
+
+def load_linkage(text: str, frame: str, axes: str, names: Sequence[str]) -> Linkage:
+    """A URDF's; without a frame, to its "EndEffector", or the link behind most joints.
+
+    Args:
+        text: XML text.
+        frame: the end effector's link.
+        axes: the task's, of "xyz".
+        names: joints whose positions are known.
+
+    Raises:
+        RobotError: it is not sound, or no joint moves the frame.
+    """
+    check_axes(axes)
+    urdf = read_urdf(text)
+    moving = tuple(
+        joint
+        for joint in urdf.joints.values()
+        if joint.moves and (joint.leader == joint.name or joint.name in names)
+    )
+    if not frame:
+        depths = {link: sum(j.moves for j in urdf.chain(link)) for link in urdf.links}
+        last = max(reversed(urdf.links), key=depths.__getitem__)
+        frame = DEFAULT_FRAME if DEFAULT_FRAME in urdf.links else last
+    if frame not in urdf.links:
+        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
+    kinematics = Kinematics(urdf, [joint.name for joint in moving])
+    linkage = Linkage(urdf, kinematics, moving, frame, axes)
+    if not linkage.chain:
+        raise RobotError(f"no joint moves the frame '{frame}'")
+    return linkage

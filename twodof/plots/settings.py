@@ -1,0 +1,52 @@
+"""What a run was told, in words and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..bag.recording import Recording
+from ..plant.urdf import UNBOUNDED
+
+UNITS = {
+    "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
+    "omega_des": "rad/s", "alpha_des": "rad/s²", "Kp_rot": "s⁻²", "Kd_rot": "s⁻¹",
+    "gravity": "m/s²", "max_step": "s", "payload": "kg", "payload_com": "m", "f_ext": "N",
+}  # fmt: skip
+"""Units of variables, where they do not depend on the joint."""
+
+
+def settings_of(bag: Recording) -> dict[str, str]:
+    """What the run was told, vectors and scalars by group, e.g. {"Kp": "50 s⁻²"}; {} if unknown."""
+    run = bag.provenance
+    if not run:
+        return {}
+    step = f"{1e3 * run['step']:g} ms"
+    settings = {"FMU": run["fmu"]["file"], "robot": run["robot"], "step": step}
+    (_, first), *later = bag.schedule
+    given = {name for _, values in run["input_changes"] for name in values}
+    varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
+    groups: dict[str, list[Any]] = {}
+    for name, value in first.items():
+        groups.setdefault(_group(name), []).append(value)
+    for group, values in groups.items():
+        unit = f" {UNITS[group]}" if group in UNITS else ""
+        settings[group] = "varied" if group in varied else _text(values) + unit
+    return settings
+
+
+def _group(name: str) -> str:
+    return name.partition("[")[0]
+
+
+def _text(values: Sequence[Any]) -> str:
+    """One value where all are equal, as gains often are, else all of them."""
+    texts = [str(v).lower() if isinstance(v, bool) else number(v) for v in values]
+    return texts[0] if len(set(texts)) == 1 else f"({', '.join(texts)})"
+
+
+def number(value: float) -> str:
+    """Six digits, with the minus sign of typography; the largest double means none."""
+    if abs(value) >= UNBOUNDED:
+        return "none"
+    return f"{value + 0.0:.6g}".replace("-", "\N{MINUS SIGN}")  # + 0.0: no negative zero
