@@ -23,12 +23,13 @@ def call(options: argparse.Namespace) -> int:
     """Do it; the exit status."""
     from ..pages.live import live
 
+    settings = parse_settings(options.settings)
     fmu = fast_fmu(options)
     with asked_to_stop() as asked:
         bags = live(
             fmu, asked, lambda url: open_page(options, url, fmu=fmu),
-            **place(options), step=options.step, settings=parse_settings(options.settings),
-            bag=options.output, command_line=options.command_line,
+            **place(options), step=options.step, settings=settings, bag=options.output,
+            command_line=options.command_line,
         )  # fmt: skip
     for bag in bags:
         print(f"bag   {bag}")

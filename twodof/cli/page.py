@@ -25,10 +25,11 @@ def call(options: argparse.Namespace) -> int:
     from ..files import free_name
     from ..pages.arm import is_page, page
 
+    settings = parse_settings(options.settings)
     options.native = not options.fmu or is_robot(options.fmu)
     fmu = chosen_fmu(options)
     output = options.output or free_name(fmu.stem, ".html", is_page)
-    path = page(fmu, output, step=options.step, settings=parse_settings(options.settings))
+    path = page(fmu, output, step=options.step, settings=settings)
     size = path.stat().st_size / 1024
     print_table(("FMU", str(fmu)), ("page", f"{path} ({size:.0f} KB); it needs no network"))
     return 0

@@ -70,8 +70,8 @@ def experiment_of(
     from ..fmu import load_fmu
     from ..simulation.experiments import experiment
 
-    fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
     settings = parse_settings(options.settings)
+    fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
     if table is not None:
         folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
         if Path(folder).is_dir() and folder:
