@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,7 +32,10 @@ ROBOTS = next(
 STEP = 0.01  # s
 STEPS = 500  # of the default run
 Q_START, X_DES = (0.5, 0.35), (0.2, 0.05)
-STARTS = {"q_start": Q_START, "x_des": X_DES, "gravity": (0.0, -9.81, 0.0)}
+STARTS = {
+    "q_start": Q_START, "x_des": X_DES, "gravity": (0.0, -9.81, 0.0),
+    "quat_des": (0.0, 0.0, math.sin(sum(Q_START) / 2), math.cos(sum(Q_START) / 2)),
+}  # fmt: skip
 Sources = dict[str, bytes]
 
 
@@ -86,7 +90,8 @@ def spatial_arm(
     starts: dict[str, Any] = {"q_start": q_start, "x_des": (0.0, 0.0, 0.0)}
     plant = Plant(robot, variable_table(robot, starts))
     plant.initialise()
-    return Arm(robot, {**starts, "x_des": tuple(x - 0.1 for x in plant.x)}, control)
+    starts |= {"x_des": tuple(x - 0.1 for x in plant.x), "quat_des": tuple(plant.quat)}
+    return Arm(robot, starts, control)
 
 
 def without_shapes(urdf: str) -> ET.Element:

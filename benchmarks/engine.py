@@ -55,7 +55,7 @@ ROUNDS = 15
 JOINTS = (2, 7, 16, 30)
 PATHS = ("M cancels", "general")
 CASADI_BAR, LIMITS_BAR, GCC_BAR, DERIVATIVE_BAR = 1.0, 1.25, 1.2, 4.0
-CALLS = 500  # of a right-hand side
+CALLS = 2000  # of a right-hand side
 CC = ("cc", "-O2")
 Costs = dict[str, float]
 
@@ -110,7 +110,7 @@ def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float,
     names = [variable.name for variable in variable_table(arm.robot, arm.starts, arm.control)]
     known, unknown = names.index("q[1]"), names.index("der(q[1])")
     rounds = [
-        [side_cost(derivative, calls, known, unknown) for derivative in (0, 1)] for _ in range(500)
+        [side_cost(derivative, calls, known, unknown) for derivative in (0, 1)] for _ in range(200)
     ]
     side, derivative = map(min, zip(*rounds))
     return side, derivative
