@@ -30,7 +30,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--frame": dict(
         type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)",
     ),
-    "--native": dict(action="store_true", help="build and run the native default FMU instead"),
+    "--native": dict(action="store_true", help="build and run a native FMU, of a URDF or none"),
     "--stop-time": dict(type=float, metavar="S", help="s (the FMU's own)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's own)"),
     "--set": dict(
@@ -42,7 +42,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         help="inputs over time: a column 'time' and one for each input; or a bag's commands",
     ),
     # what it leaves
-    "--storage": dict(choices=("mcap", "sqlite3"), default="mcap"),
+    "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)"),
     "--scene": dict(
         action="store_true", help="add robot description, tf, target and end effector"
     ),
