@@ -15,43 +15,29 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
+import numpy as np
+from arms import STEP, STEPS, compiled, shipped_arm
+from report import Figure, machine, print_figures, print_rows, spent
 
-from steps import STEP, Figure, engine_files, processor, shipped_arm  # noqa: E402
+import twodof
+from twodof.sweeps.runner import Job, Runner
 
-import twodof  # noqa: E402
-from twodof.export.compiler import compile_library, host_platform  # noqa: E402
-from twodof.sweeps.runner import Job, Runner  # noqa: E402
-
-TURNS, SAMPLES, RUNS, STEPS = 5, 50_000, 20, 500
+TURNS, SAMPLES, RUNS, SWEPT = 5, 50_000, 20, 400
 MESSAGES = 10_000_000
 TWODOF = [sys.executable, "-m", "twodof"]
 
 
 def floor(folder: Path) -> Callable[[int, bool], float]:
     """Processor time of a step in C, s, of a run of so many, logged or bare."""
-    arm, path = shipped_arm(), folder / "logged"
-    sources = engine_files(arm, "logged")
-    sources["logged_step.c"] = (HERE / "logged_step.c").read_bytes()
-    units = ("directional.c", "logged_step.c")
-    path.write_bytes(compile_library(sources, host_platform(), "logged", units=units))
-    cost = ctypes.CDLL(str(path)).logged_cost
+    cost = compiled(shipped_arm(), folder, "logged_step.c").logged_cost
     cost.argtypes = (ctypes.c_double, ctypes.c_int, ctypes.c_char_p, ctypes.c_int)
     cost.restype = ctypes.c_double
     log = os.fsencode(folder / "log")
     return lambda steps, logs: float(cost(STEP, steps, log, logs))
-
-
-def spent(work: Callable[[], object]) -> float:
-    begin = time.process_time()
-    work()
-    return time.process_time() - begin
 
 
 MEASURE = """
@@ -97,14 +83,16 @@ def steps_around(
 
     def logged(**options: bool) -> float:
         bag = twodof.Bag(folder / "bag", overwrite=True, **options)
-        return spent(lambda: twodof.simulate(run, bag)) / SAMPLES
+        return spent(lambda: twodof.simulate(run, bag))[0] / SAMPLES
 
     turns = [(in_c(SAMPLES, True), logged(), logged(scene=True)) for _ in range(TURNS)]
     in_c_alone, plain, scene = (1e6 * median(times) for times in zip(*turns))
-    print(f"\nA logged sample of a run of {SAMPLES}, default arm\n")
-    print(f"  C: doStep, getReal, CDR, write   {in_c_alone:7.1f} µs")
-    print(f"  twodof.simulate and its bag      {plain:7.1f} µs")
-    print(f"  with scene=True                  {scene:7.1f} µs")
+    print_rows(
+        f"A logged sample of a run of {SAMPLES}, default arm",
+        ("C: doStep, getReal, CDR, write", f"{in_c_alone:.1f} µs"),
+        ("twodof.simulate and its bag", f"{plain:.1f} µs"),
+        ("with scene=True", f"{scene:.1f} µs"),
+    )
     ratio = median(turn[1] / turn[0] for turn in turns)
     yield Figure(
         f"a sample of a run of {SAMPLES} in twodof.simulate with its bag, MCAP without fsync /"
@@ -122,18 +110,52 @@ def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterato
     with Runner(job) as runner:
         runner.run(points[0])
         turns = [
-            (RUNS * STEPS * in_c(STEPS * RUNS, False), spent(lambda: runner.run_all(points)))
+            (RUNS * STEPS * in_c(STEPS * RUNS, False), spent(lambda: runner.run_all(points))[0])
             for _ in range(TURNS)
         ]
     bare, swept = (1e3 * median(times) / RUNS for times in zip(*turns))
     ratio = median(turn[1] / turn[0] for turn in turns)
-    print(f"\nA run of a sweep, {STEPS} steps\n")
-    print(f"  C: doStep alone                  {bare:7.2f} ms")
-    print(f"  run, metrics and row             {swept:7.2f} ms")
+    print_rows(
+        f"A run of a sweep, {STEPS} steps",
+        ("C: doStep alone", f"{bare:.2f} ms"),
+        ("run, metrics and row", f"{swept:.2f} ms"),
+    )
     yield Figure(
         f"a run of a sweep, {STEPS} steps with metrics and row, in this process / as many bare"
         " doSteps in a loop of C, flags as in the FMU",
         f"{ratio:.2f}", "<= 1.5",
+    )  # fmt: skip
+
+
+def workers_around(fmu: twodof.Fmu) -> Iterator[Figure]:
+    """How well two workers share. A start is a sweep of one run for each; a run is what one more
+    costs."""
+    gains = np.linspace(10.0, 200.0, SWEPT)
+
+    def swept(workers: int, count: int) -> np.ndarray:
+        grid = {"Kp": gains[:count], "Kd": [40.0]}
+        return np.array(spent(lambda: twodof.sweep(fmu, grid=grid, workers=workers)))
+
+    def start_and_run(workers: int) -> np.ndarray:
+        """Of a start and of a run, by coordinator and workers, s."""
+        start = swept(workers, workers)
+        return np.array([start, (swept(workers, SWEPT) - start) / (SWEPT - workers)])
+
+    start_and_run(1)  # this process has imported all that it needs
+    turns = [(start_and_run(1), start_and_run(2)) for _ in range(TURNS)]
+    one, two = (np.median(rows, axis=0) for rows in map(np.array, zip(*turns)))
+    print_rows(
+        f"A sweep of {SWEPT} runs",
+        ("", "start", "run", "of that the coordinator"),
+        *(
+            (name, f"{start.sum():.2f} s", f"{1e3 * run.sum():.2f} ms", f"{1e3 * run[0]:.3f} ms")
+            for name, (start, run) in (("1 worker", one), ("2 workers", two))
+        ),
+    )
+    shared = median(2 * turn[0][1][1] / turn[1][1].sum() for turn in turns)
+    yield Figure(
+        "a run more of a sweep: 2 workers on two free cores / 1, in speed", f"{shared:.2f}",
+        ">= 1.7",
     )  # fmt: skip
 
 
@@ -148,29 +170,31 @@ def processes(folder: Path, messages: int) -> Iterator[Figure]:
         f"info of {count}": (("info", bag), 3, "0.5 s, 100 MB"),
         f"plot of {count}": (("plot", bag, "-o", "big.png"), 1, "15 s, 400 MB"),
     }
-    print("\nA process as a whole\n")
+    printed = []
     for name, (arguments, times, wanted) in rows.items():
         costs = [process(*arguments, folder=folder) for _ in range(times)]
         seconds, memory = (median(column) for column in zip(*costs))
-        print(f"  {name:28} {seconds:7.2f} s {memory:6.0f} MB")
+        printed.append((name, f"{seconds:.2f} s", f"{memory:.0f} MB"))
         if wanted:
             measured = f"{seconds:.2f} s" + f", {memory:.0f} MB" * ("MB" in wanted)
             yield Figure(f"process 'twodof {name}', with its children", measured, f"<= {wanted}")
+    print_rows("A process as a whole", *printed)
 
 
 def main(messages: int = MESSAGES) -> list[Figure]:
     """Measure and print; the figures of which something is wanted."""
-    print(f"twodof {twodof.__version__}; {processor()}; processor time")
     with tempfile.TemporaryDirectory(prefix="twodof_") as name:
         folder = Path(name)
         options = twodof.FmuOptions(native=True)
         fmu = twodof.load_fmu(twodof.build_fmu(folder / "Native.fmu", options))
         in_c = floor(folder)
-        figures = [*steps_around(fmu, in_c, folder), *sweep_around(fmu, in_c)]
+        figures = [
+            *steps_around(fmu, in_c, folder), *sweep_around(fmu, in_c), *workers_around(fmu)
+        ]  # fmt: skip
         big_bag(fmu, folder / "big", messages)
         return [*figures, *processes(folder, messages)]
 
 
 if __name__ == "__main__":
-    for figure in main(*map(int, sys.argv[1:])):
-        print(f"\n{figure.what}: {figure.measured}; wanted {figure.wanted}")
+    print(machine())
+    print_figures(main(*map(int, sys.argv[1:])))

@@ -1,41 +1,63 @@
-"""The native engine by robot, path and compiler: beside CasADi's C, with effort limits, by gcc.
+"""The native engine in C by robot, path and compiler: beside MuJoCo, and C that CasADi generates.
 
     python benchmarks/engine.py [JOINTS ...]
 
-Processor time of one step of 10 ms in C, of the default arm and of chains with so many joints (2,
-7, 16 and 30 if none are given; thirty take minutes to compile). CasADi's code (generated.py) runs
-in the same integrator, at the best of its builds; it does without ranks and payloads. In each round
-all programs run once, so that noise of the machine hits all alike; ratios are medians over the
-rounds. No limit is reached.
+Processor time, without Python. Steps are of 10 ms: of the default arm, a Panda and chains with so
+many joints (2, 7, 16 and 30 if none are given; thirty take minutes to compile). In each round all
+programs run once, so that noise of the machine hits all alike; ratios are medians over the rounds.
+
+- The engine: Dormand-Prince 5(4), rtol 1e-3, atol 1e-6, steps of 1 ms at most; with controller and
+  limits, none of which is reached; compiled as in its FMU. Where nothing but an unlimited control
+  torque acts, M⁻¹ M need not be computed: M cancels; elsewhere it takes the general path.
+- CasADi's code (generated.py) runs in the same integrator, at the best of its builds; it does
+  without ranks and payloads.
+- MuJoCo (mujoco_step.c): mj_step, RK4, steps of 1 ms; limits off, no shapes and so no contacts;
+  free and with the guide's controller in each stage. Its library is that of its package, which is
+  not imported: that has the library ask for the time, at more than the cost of a step.
+- A derivative is one along a direction of all states, in Model Exchange; the least of many calls.
 """
 
 from __future__ import annotations
 
+import ctypes
+import importlib.util
+import itertools
+import math
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
-
-from generated import rivals  # noqa: E402
-from steps import (  # noqa: E402
+from arms import (
+    HERE,
+    STEPS,
+    URDF,
     Arm,
-    Figure,
     by_own_compiler,
     chain,
+    compiled,
     native_cost,
-    processor,
+    panda,
     shipped_arm,
+    ur5,
+    without_shapes,
 )
+from generated import rivals
+from report import Figure, machine, print_figures, print_rows
+
+from twodof.plant.variables import CONTROLS, variable_table
 
 ROUNDS = 15
 JOINTS = (2, 7, 16, 30)
 PATHS = ("M cancels", "general")
-CASADI_BAR, LIMITS_BAR, GCC_BAR = 1.0, 1.25, 1.2
+CASADI_BAR, LIMITS_BAR, GCC_BAR, DERIVATIVE_BAR = 1.0, 1.25, 1.2, 4.0
+CALLS = 2000  # of a right-hand side
+CC = ("cc", "-O2")
+Costs = dict[str, float]
 
 
 def programs(n: int, folder: Path) -> dict[str, Callable[[], float]]:
@@ -44,7 +66,7 @@ def programs(n: int, folder: Path) -> dict[str, Callable[[], float]]:
     free = Arm(replace(arm.robot, effort=(1e6,) * n), arm.starts)
     pushed = Arm(free.robot, {**free.starts, "tau_ext": (1e-3,) * n})
     limited = Arm(free.robot, {**free.starts, "limit_effort": True})
-    return {
+    costs = {
         "M cancels": native_cost(free, folder),
         "general": native_cost(pushed, folder),
         "limits on": native_cost(limited, folder),
@@ -53,51 +75,118 @@ def programs(n: int, folder: Path) -> dict[str, Callable[[], float]]:
         **{f"M cancels: {name}": cost for name, cost in rivals(free, folder, False).items()},
         **{f"general: {name}": cost for name, cost in rivals(pushed, folder, True).items()},
     }
+    if n == 2:
+        mujoco = mujoco_runner(folder)
+        for kind in ("free", "controlled"):
+            costs[f"MuJoCo, {kind}"] = lambda kind=kind: mujoco(kind, STEPS)[0]
+    return costs
 
 
-def best(path: str, rounds: list[dict[str, float]]) -> str:
+def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]]]:
+    """Compiles mujoco_step.c; a run of so many steps gives a step's cost, s, and the last angles.
+
+    A run has a process of its own, in which MuJoCo's Python package is not even imported.
+    """
+    (package,) = importlib.util.find_spec("mujoco").submodule_search_locations
+    (library,) = Path(package).glob("libmujoco.*")
+    program, urdf = folder / "mujoco_step", folder / "mujoco_arm.urdf"
+    urdf.write_bytes(ET.tostring(without_shapes(URDF.read_text("utf-8"))))
+    command = [*CC, f"-I{package}/include", str(HERE / "mujoco_step.c"), "-o", str(program)]
+    subprocess.run([*command, str(library), f"-Wl,-rpath,{package}"], check=True)
+
+    def run(kind: str, steps: int) -> tuple[float, list[float]]:
+        command = [str(program), str(urdf), kind, str(steps)]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        cost, *q = map(float, done.stdout.split())
+        return cost, q
+
+    return run
+
+
+def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float, float]:
+    """Of the right-hand side and of a derivative, s: the least of runs in turns."""
+    side_cost = compiled(arm, folder, "native_step.c").side_cost
+    side_cost.restype = ctypes.c_double
+    names = [variable.name for variable in variable_table(arm.robot, arm.starts, arm.control)]
+    known, unknown = names.index("q[1]"), names.index("der(q[1])")
+    rounds = [
+        [side_cost(derivative, calls, known, unknown) for derivative in (0, 1)] for _ in range(200)
+    ]
+    side, derivative = map(min, zip(*rounds))
+    return side, derivative
+
+
+def measured(joints: Sequence[int]) -> Iterator[tuple[int, list[Costs]]]:
+    """The costs of each round, by joints."""
+    for n in joints:
+        with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
+            costs = programs(n, Path(folder))
+            yield n, [{name: cost() for name, cost in costs.items()} for _ in range(ROUNDS)]
+
+
+def ratio(rounds: list[Costs], a: str, b: str) -> float:
+    return median(times[a] / times[b] for times in rounds)
+
+
+def best(path: str, rounds: list[Costs]) -> str:
     """The rival's fastest build, by its median."""
     names = [name for name in rounds[0] if name.startswith(f"{path}: ")]
     return min(names, key=lambda name: median(times[name] for times in rounds))
 
 
+def growth(joints: Sequence[int], times: Sequence[float]) -> float:
+    """The exponent p of time ~ joints^p, the largest between neighbours."""
+    pairs = itertools.pairwise(zip(joints, times, strict=True))
+    return max(math.log(t1 / t0) / math.log(n1 / n0) for (n0, t0), (n1, t1) in pairs)
+
+
+def figures_of(n: int, rounds: list[Costs]) -> Iterator[Figure]:
+    """Of which something is wanted."""
+    ours = f"{n} joints: engine by zig, flags as in its FMU"
+    for path in PATHS:
+        row = best(path, rounds)
+        against = f"{ratio(rounds, path, row):.2f}"
+        yield Figure(f"{ours}, / CasADi's C, {row}", against, f"<= {CASADI_BAR:g}")
+    limits = f"{ratio(rounds, 'limits on', 'M cancels'):.2f}"
+    yield Figure(f"{ours}, limits of effort on / off", limits, f"<= {LIMITS_BAR}")
+    for path in PATHS:
+        gcc = f"{ratio(rounds, f'{path}, cc', path):.2f}"
+        yield Figure(f"{ours}, {path}: the same by cc / that", gcc, f"<= {GCC_BAR}")
+
+
 def main(joints: Sequence[int] = JOINTS) -> list[Figure]:
     """Measure and print; the figures of which something is wanted."""
-    figures = []
-    print(f"{processor()}; processor time of a step of 10 ms, and ratios\n")
-    print("joints  M cancels    general  / CasADi  limits on / off        cc / zig")
-    for n in joints:
-        with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
-            costs = programs(n, Path(folder))
-            rounds = [{name: cost() for name, cost in costs.items()} for _ in range(ROUNDS)]
-
-        def ratio(a: str, b: str, rounds: list[dict[str, float]] = rounds) -> float:
-            return median(times[a] / times[b] for times in rounds)
-
-        rows = [best(path, rounds) for path in PATHS]
-        taken = [f"{1e6 * median(r[path] for r in rounds):8.1f} µs" for path in PATHS]
-        against = "".join(f"{ratio(path, row):5.2f}" for path, row in zip(PATHS, rows))
-        gcc = "".join(f"{ratio(f'{path}, cc', path):8.2f}" for path in PATHS)
-        limits = ratio("limits on", "M cancels")
-        print(f"{n:6}{taken[0]}{taken[1]}{against}{limits:17.2f}{gcc}", flush=True)
-        print("       CasADi's best builds: " + "; ".join(rows))
-        ours = "engine by zig, flags as in its FMU"
-        ratios = {
-            f"{ours} / CasADi's C by the best of its builds, {row}": (path, row, CASADI_BAR)
-            for path, row in zip(PATHS, rows)
-        }
-        ratios[f"{ours}, limits of effort on / off"] = ("limits on", "M cancels", LIMITS_BAR)
-        ratios |= {f"the same by cc / {ours}, {p}": (f"{p}, cc", p, GCC_BAR) for p in PATHS}
-        figures += [
-            Figure(f"{n} joints: {what}", f"{ratio(a, b):.2f}", f"<= {bar:g}")
-            for what, (a, b, bar) in ratios.items()
-        ]
-    print(
-        f"\nwanted: <= {CASADI_BAR:g} of CasADi, limits on <= {LIMITS_BAR} of off,"
-        f" cc <= {GCC_BAR} of zig"
-    )
-    return figures
+    head = ("joints", *PATHS, *(f"/ CasADi, {path}" for path in PATHS), "limits on / off",
+            *(f"cc / zig, {path}" for path in PATHS))  # fmt: skip
+    rows, times, figures = [], [], []
+    for n, rounds in measured(joints):
+        figures += (here := [*figures_of(n, rounds)])
+        times.append([median(costs[path] for costs in rounds) for path in PATHS])
+        rows.append((n, *(f"{1e6 * t:.1f} µs" for t in times[-1]), *(f.measured for f in here)))
+        for kind in ("free", "controlled") if n == 2 else ():
+            name = f"MuJoCo, {kind}"
+            cost = f"{1e6 * median(costs[name] for costs in rounds):.1f} µs"
+            print(f"{name}: {cost}, {ratio(rounds, name, 'M cancels'):.1f} times the engine's")
+    print_rows("A step of 10 ms in C", head, *rows)
+    for path, taken in zip(PATHS, zip(*times)) if len(rows) > 1 else ():
+        power = growth(joints, taken)
+        print(f"  where the path is {path}, time grows by at most joints^{power:.2f}")
+    with tempfile.TemporaryDirectory(prefix="twodof_") as name:
+        folder = Path(name)
+        cost = native_cost(panda(), folder)
+        damped = 1e6 * median(cost() for _ in range(ROUNDS))
+        print(f"  a Panda, 7 joints, its damping: {damped:.1f} µs")
+        rows = [("", "right-hand side", "derivative", "ratio")]
+        for arm, control in itertools.product((shipped_arm, ur5, panda), CONTROLS):
+            side, derivative = derivative_costs(arm(control), folder)
+            rows.append((f"{arm.__name__}, {control}", f"{1e6 * side:.3f} µs",
+                         f"{1e6 * derivative:.3f} µs", f"{derivative / side:.2f}"))  # fmt: skip
+        print_rows("A directional derivative", *rows)
+    worst = max(float(row[-1]) for row in rows[1:])
+    what = "a directional derivative / the right-hand side, at most"
+    return [*figures, Figure(what, f"{worst:.2f}", f"<= {DERIVATIVE_BAR:g}")]
 
 
 if __name__ == "__main__":
-    main([*map(int, sys.argv[1:])] or JOINTS)
+    print(machine())
+    print_figures(main([*map(int, sys.argv[1:])] or JOINTS))

@@ -14,7 +14,7 @@ from typing import Any
 
 import casadi
 import numpy as np
-from steps import Arm, by_own_compiler, native_cost
+from arms import Arm, by_own_compiler, native_cost
 
 from twodof.export.bodies import Array, joint_tree
 from twodof.export.recursions import (

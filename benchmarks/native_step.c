@@ -1,41 +1,74 @@
-/* Cost of one communication step in C, the engine compiled in. As a library, step_cost; as a
-   program, which prints µs per step, the best of several runs from the start:
-
-       native_step [h, s] [steps a run] [runs] */
-#include <stdio.h>
-#include <stdlib.h>
+/* What the engine costs in C, compiled in: a communication step of co-simulation, and in Model
+   Exchange the right-hand side and a directional derivative. As a program it only runs. */
 #include <time.h>
 
 #include "fmu.c"
 
+static fmi2Component begun(fmi2Type type)
+{
+    static const fmi2CallbackFunctions callbacks = {NULL, NULL, NULL, NULL, NULL};
+    fmi2Component arm = fmi2Instantiate("arm", type, MODEL_GUID, "", &callbacks, 0, 0);
+    if (arm && !fmi2SetupExperiment(arm, 0, 0.0, 0.0, 0, 0.0) &&
+        !fmi2EnterInitializationMode(arm) && !fmi2ExitInitializationMode(arm))
+        return arm;
+    fmi2FreeInstance(arm);
+    return NULL;
+}
+
+static double since(clock_t begin, int count)
+{
+    return (double)(clock() - begin) / CLOCKS_PER_SEC / count;
+}
+
 /* Processor time of a step, s, the mean of a run from the start; NaN where a call fails. */
 FMI2_Export double step_cost(double h, int steps)
 {
-    const fmi2CallbackFunctions callbacks = {NULL, NULL, NULL, NULL, NULL};
-    fmi2Component arm = fmi2Instantiate("arm", fmi2CoSimulation, MODEL_GUID, "", &callbacks, 0, 0);
-    if (!arm)
-        return NAN;
-    int status = fmi2SetupExperiment(arm, 0, 0.0, 0.0, 0, 0.0);
-    status |= fmi2EnterInitializationMode(arm) | fmi2ExitInitializationMode(arm);
+    fmi2Component arm = begun(fmi2CoSimulation);
+    int status = arm ? fmi2OK : fmi2Error;
     const clock_t begin = clock();
-    for (int k = 0; k < steps; k++)
+    for (int k = 0; arm && k < steps; k++)
         status |= fmi2DoStep(arm, k * h, h, fmi2True);
-    const double cost = (double)(clock() - begin) / CLOCKS_PER_SEC / steps;
+    const double cost = since(begin, steps);
     fmi2FreeInstance(arm);
     return status == fmi2OK ? cost : NAN;
 }
 
-int main(int count, char *argument[])
+/* Processor time of the right-hand side, or of its derivative along a direction of all states, s,
+   at states that differ; NaN where a call fails. References are those of q[1] and der(q[1]). */
+FMI2_Export double side_cost(int derivative, int calls, int known, int unknown)
 {
-    const double h = count > 1 ? atof(argument[1]) : 0.01;
-    const int steps = count > 2 ? atoi(argument[2]) : 500, runs = count > 3 ? atoi(argument[3]) : 20;
-    double best = HUGE_VAL;
-    for (int run = 0; run < runs; run++) {
-        const double cost = step_cost(h, steps);
-        if (isnan(cost))
-            return 1;
-        best = cost < best ? cost : best;
+    enum { STATES = 2 * N_JOINTS };
+    fmi2Component arm = begun(fmi2ModelExchange);
+    fmi2EventInfo info;
+    fmi2Real state[STATES], rate[STATES], seed[STATES];
+    fmi2ValueReference knowns[STATES], unknowns[STATES];
+    if (!arm || fmi2NewDiscreteStates(arm, &info) || fmi2EnterContinuousTimeMode(arm) ||
+        fmi2GetContinuousStates(arm, state, STATES))
+        return NAN;
+    for (int i = 0; i < STATES; i++) {
+        knowns[i] = known + i;
+        unknowns[i] = unknown + i;
+        seed[i] = 0.1 * (i + 1);
+        state[i] += i < N_JOINTS ? 0.0 : 0.1; /* at rest damping costs nothing */
     }
-    printf("%.3f\n", 1e6 * best);
-    return 0;
+    /* as they are called from without */
+    fmi2SetContinuousStatesTYPE *volatile set = fmi2SetContinuousStates;
+    fmi2GetDerivativesTYPE *volatile rates = fmi2GetDerivatives;
+    fmi2GetDirectionalDerivativeTYPE *volatile slope = fmi2GetDirectionalDerivative;
+    int status = fmi2OK;
+    const clock_t begin = clock();
+    for (int k = 0; k < calls; k++) {
+        state[0] += 1e-9;
+        status |= set(arm, state, STATES);
+        status |= derivative ? slope(arm, unknowns, STATES, knowns, STATES, seed, rate)
+                             : rates(arm, rate, STATES);
+    }
+    const double cost = since(begin, calls);
+    fmi2FreeInstance(arm);
+    return status == fmi2OK ? cost : NAN;
+}
+
+int main(void)
+{
+    return isnan(step_cost(0.01, 20));
 }

@@ -13,7 +13,7 @@ of one hour of that Panda at 100 Hz (some minutes). Prints
 - of a target that is dragged: from the event until the frame after the one that shows it begins.
 
 A machine that does something else lengthens the times, hardly the processor times. Needs chromium
-and the packages 'playwright' and 'example-robot-data'.
+and the packages 'playwright', 'psutil' and 'example-robot-data'.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+import numpy as np
+import psutil
+from arms import ROBOTS
+from playwright.sync_api import Browser, Page
 
-import browser  # noqa: E402
-import numpy as np  # noqa: E402
-from native_models import robots_folder  # noqa: E402
-from playwright.sync_api import Browser, Page  # noqa: E402
+import twodof
 
-import twodof  # noqa: E402
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+import browser
 
 SECONDS = 10.0  # of frames
 DRAGS = 30
@@ -80,8 +80,8 @@ def pages(folder: Path) -> Iterator[Path]:
     arm = twodof.build_fmu(folder / "arm.fmu", twodof.FmuOptions(native=True))
     yield twodof.page(arm, folder / "arm.html")
     robot = {
-        "urdf": robots_folder() / "panda_description/urdf/panda.urdf",
-        "mesh_dir": robots_folder().parent, "frame": "panda_hand_tcp", "native": True,
+        "urdf": ROBOTS / "panda_description/urdf/panda.urdf",
+        "mesh_dir": ROBOTS.parent, "frame": "panda_hand_tcp", "native": True,
     }  # fmt: skip
     options = twodof.FmuOptions(**robot, control="pose")
     panda = twodof.build_fmu(folder / "panda.fmu", options)
@@ -118,11 +118,11 @@ def frames(page: Page) -> None:
     """Of an arm that runs."""
     page.wait_for_timeout(1000)
     with spent() as processor:
-        found = np.array(page.evaluate(FRAMES, SECONDS))
-    between = np.diff(found[:, 0])
-    late = found[:, 0] - found[0, 0] - (found[:, 1] - found[0, 1])
+        shown = np.array(page.evaluate(FRAMES, SECONDS))  # when, and the time of the arm
+    between = np.diff(shown[:, 0])
+    late = shown[:, 0] - shown[0, 0] - (shown[:, 1] - shown[0, 1])
     print(
-        f"  {1 / between.mean():.0f} frames a second, {1e3 * processor[0] / len(found):.0f} ms of"
+        f"  {1 / between.mean():.0f} frames a second, {1e3 * processor[0] / len(shown):.0f} ms of"
         f" processor time each; the plant late by at most {1e3 * late.max():.0f} ms, longest frame"
         f" {1e3 * between.max():.0f} ms"
     )
@@ -151,25 +151,17 @@ def drag(page: Page) -> None:
 @contextmanager
 def spent() -> Iterator[list[float]]:
     """The processor time of the browser meanwhile, s, in all of its processes."""
-    before, found = processor_time(), [0.0]
-    yield found
-    found[0] = processor_time() - before
+    before, seconds = processor_time(), [0.0]
+    yield seconds
+    seconds[0] = processor_time() - before
 
 
 def processor_time() -> float:
-    """Of all processes that descend from this one, s."""
-    tick = os.sysconf("SC_CLK_TCK")
-    children: dict[int, list[tuple[int, float]]] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended since
-            words = stat.read_text().rpartition(")")[2].split()
-            times = sum(map(int, words[11:15])) / tick
-            children.setdefault(int(words[1]), []).append((int(stat.parent.name), times))
-    waiting, total = [os.getpid()], 0.0
-    while waiting:
-        for pid, times in children.get(waiting.pop(), []):
-            waiting.append(pid)
-            total += times
+    """Of all processes that descend from this one, with those of theirs that have ended, s."""
+    total = 0.0
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):  # it has ended since
+            total += sum(child.cpu_times()[:4])
     return total
 
 

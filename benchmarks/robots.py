@@ -1,14 +1,22 @@
-"""Every URDF of example-robot-data as it is: built, run for 1 s and logged in both flavours.
+"""Every URDF of example-robot-data as it is, built and run, and FMI 3.0 against 2.0.
 
-    python benchmarks/robots.py             all, about 20 minutes
-    python benchmarks/robots.py panda ur5   those whose path has one of these words
+    python benchmarks/robots.py                      all, about 20 minutes
+    python benchmarks/robots.py panda ur5            those whose path has one of these words
+    python benchmarks/robots.py --versions [WORD …]  ten robots in FMI 3.0 and 2.0, about 10 minutes
 
-Prints a table in Markdown. A robot with several last links is built with the first of those that
-most joints move. "off" is how far the bare plant, thrown at 1 rad/s or m/s a joint for 0.1 s
-without limits at rtol 1e-9, ends from SciPy's DOP853 (Radau where joints are damped) on
-Pinocchio's dynamics, rad or m. Times are processor time for a step of 10 ms of the default
-control at rest on its target, its message in the bag included. Ends with status 1 if a URDF is
+Prints a table in Markdown, and ends with status 1 where something is wrong.
+
+Each is run for 1 s and logged in both flavours. A robot with several last links is built with the
+first of those that most joints move. "off" is how far the bare plant, thrown at 1 rad/s or m/s a
+joint for 0.1 s without limits at rtol 1e-9, ends from SciPy's DOP853 (Radau where joints are
+damped) on Pinocchio's dynamics, rad or m. Times are processor time for a step of 10 ms of the
+default control at rest on its target, its message in the bag included. Wrong is a URDF that is
 refused for none of the reasons in REFUSED.
+
+Versions: each robot under every control is thrown at 0.3 rad/s or m/s a joint, with a force at its
+frame, and steps 10 ms for 1 s, in FMPy's `simulate_fmu`; what is compared, bit for bit, are all
+values of q, v, x and tau, and wrong is one that differs. Ratios are of 3.0 to 2.0: bytes of the
+library, and processor time of a step with its outputs read, the least of interleaved runs.
 """
 
 from __future__ import annotations
@@ -18,23 +26,38 @@ import re
 import sys
 import tempfile
 import time
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
+import fmpy
 import numpy as np
 import pinocchio as pin
+from arms import ROBOTS
 from scipy.integrate import solve_ivp
 
 import twodof
 from twodof.export.urdf_source import last_links
+from twodof.fmu import Instance, instantiate
 from twodof.plant.robot import Robot, load_robot
 from twodof.plant.urdf import read_urdf
+from twodof.plant.variables import CONTROLS
 
 REFUSED = (
     "of type 'floating'", "of type 'planar'", "of type 'spherical'", "has no moving joint",
     "no mass or no inertia about its axis", "which does not exist", "not physical",
     "has no links",
 )  # fmt: skip
+COMPARED = (
+    "ur_description/urdf/ur3_robot.urdf", "ur_description/urdf/ur5_robot.urdf",
+    "ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf",
+    "z1_description/urdf/z1.urdf", "kinova_description/robots/kinova.urdf",
+    "xarm_description/urdf/xarm7.urdf", "so_arm_description/urdf/so100.urdf",
+    "tiago_description/robots/tiago_no_hand.urdf", "baxter_description/urdf/baxter.urdf",
+)  # fmt: skip
 FLIGHT = 0.1  # s
+GROUPS = ("q", "v", "x", "tau")
+STEP, STEPS, ROUNDS = 0.01, 100, 60
 PATIENCE = 60.0  # s of processor time, after which a run of a stiff robot is cut short
 
 
@@ -51,15 +74,6 @@ class Clock(twodof.Sink):
     def late(self) -> bool:
         """Whether it has taken too long."""
         return self.last > self.first + PATIENCE
-
-
-def robots_folder() -> Path:
-    """Where example-robot-data keeps its robots."""
-    for parent in Path(pin.__file__).parents:
-        folder = parent / "share" / "example-robot-data" / "robots"
-        if folder.is_dir():
-            return folder
-    raise SystemExit("install example-robot-data")
 
 
 def frame_of(text: str) -> str:
@@ -92,7 +106,7 @@ def apart(fmu: Path, robot: Robot) -> float:
     return float(np.abs(end - samples[-1].q).max())
 
 
-def measure(urdf: Path, folder: Path) -> list[str]:
+def built(urdf: Path, folder: Path) -> list[str]:
     """A row of the table: joints, frame, how far off, µs a step of either flavour."""
     text = urdf.read_text("utf-8")
     frame = frame_of(text)
@@ -111,24 +125,102 @@ def measure(urdf: Path, folder: Path) -> list[str]:
     return [str(len(robot.joints)), frame, f"{off:.0e}", *times]
 
 
+# --- FMI 3.0 against 2.0 ---
+
+
+def simulated(path: Path) -> np.ndarray:
+    """All samples, by FMPy: a row of q, v, x and tau each."""
+    fmu = twodof.load_fmu(path)
+    starts = {"v_start": [0.3] * len(fmu.joints), "f_ext": [1.0, 2.0, -3.0]}
+    names: list[str] = list(GROUPS)
+    values: dict[str, object] = dict(starts)
+    if fmu.version == 2:
+        names = [name for group in GROUPS for name in fmu.vector(group)]
+        values = {n: v for g, all_ in starts.items() for n, v in zip(fmu.vector(g), all_)}
+    rows = fmpy.simulate_fmu(
+        str(path), fmi_type="CoSimulation", stop_time=STEPS * STEP, step_size=STEP,
+        output_interval=STEP, start_values=values, output=names,
+    )  # fmt: skip
+    return np.array([np.hstack([np.ravel(row[name]) for name in names]) for row in rows])
+
+
+def seconds(fmu: twodof.Fmu, instance: Instance) -> float:
+    """Processor time of a run."""
+    instance.reset()
+    instance.initialise(0.0, np.inf, {name: 0.3 for name in fmu.vector("v_start")})
+    read = instance.reader([name for group in GROUPS for name in fmu.vector(group)])
+    start = time.process_time()
+    for k in range(STEPS):
+        instance.step(k * STEP, STEP)
+        read()
+    return time.process_time() - start
+
+
+def library_size(path: Path) -> int:
+    """Bytes of the binary."""
+    with zipfile.ZipFile(path) as archive:
+        return sum(i.file_size for i in archive.infolist() if i.filename[:9] == "binaries/")
+
+
+def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
+    """A row of the table, and whether all values are equal."""
+    frame = frame_of(urdf.read_text("utf-8"))
+    paths = []
+    for fmi in (2, 3):
+        options = twodof.FmuOptions(
+            urdf=urdf, frame=frame, control=control, native=True, fmi=fmi, meshes=False,
+            live_documentation=False,
+        )  # fmt: skip
+        paths.append(twodof.build_fmu(folder / f"fmi{fmi}.fmu", options))
+    two, three = map(simulated, paths)
+    size = library_size(paths[1]) / library_size(paths[0])
+    fmus = [twodof.load_fmu(path) for path in paths]
+    with instantiate(fmus[0]) as old, instantiate(fmus[1]) as new:
+        times = [(seconds(fmus[0], old), seconds(fmus[1], new)) for _ in range(ROUNDS)]
+    best = np.min(times, axis=0)
+    equal = two.shape == three.shape == (STEPS + 1, two.shape[1]) and bool((two == three).all())
+    moved = f"{np.ptp(two, axis=0).max():.2g}"
+    words = "yes" if equal else f"**no**, {np.abs(two - three).max():.1e}"
+    row = [str(len(fmus[0].joints)), frame, control, words, moved, f"{size:.3f}"]
+    return [*row, f"{best[1] / best[0]:.3f}"], equal
+
+
+def built_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
+    """Rows of the table, and whether each is right."""
+    yield ["URDF", "joints", "frame", "off", "Python, µs a step", "native"], True
+    for urdf in sorted(ROBOTS.rglob("*.urdf")):
+        name = str(urdf.relative_to(ROBOTS))
+        if words and not any(word in name for word in words):
+            continue
+        try:
+            yield [name, *built(urdf, folder)], True
+        except (twodof.TwoDofError, ValueError) as error:
+            reason = re.sub(r"\s+", " ", str(error)).replace(f"{ROBOTS}/", "")
+            right = any(known in reason for known in REFUSED)
+            yield [name, "", f"refused: {reason[:160]}", "", "", ""], right
+
+
+def compared_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
+    """Rows of the table, and whether each is right."""
+    yield ["URDF", "joints", "frame", "control", "equal", "moved", "bytes", "time"], True
+    for name in COMPARED:
+        for control in CONTROLS if not words or any(word in name for word in words) else ():
+            row, equal = compared(ROBOTS / name, control, folder)
+            yield [Path(name).name, *row], equal
+
+
 def main() -> int:
-    """Print the table; 1 where a URDF fails that should not."""
+    """Print the table; 1 where something is wrong."""
     logging.disable(logging.WARNING)
-    words, wrong, root = sys.argv[1:], 0, robots_folder()
-    every = [
-        p for p in sorted(root.rglob("*.urdf")) if not words or any(w in str(p) for w in words)
-    ]
-    print("| URDF | joints | frame | off | Python, µs a step | native |\n| --- |" + " --- |" * 5)
+    words = [word for word in sys.argv[1:] if word != "--versions"]
+    rows = compared_rows if words != sys.argv[1:] else built_rows
+    wrong = 0
     with tempfile.TemporaryDirectory() as folder:
-        for urdf in every:
-            name = str(urdf.relative_to(root))
-            try:
-                row = measure(urdf, Path(folder))
-            except (twodof.TwoDofError, ValueError) as error:
-                reason = re.sub(r"\s+", " ", str(error)).replace(str(root) + "/", "")
-                wrong += not any(known in reason for known in REFUSED)
-                row = ["", f"refused: {reason[:160]}", "", "", ""]
-            print(f"| {name} | " + " | ".join(row) + " |", flush=True)
+        for k, (row, right) in enumerate(rows(words, Path(folder))):
+            print(f"| {' | '.join(row)} |", flush=True)
+            if k == 0:
+                print("|" + " --- |" * len(row))
+            wrong += not right
     return 1 if wrong else 0
 
 

@@ -73,6 +73,16 @@ def native_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def folder(tmp_path: Path, fmu_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with the default arm's FMU."""
+    place = tmp_path / "work"
+    place.mkdir()
+    (place / "arm.fmu").symlink_to(fmu_path)
+    monkeypatch.chdir(place)
+    return place
+
+
+@pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
     """Mounts a small disk of so many KiB, as often as asked."""
     mounted: list[Path] = []

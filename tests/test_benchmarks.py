@@ -1,14 +1,14 @@
-"""What the benchmark's table says beside the times: distances and numbers of right-hand sides."""
+"""What the benchmarks say beside the times: that all compute the same, and what is measured."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -17,26 +17,24 @@ from harness import needs
 from scipy.integrate import solve_ivp
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+Mujoco = Callable[[str, int], tuple[float, list[float]]]
 
 
 @pytest.fixture(scope="module")
-def benchmark() -> Iterator[ModuleType]:
-    """benchmarks/steps.py by its path: the folder is no package."""
-    spec = importlib.util.spec_from_file_location("benchmarks_steps", BENCHMARKS / "steps.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    before = list(sys.path)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    sys.path[:] = before
-    yield module
-    del sys.modules[spec.name]
+def benchmarks() -> Iterator[SimpleNamespace]:
+    """Their modules: the folder is no package."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        names = ("arms", "steps", "engine", "generated", "listing", "report")
+        yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
+    for name in names:
+        del sys.modules[name]
 
 
-def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmark: ModuleType) -> None:
-    h = benchmark.STEP
-    e = np.array([benchmark.exact(k) - benchmark.X_DES for k in range(0, 500)])
-    np.testing.assert_allclose(e[0], benchmark.position(benchmark.Q_START) - benchmark.X_DES)
+def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmarks: SimpleNamespace) -> None:
+    steps, h = benchmarks.steps, benchmarks.arms.STEP
+    e = np.array([steps.exact(k) - steps.X_DES for k in range(0, 500)])
+    np.testing.assert_allclose(e[0], steps.position(steps.Q_START) - steps.X_DES)
     # e'' + 40 e' + 50 e = 0 from rest, as a recurrence that is exact for any step
     fast, slow = np.roots([1.0, 40.0, 50.0])
     a, b = np.exp(fast * h), np.exp(slow * h)
@@ -44,97 +42,89 @@ def test_exact_solution_begins_at_rest_and_obeys_its_equation(benchmark: ModuleT
     np.testing.assert_allclose(e[1], e[0] * (fast * b - slow * a) / (fast - slow), rtol=1e-13)
 
 
-def test_listing_is_off_by_centimetres_and_needs_65_right_hand_sides(
-    benchmark: ModuleType,
+def test_listing_is_off_by_centimetres_and_an_fmu_is_not(
+    benchmarks: SimpleNamespace, native_path: Path, tmp_path: Path
 ) -> None:
-    listing = benchmark.Listing()
-    assert 0.035 <= benchmark.accuracy(listing) <= 0.055
-    assert 60 <= listing.evaluations() / benchmark.STEPS <= 70
+    steps = benchmarks.steps
+    assert 0.035 <= steps.accuracy(steps.Listing()) <= 0.055
+    fmu = steps.FmuInFmpy(native_path, tmp_path, outputs=True)
+    assert steps.accuracy(fmu) <= 1e-12
+    assert all(time > 0.0 for time in steps.step_times([fmu], passes=1))
+    fmu.free()
 
 
-def test_plant_is_exact_and_needs_61_right_hand_sides(benchmark: ModuleType) -> None:
-    arm = benchmark.shipped_arm()
-    assert benchmark.accuracy(benchmark.PlantAlone(arm)) <= 1e-12
-    assert benchmark.right_hand_sides(arm) == 61 * benchmark.STEPS
-
-
-def test_step_times_measure_every_row(benchmark: ModuleType, monkeypatch) -> None:
-    monkeypatch.setattr(benchmark, "STEPS", 20)
-    rows = [benchmark.Listing(), benchmark.PlantAlone(benchmark.shipped_arm())]
-    times, busy = benchmark.step_times(rows, passes=1)
-    assert len(times) == 2 and min(times) > 0.0 and busy > 0.0
-
-
-def test_growth_is_the_largest_exponent(benchmark: ModuleType) -> None:
-    assert benchmark.growth([2, 7, 16], [4.0, 49.0, 256.0]) == pytest.approx(2.0)
-    assert benchmark.growth([1, 2, 4], [1.0, 2.0, 16.0]) == pytest.approx(3.0)
-
-
-def test_robots_are_measured_as_they_come(benchmark: ModuleType, robots: Path) -> None:
+def test_robots_are_measured_as_they_come(benchmarks: SimpleNamespace, robots: Path) -> None:
     urdf = ET.parse(robots / "panda_description/urdf/panda.urdf")
     damping = [
         float(dynamics.get("damping"))
         for joint in urdf.iter("joint")
         if joint.get("type") == "revolute" and (dynamics := joint.find("dynamics")) is not None
     ]
-    assert list(benchmark.panda().robot.damping) == damping and len(damping) == 7
-    assert list(benchmark.chain(16).robot.damping) == [0.0] * 16
+    assert list(benchmarks.arms.panda().robot.damping) == damping and len(damping) == 7
+    assert list(benchmarks.arms.chain(16).robot.damping) == [0.0] * 16
 
 
 @pytest.fixture(scope="module")
-def mujoco(
-    benchmark: ModuleType, tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str, int], tuple[float, list[float]]]:
+def mujoco(benchmarks: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Mujoco:
     needs("cc")
-    return benchmark.mujoco_runner(tmp_path_factory.mktemp("mujoco"))
+    return benchmarks.engine.mujoco_runner(tmp_path_factory.mktemp("mujoco"))
 
 
-def test_mujoco_has_the_same_arm(benchmark: ModuleType, mujoco: Callable) -> None:
+def test_mujoco_has_the_same_arm(benchmarks: SimpleNamespace, mujoco: Mujoco) -> None:
     """Free fall from the start: MuJoCo's motion is that of Pinocchio's dynamics."""
-    robot = benchmark.shipped_arm().robot
-    model = robot.model.copy()
-    model.gravity.linear = np.array(benchmark.STARTS["gravity"])
+    model = benchmarks.arms.shipped_arm().robot.model.copy()
+    model.gravity.linear = np.array(benchmarks.arms.STARTS["gravity"])
     data = model.createData()
 
     def motion(_t: float, y: np.ndarray) -> np.ndarray:
         return np.concatenate([y[2:], pin.aba(model, data, y[:2], y[2:], np.zeros(2))])
 
-    start = [*benchmark.Q_START, 0.0, 0.0]
+    start = [*benchmarks.arms.Q_START, 0.0, 0.0]
     expected = solve_ivp(motion, (0.0, 0.3), start, "DOP853", rtol=1e-12, atol=1e-12).y[:2, -1]
     assert mujoco("free", 30)[1] == pytest.approx(expected, abs=1e-7)
 
 
-def test_mujoco_has_the_same_controller(benchmark: ModuleType, mujoco: Callable) -> None:
-    for steps in (1, 5, 50, 500):
-        x = benchmark.position(mujoco("controlled", steps)[1])
-        assert x == pytest.approx(benchmark.exact(steps), abs=1e-9)
+def test_mujoco_has_the_same_controller(benchmarks: SimpleNamespace, mujoco: Mujoco) -> None:
+    for steps in (1, 50, 500):
+        x = benchmarks.steps.position(mujoco("controlled", steps)[1])
+        assert x == pytest.approx(benchmarks.steps.exact(steps), abs=1e-9)
 
 
 def test_mujoco_is_measured_without_its_python_package() -> None:
     """That has the library ask for the time, at more than the cost of a step."""
-    code = "import sys, steps; sys.exit('mujoco' in sys.modules)"
+    code = "import sys, engine; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True)
 
 
-def test_steps_are_timed_from_c(
-    benchmark: ModuleType, mujoco: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_rival_has_the_same_right_hand_side(benchmarks: SimpleNamespace) -> None:
+    arm = benchmarks.arms.chain(4)
+    plant = benchmarks.arms.Plant(
+        arm.robot, benchmarks.arms.variable_table(arm.robot, {**arm.starts, "tau_ext": (0.1,) * 4})
+    )
+    plant.initialise()
+    q, v = plant.q, [0.3, -0.2, 0.1, 0.4]
+    expected = plant._equations_of_motion()(np.array(q), np.array(v))[0]
+    inputs = [getattr(plant, name) for name in benchmarks.generated.INPUTS]
+    for way in benchmarks.generated.WAYS:
+        rival = benchmarks.generated.right_hand_side(arm.robot, way)(q, v, *inputs)
+        np.testing.assert_allclose(np.array(rival).ravel(), expected, rtol=1e-9)
+
+
+def test_the_engine_is_timed_in_c(benchmarks: SimpleNamespace, tmp_path: Path) -> None:
+    arm = benchmarks.arms.shipped_arm()
+    costs = [benchmarks.arms.native_cost(arm, tmp_path)()]
+    costs += benchmarks.engine.derivative_costs(benchmarks.arms.shipped_arm("pose"), tmp_path, 100)
+    assert all(0.0 < cost < 1e-3 for cost in costs)
+
+
+def test_growth_is_the_largest_exponent(benchmarks: SimpleNamespace) -> None:
+    growth = benchmarks.engine.growth
+    assert growth([2, 7, 16], [4.0, 49.0, 256.0]) == pytest.approx(2.0)
+    assert growth([1, 2, 4], [1.0, 2.0, 16.0]) == pytest.approx(3.0)
+
+
+def test_tables_are_aligned(
+    benchmarks: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(benchmark, "STEPS", 100)  # clock() has a resolution of 1 µs
-    costs = [benchmark.native_cost(benchmark.shipped_arm(), tmp_path)]
-    costs += [lambda kind=kind: mujoco(kind, 100)[0] for kind in ("free", "controlled")]
-    rows = [benchmark.RowInC("", 2, "", cost, 61.0) for cost in costs]
-    assert all(0.0 < cost < 1e-3 for cost in benchmark.times_in_c(rows, rounds=3))
-
-
-def test_targets_repeat_with_their_seed(monkeypatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import targets
-
-    def run() -> tuple[list[float], list[float], int]:
-        plant = targets.shipped_plant()
-        findings = targets.Findings()
-        targets.run_target(plant, 1, 3, findings, verbose=False)
-        return plant.q, plant.x_des, findings.wrong()
-
-    assert run() == run()
-    assert run()[2] == 0
+    benchmarks.report.print_rows("of all", ("", "time"), ("a", "1 s"), ("bcd", "10 s"))
+    assert capsys.readouterr().out == "\nof all\n\n       time\n  a     1 s\n  bcd  10 s\n"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
-import os
 import pkgutil
 import subprocess
 import sys
@@ -16,7 +14,6 @@ import pandas
 import pytest
 
 import twodof
-from twodof.cli.main import main
 from twodof.version import versions
 
 PROGRAM = """
@@ -69,7 +66,8 @@ def test_names_are_the_public_ones_and_no_module_takes_their_place() -> None:
 
 def test_a_users_program_is_checked_by_its_types(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
-    command = [sys.executable, "-m", "mypy", "--strict", "program.py"]
+    cache = f"--cache-dir={Path(__file__).parents[1] / '.mypy_cache'}"
+    command = [sys.executable, "-m", "mypy", "--strict", cache, "program.py"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     lines = [line.split(": ", 1)[1] for line in done.stdout.splitlines()[:-1]]
     assert [line[:50] for line in lines if line.startswith("error")] == [
@@ -132,103 +130,28 @@ def test_nothing_but_building_needs_pinocchio(native_path: Path, tmp_path: Path)
     assert program(["pinocchio"], code, tmp_path) == "1\n"
 
 
-@pytest.mark.parametrize(
-    ("names", "code", "extra"),
-    [
-        (["websockets"], "twodof.view('bag')", "view"),
-        (["websockets"], "twodof.live('x.fmu')", "view"),
-        (["matplotlib"], "twodof.plot('bag')", "view"),
-        (["pyarrow"], "twodof.sweep('x.fmu', grid={'Kp': [1.0]})", "sweep"),
-        (["cyclonedds"], "twodof.publish('x.fmu')", "ros"),
-    ],
-)
-def test_what_needs_an_extra_says_so_when_it_is_used(
-    tmp_path: Path, names: list[str], code: str, extra: str
-) -> None:
-    said = program(
-        names,
-        f"{code.split('(')[0]}\n"
-        f"try:\n    {code}\nexcept twodof.TwoDofError as error:\n    print(error)",
-        tmp_path,
-    )
-    assert f"extra '{extra}'" in said
-
-
-# --- the command line ---
-
-
-def test_help_of_a_verb_is_its_options(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["help", "run"]) == 0
-    told = capsys.readouterr().out
-    with pytest.raises(SystemExit) as ended:
-        main(["run", "--help"])
-    assert ended.value.code == 0 and capsys.readouterr().out == told
-    assert main(["help"]) == 0
-    assert "recover" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["run", "--nativ"], ["run", "--set", "Kp"], ["run", "--set", "Kp=high"], ["nothing"],
-        ["sweep", "--grid", "Kp=1"], ["sweep", "--resume"], ["plot"], ["help", "nothing"],
-        ["publish", "--rate", "0"], ["run", "x.fmu", "--native"], ["run", "--stop-time", "inf"],
-    ],
-)  # fmt: skip
-def test_a_wrong_command_line_is_status_2(
-    arguments: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
+ABSENT = {
+    "twodof.view('bag')": "view",
+    "twodof.live('x.fmu')": "view",
+    "twodof.plot('bag')": "view",
+    "twodof.sweep('x.fmu', grid={'Kp': [1.0]})": "sweep",
+    "twodof.publish('x.fmu')": "ros",
+}
+CALLS = """
+for call in sys.argv[1:]:
+    eval(call.partition("(")[0])
     try:
-        status: object = main(arguments)
-    except SystemExit as ended:
-        status = ended.code
-    assert status == 2
-    assert "twodof" in capsys.readouterr().err
-    assert not [path for path in tmp_path.iterdir() if path.suffix != ".fmu"]
+        eval(call)
+    except twodof.TwoDofError as error:
+        print(error)
+"""
 
 
-def test_facts_as_json(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def facts(*arguments: object) -> dict[str, object]:
-        assert main([*map(str, arguments), "--json"]) == 0
-        told: dict[str, object] = json.loads(capsys.readouterr().out)
-        return told
-
-    bag, table = tmp_path / "bag", tmp_path / "sweep"
-    run = facts("run", native_path, "-o", bag, "--stop-time", 0.5, "--scene")
-    (last,) = (twodof.samples(native_path, stop_time=0.5),)
-    *_, sample = last
-    assert (run["joint_states"], run["q"], run["error"]) == (51, [*sample.q], sample.error)
-    info = facts("info", bag)
-    assert (info["kind"], info["joint_states"]) == ("bag", 51)
-    assert {topic["name"] for topic in info["topics"]} >= {"/tf", "/target"}  # type: ignore[attr-defined]
-    assert facts("info", native_path)["guid"] == twodof.load_fmu(native_path).guid
-    swept = facts("sweep", native_path, "--grid", "Kp=20:60:3", "--stop-time", 0.2, "-o", table)
-    assert (swept["runs"], swept["outcomes"]) == (3, {"finished": 3})
-    assert facts("info", table)["best"] == swept["best"]
-
-
-def test_messages_name_arguments_in_python_and_options_on_the_command_line(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.01)
-    with pytest.raises(twodof.TwoDofError, match=r"`path` or give `overwrite=True`"):
-        twodof.Bag(tmp_path / "bag")
-    assert main(["run", str(native_path), "-o", str(tmp_path / "bag")]) == 1
-    assert "choose another with -o or give --overwrite" in capsys.readouterr().err
-
-
-def test_one_value_for_a_vector_says_that_it_was_spread(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--set", "Kp=60"]
-    assert main(["run", str(native_path), *options]) == 0
-    assert "Kp            60, all 2 elements\n" in capsys.readouterr().out
-    given = twodof.read_bag(tmp_path / "bag").provenance["start_values"]
-    assert given["Kp[1]"] == given["Kp[2]"] == 60.0
+def test_what_needs_an_extra_says_so_when_it_is_used(tmp_path: Path) -> None:
+    names = ["websockets", "matplotlib", "pyarrow", "cyclonedds"]
+    errors = program(names, CALLS, tmp_path, *ABSENT).splitlines()
+    for error, extra in zip(errors, ABSENT.values(), strict=True):
+        assert f"extra '{extra}'" in error
 
 
 def test_times_are_those_of_the_fmus_default_experiment(native_path: Path, tmp_path: Path) -> None:
@@ -253,20 +176,6 @@ def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path:
     (tmp_path / "in.csv").write_text("time,Kp,Kp[2]\n0,50,60\n")
     with pytest.raises(twodof.TwoDofError, match=r"two columns for 'Kp\[2\]'"):
         twodof.experiment(native_path, input_file=tmp_path / "in.csv")
-
-
-def test_the_shell_completes_verbs_and_options(tmp_path: Path) -> None:
-    answer = tmp_path / "answer"
-    for line, expected in (("twodof pu", "publish"), ("twodof run --stor", "--storage")):
-        subprocess.run(
-            [sys.executable, "-m", "twodof"],
-            env={
-                **os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
-                "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "COMP_TYPE": "9",
-            },
-            check=True,
-        )  # fmt: skip
-        assert expected in answer.read_text()
 
 
 def test_versions_are_of_what_is_installed() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import twodof
-from twodof.cli.common import parse_settings
+from twodof.cli.options import parse_settings
 from twodof.errors import InputError
 from twodof.fmu import Fmu
 from twodof.simulation.experiments import Setting, read_changes, resolve

@@ -18,9 +18,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or to be ignored
     if heard:
         signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
-    from .cli.common import INTERRUPTED
-    from .cli.main import interrupt
     from .cli.main import main as command
+    from .cli.signals import INTERRUPTED, interrupt
 
     try:
         if heard:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from .common import best_runs, controlled, print_best, print_json, print_table
-from .options import add_json_option
+from .options import add_options
+from .printing import print_json, print_table
+from .sweep import best_runs, print_best
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -18,12 +19,10 @@ if TYPE_CHECKING:
     from ..fmu import Fmu
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    info = verbs.add_parser("info", help="show what is in an FMU, a bag or a sweep")
+def add(info: argparse.ArgumentParser) -> None:
+    """The verb's options."""
     info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path)
-    add_json_option(info)
-    info.set_defaults(call=call)
+    add_options(info, "--json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -162,6 +161,15 @@ def _print_fmu(fmu: Fmu) -> None:
             rows.append((f"{group}{size}", units, starts, causality))
     print()
     print_table(*rows)
+
+
+def controlled(fmu: Fmu) -> str:
+    """What an FMU controls."""
+    if not fmu.frame:
+        return "unknown"
+    of = f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}"
+    law = "task control with --orientation" if fmu.control == "pose" else f"{fmu.control} control"
+    return f"{of}; {law}" if fmu.control else of
 
 
 def _start(text: str) -> str:

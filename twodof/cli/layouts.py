@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from .common import chosen_fmu, print_next, print_table, quote
-from .options import add_fmu
+from .fmus import chosen_fmu
+from .options import add_fmu, add_options
+from .printing import print_next, print_table, quote
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    layouts = verbs.add_parser(
-        "layouts", help="write layouts of a robot for RViz, PlotJuggler and Foxglove",
-        description="Write files in which RViz, PlotJuggler and Foxglove show a robot that is"
-        " published, or recorded with --scene and --effort.",
-    )  # fmt: skip
-    add_fmu(layouts)
+def add(layouts: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    layouts.description = (
+        "Write files in which RViz, PlotJuggler and Foxglove show a robot that is published, or"
+        " recorded with --scene and --effort."
+    )
+    add_fmu(layouts, "TwoDof.fmu, built if need be")
+    add_options(layouts, "--frame")
     layouts.add_argument("-o", dest="folder", default=".", metavar="FOLDER", help="(%(default)s)")
-    layouts.add_argument("--namespace", default="", metavar="NS", help="of the topics")
+    add_options(layouts, "--namespace")
     layouts.add_argument("--overwrite", action="store_true", help="replace files that differ")
-    layouts.set_defaults(call=call, native=False)
+    layouts.set_defaults(native=False)
 
 
 def call(options: argparse.Namespace) -> int:

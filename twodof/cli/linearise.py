@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from .common import parse_settings, print_json, print_table
-from .options import add_json_option
+from .options import add_options, parse_settings
+from .printing import print_json, print_table
 
 if TYPE_CHECKING:
     from ..linear import LinearModel
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    linearise = verbs.add_parser(
-        "linearise", help="show the linear model of a native FMU about an operating point"
-    )
+def add(linearise: argparse.ArgumentParser) -> None:
+    """The verb's options."""
     linearise.add_argument("fmu", metavar="FMU")
     linearise.add_argument(
         "--at", action="append", default=[], metavar="NAME=VALUE",
         help="of the point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
         " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
     )  # fmt: skip
-    add_json_option(linearise)
-    linearise.set_defaults(call=call)
+    add_options(linearise, "--json")
 
 
 def call(options: argparse.Namespace) -> int:

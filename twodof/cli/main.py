@@ -6,7 +6,6 @@ Imports are inside the verbs, so that ``twodof --help`` is instant.
 from __future__ import annotations
 
 import argparse
-import errno
 import io
 import logging
 import os
@@ -18,11 +17,25 @@ from typing import Any
 from ..errors import TwoDofError
 from ..version import __version__
 from . import build, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
-from .common import INTERRUPTED, CommandLineError, in_options, plain
+from .options import CommandLineError
+from .printing import in_options, plain
+from .signals import INTERRUPTED, is_interrupt
 
-VERBS = (build, run, publish, layouts, info, linearise, plot, view, live, page, sweep, recover)
+VERBS = {
+    build: "build an FMU from a URDF",
+    run: "simulate an FMU and write a bag",
+    publish: "step an FMU in real time on a ROS 2 network",
+    layouts: "write layouts of a robot for RViz, PlotJuggler and Foxglove",
+    info: "show what is in an FMU, a bag or a sweep",
+    linearise: "show the linear model of a native FMU about an operating point",
+    plot: "draw bags, or the map of a sweep, into one figure",
+    view: "replay a bag in the browser",
+    live: "drive an FMU in the browser",
+    page: "write a robot as one HTML file that runs",
+    sweep: "run an FMU over many gains, and map what comes out",
+    recover: "make a bag whose writer died complete",
+}
 LONGEST_LINE = 2000
-_interrupts: list[int] = []
 
 
 class _Parser(argparse.ArgumentParser):
@@ -33,7 +46,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser; what it gives has the verb's name as ``verb``."""
+    """The parser; what it gives has the verb's name as ``verb``, and what it does as ``call``."""
     program = _Parser(
         prog="twodof",
         description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
@@ -41,13 +54,10 @@ def parser() -> argparse.ArgumentParser:
     )
     program.add_argument("--version", action="version", version=f"twodof {__version__}")
     verbs = program.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for verb in VERBS:
-        verb.add(verbs)
-    _add_help(program, verbs)
-    return program
-
-
-def _add_help(program: argparse.ArgumentParser, verbs: Any) -> None:
+    for verb, text in VERBS.items():
+        added = verbs.add_parser(verb.__name__.rpartition(".")[2], help=text)
+        added.set_defaults(call=verb.call)
+        verb.add(added)
     helped = verbs.add_parser("help", help="show this, or the options of a verb")
     helped.add_argument("about", nargs="?", metavar="VERB", choices=[*verbs.choices])
 
@@ -56,6 +66,7 @@ def _add_help(program: argparse.ArgumentParser, verbs: Any) -> None:
         return 0
 
     helped.set_defaults(call=call)
+    return program
 
 
 class _Words(logging.Formatter):
@@ -86,22 +97,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except MemoryError:
         return _fail("there is not enough memory")
-    except ImportError as error:  # of a broken environment, or where memory does not do
-        if _interrupts:
+    except (ImportError, OSError) as error:
+        if is_interrupt(error):
             return _fail("interrupted", INTERRUPTED)
-        return _fail(f"cannot load what it needs: {error}")
-    except OSError as error:
-        if _is_interrupt(error):
-            return _fail("interrupted", INTERRUPTED)
+        if isinstance(error, ImportError):  # of a broken environment, or where memory does not do
+            return _fail(f"cannot load what it needs: {error}")
         _silence()
         culprit = "" if error.filename is None else f"'{error.filename}': "
         return _fail(f"{culprit}{error.strerror or error}")
-
-
-def interrupt(number: int, _frame: object) -> None:
-    """Ctrl-C; noted, as a module in C that is being imported makes an ImportError of it."""
-    _interrupts.append(number)
-    raise KeyboardInterrupt
 
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:
@@ -121,14 +124,6 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     return options
-
-
-def _is_interrupt(error: OSError) -> bool:
-    """Whether Ctrl-C came while a file was closed, which then is closed again and fails.
-
-    So does ``shutil.rmtree``, which removes the folder that an FMU was unzipped to.
-    """
-    return error.errno == errno.EBADF and isinstance(error.__context__, KeyboardInterrupt)
 
 
 def _fail(message: str, status: int = 1) -> int:

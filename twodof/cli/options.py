@@ -1,11 +1,71 @@
-"""Options that several verbs have."""
+"""Options that several verbs have, and what they say."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from .common import CommandLineError
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from ..simulation.experiments import Setting
+
+
+class CommandLineError(InputError):
+    """An option is wrong, or does not go with another."""
+
+
+def not_empty(text: str) -> str:
+    """A text that is not empty, as that of a variable is which a shell does not know."""
+    if not text:
+        raise argparse.ArgumentTypeError("it is empty")
+    return text
+
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    # what is run, for how long
+    "--frame": dict(
+        type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)",
+    ),
+    "--native": dict(action="store_true", help="build and run a native FMU, of a URDF or none"),
+    "--stop-time": dict(type=float, metavar="S", help="s (the FMU's own)"),
+    "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's own)"),
+    "--set": dict(
+        dest="settings", action="append", default=[], metavar="NAME=VALUE",
+        help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
+    ),
+    "--input": dict(
+        metavar="CSV|BAG[:TOPIC]",
+        help="inputs over time: a column 'time' and one for each input; or a bag's commands",
+    ),
+    # what it leaves
+    "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)"),
+    "--scene": dict(
+        action="store_true", help="add robot description, tf, target and end effector"
+    ),
+    "--effort": dict(action="store_true", help="add the control effort"),
+    "--stamp-start": dict(type=float, metavar="S", help="first stamp, s since the epoch (now)"),
+    "--overwrite": dict(action="store_true", help="replace an existing bag"),
+    "--json": dict(action="store_true", help="print the facts as JSON, SI units"),
+    "--fsync": dict(
+        action="store_true", help="wait for the disk twice a second, for a power loss"
+    ),
+    "--namespace": dict(default="", metavar="NS", help="of the topics"),
+    # where a page is served
+    "--host": dict(help="address to listen on (127.0.0.1, this machine alone)"),
+    "--port": dict(type=int, help="(8080); 0: any that is free"),
+    "--no-browser": dict(action="store_true", help="open no browser"),
+}  # fmt: skip
+
+OF_A_RUN = (
+    "--native", "--set", "--input", "--storage", "--scene", "--effort", "--stamp-start",
+    "--overwrite", "--json", "--fsync",
+)  # fmt: skip
+"""That may leave a bag, but for what is run."""
+OF_A_PAGE = ("--host", "--port", "--no-browser")
 
 SAME = {
     "-o": ("output",),
@@ -14,6 +74,37 @@ SAME = {
     "--range": ("ranges",),
 }
 """What options are called in the namespace, where that is not their own name."""
+
+
+def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add options of the table."""
+    for name in names:
+        parser.add_argument(name, **OPTIONS[name])
+
+
+def add_fmu(parser: argparse.ArgumentParser, default: str, metavar: str = "FMU|URDF") -> None:
+    """Add what is run, which can be left out."""
+    parser.add_argument(
+        "fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}"
+    )
+
+
+def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    """Add where what is made goes."""
+    parser.add_argument("-o", dest="output", type=not_empty, metavar=metavar, help=text)
+
+
+def add_robot_options(parser: argparse.ArgumentParser) -> None:
+    """Add the robot of a bag from elsewhere."""
+    parser.add_argument(
+        "--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none"
+    )
+    parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
+
+
+def said(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """What options say that are called as arguments of the library."""
+    return {name: getattr(options, name) for name in names}
 
 
 def check_company(
@@ -37,108 +128,36 @@ def check_company(
 def _given(options: argparse.Namespace, option: str) -> bool:
     """Whether an option is on the command line; such ones have no defaults of their own."""
     names = SAME.get(option, (option.lstrip("-").replace("-", "_"),))
-    values = [getattr(options, name) for name in names]
-    return any(value is not None and value is not False and value != [] for value in values)
+    return any(value is not None and value is not False and value != []
+               for value in said(options, *names).values())  # fmt: skip
 
 
-def not_empty(text: str) -> str:
-    """A text that is not empty, as that of a variable is which a shell does not know."""
-    if not text:
-        raise argparse.ArgumentTypeError("it is empty")
-    return text
+def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
+    """NAME=VALUE texts of an option: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
+    settings: dict[str, Setting] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise CommandLineError(f"{option} {text}: expected NAME=VALUE")
+        if name in settings:
+            raise CommandLineError(f"{option} {name} is given twice")
+        settings[name] = _parse_value(f"{option} {name}", value.strip())
+    return settings
 
 
-def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
-    """Where what is made goes."""
-    parser.add_argument("-o", dest="output", type=not_empty, metavar=metavar, help=text)
+def _parse_value(name: str, text: str) -> Setting:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise CommandLineError(f"{name}={text}: '{text}' is not a number") from None
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Of a run that may leave a bag, but for what is run."""
-    parser.add_argument(
-        "--native", action="store_true", help="build and run the native default FMU instead"
-    )
-    add_set_option(parser)
-    parser.add_argument(
-        "--input", metavar="CSV|BAG[:TOPIC]",
-        help="inputs over time: a column 'time' and one for each input; or a bag's commands",
-    )  # fmt: skip
-    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
-    parser.add_argument(
-        "--scene", action="store_true", help="add robot description, tf, target and end effector"
-    )
-    parser.add_argument("--effort", action="store_true", help="add the control effort")
-    parser.add_argument(
-        "--stamp-start", type=float, metavar="S", help="first stamp, s since the epoch (now)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
-    add_json_option(parser)
-    parser.add_argument(
-        "--fsync", action="store_true", help="wait for the disk twice a second, for a power loss"
-    )
+def dated(stem: str) -> Path:
+    """The default name of what a run leaves."""
+    from ..files import free_name
 
-
-def add_fmu(parser: argparse.ArgumentParser) -> None:
-    """What is run."""
-    parser.add_argument(
-        "fmu", nargs="?", type=not_empty, metavar="FMU|URDF",
-        help="default: TwoDof.fmu, built if need be",
-    )  # fmt: skip
-    add_frame_option(parser)
-
-
-def add_frame_option(parser: argparse.ArgumentParser) -> None:
-    """Of a URDF that is run, for `chosen_fmu`."""
-    parser.add_argument(
-        "--frame",
-        type=not_empty,
-        metavar="LINK",
-        help="of a URDF, the controlled link (its end)",
-    )
-
-
-def add_time_options(parser: argparse.ArgumentParser) -> None:
-    """Stop time and step."""
-    parser.add_argument("--stop-time", type=float, metavar="S", help="s (the FMU's own)")
-    add_step_option(parser)
-
-
-def add_step_option(parser: argparse.ArgumentParser) -> None:
-    """Communication step."""
-    parser.add_argument(
-        "--step", type=float, metavar="S", help="communication step, s (the FMU's own)"
-    )
-
-
-def add_set_option(parser: argparse.ArgumentParser) -> None:
-    """Start values."""
-    parser.add_argument(
-        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE",
-        help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
-    )  # fmt: skip
-
-
-def add_json_option(parser: argparse.ArgumentParser) -> None:
-    """Facts for another program."""
-    parser.add_argument("--json", action="store_true", help="print the facts as JSON, SI units")
-
-
-def add_robot_options(parser: argparse.ArgumentParser) -> None:
-    """Robot of a bag from elsewhere."""
-    parser.add_argument(
-        "--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none"
-    )
-    parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
-
-
-def add_page_options(parser: argparse.ArgumentParser) -> None:
-    """Where a page is served."""
-    parser.add_argument("--host", help="address to listen on (127.0.0.1, this machine alone)")
-    parser.add_argument("--port", type=int, help="(8080); 0: any that is free")
-    parser.add_argument("--no-browser", action="store_true", help="open no browser")
-
-
-def page_place(options: argparse.Namespace) -> dict[str, Any]:
-    """Where a page is served, as far as the options say it."""
-    given = {name: getattr(options, name) for name in ("host", "port")}
-    return {name: value for name, value in given.items() if value is not None}
+    return free_name(time.strftime(f"{stem}_%Y_%m_%d-%H_%M_%S"))

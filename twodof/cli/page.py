@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
-from typing import Any
 
-from .common import chosen_fmu, parse_settings, print_table
-from .options import add_frame_option, add_output, add_set_option, add_step_option, not_empty
+from .fmus import chosen_fmu, is_robot
+from .options import add_fmu, add_options, add_output, parse_settings
+from .printing import print_table
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    page = verbs.add_parser(
-        "page", help="write a robot as one HTML file that runs",
-        description="Write a native FMU as one HTML file: the robot in 3D, its plant running in the"
-        " browser, a target to drag. It needs no network and no server.",
-    )  # fmt: skip
-    page.add_argument(
-        "fmu", nargs="?", type=not_empty, metavar="FMU|URDF",
-        help="default: the default arm's native FMU",
-    )  # fmt: skip
+def add(page: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    page.description = (
+        "Write a native FMU as one HTML file: the robot in 3D, its plant running in the browser, a"
+        " target to drag. It needs no network and no server."
+    )
+    add_fmu(page, "the default arm's native FMU")
     add_output(page, "FILE.html", "default: <name>.html")
-    add_frame_option(page)
-    add_step_option(page)
-    add_set_option(page)
-    page.set_defaults(call=call)
+    add_options(page, "--frame", "--step", "--set")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -33,10 +25,11 @@ def call(options: argparse.Namespace) -> int:
     from ..files import free_name
     from ..pages.arm import is_page, page
 
-    options.native = not options.fmu or Path(options.fmu).suffix in (".urdf", ".xacro")
+    settings = parse_settings(options.settings)
+    options.native = not options.fmu or is_robot(options.fmu)
     fmu = chosen_fmu(options)
     output = options.output or free_name(fmu.stem, ".html", is_page)
-    path = page(fmu, output, step=options.step, settings=parse_settings(options.settings))
+    path = page(fmu, output, step=options.step, settings=settings)
     size = path.stat().st_size / 1024
     print_table(("FMU", str(fmu)), ("page", f"{path} ({size:.0f} KB); it needs no network"))
     return 0

@@ -5,27 +5,26 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from .common import CommandLineError, print_best, print_table
-from .options import add_output, add_robot_options
+from .options import CommandLineError, add_output, add_robot_options
+from .printing import print_table
+from .sweep import print_best
 
 if TYPE_CHECKING:
     from ..plots.figure import Drawing
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    plot = verbs.add_parser(
-        "plot", help="draw bags, or the map of a sweep, into one figure",
-        description="Draw joint positions, velocities and efforts, the end effector's path and its"
-        " error; of a sweep, each metric over the variables.",
-    )  # fmt: skip
+def add(plot: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    plot.description = (
+        "Draw joint positions, velocities and efforts, the end effector's path and its error; of a"
+        " sweep, each metric over the variables."
+    )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
     add_output(plot, "FILE", ".png, .svg, .pdf or .html (a window)")
     plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     add_robot_options(plot)
-    plot.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -7,24 +7,13 @@ import math
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from .common import (
-    INTERRUPTED,
-    CommandLineError,
-    asked_to_stop,
-    bag_of,
-    experiment_of,
-    facts_of,
-    identifier,
-    in_options,
-    print_json,
-    print_next,
-    print_summary,
-    print_table,
-    quote,
-)
-from .options import add_frame_option, add_output, add_run_options, check_company
+from .fmus import identifier
+from .options import OF_A_RUN, CommandLineError, add_options, add_output, check_company, said
+from .printing import in_options, print_json, print_next, print_table, quote
+from .run import bag_of, experiment_of, facts_of, print_summary
+from .signals import INTERRUPTED, asked_to_stop
 
 if TYPE_CHECKING:
     from ..ros.foxglove import Foxglove
@@ -32,66 +21,46 @@ if TYPE_CHECKING:
     from ..simulation.experiments import Experiment
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    publish = verbs.add_parser(
-        "publish", help="step an FMU in real time on a ROS 2 network",
-        description="Step an FMU in real time and publish each step as sensor_msgs/JointState over"
-        " DDS, until Ctrl-C. Commands from others drive the robot: joint states on /joint_commands,"
-        " or points on /target_command and /clicked_point, as its control takes. Honours"
-        " ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and"
-        " CYCLONEDDS_URI.",
-    )  # fmt: skip
-    publish.add_argument(
+def add(publish: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    publish.description = (
+        "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
+        " Ctrl-C. Commands from others drive the robot: joint states on /joint_commands, or points"
+        " on /target_command and /clicked_point, as its control takes. Honours ROS_DOMAIN_ID,"
+        " ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and CYCLONEDDS_URI."
+    )
+    option, flag = publish.add_argument, partial(publish.add_argument, action="store_true")
+    option(
         "robots", nargs="*", metavar="[NAME=]FMU|URDF",
         help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME"
         " or its file's",
     )  # fmt: skip
     add_output(publish, "BAG", "record a bag too, one of all robots")
-    add_frame_option(publish)
-    publish.add_argument("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
-    publish.add_argument(
-        "--rate", type=float, default=100.0, metavar="HZ", help="steps a second (%(default)g)"
-    )
-    publish.add_argument(
-        "--subnet", action="store_true", help="for other hosts too, not for this one alone"
-    )
-    publish.add_argument(
-        "--foxglove", action="store_true", help="serve Foxglove too, on this machine alone"
-    )
-    publish.add_argument("--foxglove-port", type=int, metavar="PORT", help="(8765)")
-    _add_loop_options(publish)
-    add_run_options(publish)
-    publish.set_defaults(call=call, storage=None)
-
-
-def _add_loop_options(publish: argparse.ArgumentParser) -> None:
-    """Of a robot in the loop of a controller."""
-    publish.add_argument("--namespace", default="", metavar="NS", help="of the topics")
-    publish.add_argument(
-        "--state-topic", default="joint_states", metavar="TOPIC", help="(%(default)s)"
-    )
-    publish.add_argument(
+    add_options(publish, "--frame")
+    option("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
+    option("--rate", type=float, default=100.0, metavar="HZ", help="steps a second (%(default)g)")
+    flag("--subnet", help="for other hosts too, not for this one alone")
+    flag("--foxglove", help="serve Foxglove too, on this machine alone")
+    option("--foxglove-port", type=int, metavar="PORT", help="(8765)")
+    add_options(publish, "--namespace")
+    option("--state-topic", default="joint_states", metavar="TOPIC", help="(%(default)s)")
+    option(
         "--command-topic", metavar="TOPIC",
         help="where commands are heard (joint_commands or target_command, as the control takes)",
     )  # fmt: skip
-    publish.add_argument(
-        "--lockstep", action="store_true", help="do a step when its command has come, by stamp"
-    )
-    publish.add_argument(
+    flag("--lockstep", help="do a step when its command has come, by stamp")
+    option(
         "--timeout", type=float, metavar="S",
         help="s without a command until the robot is held (0.5), or in lockstep until the end (10)",
     )  # fmt: skip
-    publish.add_argument(
+    option(
         "--on-timeout", choices=("hold", "ramp"),
         help="hold the last command (targets), or ramp to zero (efforts)",
     )  # fmt: skip
-    publish.add_argument(
-        "--clock", action="store_true", help="publish /clock, and hear /pause and /step"
-    )
-    publish.add_argument(
-        "--speed", type=float, metavar="FACTOR", help="of real time (1; in lockstep unlimited)"
-    )
+    flag("--clock", help="publish /clock, and hear /pause and /step")
+    option("--speed", type=float, metavar="FACTOR", help="of real time (1; in lockstep unlimited)")
+    add_options(publish, *OF_A_RUN)
+    publish.set_defaults(storage=None)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -111,13 +80,14 @@ def call(options: argparse.Namespace) -> int:
     if bag is not None:  # a part of it for each robot, in its namespace
         space = options.namespace
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
-    wire: dict[str, Any] = dict(
-        place=network(subnet=options.subnet), scene=options.scene, effort=options.effort,
-        clock=options.clock, namespace=options.namespace, state_topic=options.state_topic,
-        command_topic=options.command_topic, lockstep=options.lockstep, timeout=options.timeout,
-        on_timeout=options.on_timeout,
-        opened=(lambda _: None) if options.json else partial(_print_network, options.stop_time),
+    wire = said(
+        options, "scene", "effort", "clock", "namespace", "state_topic", "command_topic",
+        "lockstep", "timeout", "on_timeout",
     )  # fmt: skip
+    wire["place"] = network(subnet=options.subnet)
+    wire["opened"] = (
+        (lambda _: None) if options.json else partial(_print_network, options.stop_time)
+    )
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
     with asked_to_stop() as asked:
@@ -140,8 +110,8 @@ def call(options: argparse.Namespace) -> int:
     else:
         for name, summary in summaries.items():
             print_summary(options, robots[name], bags.get(name), summary, pace)
-    if bag is not None and not options.json:
-        print_next(f"twodof plot {quote(bag.path)}", f"ros2 bag play {quote(bag.path)}")
+        if bag is not None:
+            print_next(f"twodof plot {quote(bag.path)}", f"ros2 bag play {quote(bag.path)}")
     return INTERRUPTED if any(summary.stopped for summary in summaries.values()) else 0
 
 

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from .common import print_next, print_table, quote
+from .printing import print_next, print_table, quote
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    recover = verbs.add_parser(
-        "recover", help="make a bag whose writer died complete",
-        description="Make a bag whose writer died complete, so that every reader opens it.",
-    )  # fmt: skip
+def add(recover: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    recover.description = "Make a bag whose writer died complete, so that every reader opens it."
     recover.add_argument("bag", metavar="BAG", type=Path)
-    recover.set_defaults(call=call)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -5,38 +5,39 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .common import (
-    INTERRUPTED,
+from .fmus import chosen_fmu
+from .options import (
+    OF_A_RUN,
     CommandLineError,
-    asked_to_stop,
-    bag_of,
+    add_fmu,
+    add_options,
+    add_output,
     dated,
-    experiment_of,
-    print_next,
-    print_summary,
-    quote,
+    parse_settings,
+    said,
 )
-from .options import add_fmu, add_output, add_run_options, add_time_options
+from .printing import print_json, print_next, print_table, quote
+from .signals import INTERRUPTED, asked_to_stop
 
 if TYPE_CHECKING:
+    from ..bag.writer import Bag
     from ..simulation.experiments import Experiment
+    from ..simulation.master import Summary
+    from ..simulation.pace import RealTime
     from ..simulation.sample import Sample, Sink
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    run = verbs.add_parser(
-        "run", help="simulate an FMU and write a bag",
-        description="Simulate an FMU and write each step as sensor_msgs/JointState into a bag.",
-    )  # fmt: skip
+def add(run: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "default: rosbag2_<date and time>")
-    add_time_options(run)
+    add_options(run, "--stop-time", "--step")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
-    add_fmu(run)
-    add_run_options(run)
-    run.set_defaults(call=call)
+    add_fmu(run, "TwoDof.fmu, built if need be")
+    add_options(run, "--frame", *OF_A_RUN)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -52,18 +53,98 @@ def call(options: argparse.Namespace) -> int:
     bag = bag_of(options, options.output or dated("rosbag2"))
     pace = RealTime() if options.realtime else None
     with asked_to_stop() as asked:
-        summary = simulate(run, bag, *progress(), pace=pace, stop=asked)
-    print_summary(options, run, bag, summary, pace)
-    if not options.json:
-        print_next(
-            f"twodof plot {quote(bag.path)}",
-            f"twodof view {quote(bag.path)}",
-            f"ros2 bag play {quote(bag.path)}",
-        )
+        summary = simulate(run, bag, *_progress(), pace=pace, stop=asked)
+    if options.json:
+        print_json(**facts_of(run, bag, summary, pace))
+    else:
+        print_summary(options, run, bag, summary, pace)
+        path = quote(bag.path)
+        print_next(f"twodof plot {path}", f"twodof view {path}", f"ros2 bag play {path}")
     return INTERRUPTED if summary.stopped else 0
 
 
-def progress() -> list[Sink]:
+def experiment_of(
+    options: argparse.Namespace, stop_time: float | None, step: float | None
+) -> Experiment:
+    """The experiment that the options ask for."""
+    from ..fmu import load_fmu
+    from ..simulation.experiments import experiment
+
+    settings = parse_settings(options.settings)
+    fmu, table, changes = load_fmu(chosen_fmu(options)), options.input, None
+    if table is not None:
+        folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
+        if Path(folder).is_dir() and folder:
+            from ..bag.commands import read_commands
+            from ..bag.provenance import robots_of
+
+            if topic in robots_of(Path(folder)):  # of one of several robots, as it was driven
+                folder, topic = table, None
+            table = None
+            changes = read_commands(fmu, folder, topic, step=step, settings=settings)
+    return experiment(
+        fmu, stop_time=stop_time, step=step, settings=settings,
+        input_file=table, changes=changes, stamp_start=options.stamp_start,
+    )  # fmt: skip
+
+
+def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
+    """The bag that the options ask for."""
+    from ..bag.writer import Bag
+
+    names = ("storage", "scene", "effort", "overwrite", "fsync", "command_line")
+    return Bag(path, **said(options, *names))
+
+
+def facts_of(
+    run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None
+) -> dict[str, Any]:
+    """How a run went, for another program."""
+    last = summary.last
+    return dict(
+        fmu=str(run.fmu.path),
+        bag=None if bag is None else bag.address,
+        joint_states=last.k + 1,
+        end_time=last.t,
+        stopped=summary.stopped,
+        q=last.q, v=last.v, x=last.x, x_des=last.target, error=summary.error,
+        wall_time=summary.wall_time,
+        missed=None if pace is None else pace.missed,
+        worst=None if pace is None else pace.worst,
+    )  # fmt: skip
+
+
+def print_summary(
+    options: argparse.Namespace, run: Experiment, bag: Bag | None, summary: Summary,
+    pace: RealTime | None,
+) -> None:  # fmt: skip
+    """How a run went."""
+    last = summary.last
+    rows = [("FMU", f"{run.fmu.path}")]
+    for name, value in parse_settings(options.settings).items():
+        elements = run.fmu.vector(name)
+        if len(elements) > 1 and isinstance(value, int | float):
+            rows.append((f"{name}", f"{value:g}, all {len(elements)} elements"))
+    if bag is not None:
+        messages = f"{last.k + 1} messages on {bag.topic}, {options.storage}"
+        rows.append(("bag", f"{bag.address} ({messages})"))
+    if summary.error is not None:
+        target = ", ".join(f"{value:g}" for value in last.target or ())
+        rows.append(("end effector", f"{summary.error:.3g} m from its target ({target}) m"))
+    simulated = last.k * run.step
+    speed = simulated / summary.wall_time if summary.wall_time else 0.0
+    taken = f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time"
+    rows.append(("time", taken))
+    if pace is not None:
+        missed = f"{pace.missed} of {last.k + 1} missed, worst {pace.worst * 1e3:.1f} ms"
+        rows.append(("deadlines", missed))
+    if summary.stopped:
+        complete = "" if bag is None else "; the bag is complete up to there"
+        rows.append(("stopped", f"on request at {last.t:g} s{complete}"))
+    print_table(*rows)
+
+
+def _progress() -> list[Sink]:
     """A sink that shows a bar on a terminal; none in a pipe."""
     if not sys.stderr.isatty():
         return []

@@ -5,65 +5,54 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterable
+from functools import partial
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from .common import (
-    INTERRUPTED,
-    CommandLineError,
-    asked_to_stop,
-    best_runs,
-    dated,
-    fast_fmu,
-    parse_settings,
-    print_best,
-    print_json,
-    print_next,
-    print_table,
-    quote,
-)  # fmt: skip
+from .fmus import fast_fmu
 from .options import (
-    add_json_option,
+    CommandLineError,
+    add_fmu,
+    add_options,
     add_output,
-    add_set_option,
-    add_time_options,
     check_company,
-    not_empty,
+    dated,
+    parse_settings,
+    said,
 )
+from .printing import print_json, print_next, print_table, quote
+from .signals import INTERRUPTED, asked_to_stop
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    sweep = verbs.add_parser(
-        "sweep", help="run an FMU over many gains, and map what comes out",
-        description="Run an FMU over a grid or random values of any of its inputs and parameters."
-        " The native default FMU is built where none is named.",
-    )  # fmt: skip
-    sweep.add_argument(
-        "fmu", nargs="?", type=not_empty, metavar="FMU", help="default: the default arm's"
+def add(sweep: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    sweep.description = (
+        "Run an FMU over a grid or random values of any of its inputs and parameters. The native"
+        " default FMU is built where none is named."
     )
-    sweep.add_argument(
+    option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
+    add_fmu(sweep, "the default arm's", "FMU")
+    option(
         "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",
         help="values evenly spaced; all combinations of several",
     )  # fmt: skip
-    sweep.add_argument("--random", type=int, metavar="N", help="draws of each --range")
-    sweep.add_argument("--seed", type=int, metavar="S", help="of the draws (0)")
-    sweep.add_argument(
+    option("--random", type=int, metavar="N", help="draws of each --range")
+    option("--seed", type=int, metavar="S", help="of the draws (0)")
+    option(
         "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH",
         help="values drawn uniformly",
     )  # fmt: skip
-    add_time_options(sweep)
-    add_set_option(sweep)
+    add_options(sweep, "--stop-time", "--step", "--set")
     add_output(sweep, "OUT", "default: sweep_<date and time>")
-    sweep.add_argument(
-        "--resume", action="store_true", help="go on with OUT; what is done is not repeated"
-    )
-    sweep.add_argument("--bags", action="store_true", help="keep a bag of each run in OUT/bags")
-    sweep.add_argument("--workers", type=int, metavar="N", help="local processes (one for a core)")
-    sweep.add_argument("--scheduler", metavar="tcp://…", help="of a Dask cluster to use instead")
-    add_json_option(sweep)
-    sweep.set_defaults(call=call)
+    flag("--resume", help="go on with OUT; what is done is not repeated")
+    flag("--bags", help="keep a bag of each run in OUT/bags")
+    option("--workers", type=int, metavar="N", help="local processes (one for a core)")
+    option("--scheduler", metavar="tcp://…", help="of a Dask cluster to use instead")
+    add_options(sweep, "--json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -77,7 +66,7 @@ def call(options: argparse.Namespace) -> int:
         needs={"--resume": "-o", "--seed": "--random"},
         excludes={"--workers": "--scheduler"},
     )
-    grid, ranges = parse_grids(options.grids), parse_ranges(options.ranges)
+    grid, ranges = _grids(options.grids), _ranges(options.ranges)
     settings = parse_settings(options.settings)
     fmu = fast_fmu(options)
     output = Path(options.output or dated("sweep"))
@@ -97,10 +86,9 @@ def call(options: argparse.Namespace) -> int:
 
         table = sweep(
             fmu, grid=grid, ranges=ranges, random=options.random or 0, seed=options.seed or 0,
-            stop_time=options.stop_time, step=options.step, settings=settings, output=output,
-            resume=options.resume, bags=options.bags, workers=options.workers,
-            scheduler=options.scheduler, progress=progress, stop=asked,
-            command_line=options.command_line,
+            settings=settings, output=output, progress=progress, stop=asked,
+            **said(options, "stop_time", "step", "resume", "bags", "workers", "scheduler",
+                   "command_line"),
         )  # fmt: skip
     stopped = len(table) < total
     counts = table["outcome"].value_counts()
@@ -123,8 +111,32 @@ def call(options: argparse.Namespace) -> int:
     return INTERRUPTED if stopped else 0
 
 
-def parse_grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
-    """NAME=LOW:HIGH:COUNT texts of a command line: evenly spaced values, both ends included."""
+def best_runs(table: DataFrame) -> DataFrame:
+    """The first few runs by settling time, effort and final error: variables, metrics known."""
+    from ..sweeps.results import ranked
+
+    best = ranked(table).head(5)
+    columns = [*best.columns]
+    return best[columns[: columns.index("end_time")]].dropna(axis="columns", how="all")
+
+
+def print_best(table: DataFrame) -> None:
+    """The best runs, with units."""
+    from ..sweeps.metrics import METRICS
+    from ..sweeps.results import RANKED
+
+    best = best_runs(table)
+    units = [METRICS[name].unit if name in METRICS else "" for name in best.columns]
+    rows = [[f"{value:.4g}" for value in row] for row in best.to_numpy()]
+    ranks = [RANKED[name] for name in RANKED if name in best.columns][:2]
+    title = f"best: {', '.join(ranks) or 'no metric ranks them'}"
+    print(f"\n{title}" if rows else "\nno run was finished")
+    if rows:
+        print_table(best.columns, units, *rows, align=str.rjust, before="  ")
+
+
+def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
+    """Of --grid: evenly spaced values, both ends included."""
     import numpy as np
 
     from ..sweeps.design import MAX_RUNS
@@ -136,19 +148,15 @@ def parse_grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
             raise CommandLineError(f"--grid {text}: COUNT {number:g} is no whole number from 2 on")
         if number > MAX_RUNS:
             raise CommandLineError(f"--grid {text}: COUNT must be at most {MAX_RUNS}")
-        if not low < high:
-            raise CommandLineError(f"--grid {text}: LOW {low:g} must be below HIGH {high:g}")
         grids[name] = tuple(np.linspace(low, high, int(number)).tolist())
     return grids
 
 
-def parse_ranges(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """NAME=LOW:HIGH texts of a command line."""
+def _ranges(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """Of --range."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in texts:
         name, (low, high) = _parse("--range", text, "NAME=LOW:HIGH", ranges)
-        if not low < high:
-            raise CommandLineError(f"--range {text}: LOW {low:g} must be below HIGH {high:g}")
         ranges[name] = (low, high)
     return ranges
 
@@ -166,4 +174,7 @@ def _parse(option: str, text: str, form: str, before: Iterable[str]) -> tuple[st
         raise CommandLineError(f"{option} {text}: its numbers must be finite")
     if name in before:
         raise CommandLineError(f"{option} {name} is given twice")
+    low, high = numbers[:2]
+    if not low < high:
+        raise CommandLineError(f"{option} {text}: LOW {low:g} must be below HIGH {high:g}")
     return name, numbers

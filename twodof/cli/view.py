@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .common import asked_to_stop, in_options, open_page
-from .options import add_page_options, add_robot_options, check_company, not_empty, page_place
+from .options import OF_A_PAGE, add_options, add_robot_options, check_company, not_empty, said
+from .printing import in_options
+from .signals import asked_to_stop
 
 
-def add(verbs: Any) -> None:
-    """Add the verb and its options."""
-    view = verbs.add_parser(
-        "view", help="replay a bag in the browser",
-        description="Replay a bag in the browser, or write a page that replays it offline.",
-    )  # fmt: skip
+def add(view: argparse.ArgumentParser) -> None:
+    """The verb's options."""
+    view.description = "Replay a bag in the browser, or write a page that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path)
     view.add_argument(
         "--export", type=not_empty, metavar="FILE.html",
@@ -27,8 +27,7 @@ def add(verbs: Any) -> None:
         "--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes"
     )
     view.add_argument("--fmu", metavar="FMU", help="where the robot's meshes are")
-    add_page_options(view)
-    view.set_defaults(call=call)
+    add_options(view, *OF_A_PAGE)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -36,15 +35,37 @@ def call(options: argparse.Namespace) -> int:
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
     from ..pages.replay import export, view
 
-    robot = {name: getattr(options, name) for name in ("urdf", "mesh_dir", "frame", "fmu")}
+    robot = said(options, "urdf", "mesh_dir", "frame", "fmu")
     if options.export:
-        for remark in export(options.bag, options.export, **robot):
-            print(f"WARNING: {in_options(remark)}", file=sys.stderr)
+        _print_remarks(export(options.bag, options.export, **robot))
         print(f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:
         view(
             options.bag, asked, lambda url, remarks: open_page(options, url, remarks),
-            **page_place(options), **robot,
+            **place(options), **robot,
         )  # fmt: skip
     return 0
+
+
+def place(options: argparse.Namespace) -> dict[str, Any]:
+    """Where a page is served, as far as the options say it."""
+    return {key: value for key, value in said(options, "host", "port").items() if value is not None}
+
+
+def open_page(
+    options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None
+) -> None:
+    """Tell where the page is, and open it where there is a display."""
+    _print_remarks(remarks)
+    what = f"{fmu}; " if fmu is not None else ""
+    print(f"open  {url} ({what}Ctrl-C ends)", flush=True)
+    if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+        import webbrowser
+
+        webbrowser.open(url)
+
+
+def _print_remarks(remarks: Sequence[str]) -> None:
+    for remark in remarks:
+        print(f"WARNING: {in_options(remark)}", file=sys.stderr)

@@ -1,0 +1,427 @@
+"""What is wrong gets one line that names the culprit, and leaves nothing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import shutil
+import stat
+import zipfile
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+import twodof
+from twodof.cli.main import main
+
+EMPTY_ZIP = b"PK\x05\x06" + bytes(18)
+
+
+def listing(folder: Path) -> dict[str, tuple[int, int]]:
+    """Sizes and times of all that is below a folder."""
+    entries = {}
+    for path in folder.rglob("*"):
+        state = path.lstat()
+        changed = 0 if stat.S_ISDIR(state.st_mode) else state.st_mtime_ns
+        entries[str(path.relative_to(folder))] = (state.st_size, changed)
+    return entries
+
+
+@pytest.fixture(scope="module")
+def bag_path(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "bag"
+    twodof.simulate(fmu_path, twodof.Bag(path), stop_time=0.05)
+    return path
+
+
+GOOD_LINK = (
+    '<link name="a"><inertial><mass value="1"/>'
+    '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+)
+
+
+def urdf(*, kind: str = "revolute", link: str = GOOD_LINK, mesh: str = "") -> str:
+    shape = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>' if mesh else ""
+    return (
+        f'<robot name="r"><link name="base">{shape}</link>{link}<joint name="j" type="{kind}">'
+        '<parent link="base"/><child link="a"/><limit lower="-1" upper="1"/></joint></robot>'
+    )
+
+
+def description(
+    *,
+    kind: str = "CoSimulation",
+    outputs: tuple[str, ...] = ("q[1]", "v[1]"),
+    causality: str = "output",
+    head: str = "",
+) -> str:
+    """A modelDescription.xml of another maker, as small as it may be."""
+    variables = "".join(
+        f'<ScalarVariable name="{name}" valueReference="{i}" causality="{causality}"'
+        ' variability="continuous"><Real/></ScalarVariable>'
+        for i, name in enumerate(outputs)
+    )
+    unknowns = "".join(f'<Unknown index="{i + 1}"/>' for i in range(len(outputs)))
+    unknown = f"<Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns>"
+    if causality != "output":
+        unknown = ""
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>{head}'
+        f'<fmiModelDescription fmiVersion="2.0" modelName="m" guid="g">'
+        f'<{kind} modelIdentifier="m"/><ModelVariables>{variables}</ModelVariables>'
+        f"<ModelStructure>{unknown}</ModelStructure></fmiModelDescription>"
+    )
+
+
+VENDOR_JOINTS = (
+    '<VendorAnnotations><Tool name="twodof"><Robot name="r"><Joint name="a"/><Joint name="b"/>'
+    "</Robot></Tool></VendorAnnotations>"
+)
+FMI1 = (
+    '<fmiModelDescription fmiVersion="1.0" modelName="m" modelIdentifier="m" guid="g"'
+    ' numberOfContinuousStates="0" numberOfEventIndicators="0"><ModelVariables/>'
+    "</fmiModelDescription>"
+)
+FMI3 = (
+    '<fmiModelDescription fmiVersion="3.0" modelName="m" instantiationToken="t">'
+    '<ModelExchange modelIdentifier="m"/><ModelVariables>'
+    '<Float64 name="time" valueReference="0" causality="independent"/>'
+    '<Float64 name="q[1]" valueReference="1" causality="output"/>'
+    '<Float64 name="v[1]" valueReference="2" causality="output"/></ModelVariables>'
+    '<ModelStructure><Output valueReference="1"/><Output valueReference="2"/>'
+    "</ModelStructure></fmiModelDescription>"
+)
+
+
+def damaged(content: bytes) -> bytes:
+    """A zip in which the compressed data of the description is not what deflate writes."""
+    at = content.index(b"modelDescription.xml") + len("modelDescription.xml")
+    return content[:at] + b"\xff" * 40 + content[at + 40 :]
+
+
+def swollen(content: bytes) -> bytes:
+    """A zip whose directory says that each entry unzips to 4 GB."""
+    entry = re.compile(rb"(PK\x01\x02.{20})....", re.DOTALL)
+    return entry.sub(lambda match: match[1] + b"\xfe\xff\xff\xff", content)
+
+
+def text(name: str, content: str | bytes) -> Callable[[Path], None]:
+    data = content.encode() if isinstance(content, str) else content
+
+    def make(folder: Path) -> None:
+        (folder / name).write_bytes(data)
+
+    return make
+
+
+def fmu(
+    xml: str, *more: str, binary: str = "linux64/m.so", link: str = "",
+    change: Callable[..., bytes] = bytes,
+) -> Callable[[Path], None]:  # fmt: skip
+    def make(folder: Path) -> None:
+        with zipfile.ZipFile(folder / "bad.fmu", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", xml)
+            for name in (f"binaries/{binary}", *more):
+                archive.writestr(name, b"content")
+            if link:
+                entry = zipfile.ZipInfo(link)
+                entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+                archive.writestr(entry, "/etc/passwd")
+        (folder / "bad.fmu").write_bytes(change((folder / "bad.fmu").read_bytes()))
+
+    return make
+
+
+def nothing(folder: Path) -> None:
+    del folder
+
+
+def a_bag(folder: Path) -> None:
+    (folder / "bag").mkdir()
+    (folder / "bag/metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 8\n")
+
+
+def a_linked_bag(folder: Path) -> None:
+    a_bag(folder)
+    (folder / "link").symlink_to("bag")
+
+
+BUILD = ["build", "-o", "new.fmu", "--frame", "a", "--urdf", "arm.urdf"]
+RUN = ["run", "arm.fmu", "-o", "out", "--stop-time", "0.02"]
+RUN_BAD = ["run", "bad.fmu", "-o", "out"]
+INFO = ["info", "bad.fmu"]
+CSV = [*RUN, "--input", "in.csv"]
+LONG = "x" * 300
+
+Case = tuple[Callable[[Path], None], list[str], str]
+BAD: dict[str, Case] = {
+    # build
+    "URDF missing": (nothing, BUILD, "arm.urdf': No such file"),
+    "URDF a folder": (nothing, [*BUILD[:-1], "."], "'.': Is a directory"),
+    "URDF no XML": (text("arm.urdf", "a: 1"), BUILD, "arm.urdf: the URDF is not XML"),
+    "URDF no text": (text("arm.urdf", b"\xff\x00"), BUILD, "'arm.urdf' is not UTF-8"),
+    "URDF with NUL": (
+        text("arm.urdf", urdf(mesh="a\0b.stl")), BUILD, "mesh 'a.*b.stl'|the URDF is not XML",
+    ),
+    "URDF with entities": (
+        text("arm.urdf", '<!DOCTYPE robot [<!ENTITY a "b">]>' + urdf()), BUILD, "document type",
+    ),
+    "no such frame": (
+        text("arm.urdf", urdf()), [*BUILD, "--frame", "hand"], "no frame 'hand'.*: base, a$",
+    ),
+    "joint type": (text("arm.urdf", urdf(kind="planar")), BUILD, "'j' is of type 'planar'"),
+    "no mass": (text("arm.urdf", urdf(link='<link name="a"/>')), BUILD, "'j': .*no mass .*--lock"),
+    "negative mass": (
+        text("arm.urdf", urdf(link=GOOD_LINK.replace('value="1"', 'value="-1"'))),
+        BUILD, "'a': negative mass -1",
+    ),
+    "inertia not physical": (
+        text("arm.urdf", urdf(link=GOOD_LINK.replace('ixx="1"', 'ixx="-9"'))), BUILD, "'a': its in",
+    ),
+    "inertia missing": (
+        text("arm.urdf", urdf(link=re.sub("<inertia .*?/>", "", GOOD_LINK))), BUILD, "link 'a'",
+    ),
+    "q-start NaN": (nothing, ["build", "--q-start", "nan", "0"], "q_start .*nan.* finite"),
+    "name that leaves the folder": (nothing, ["build", "--name", "../x"], "name '../x'"),
+    "output below a file": (
+        text("file", "x"), ["build", "-o", "file/x.fmu"], "cannot write 'file/x.fmu': Not a direc",
+    ),
+    "output a folder": (nothing, ["build", "-o", "."], "cannot write '.'"),
+    # an FMU
+    "FMU missing": (nothing, RUN_BAD, "no FMU 'bad.fmu'; build one with 'twodof build'"),
+    "FMU a folder": (nothing, ["run", ".", "-o", "out"], "cannot read '.': Is a directory"),
+    "FMU no zip": (text("bad.fmu", "FMU"), RUN_BAD, "'bad.fmu' is no FMU: .*not a zip"),
+    "FMU empty zip": (text("bad.fmu", EMPTY_ZIP), RUN_BAD, "'bad.fmu' .*no modelDescription.xml"),
+    "FMU damaged": (fmu(description(), change=damaged), RUN_BAD, "'bad.fmu'"),
+    "FMI 1.0": (fmu(FMI1), RUN_BAD, "'bad.fmu' is FMI 1.0 .*FMI 2.0"),
+    "FMI 3.0": (fmu(FMI3), RUN_BAD, "'bad.fmu' is FMI 3.0 .*FMI 2.0 or 3.0 co-simulation"),
+    "model exchange": (
+        fmu(description(kind="ModelExchange")), RUN_BAD, "'bad.fmu' is FMI 2.0 model exchange",
+    ),
+    "description no XML": (fmu("<fmiModel"), RUN_BAD, "'bad.fmu': modelDescription.xml is not val"),
+    "description not of the schema": (
+        fmu(description().replace("modelName", "title")), RUN_BAD, "'bad.fmu'.*(title|modelName)",
+    ),
+    "description with a DTD, info": (
+        fmu(description(head='<!DOCTYPE x SYSTEM "/etc/passwd">')), INFO, "declares entities",
+    ),
+    "no binary for this platform": (
+        fmu(description(), binary="win64/m.dll"), RUN_BAD,
+        r"no binary for this platform \(linux64\), only for: win64",
+    ),
+    "binary that is none": (fmu(description()), RUN_BAD, "'bad.fmu' cannot be loaded"),
+    "no outputs q": (fmu(description(outputs=("y",))), RUN_BAD, r"no outputs q\[1\]"),
+    "q and v not outputs": (fmu(description(causality="local")), INFO, r"no outputs q\[1\]"),
+    "q and v not Real": (
+        fmu(description().replace("<Real/>", "<Integer/>").replace("continuous", "discrete")),
+        INFO, r"no outputs q\[1\]",
+    ),
+    "joints of another number": (
+        fmu(description().replace("<ModelVariables>", VENDOR_JOINTS + "<ModelVariables>")),
+        INFO, "'bad.fmu' names 2 joints but has 1 outputs",
+    ),
+    "zip slip": (fmu(description(), "../evil"), RUN_BAD, "unsafe: its member '../evil' leaves"),
+    "zip slip of Windows": (fmu(description(), "..\\evil"), RUN_BAD, "unsafe: .*evil"),
+    "absolute member": (fmu(description(), "/tmp/twodof_evil"), RUN_BAD, "unsafe: .*'/tmp/twodof_"),
+    "symbolic link": (
+        fmu(description(), link="resources/link"), RUN_BAD, "unsafe: its member 'resources/link'",
+    ),
+    "zip bomb": (fmu(description(), change=swollen), RUN_BAD, "unsafe: unzipped it exceeds"),
+    # settings
+    "--set of an unknown name": (nothing, [*RUN, "--set", "Kpp=1"], "'Kpp'; did you mean 'Kp'"),
+    "--set with a line break": (nothing, [*RUN, "--set", "K\np=1"], "no variable 'K.*p'"),
+    # inputs over time
+    "CSV a folder": (nothing, [*CSV[:-1], "."], "cannot read the bag '.': it has no"),
+    "CSV with words": (text("in.csv", "time,Kn\n1,high"), CSV, "'in.csv' row 2: Kn = 'high'"),
+    "CSV with a line break": (text("in.csv", 'time,Kn\n1,"a\nb"'), CSV, "'in.csv' row 2: Kn = 'a"),
+    # times
+    "stop no multiple": (nothing, [*RUN, "--step", "0.015"], "0.02 s is no whole .* of 0.015 s"),
+    # the bag
+    "bag exists": (a_bag, [*RUN, "-o", "bag"], "'bag' exists already.*--overwrite"),
+    "bag is a file": (text("bag", "x"), [*RUN, "-o", "bag"], "'bag' exists already"),
+    "folder that is no bag, --overwrite": (
+        lambda folder: (folder / "bag").mkdir(), [*RUN, "-o", "bag", "--overwrite"],
+        "'bag' is not a bag",
+    ),
+    "file, --overwrite": (
+        text("bag", "x"), [*RUN, "-o", "bag", "--overwrite"], "'bag' is not a bag",
+    ),
+    "bag below a file": (text("file", "x"), [*RUN, "-o", "file/bag"], "'file/bag'.*Not a dir"),
+    "bag with too long a name": (nothing, [*RUN, "-o", LONG], f"'{LONG}'.*too long"),
+    "symbolic link to a bag, --overwrite": (
+        a_linked_bag,
+        [*RUN, "-o", "link", "--overwrite"], "'link'",
+    ),
+    "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "stamp_start = -1 s"),
+    "info of a folder": (nothing, ["info", "."], r"cannot read the bag '\.'"),
+    "info of a bag's file": (text("a.db3", "x"), ["info", "a.db3"], "give the bag's folder"),
+    "info of a file that is no bag": (
+        text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"
+    ),
+    "info of too long a name": (nothing, ["info", LONG], f"'{LONG}'.*too long"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "arguments", "culprit"), BAD.values(), ids=BAD)
+def test_bad_input_gets_one_line_and_leaves_nothing(
+    make: Callable[[Path], None],
+    arguments: list[str],
+    culprit: str,
+    folder: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    make(folder)
+    before = listing(folder.parent)
+    status = main(arguments)
+    out, err = capfd.readouterr()
+    assert status not in (0, None)
+    assert out == ""
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith("twodof: error: ")
+    assert re.search(culprit, err), err
+    assert listing(folder.parent) == before
+    assert not Path("/tmp/twodof_evil").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "culprit"),
+    [
+        ([], "VERB"),
+        (["fly"], "fly"),
+        (["help", "nothing"], "nothing"),
+        (["info"], "FMU|BAG"),
+        (["run", "--nativ"], "--nativ"),
+        (["run", "--step", "small"], "--step.*small"),
+        (["run", "--storage", "db3"], "--storage.*db3"),
+        (["run", "--set", "Kp"], "--set Kp: expected NAME=VALUE"),
+        (["run", "--set", "Kp=high"], "--set Kp=high: 'high' is not a number"),
+        (["run", "--stop-time", "inf"], "stop time inf s"),
+        (["run", "arm.fmu", "--native"], "leave it out beside an FMU"),
+        (["run", "--frame", "a"], "--frame is of a URDF"),
+        (["build", "--gravity", "0", "1"], "--gravity"),
+        (["build", "--lock", "a=b"], "--lock a=b: 'b' is not a number"),
+        (["build", "--scalars"], "--scalars goes with --native --fmi 3"),
+        (["build", "--orientation", "--control", "joint"], "--orientation goes with"),
+        (["build", "a.urdf", "--urdf", "b"], "given twice"),
+        (["build", "--no-live-documentation"], "without --native"),
+        (["build", "--mesh-dir", "."], "without a URDF"),
+        (["build", "arm.urdf", "--mesh-dir", ".", "--no-meshes"],
+         "--no-meshes does nothing beside --mesh-dir"),
+        (["publish", "--rate", "0"], "--rate 0"),
+        (["publish", "arm.fmu", "--storage", "mcap"], "--storage does nothing without -o"),
+        (["publish", "arm.fmu", "--fsync"], "--fsync does nothing without -o"),
+        (["publish", "arm.fmu", "--foxglove-port", "0"], "without --foxglove$"),
+        (["publish", "a=arm.fmu", "a=arm.fmu", "-o", "z"], "two robots are 'a'"),
+        (["publish", "=arm.fmu", "b=arm.fmu"], "'=arm.fmu' names no robot"),
+        (["publish", "left="], "'left=' names no FMU"),
+        (["sweep", "--resume"], "--resume does nothing without -o"),
+        (["sweep", "arm.fmu", "--grid", "Kp=1"], "expected NAME=LOW:HIGH:COUNT"),
+        (["sweep", "arm.fmu", "--grid", "Kp=1:2:2", "--seed", "0"], "without --random"),
+        (["sweep", "arm.fmu", "--workers", "1", "--scheduler", "tcp://a"],
+         "--workers does nothing beside --scheduler"),
+        (["plot"], "BAG"),
+        (["view", "bag", "--export", "a.html", "--port", "0"], "beside --export"),
+        *(
+            ([verb, option, ""], f"argument {option}: it is empty")
+            for verb, option in (
+                ("run", "-o"), ("publish", "-o"), ("sweep", "-o"), ("page", "-o"), ("live", "-o"),
+                ("view", "--export"), *product(("run", "publish", "layouts", "page"), ["--frame"]),
+                *product(("plot", "view"), ("--frame", "--urdf")), ("build", "--frame"),
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_a_wrong_command_line_is_status_2(
+    arguments: list[str], culprit: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = listing(folder)
+    try:
+        status: object = main(arguments)
+    except SystemExit as end:
+        status = end.code
+    assert status == 2
+    assert re.search(f"twodof.*: error: .*{culprit}", capsys.readouterr().err.splitlines()[-1])
+    assert listing(folder) == before
+
+
+def test_refused_build_keeps_the_file_that_was_there(
+    folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "arm.urdf").write_text(urdf(kind="planar"))
+    (folder / "new.fmu").write_bytes(b"before")
+    assert main(BUILD) == 1
+    assert (folder / "new.fmu").read_bytes() == b"before"
+    assert "'planar'" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("provenance", ["{}", '{"robot": "x"}', "[]", "1"])
+def test_info_of_a_bag_with_a_run_json_of_another_tool(
+    provenance: str, bag_path: Path, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(bag_path, folder / "bag")
+    (folder / "bag/run.json").write_text(provenance)
+    assert main(["info", "bag"]) == 0
+    assert "6 joint states" in capfd.readouterr().out
+
+
+HOSTILE = "\x1b]0;title\x07 \x9b2J \x1b[31m"
+"""Commands to a terminal, which some carry out whoever printed them."""
+
+
+def test_text_of_a_bag_is_no_command_to_the_terminal(
+    bag_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "bag"
+    shutil.copytree(bag_path, bag)
+    provenance = json.loads((bag / "run.json").read_text())
+    provenance["command_line"] = provenance["fmu"]["name"] = HOSTILE
+    (bag / "run.json").write_text(json.dumps(provenance))
+    assert main(["info", str(bag)]) == 0
+    assert main(["info", str(tmp_path / HOSTILE)]) == 1
+    logging.getLogger("twodof").warning("mesh '%s' is left out", HOSTILE)
+    out, err = capsys.readouterr()
+    assert out.count(r"\x1b[31m") == 2 and err.count(r"\x1b[31m") >= 1
+    assert all(c.isprintable() or c == "\n" for c in out + err)
+    assert main(["info", str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["command_line"] == HOSTILE
+
+
+@pytest.mark.parametrize("kept", [0, 10, 300])
+def test_info_of_a_truncated_bag_is_refused(
+    kept: int, bag_path: Path, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(bag_path, folder / "bag")
+    file = folder / "bag/bag.mcap"
+    file.write_bytes(file.read_bytes()[:kept])
+    assert main(["info", "bag"]) == 1
+    assert re.fullmatch("twodof: error: .*'bag'.*\n", capfd.readouterr().err)
+
+
+def test_damaged_default_fmu_is_built_again(
+    folder: Path, fmu_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "TwoDof.fmu").write_bytes(damaged(fmu_path.read_bytes()))
+    assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 0
+    assert (folder / "TwoDof.fmu").read_bytes() == fmu_path.read_bytes()
+    assert capfd.readouterr().err == ""
+
+
+def test_a_run_replaces_no_file_that_is_no_fmu(
+    folder: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """By the name that it chooses itself; and tells where it was another FMU."""
+    (folder / "robot.urdf").write_text(urdf())
+    (folder / "robot.fmu").write_text("notes")
+    run = ["run", "robot.urdf", "--stop-time", "0.1", "-o", "bag", "--overwrite"]
+    assert main(run) == 1
+    assert "'robot.fmu' is no FMU, and is not replaced" in capfd.readouterr().err
+    assert (folder / "robot.fmu").read_text() == "notes"
+    (folder / "robot.fmu").unlink()
+    assert main([*run]) == main([*run]) == 0
+    assert "replaced" not in caplog.text
+    (folder / "robot.urdf").write_text(urdf().replace('upper="1"', 'upper="2"'))
+    assert main([*run]) == 0
+    assert "'robot.fmu' was another FMU, and is replaced" in caplog.text

@@ -1,0 +1,65 @@
+"""Ctrl-C and its like."""
+
+from __future__ import annotations
+
+import errno
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from ..errors import SimulationError
+
+INTERRUPTED = 130
+"""Exit status of what was asked to end."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
+PATIENCE = 5.0  # s for what is under way to end when it was asked to
+_interrupts: list[int] = []
+
+
+def interrupt(number: int, _frame: object) -> None:
+    """Ctrl-C; noted, as a module in C that is being imported makes an ImportError of it."""
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
+def is_interrupt(error: ImportError | OSError) -> bool:
+    """Whether an error is what became of Ctrl-C.
+
+    An OSError is where it came while a file was closed, which then is closed again and fails. So
+    does ``shutil.rmtree``, which removes the folder that an FMU was unzipped to.
+    """
+    if isinstance(error, ImportError):
+        return bool(_interrupts)
+    return error.errno == errno.EBADF and isinstance(error.__context__, KeyboardInterrupt)
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Whether a signal asked the run to end; read between steps, so that a step is never cut.
+
+    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once, and
+    so does the clock where the first has no effect; more are ignored, as all that is left is
+    closing the bag.
+    """
+    asked = False
+
+    def ask(_number: int, _frame: object) -> None:
+        nonlocal asked
+        if asked:
+            for number in SIGNALS:
+                signal.signal(number, signal.SIG_IGN)
+            raise KeyboardInterrupt
+        asked = True
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+
+    before = {number: signal.signal(number, ask) for number in SIGNALS}
+    try:
+        yield lambda: asked
+    except SimulationError as error:
+        if asked:  # the Python flavour discards a step that is interrupted
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
