@@ -11,13 +11,8 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["parameters, which begin the run anew", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
 ]);
 
-/**
- * An element with text, and what it holds.
- * @param {string} tag
- * @param {string} text
- * @param {...Node} inner
- * @returns {HTMLElement}
- */
+/** An element with text, and what it holds. */
+/** @type {(tag: string, text: string, ...inner: Node[]) => HTMLElement} */
 function element(tag, text, ...inner) {
   const made = document.createElement(tag);
   made.textContent = text;
@@ -25,10 +20,7 @@ function element(tag, text, ...inner) {
   return made;
 }
 
-/**
- * @param {string} id
- * @returns {any}
- */
+/** @type {(id: string) => any} */
 function byId(id) {
   return document.getElementById(`arm-${id}`);
 }
@@ -55,10 +47,8 @@ class Controls {
     }
   }
 
-  /**
-   * The sliders of a group: one for all gains, else one for each element.
-   * @param {string} group
-   */
+  /** The sliders of a group: one for all gains, else one for each element. */
+  /** @type {(group: string) => HTMLElement[]} */
   rows(group) {
     const names = /** @type {string[]} */ (this.session.groups.get(group));
     if (GAINS.includes(group)) return [this.row(group, names[0])];
@@ -93,10 +83,8 @@ class Controls {
     return row;
   }
 
-  /**
-   * A variable's name, with that of its joint or axis in place of its number.
-   * @param {string} name
-   */
+  /** A variable's name, with that of its joint or axis in place of its number. */
+  /** @type {(name: string) => string} */
   label(name) {
     const [group, number] = name.replace("]", "").split("["), { axes } = this.session.facts;
     if (number === undefined) return name;
@@ -105,10 +93,7 @@ class Controls {
     return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
   }
 
-  /**
-   * @param {HTMLElement} label
-   * @param {string} name
-   */
+  /** @type {(label: HTMLElement, name: string) => HTMLElement} */
   checkbox(label, name) {
     const input = document.createElement("input");
     input.type = "checkbox";
@@ -120,12 +105,8 @@ class Controls {
     return row;
   }
 
-  /**
-   * What a slider goes from and to.
-   * @param {string} name
-   * @param {number} value
-   * @returns {[number, number]}
-   */
+  /** What a slider goes from and to. */
+  /** @type {(name: string, value: number) => [number, number]} */
   range(name, value) {
     const [group, number] = name.replace("]", "").split("["), i = Number(number) - 1;
     const { joints, axes } = this.session.facts, joint = joints[i];
@@ -158,20 +139,16 @@ class Controls {
   }
 }
 
-/**
- * Units of position, velocity and effort.
- * @param {JointFacts[]} joints
- */
+/** Units of position, velocity and effort. */
+/** @type {(joints: JointFacts[]) => string[]} */
 function unitsOf(joints) {
   const slide = joints.some(({ prismatic }) => prismatic), turns = joints.some(({ prismatic }) => !prismatic);
   if (slide && turns) return ["rad or m", "rad/s or m/s", "N·m or N"];
   return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
 }
 
-/**
- * Names without the whole words that all of them begin and end with.
- * @param {JointFacts[]} joints
- */
+/** Names without the whole words that all of them begin and end with. */
+/** @type {(joints: JointFacts[]) => string[]} */
 function shortNames(joints) {
   const names = joints.map(({ name }) => name), [first] = names;
   if (names.length < 2) return names;
@@ -186,10 +163,8 @@ function shortNames(joints) {
   return names.map((name) => name.slice(begin, name.length - cut));
 }
 
-/**
- * A number to be read, no zero with a sign.
- * @param {number} value
- */
+/** A number to be read, no zero with a sign. */
+/** @type {(value: number) => string} */
 function digits(value) {
   if (!Number.isFinite(value)) return "\u2013";
   const rounded = value.toFixed(Math.abs(value) < 10 ? 4 : 2);
@@ -224,10 +199,7 @@ class Readout {
     });
   }
 
-  /**
-   * @param {string} name
-   * @param {string} text
-   */
+  /** @type {(name: string, text: string) => void} */
   tell(name, text) {
     let cell = this.more.get(name);
     if (!cell) {

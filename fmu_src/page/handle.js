@@ -45,11 +45,8 @@ class Handle {
     return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
   }
 
-  /**
-   * Pixels from a point of the picture to one of the scene.
-   * @param {number[]} at
-   * @param {Numbers} p
-   */
+  /** Pixels from a point of the picture to one of the scene. */
+  /** @type {(at: number[], p: Numbers) => number} */
   distance(at, p) {
     const [x, y] = this.camera.project(p);
     return Math.hypot((x - at[0]) * this.canvas.clientWidth, (y - at[1]) * this.canvas.clientHeight);
@@ -84,10 +81,8 @@ class Handle {
     else this.camera.orbit(dx, dy);
   }
 
-  /**
-   * Carry the target in the plane of the picture, or in that of the task axes.
-   * @param {number[]} at
-   */
+  /** Carry the target in the plane of the picture, or in that of the task axes. */
+  /** @type {(at: number[]) => (x: number, y: number) => void} */
   carry(at) {
     const begin = this.place(), { camera, axes } = this;
     let normal = camera.back;
@@ -104,10 +99,8 @@ class Handle {
     };
   }
 
-  /**
-   * The points of the ring about an axis of the target.
-   * @param {number} axis
-   */
+  /** The points of the ring about an axis of the target. */
+  /** @type {(axis: number) => number[][]} */
   ring(axis) {
     const place = this.place(), turned = rotation(this.session.held("quat_des"));
     const [one, two] = [base((axis + 1) % 3), base((axis + 2) % 3)];
@@ -118,22 +111,16 @@ class Handle {
     });
   }
 
-  /**
-   * The axis of the ring that is next to a point of the picture, else -1.
-   * @param {number[]} at
-   * @param {number} grip
-   */
+  /** The axis of the ring that is next to a point of the picture, else -1. */
+  /** @type {(at: number[], grip: number) => number} */
   nearest(at, grip) {
     const distances = [0, 1, 2].map((axis) => Math.min(...this.ring(axis).map((p) => this.distance(at, p))));
     const least = Math.min(...distances);
     return least < GRIP_OF_RING * grip ? distances.indexOf(least) : -1;
   }
 
-  /**
-   * Turn the target about one of its axes.
-   * @param {number[]} at
-   * @param {number} axis
-   */
+  /** Turn the target about one of its axes. */
+  /** @type {(at: number[], axis: number) => (x: number, y: number) => void} */
   turn(at, axis) {
     const place = this.place(), start = this.session.held("quat_des"), turned = rotation(start);
     const normal = transform(turned, base(axis)), one = transform(turned, base((axis + 1) % 3));
@@ -157,18 +144,13 @@ class Handle {
   }
 }
 
-/**
- * @param {number} axis
- * @returns {number[]}
- */
+/** @type {(axis: number) => number[]} */
 function base(axis) {
   return [0, 1, 2].map((i) => Number(i === axis));
 }
 
-/**
- * The direction of a single task axis.
- * @param {string} axes
- */
+/** The direction of a single task axis. */
+/** @type {(axes: string) => number[]} */
 function line(axes) {
   return base("xyz".indexOf(axes));
 }

@@ -4,10 +4,7 @@ const TRAIL = 1.5; // s
 const MOMENTS = 30, PATH_POINTS = 600; // of a replay, that are in the picture at first, and of its path
 const PANEL = 0.1; // s between pictures of curves and numbers, where no cursor asks for more
 
-/**
- * @param {string} id
- * @returns {Promise<ArrayBuffer>}
- */
+/** @type {(id: string) => Promise<ArrayBuffer>} */
 async function unpacked(id) {
   const text = atob(byId(id).textContent), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
@@ -87,19 +84,14 @@ class App {
     return place;
   }
 
-  /**
-   * Set a variable; a refusal is shown.
-   * @param {string} name
-   * @param {Value | number[]} value
-   */
+  /** Set a variable; a refusal is shown. */
+  /** @type {(name: string, value: Value | number[]) => void} */
   tell(name, value) {
     this.order(() => this.session.set(name, value));
   }
 
-  /**
-   * Do what the user asks for.
-   * @param {() => void} action
-   */
+  /** Do what the user asks for. */
+  /** @type {(action: () => void) => void} */
   order(action) {
     this.session.said = "";
     this.attempt(action);
@@ -244,22 +236,15 @@ class App {
     return { "end effector": this.end(k), ...(groups.has("x_des") && { target: this.target(k) }) };
   }
 
-  /**
-   * @param {Scene} scene
-   * @param {Float64Array[]} links
-   */
+  /** @type {(scene: Scene, links: Float64Array[]) => void} */
   addRobot(scene, links) {
     this.session.facts.shapes.forEach(({ link, place, colour }, i) => {
       scene.addSolid(i + 1, multiply(links[link], place), [...colour, 1]);
     });
   }
 
-  /**
-   * What is drawn beside the robot.
-   * @param {Scene} scene
-   * @param {number} k
-   * @param {Float64Array[]} links
-   */
+  /** What is drawn beside the robot. */
+  /** @type {(scene: Scene, k: number, links: Float64Array[]) => void} */
   addTrail(scene, k, links) {
     const { session, robot, camera } = this, { facts } = session, size = camera.size;
     const first = session.nearest(session.time(k) - TRAIL), stride = Math.max(1, Math.ceil((k - first) / 60));
@@ -285,11 +270,7 @@ class App {
   }
 }
 
-/**
- * @param {number[]} centre
- * @param {number} radius
- * @param {number[]} normal
- */
+/** @type {(centre: number[], radius: number, normal: number[]) => number[][]} */
 function circle(centre, radius, normal) {
   const one = [normal[1], normal[2], normal[0]], two = cross(normal, one);
   return Array.from({ length: 97 }, (_, i) => {
@@ -303,20 +284,15 @@ function fractions(colour) {
   return [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16) / 255);
 }
 
-/**
- * Numbers of samples, some so many of them, from the first to the last.
- * @param {number} count
- * @param {number} some
- */
+/** Numbers of samples, some so many of them, from the first to the last. */
+/** @type {(count: number, some: number) => number[]} */
 function spread(count, some) {
   const most = Math.min(count, some);
   return Array.from({ length: most }, (_, i) => Math.round((i * (count - 1)) / Math.max(most - 1, 1)));
 }
 
-/**
- * What moves the robot: an engine or samples in this page, or else its server.
- * @param {Facts} facts
- */
+/** What moves the robot: an engine or samples in this page, or else its server. */
+/** @type {(facts: Facts) => Promise<Session | Replay | Remote>} */
 async function makeSession(facts) {
   if (byId("engine")) return new Session(facts, await Engine.load(new Uint8Array(await unpacked("engine"))));
   if (byId("samples")) return new Replay(facts, await unpacked("samples"));

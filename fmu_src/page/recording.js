@@ -101,28 +101,20 @@ class Bytes {
     return this;
   }
 
-  /**
-   * A text behind its length.
-   * @param {string} text
-   * @param {string} end
-   */
+  /** A text behind its length. */
+  /** @type {(text: string, end?: string) => Bytes} */
   text(text, end = "") {
     const content = new TextEncoder().encode(text + end);
     return this.put(32, content.length).raw(content);
   }
 
-  /**
-   * Gap before numbers of a size, in CDR, which counts from behind its first 4 bytes.
-   * @param {number} size
-   */
+  /** Gap before numbers of a size, in CDR, which counts from behind its first 4 bytes. */
+  /** @type {(size: number) => Bytes} */
   align(size) {
     return this.raw(new Uint8Array((size - ((this.length - 4) % size)) % size));
   }
 
-  /**
-   * @param {number} opcode
-   * @param {Bytes} content
-   */
+  /** @type {(opcode: number, content: Bytes) => Bytes} */
   record(opcode, content) {
     return this.put(8, opcode).put(64, content.length).raw(content.content);
   }
@@ -168,20 +160,13 @@ function* messages(session, robot) {
   }
 }
 
-/**
- * @param {bigint} stamp
- * @param {string} frame
- * @param {number[]} place
- * @param {Float64Array} quat
- */
+/** @type {(stamp: bigint, frame: string, place: number[], quat: Float64Array) => Uint8Array} */
 function point(stamp, frame, place, quat) {
   return headed(stamp, frame).align(8).doubles(place).doubles(quat).content;
 }
 
-/**
- * Where the session comes from, as a bag's run.json has it.
- * @param {Session} session
- */
+/** Where the session comes from, as a bag's run.json has it. */
+/** @type {(session: Session) => string} */
 function provenance(session) {
   return JSON.stringify({
     format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
@@ -189,11 +174,8 @@ function provenance(session) {
   });
 }
 
-/**
- * The session as an MCAP file.
- * @param {Session} session
- * @param {Robot} robot
- */
+/** The session as an MCAP file. */
+/** @type {(session: Session, robot: Robot) => Uint8Array} */
 function mcap(session, robot) {
   const pose = session.groups.has("quat") ? "geometry_msgs/msg/PoseStamped" : "geometry_msgs/msg/PointStamped";
   const topics = ["/joint_states", "/end_effector", ...(session.groups.has("x_des") ? ["/target"] : [])];
@@ -254,21 +236,15 @@ class Chunk {
     return this.records.length === 0;
   }
 
-  /**
-   * @param {number} channel
-   * @param {bigint} stamp
-   * @param {Uint8Array} data
-   */
+  /** @type {(channel: number, stamp: bigint, data: Uint8Array) => void} */
   add(channel, stamp, data) {
     this.places[channel - 1].push([stamp, this.records.length]);
     this.times.push(stamp);
     this.records.record(OP.message, new Bytes().put(16, channel).put(32, 0).put(64, stamp, stamp).raw(data));
   }
 
-  /**
-   * Append it and its indexes, and begin anew; the record of where they are.
-   * @param {Bytes} file
-   */
+  /** Append it and its indexes, and begin anew; the record of where they are. */
+  /** @type {(file: Bytes) => Bytes} */
   write(file) {
     const { records, places } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
     const content = new Bytes().put(64, start, end, records.length).put(32, 0).text("").put(64, records.length);

@@ -50,11 +50,8 @@ class Remote extends Samples {
     this.socket = socket;
   }
 
-  /**
-   * That of this page's server, once its first sample is there.
-   * @param {Facts} facts
-   * @returns {Promise<Remote>}
-   */
+  /** That of this page's server, once its first sample is there. */
+  /** @type {(facts: Facts) => Promise<Remote>} */
   static connect(facts) {
     const socket = connection();
     const remote = new Remote(facts, socket);
@@ -101,10 +98,7 @@ class Remote extends Samples {
     while (now - this.past[0][0] > PACE_WINDOW) this.past.shift();
   }
 
-  /**
-   * @param {string} order
-   * @param {unknown} value
-   */
+  /** @type {(order: string, value?: unknown) => void} */
   tell(order, value = null) {
     this.told += 1;
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify([order, value]));

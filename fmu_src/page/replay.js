@@ -23,10 +23,8 @@ class Replay extends Samples {
     return this.nearest(this.moment);
   }
 
-  /**
-   * All of it.
-   * @returns {[number, number]}
-   */
+  /** All of it. */
+  /** @returns {[number, number]} */
   get span() {
     return [0, this.duration || this.facts.step];
   }

@@ -21,10 +21,8 @@ class Robot {
     return places;
   }
 
-  /**
-   * Where the task frame is.
-   * @param {Float64Array[]} links
-   */
+  /** Where the task frame is. */
+  /** @type {(links: Float64Array[]) => Float64Array} */
   frame(links) {
     return links[this.facts.frameLink];
   }
@@ -51,11 +49,8 @@ class Robot {
     return { centre: transform(links[chain[first]], [0, 0, 0]), radius };
   }
 
-  /**
-   * Joints that are at a limit.
-   * @param {Numbers} q
-   * @param {Map<string, Value>} values
-   */
+  /** Joints that are at a limit. */
+  /** @type {(q: Numbers, values: Map<string, Value>) => JointFacts[]} */
   atLimit(q, values) {
     return this.facts.joints.filter((_, i) =>
       ["q_min", "q_max"].some((side) => {

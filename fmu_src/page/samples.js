@@ -77,20 +77,15 @@ class Samples {
     this.values = this.defaults();
   }
 
-  /**
-   * @param {string} name
-   * @returns {Variable}
-   */
+  /** @type {(name: string) => Variable} */
   variable(name) {
     const variable = this.variables.get(name);
     if (!variable) throw new Error(`there is no variable '${name}'`);
     return variable;
   }
 
-  /**
-   * Inputs and parameters as they are at first.
-   * @returns {Map<string, Value>}
-   */
+  /** Inputs and parameters as they are at first. */
+  /** @returns {Map<string, Value>} */
   defaults() {
     const told = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
     return new Map(told.map((v) => [v.name, /** @type {Value} */ (v.start)]));
@@ -115,10 +110,8 @@ class Samples {
     });
   }
 
-  /**
-   * Take one sample more.
-   * @param {Numbers} sample
-   */
+  /** Take one sample more. */
+  /** @type {(sample: Numbers) => void} */
   append(sample) {
     if ((this.count + 1) * this.width > this.data.length) {
       const longer = new Float64Array(2 * this.data.length);
@@ -139,10 +132,8 @@ class Samples {
     return this.data[k * this.width];
   }
 
-  /**
-   * Number of the sample that is nearest to a time, s.
-   * @param {number} t
-   */
+  /** Number of the sample that is nearest to a time, s. */
+  /** @type {(t: number) => number} */
   nearest(t) {
     let first = 0, last = this.count - 1;
     while (first < last) {
@@ -158,19 +149,15 @@ class Samples {
     return this.count - 1;
   }
 
-  /**
-   * Times that are of interest, s.
-   * @returns {[number, number]}
-   */
+  /** Times that are of interest, s. */
+  /** @returns {[number, number]} */
   get span() {
     const end = this.time(this.now);
     return [Math.max(0, end - WINDOW), Math.max(end, WINDOW)];
   }
 
-  /**
-   * More to tell beside the samples, names and texts.
-   * @returns {[string, string][]}
-   */
+  /** More to tell beside the samples, names and texts. */
+  /** @returns {[string, string][]} */
   remarks() {
     return [];
   }
@@ -196,11 +183,8 @@ class Samples {
     return this.data.subarray(k * this.width + begin, k * this.width + begin + size);
   }
 
-  /**
-   * A vector of inputs or parameters as they are set now.
-   * @param {string} group
-   * @returns {number[]}
-   */
+  /** A vector of inputs or parameters as they are set now. */
+  /** @type {(group: string) => number[]} */
   held(group) {
     return (this.groups.get(group) ?? []).map((name) => Number(this.values.get(name)));
   }

@@ -81,10 +81,7 @@ class Scene {
     this.begin();
   }
 
-  /**
-   * @param {string[]} sources
-   * @returns {WebGLProgram}
-   */
+  /** @type {(sources: string[]) => WebGLProgram} */
   program(sources) {
     const { gl } = this, program = /** @type {WebGLProgram} */ (gl.createProgram());
     sources.forEach((source, i) => {
@@ -178,12 +175,7 @@ class Scene {
     this.begin();
   }
 
-  /**
-   * @param {Scene["solids"]} solids
-   * @param {Float64Array} view
-   * @param {number[]} light
-   * @param {number} bright
-   */
+  /** @type {(solids: Scene["solids"], view: Float64Array, light: number[], bright: number) => void} */
   drawSolids(solids, view, light, bright) {
     const { gl, solid } = this;
     /** @param {string} name */
@@ -239,11 +231,8 @@ function smoothed(places, triangles) {
   return { corners: corners.subarray(0, 4 * made), normals: normals.subarray(0, 4 * made), indices };
 }
 
-/**
- * Normals of triangles, of their areas' length: that of a triangle begins at its first corner.
- * @param {Uint16Array} places
- * @param {Uint32Array} triangles
- */
+/** Normals of triangles, of their areas' length: that of a triangle begins at its first corner. */
+/** @type {(places: Uint16Array, triangles: Uint32Array) => Float64Array} */
 function facesOf(places, triangles) {
   const faces = new Float64Array(triangles.length);
   for (let t = 0; t < triangles.length; t += 3) {
@@ -255,12 +244,8 @@ function facesOf(places, triangles) {
   return faces;
 }
 
-/**
- * Of the angle between two faces; NaN where one has no area.
- * @param {Float64Array} faces
- * @param {number} f
- * @param {number} g
- */
+/** Of the angle between two faces; NaN where one has no area. */
+/** @type {(faces: Float64Array, f: number, g: number) => number} */
 function cosine(faces, f, g) {
   const [x, y, z] = [faces[f], faces[f + 1], faces[f + 2]], [u, v, w] = [faces[g], faces[g + 1], faces[g + 2]];
   return (x * u + y * v + z * w) / Math.sqrt((x * x + y * y + z * z) * (u * u + v * v + w * w));

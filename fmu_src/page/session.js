@@ -25,10 +25,8 @@ class Session extends Samples {
     this.startAgain();
   }
 
-  /**
-   * Begin anew; inputs and parameters as they are, or as the FMU has them.
-   * @param {boolean} all
-   */
+  /** Begin anew; inputs and parameters as they are, or as the FMU has them. */
+  /** @type {(all?: boolean) => void} */
   startAgain(all = false) {
     if (all) this.values = this.defaults();
     this.engine.reset();
