@@ -82,10 +82,8 @@ class Engine {
     this.call("engine_initialise");
   }
 
-  /**
-   * @param {number} t
-   * @param {number} h s
-   */
+  /** From a time by a step, s. */
+  /** @type {(t: number, h: number) => void} */
   step(t, h) {
     this.call("engine_step", t, h);
   }

@@ -19,7 +19,7 @@ class Handle {
     this.session = session;
     this.place = place;
     this.told = told;
-    this.axes = session.steered && session.groups.has("x_des") ? session.facts.axes : "";
+    this.axes = session.steered && session.groups.has("x_des") ? session.axes : [];
     this.turns = session.steered && session.groups.has("quat_des");
     /** @type {Map<number, number[]>} where pointers are, in parts of the picture */
     this.pointers = new Map();
@@ -61,7 +61,7 @@ class Handle {
     this.drag = null;
     if (this.pointers.size > 1 || event.button !== 0) return;
     const ring = this.turns ? this.nearest(at, grip) : -1;
-    if (this.axes && this.distance(at, this.place()) < GRIP * grip) this.drag = this.carry(at);
+    if (this.axes.length && this.distance(at, this.place()) < GRIP * grip) this.drag = this.carry(at);
     else if (ring >= 0) this.drag = this.turn(at, ring);
   }
 
@@ -86,29 +86,23 @@ class Handle {
   carry(at) {
     const begin = this.place(), { camera, axes } = this;
     let normal = camera.back;
-    if (axes.length < 3) {
-      const free = "xyz".split("").filter((axis) => !axes.includes(axis)).map((axis) => base("xyz".indexOf(axis)));
-      normal = free.length === 1 ? free[0] : unit(plus(camera.back, -dot(camera.back, line(axes)), line(axes)));
-    }
+    if (axes.length === 2) normal = base(this.session.free[0]);
+    if (axes.length === 1) normal = unit(plus(normal, -normal[axes[0]], base(axes[0])));
     const first = camera.meet(at[0], at[1], begin, normal) ?? begin;
     return (/** @type {number} */ x, /** @type {number} */ y) => {
       const met = camera.meet(x, y, begin, normal);
       if (!met) return;
       const place = plus(plus(begin, 1, met), -1, first);
-      this.told("x_des", axes.split("").map((axis) => place["xyz".indexOf(axis)]));
+      this.told("x_des", axes.map((axis) => place[axis]));
     };
   }
 
   /** The points of the ring about an axis of the target. */
   /** @type {(axis: number) => number[][]} */
   ring(axis) {
-    const place = this.place(), turned = rotation(this.session.held("quat_des"));
-    const [one, two] = [base((axis + 1) % 3), base((axis + 2) % 3)];
-    return Array.from({ length: RING_POINTS + 1 }, (_, i) => {
-      const angle = (2 * Math.PI * i) / RING_POINTS;
-      const p = plus(plus([0, 0, 0], Math.cos(angle), one), Math.sin(angle), two);
-      return plus(place, RING * this.camera.size, transform(turned, p));
-    });
+    const turned = rotation(this.session.held("quat_des"));
+    const [one, two] = [1, 2].map((i) => transform(turned, base((axis + i) % 3)));
+    return circle(this.place(), RING * this.camera.size, one, two, RING_POINTS);
   }
 
   /** The axis of the ring that is next to a point of the picture, else -1. */
@@ -125,10 +119,7 @@ class Handle {
     const place = this.place(), start = this.session.held("quat_des"), turned = rotation(start);
     const normal = transform(turned, base(axis)), one = transform(turned, base((axis + 1) % 3));
     const two = cross(normal, one);
-    /**
-     * @param {number} x
-     * @param {number} y
-     */
+    /** @type {(x: number, y: number) => number | null} */
     const angle = (x, y) => {
       const met = this.camera.meet(x, y, place, normal);
       const arm = met && plus(met, -1, place);
@@ -142,15 +133,4 @@ class Handle {
       this.told("quat_des", compose(start, [...plus([0, 0, 0], Math.sin(half), base(axis)), Math.cos(half)]));
     };
   }
-}
-
-/** @type {(axis: number) => number[]} */
-function base(axis) {
-  return [0, 1, 2].map((i) => Number(i === axis));
-}
-
-/** The direction of a single task axis. */
-/** @type {(axes: string) => number[]} */
-function line(axes) {
-  return base("xyz".indexOf(axes));
 }

@@ -76,3 +76,23 @@ function unit(a) {
   const length = Math.hypot(a[0], a[1], a[2]);
   return [a[0] / length, a[1] / length, a[2] / length];
 }
+
+/** @type {(axis: number) => number[]} */
+function base(axis) {
+  return [0, 1, 2].map((i) => Number(i === axis));
+}
+
+/** Where a frame is. */
+/** @type {(m: Numbers) => number[]} */
+function originOf(m) {
+  return [m[12], m[13], m[14]];
+}
+
+/** Points of a circle, from one direction to the other and around. */
+/** @type {(centre: Numbers, radius: number, one: Numbers, two: Numbers, parts?: number) => number[][]} */
+function circle(centre, radius, one, two, parts = 96) {
+  return Array.from({ length: parts + 1 }, (_, i) => {
+    const angle = (2 * Math.PI * i) / parts;
+    return plus(plus(centre, radius * Math.cos(angle), one), radius * Math.sin(angle), two);
+  });
+}

@@ -104,11 +104,8 @@ class Remote extends Samples {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify([order, value]));
   }
 
-  /**
-   * Set an input from the next step on; a parameter begins the run anew.
-   * @param {string} name of a variable, or of a vector: a number sets all of its elements
-   * @param {Value | number[]} value
-   */
+  /** Set an input from the next step on; a parameter begins the run anew. */
+  /** @type {(name: string, value: Value | number[]) => void} */
   set(name, value) {
     const pairs = this.checked(name, value);
     this.values = new Map([...this.values, ...pairs]);

@@ -35,10 +35,8 @@ class Replay extends Samples {
     if (on && this.moment >= this.duration) this.moment = 0;
   }
 
-  /**
-   * @param {number} passed s, by the clock
-   * @param {number} speed
-   */
+  /** Go on by s of the clock. */
+  /** @type {(passed: number, speed: number) => void} */
   advance(passed, speed) {
     this.moment += Math.min(passed, LONGEST) * speed;
     if (this.moment < this.duration) return;

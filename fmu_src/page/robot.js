@@ -6,10 +6,8 @@ class Robot {
     this.facts = facts;
   }
 
-  /**
-   * Where all links are in the root frame.
-   * @param {Numbers} q rad or m
-   */
+  /** Where all links are in the root frame, at positions in rad or m. */
+  /** @type {(q: Numbers) => Float64Array[]} */
   links(q) {
     /** @type {Float64Array[]} */
     const places = [placed([0, 0, 0])];
@@ -27,6 +25,12 @@ class Robot {
     return links[this.facts.frameLink];
   }
 
+  /** Where the end effector is. */
+  /** @type {(q: Numbers) => number[]} */
+  end(q) {
+    return originOf(this.frame(this.links(q)));
+  }
+
   /**
    * A ball outside of which no target can be reached: about the first joint that moves the frame, as
    * far as all that follow are long; and the links to the frame.
@@ -40,13 +44,13 @@ class Robot {
     let radius = 0;
     for (const i of chain.slice(first)) {
       const { place, prismatic, column } = this.facts.links[i];
-      if (i !== chain[first]) radius += Math.hypot(place[12], place[13], place[14]);
+      if (i !== chain[first]) radius += Math.hypot(...originOf(place));
       if (prismatic && column >= 0) {
         const { low, high } = this.facts.joints[column];
         radius += Math.max(Math.abs(low ?? Infinity), Math.abs(high ?? Infinity));
       }
     }
-    return { centre: transform(links[chain[first]], [0, 0, 0]), radius };
+    return { centre: originOf(links[chain[first]]), radius };
   }
 
   /** Joints that are at a limit. */

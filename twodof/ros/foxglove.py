@@ -8,10 +8,11 @@ from threading import Lock
 from typing import Any
 
 from ..errors import InputError, PublishError
-from ..simulation.experiments import Experiment, Value, resolve
+from ..plant.variables import GAINS
+from ..simulation.experiments import Experiment, Value, check_going_on, resolve
 from ..simulation.sample import Sample, Sink
 from .cdr import Rows
-from .messages import GAINS, Messages, check_gains, store_of
+from .messages import Messages, store_of
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -153,7 +154,7 @@ class _Gains(ServerListener):
                 if parameter.name not in self._groups:
                     raise InputError(f"'{parameter.name:.80}' is no gain of this FMU")
                 asked = resolve(self._fmu, {parameter.name: _numbers(parameter.get_value())})
-                check_gains(asked)
+                check_going_on(self._fmu, asked, self.held)
             except InputError as error:
                 LOG.warning("a parameter that Foxglove set is ignored: %s", error)
                 continue
