@@ -407,13 +407,19 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
         (["--speed", "inf"], "--speed inf is no factor"),
         (["--timeout", "-1"], "--timeout -1 is no time"),
         (["--on-timeout", "ramp"], "--on-timeout 'ramp' is for control 'effort'"),
+        (["--rate", "0"], "--rate 0: not a number of steps a second"),
+        (["--rate", "nan"], "--rate nan"),
+        (["--rate", "inf"], "--rate inf"),
+        (["--overwrite"], "--overwrite does nothing without -o"),
+        (["--stop-time", "0.005"], "the run of 0.005 s is no whole number of steps of 0.01 s"),
         (["--on-timeout", "hold", "--lockstep"], "--on-timeout is for commands of joints that are"),
     ],
 )
 def test_options_that_cannot_be(
     jointed: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
 ) -> None:
-    assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == 1
+    usage = options[0] in ("--rate", "--overwrite")
+    assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == (2 if usage else 1)
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"twodof: error: {culprit}"), line
 

@@ -6,12 +6,10 @@ import json
 import re
 import signal
 import socket
-import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 
 import browser
@@ -45,9 +43,6 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
 
 import twodof
-from twodof.errors import InputError
-from twodof.pages.loop import Loop
-from twodof.simulation.experiments import experiment
 
 Q_START = np.array([0.5, 0.35])
 KP, KD = 50.0, 40.0  # those of the default FMU
@@ -310,73 +305,6 @@ def socket_of(command: Served) -> str:
     return command.url.replace("http:", "ws:") + "/socket"
 
 
-def loop_of(fmu: Path) -> Loop:
-    return Loop(experiment(fmu, stop_time=np.inf))
-
-
-def test_the_end_does_not_wait_for_orders(native_path: Path) -> None:
-    """Some of which take long."""
-    loop, asked = loop_of(native_path), iter([False, True])
-    for _ in range(5):
-        loop.tell("reset")
-    loop.play(lambda: next(asked, True))
-    assert loop.news()["run"] < 5
-
-
-@pytest.mark.parametrize("everything", [False, True])
-def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> None:
-    """What is set before a step holds for it, and what is set after a reset is not reset."""
-    loop = loop_of(native_path)
-    for order, value in (
-        ("change", {"x_des[1]": 0.11}), ("step", None), ("change", {"x_des[1]": 0.12}),
-        ("step", None), ("reset", everything), ("change", {"x_des[2]": 0.07}), ("step", None),
-    ):  # fmt: skip
-        loop.tell(order, value)
-    loop.play(lambda: loop.news()["run"] > 1 and loop.news()["t"] == 0.01)
-    news = loop.news()
-    target = [0.2 if everything else 0.12, 0.07]
-    assert [news["values"][f"x_des[{i}]"] for i in (1, 2)] == target
-    assert news["rows"][-1][-2:] == target
-
-
-def test_there_are_no_news_of_a_run_without_a_sample(native_path: Path) -> None:
-    """While a page asks for them all the time."""
-    loop, ended, counts = loop_of(native_path), Event(), set()
-
-    def ask() -> None:
-        while not ended.is_set():
-            counts.add(len(loop.news()["rows"]))
-
-    asking, interval = Thread(target=ask), sys.getswitchinterval()
-    sys.setswitchinterval(1e-5)
-    try:
-        asking.start()
-        for _ in range(30):
-            loop.tell("reset")
-        loop.play(lambda: loop.news()["run"] > 30)
-    finally:
-        sys.setswitchinterval(interval)
-        ended.set()
-        asking.join()
-    assert counts == {1}
-
-
-def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path: Path) -> None:
-    loop, told = loop_of(native_path), [{"payload": 0.3}, {"x_des[1]": 0.11}, None, {"rtol": 0.0}]
-
-    def stop() -> bool:
-        if told:
-            values = told.pop(0)
-            loop.tell("change" if values else "step", values)
-        return bool(loop.news()["noted"])
-
-    loop.play(stop)
-    news = loop.news()
-    assert news["notes"] == ["rtol = 0 must be > 0"] and news["t"] == 0.0
-    values = [news["values"][name] for name in ("x_des[1]", "payload", "rtol")]
-    assert values == [0.11, 0.3, 1e-3]
-
-
 def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
     for headers, status in (
         ((("Host", "localhost"), ("Origin", "http://localhost")), 101),
@@ -406,17 +334,6 @@ def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> 
         other.setblocking(False)
         with pytest.raises(BlockingIOError):
             other.accept()
-
-
-def test_single_step_and_reset(page: Page) -> None:
-    for k in range(1, 4):
-        press(page, "Step")
-        until(page, lambda found, k=k: found["time"] == f"{0.01 * k:.3f} s")
-    page.wait_for_timeout(200)
-    assert rows(page)["time"] == "0.030 s"
-    press(page, "Reset")
-    found = until(page, lambda found: found["time"] == "0.000 s")
-    assert joints(found) == pytest.approx(Q_START, abs=ROUNDED)
 
 
 def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path) -> None:
@@ -465,46 +382,6 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
         if k < len(states) - 1:
             due = abs(sample.t - moment_of_change) < 1e-6
             sample = again.send(values if due else None)
-
-
-def test_full_disk_ends_the_recording_alone(native_path: Path, disk: Callable[..., Path]) -> None:
-    """One note says so, and a second one that another recording cannot begin."""
-    bag = disk(8192) / "bag"
-    loop, ended = Loop(experiment(native_path, stop_time=np.inf), bag=str(bag)), Event()
-    loop.viewers = 1
-
-    def goes_on() -> None:
-        steps = loop.steps
-        wait_until(lambda: loop.steps > steps + 30)
-
-    playing = Thread(target=loop.play, args=(ended.is_set,))
-    playing.start()
-    try:
-        loop.tell("record", True)
-        wait_until(lambda: loop.news()["recorded"] > 20)
-        with (
-            pytest.raises(OSError, match="No space left"),
-            (bag.parent / "other").open("wb") as other,
-        ):
-            while True:
-                other.write(bytes(256))
-                other.flush()
-        wait_until(lambda: loop.news()["noted"] == 1)
-        assert loop.news()["recorded"] == 0
-        loop.tell("record", True)
-        wait_until(lambda: loop.news()["noted"] == 2)
-        goes_on()
-    finally:
-        ended.set()
-        playing.join()
-    said, again = loop.news()["notes"]
-    assert again.startswith("There is no recording")
-    assert_consistent(bag, "mcap")
-    kept = len(read_with_mcap(bag))
-    assert kept == len(twodof.read_bag(bag).t) > 20
-    assert said.startswith("The recording has ended")
-    assert f"the disk is full; it is closed with its first {kept} samples" in said
-    assert not bag.with_name("bag-2").exists()
 
 
 def told(page: Page) -> str:
@@ -619,10 +496,3 @@ def test_a_page_whose_server_ends_goes_on_with_the_next(
     mass = np.array([[3.0, coupled], [coupled, 0.01 + 0.15**2]])
     e = jacobian @ np.linalg.solve(mass, [2.0, 0.0]) / 100.0
     assert np.subtract(x, (0.4, 0.1)) == pytest.approx(e, abs=2e-5)
-
-
-def test_a_gain_below_0_is_refused_before_it_ends_the_run(native_path: Path) -> None:
-    loop = loop_of(native_path)
-    with pytest.raises(InputError, match=r"Kp\[1\] = -5 is less than 0"):
-        loop.tell("change", {"Kp": -5.0})
-    assert loop.news()["values"]["Kp[1]"] == 50.0

@@ -41,8 +41,7 @@ from rosbags.rosbag2 import Reader
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError, PageError
-from twodof.export.arm_page import FUNCTIONS, SCRIPTS
-from twodof.export.compiler import UNITS, compile_web_module
+from twodof.export.arm_page import SCRIPTS
 from twodof.fmu import instantiate
 from twodof.plots.track import read_tracks
 from twodof.simulation.experiments import resolve
@@ -478,34 +477,6 @@ def test_the_documentation_of_a_native_fmu_is_alive(browser, native_path, tmp_pa
 
 def test_equal_fmus_make_equal_pages(native_path, arm, tmp_path) -> None:
     assert twodof.page(native_path, tmp_path / "again.html").read_bytes() == arm.read_bytes()
-
-
-def test_the_engine_imports_nothing(native_path, arm, tmp_path) -> None:
-    with zipfile.ZipFile(native_path) as archive:
-        sources = {
-            Path(name).name: archive.read(name)
-            for name in archive.namelist()
-            if name.startswith("sources/")
-        }
-    module = compile_web_module(
-        {**sources, "page.c": (ASSETS / "page.c").read_bytes()}, (*UNITS, "page.c"), FUNCTIONS
-    )
-    sections = set()
-    position = 8
-    while position < len(module):
-        kind, size, shift = module[position], 0, 0
-        position += 1
-        while True:
-            byte = module[position]
-            position += 1
-            size |= (byte & 127) << shift
-            shift += 7
-            if byte < 128:
-                break
-        sections.add(kind)
-        position += size
-    assert 10 in sections and 2 not in sections  # code, and no imports
-    assert len(module) < 100_000
 
 
 def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:

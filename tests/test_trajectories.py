@@ -271,20 +271,20 @@ def test_what_cannot_be_followed(
 
 
 @pytest.mark.parametrize(
-    ("points", "options", "reason"),
+    ("after", "there", "step", "reason"),
     [
-        ([(2e9, *THERE)], [], "its trajectories take 2e+09 s, more than 1000000 steps of 0.01 s"),
-        ([(1.0, *THERE)], ["--step", "0"], "more than 1000000 steps of 0 s"),
-        ([(1e-9, (1e300, 0.0), (0.0, 0.0), (0.0, 0.0))], [], "is not finite"),
+        (2e9, THERE, "0.01", "its trajectories take 2e+09 s, more than 1000000 steps of 0.01 s"),
+        (1.0, THERE, "0", "more than 1000000 steps of 0 s"),
+        (1e-9, ((1e300, 0.0), (0.0, 0.0), (0.0, 0.0)), "0.01", "is not finite"),
     ],
 )
 def test_what_would_have_no_end(
     arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
-    points: Any, options: list[str], reason: str,
+    after: float, there: Any, step: str, reason: str,
 ) -> None:  # fmt: skip
-    bag = write(tmp_path / "bag", (0.0, trajectory(points)))
-    given = ["run", str(arm), "--input", str(bag), *options, "-o", str(tmp_path / "none")]
-    assert main(given) == 1
+    bag = write(tmp_path / "bag", (0.0, trajectory([(after, *there)])))
+    given = ["--input", str(bag), "--step", step, "-o", str(tmp_path / "none")]
+    assert main(["run", str(arm), *given]) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith("twodof: error: ") and reason in line
 

@@ -178,42 +178,6 @@ def test_the_view_is_brought_back(page: Page) -> None:
     until(page, lambda shot: (shot == before).all(), picture)
 
 
-def test_picture_is_the_arm_at_that_time(page: Page, truth: np.ndarray) -> None:
-    """At moments when the target's marker is before neither link."""
-    times = (0.0, 0.15, 0.3, 2.05, 2.25, 2.4)
-    links = []
-    for time in times:
-        scrub(page, time)
-        shot = picture(page)
-        links.append([area(shot, colour) for colour in LINKS])
-    q = truth[[round(time / 0.01) for time in times], 1:]
-    assert misfits(links, q) < 1.0
-    for wrong in ([0.05, 0.0], [0.0, 0.05], [0.05, -0.05]):
-        for off in (np.ones(len(q)), *np.eye(len(q))):  # always, or at one of the moments
-            assert misfits(links, q + off[:, None] * wrong) > 2.0
-    for mirrored in (q * (-1, -1), q * (-1, -1) + (np.pi, 0.0), q * (1, -1)):
-        assert misfits(links, mirrored) > 10.0
-
-
-def misfits(links: list[list[np.ndarray]], q: np.ndarray) -> float:
-    """How far the links' pixels are off an arm at joint positions q, in tolerances.
-
-    A link's direction is seen to 0.0064 rad, as its sides are seen too. The middle of the second
-    is a point of the line from the elbow to the tip, to 0.5 pixels; where on it, and where and how
-    large the picture is, is fitted: it does not change.
-    """
-    angles, system, middles = [], [], []
-    for pair, directions in zip(links, np.cumsum(q, axis=1)):
-        for link, expected in zip(pair, directions):
-            angles.append(np.sin(direction(link) - expected))
-        for k, along in enumerate((np.cos(directions), -np.sin(directions))):  # y is downwards
-            system.append([k == 0, k == 1, *along])
-            middles.append(pair[1][:, k].mean())
-    fitted, *_ = np.linalg.lstsq(np.array(system, dtype=float), np.array(middles), rcond=None)
-    rest = np.array(system) @ fitted - middles if min(fitted[2:]) > 0 else np.inf
-    return max(np.abs(angles).max() / 0.015, np.abs(rest).max() / 1.5)
-
-
 def test_speed_is_that_of_the_wall_clock(page: Page, speed: float = 0.25) -> None:
     """Told from those of half and of twice as much, once a busy machine shows it in time."""
     page.get_by_label("speed").select_option(f"{speed:g}")
