@@ -68,13 +68,13 @@ class Foxglove(Sink):
 
     def __enter__(self) -> Foxglove:
         context = self._context = Context()  # which its channels do not keep
-        self._channels = {
-            name: Channel(
-                name, message_encoding="cdr", context=context,
-                schema=Schema(name=said.type, encoding="ros2msg", data=_definition(said.type)),
+        self._channels = {}
+        for name, said in self._messages.topics.items():
+            text, _ = store_of(said.type).generate_msgdef(said.type, ros_version=2)
+            schema = Schema(name=said.type, encoding="ros2msg", data=text.encode())
+            self._channels[name] = Channel(
+                name, schema=schema, message_encoding="cdr", context=context
             )
-            for name, said in self._messages.topics.items()
-        }  # fmt: skip
         try:
             self._server = start_server(
                 name="twodof", host=HOST, port=self._port, context=context,
@@ -168,8 +168,3 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return value[0] if len(value) == 1 else value
     return value
-
-
-def _definition(type_name: str) -> bytes:
-    """The text of a message type with those that it is made of, as in MCAP files."""
-    return store_of(type_name).generate_msgdef(type_name, ros_version=2)[0].encode()
