@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import signal
 import subprocess
@@ -49,7 +50,6 @@ ROWS = """() => ({
     ...Object.fromEntries([...document.querySelectorAll("[data-value]")].map(
         cell => [cell.dataset.value, cell.textContent.replaceAll("\\u2212", "-")])),
 })"""
-SAMPLES = "() => [...arm.data.subarray(0, arm.count * arm.width)]"
 DRAWN = """async () => {
     for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
 }"""
@@ -215,6 +215,13 @@ def assert_shown_as_text(page: Page, *texts: str) -> None:
 def rows(page: Page) -> dict[str, str]:
     """All of the readout at one moment, and its time."""
     return page.evaluate(ROWS)
+
+
+def samples(page: Page) -> np.ndarray:
+    """All samples, N × what each holds; as text, which takes a browser less time than numbers."""
+    held = "[...arm.data.subarray(0, arm.count * arm.width)]"
+    width, text = page.evaluate(f"[arm.width, JSON.stringify({held})]")
+    return np.array(json.loads(text)).reshape(-1, width)
 
 
 def numbers(text: str) -> list[float]:

@@ -19,11 +19,11 @@ client.on("advertise", (channels) => {
   }
   tell("advertised");
 });
-client.on("message", ({ subscriptionId, data }) => {
+client.on("message", ({ subscriptionId, timestamp, data }) => {
   const [topic, reader] = topics.get(subscriptionId);
-  tell(topic, reader.readMessage(data));
+  tell(topic, reader.readMessage(data), String(timestamp));
   if (topic === "/joint_states" && ++states === 8) {
-    client.setParameters([{ name: "Kp", value: [80, 90.5] }], "set");
+    client.setParameters([{ name: "Kp", value: [80, 90.5] }, { name: "Kn", value: [3] }], "set");
   }
 });
 client.on("parameterValues", ({ parameters }) => tell("parameters", parameters));

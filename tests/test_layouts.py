@@ -27,7 +27,7 @@ def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     """Of an FMU beside it, with all that a layout shows."""
     folder = tmp_path_factory.mktemp("layouts")
     fmu = folder / "Arm 1.fmu"
-    twodof.build_fmu(fmu, twodof.FmuOptions(native=True, control=request.param))
+    twodof.build_fmu(fmu, twodof.FmuOptions(control=request.param))
     twodof.simulate(fmu, twodof.Bag(folder / "bag", scene=True, effort=True), stop_time=0.05)
     twodof.layouts(fmu, folder)
     return folder / "bag"

@@ -5,6 +5,7 @@ Truth is the loop closed in Python by the same equation, and the bag read by the
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import signal
@@ -16,11 +17,14 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import SECOND
+from harness import wait_until
 from mcap.reader import make_reader
-from nodes import Node, ended, published, recorded, stamp_of
+from nodes import Node, ended, environment, published, recorded, stamp_of
 
 import twodof
 from twodof.cli.main import main
+from twodof.errors import PublishError
+from twodof.ros.network import network
 
 GAINS = {2: (2.0, 0.2), 7: (60.0, 8.0)}
 GOALS = {2: (0.9, -0.6), 7: (0.3, -0.4, 0.2, -1.8, 0.1, 1.6, 0.5)}
@@ -46,6 +50,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory, panda: str) -> Callable[[int]
     """The bare plant of the default arm (2 joints) and of the Panda (7)."""
     folder = tmp_path_factory.mktemp("bare")
 
+    @functools.cache
     def build(n: int) -> Path:
         options: dict[str, Any] = {"control": "effort", "native": True}
         if n == 7:
@@ -110,7 +115,7 @@ def test_lockstep_gives_the_same_bytes_each_time(
     length: Callable[[int, int], int],
 ) -> None:  # fmt: skip
     fmu, contents = bare(2), []
-    options = ["--lockstep", "--stamp-start", "1000", "--stop-time", "5", "--scene"]
+    options = ["--lockstep", "--stamp-start", "1000", "--stop-time", "2", "--scene"]
     bag = tmp_path / "bag"
     for _ in range(length(10, 2)):
         node = listen(*control(2))
@@ -119,7 +124,7 @@ def test_lockstep_gives_the_same_bytes_each_time(
         node.leave()
         contents.append(((bag / "run.json").read_bytes(), messages(bag)))
     assert all(content == contents[0] for content in contents)
-    assert len(json.loads(contents[0][0])["input_changes"]) > 400
+    assert len(json.loads(contents[0][0])["input_changes"]) > 160
 
 
 def test_a_controller_in_real_time_misses_nothing(
@@ -157,42 +162,45 @@ def test_a_controller_in_real_time_misses_nothing(
     assert [state[2:4] for state in states] == [[[*s.q], [*s.v]] for s in truth]
 
 
+@pytest.mark.parametrize(
+    ("topics", "command", "missing"),
+    [
+        ((), "", "nobody publishes on /joint_commands"),
+        (("/joint_commands=command",), "", "nobody hears /joint_states"),
+        (
+            ("/joint_commands=command", "/joint_states"), "",
+            "who publishes on /joint_commands is silent",
+        ),
+        (
+            ("/joint_commands=command", "/joint_states"), "1 5000000007 joint1 - - 0.1",
+            "the latest on /joint_commands is stamped 5.000000007 s, not 9.000000000 s;"
+            " a command has the stamp of the state that it answers",
+        ),
+    ],
+)  # fmt: skip
 def test_lockstep_says_who_is_missing(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
-) -> None:
-    fmu = bare(2)
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
+    topics: tuple[str, ...], command: str, missing: str,
+) -> None:  # fmt: skip
+    node = listen(*topics) if topics else None
 
-    def ends(bag: str, *told: str) -> None:
-        timeout = "1" if bag == "nobody" else "5"  # in which a busy machine finds a node
-        options = ["--lockstep", "--timeout", timeout, "-o", str(tmp_path / bag)]
-        with published(number, fmu, *options) as process:
-            while told and process.poll() is None:  # what is sent before it is heard is lost
-                node.say(*told)
-                time.sleep(0.1)
-            _, err = ended(process, 1)
-        (line,) = err.splitlines()
-        errors.append(line.partition(": no command for the sample at t = ")[2])
-        assert len(recorded(tmp_path / bag)["/joint_states"]) == 1
+    def opened(wire: twodof.Publisher) -> None:
+        """Wait until both have found each other, as a timeout does not."""
+        if node is None:
+            return
+        node.until(lambda: all(["matched", it.split("=")[0], 1] in node.told for it in topics))
+        wait_until(lambda: wire._listener.is_matched("/joint_commands"))
+        if len(topics) > 1:
+            wait_until(wire._writers["/joint_states"].get_matched_subscriptions)
+        if command:
+            node.say(f"/joint_commands {command}")
 
-    errors: list[str] = []
-    ends("nobody")
-    node = listen("/joint_commands=command")
-    ends("deaf")
-    node.leave()
-    node = listen("/joint_commands=command", "/joint_states")
-    ends("silent")
-    node.leave()
-    node = listen("/joint_commands=command", "/joint_states")
-    ends("stamp", "/joint_commands 1 5000000007 joint1 - - 0.1")
-    expected = (
-        "0 s in [\\d.]+ s: nobody publishes on /joint_commands",
-        "0 s in [\\d.]+ s: nobody hears /joint_states",
-        "0 s in [\\d.]+ s: who publishes on /joint_commands is silent",
-        "0 s in [\\d.]+ s: the latest on /joint_commands is stamped 5.000000007 s,"
-        " not \\d+[.]\\d+ s; a command has the stamp of the state that it answers",
-    )
-    for error, text in zip(errors, expected, strict=True):
-        assert re.fullmatch(text.replace("[.]\\d+", "[.]?\\d*", 1), error), error
+    place, bag = network(environment(number)), twodof.Bag(tmp_path / "bag")
+    wire = twodof.Publisher(place, lockstep=True, timeout=0.5, opened=opened)
+    expected = rf"no command for the sample at t = 0 s in 0[.]\d+ s: {re.escape(missing)}"
+    with pytest.raises(PublishError, match=expected):
+        twodof.publish(bare(2), bag, wire=wire, stamp_start=9.0)
+    assert len(recorded(tmp_path / "bag")["/joint_states"]) == 1
 
 
 def test_a_controller_that_stalls_dies_and_returns(
@@ -226,9 +234,10 @@ def test_a_controller_that_stalls_dies_and_returns(
         np.testing.assert_allclose(np.diff(tau[k - 40 : k + 1], n=2, axis=0), 0.0, atol=1e-9)
 
 
-def test_commands_that_mean_nothing_have_one_warning_a_kind(
+def test_commands_that_mean_nothing_or_are_absurd_end_no_run(
     bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
 ) -> None:
+    """The former have one warning a kind."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")
     yesterday = time.time_ns() - 86_400 * SECOND
@@ -245,16 +254,24 @@ def test_commands_that_mean_nothing_have_one_warning_a_kind(
             ):
                 node.say(f"/joint_commands {line}")
             node.hears()
+        node.say("/joint_commands 1 0 joint1,joint2 - - 1e300,-1e300")
+        node.hears(more=120)
         process.send_signal(signal.SIGINT)
         _, err = ended(process, 130)
     changes = json.loads((bag / "run.json").read_text())["input_changes"]
-    assert [values for _, values in changes] == [{"tau_cmd[1]": 0.25}]
+    first, *values = [values for _, values in changes]
+    assert first == {"tau_cmd[1]": 0.25}
+    absurd = values.index({"tau_cmd[1]": 1e300, "tau_cmd[2]": -1e300})
+    for ramp in values[:absurd]:  # of a machine that stood still
+        assert ramp.keys() == {"tau_cmd[1]"} and 0.0 <= ramp["tau_cmd[1]"] <= 0.25
+    assert np.isfinite([state[2:4] for state in recorded(bag)["/joint_states"]]).all()
     found = sorted(
         line.removeprefix("WARNING: a command on /joint_commands ") for line in err.splitlines()
     )
     expected = [
-        "cannot be read", "has 1 efforts for 2 joints", "is not finite", "is of joints that this",
-        "is of no joint of this robot: 'elbow'", "is stamped 8.64e+04 s before the sample",
+        "WARNING: no command for 0.5 s", "cannot be read", "has 1 efforts for 2 joints",
+        "is not finite", "is of joints that this", "is of no joint of this robot: 'elbow'",
+        "is stamped 8.64e+04 s before the sample",
     ]  # fmt: skip
     assert len(found) == len(expected)
     for line, text in zip(found, expected):
@@ -269,7 +286,7 @@ def test_a_flood_of_commands_holds_nothing_up(
     node = listen("/joint_states", "/joint_commands=command")
     with published(number, jointed, "-o", str(bag)) as process:
         node.hears()
-        node.say("/joint_commands 15000 0 joint2,joint1 0.1,0.2 - -")
+        node.say("/joint_commands 5000 0 joint2,joint1 0.1,0.2 - -")
         node.say("/joint_commands 1 0 joint2,joint1 0.3,0.4 - -")
         node.until(
             lambda: np.allclose(node.messages("/joint_states")[-1][2], (0.4, 0.3), atol=1e-2)
@@ -279,20 +296,6 @@ def test_a_flood_of_commands_holds_nothing_up(
     changes = json.loads((bag / "run.json").read_text())["input_changes"]
     targets = [(v["q_des[1]"], v["q_des[2]"]) for _, v in changes]
     assert targets == [(0.2, 0.1), (0.4, 0.3)]
-
-
-def test_absurd_efforts_end_no_run(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen
-) -> None:
-    bag = tmp_path / "bag"
-    node = listen("/joint_states", "/joint_commands=command")
-    with published(number, bare(2), "-o", str(bag)) as process:
-        node.hears()
-        node.say("/joint_commands 1 0 joint1,joint2 - - 1e300,-1e300")
-        node.hears(more=150)
-        process.send_signal(signal.SIGINT)
-        ended(process, 130)
-    assert np.isfinite([state[2:4] for state in recorded(bag)["/joint_states"]]).all()
 
 
 def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
@@ -319,7 +322,7 @@ def test_several_robots_are_in_step_and_apart(
     topics = [f"/{name}/joint_states" for name in names]
     node = listen(*(f"{t}=state" for t in topics), "/clock=clock", "/right/joint_commands=command")
     bag = tmp_path / "bag"
-    with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "9") as process:  # type: ignore[arg-type]
+    with published(number, *robots, "--clock", "-o", str(bag), "--stop-time", "6") as process:  # type: ignore[arg-type]
         node.hears("/Bare2/joint_states", more=50)
         node.say("/right/joint_commands 1 0 joint1,joint2 0.9,-0.6 0,0 -")
         _, err = ended(process)
@@ -327,26 +330,26 @@ def test_several_robots_are_in_step_and_apart(
     assert err.count("WARNING") == 1
     bags = [recorded(bag)[topic] for topic in topics]
     stamps = [stamp_of(state[0]) for state in bags[0]]
-    assert len(stamps) == 901 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
+    assert len(stamps) == 601 and all([stamp_of(s[0]) for s in b] == stamps for b in bags)
     for topic, states in zip(topics, bags):
         heard = node.messages(topic)
-        assert len(heard) > 500 and heard == states[-len(heard) :]
-    arrivals = [[it[2] for it in node.told if it[:2] == ["message", t]][-500:] for t in topics]
+        assert len(heard) > 300 and heard == states[-len(heard) :]
+    arrivals = [[it[2] for it in node.told if it[:2] == ["message", t]][-300:] for t in topics]
     apart = np.ptp(arrivals, axis=0)
     usual, most = np.quantile(apart, (0.5, 0.99)) / 1e6
     print(f"three robots within {usual:.3f} ms, 99 % within {most:.3f} ms")
     ends = [state[-1][2] for state in bags]
     assert np.abs(np.subtract(ends[1], [0.9, -0.6])).max() < 0.2  # it was 0.95
-    alone = [[*s.q] for s in twodof.samples(jointed, step=0.01, stop_time=9.0)]
+    alone = [[*s.q] for s in twodof.samples(jointed, step=0.01, stop_time=6.0)]
     assert [state[2] for state in bags[0]] == alone
 
 
-@pytest.mark.parametrize("speed", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("speed", [0.1, 10.0])
 def test_the_clock_is_that_of_the_simulation(
     native_path: Path, number: int, listen: Listen, speed: float
 ) -> None:
     node = listen("/clock=clock", "/joint_states")
-    end = 5 * speed
+    end = 4 * speed
     options = ["--clock", "--speed", str(speed), "--stamp-start", "100"]
     with published(number, native_path, *options, "--stop-time", str(end)) as process:
         assert ended(process)[1] == ""
@@ -369,7 +372,7 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
 
     def stands() -> bool:
         before = clock()[-1]
-        time.sleep(1.0)
+        time.sleep(0.6)
         return clock()[-1] == before
 
     with published(number, native_path, "--clock", "--stamp-start", "0") as process:
@@ -404,13 +407,19 @@ def test_pause_and_step(native_path: Path, number: int, listen: Listen) -> None:
         (["--speed", "inf"], "--speed inf is no factor"),
         (["--timeout", "-1"], "--timeout -1 is no time"),
         (["--on-timeout", "ramp"], "--on-timeout 'ramp' is for control 'effort'"),
+        (["--rate", "0"], "--rate 0: not a number of steps a second"),
+        (["--rate", "nan"], "--rate nan"),
+        (["--rate", "inf"], "--rate inf"),
+        (["--overwrite"], "--overwrite does nothing without -o"),
+        (["--stop-time", "0.005"], "the run of 0.005 s is no whole number of steps of 0.01 s"),
         (["--on-timeout", "hold", "--lockstep"], "--on-timeout is for commands of joints that are"),
     ],
 )
 def test_options_that_cannot_be(
     jointed: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
 ) -> None:
-    assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == 1
+    usage = options[0] in ("--rate", "--overwrite")
+    assert main(["publish", str(jointed), "--stop-time", "0.1", *options]) == (2 if usage else 1)
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith(f"twodof: error: {culprit}"), line
 

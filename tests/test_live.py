@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import re
 import signal
 import socket
-import subprocess
-import sys
 import time
-import urllib.request
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from threading import Event, Thread
+from typing import Any
 
 import browser
 import numpy as np
@@ -42,15 +38,11 @@ from browser import (
     until,
 )
 from harness import wait_until
-from playwright.sync_api import Browser, Locator, Page
+from playwright.sync_api import Browser, Page
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as open_socket
 
 import twodof
-from twodof.errors import InputError, PageError
-from twodof.pages.loop import Loop
-from twodof.pages.serving import Server
-from twodof.simulation.experiments import experiment
 
 Q_START = np.array([0.5, 0.35])
 KP, KD = 50.0, 40.0  # those of the default FMU
@@ -145,90 +137,69 @@ def assert_follows(
     assert x == pytest.approx(oracles.position(q), abs=2 * ROUNDED)
 
 
-def test_arm_follows_the_target_as_the_closed_form_says(page: Page) -> None:
-    target = np.array([0.12, 0.17])
-    type_into(page, "x_des[1], m", target[0])
-    type_into(page, "x_des[2], m", target[1])
-    before = picture(page)
-    seen = play(page, 3.0)
-    assert_follows(seen, target)
-    type_into(page, "x_des[2], m", -0.1)  # away from the arm
-    after = picture(page)
-    q = joints(rows(page))
-    found = [direction(area(after, colour)) for colour in LINKS]
-    assert np.sin(found - np.cumsum(q)) == pytest.approx(0.0, abs=0.015)  # rad
-    assert min(colours(before), colours(after)) > 100
-    assert (before != after).any(axis=-1).mean() > 0.01
-
-
-def test_readout_tells_how_well_time_is_kept(page: Page) -> None:
-    seen = play(page, 1.0)
-    counts = [numbers(found["deadlines missed"]) for found in seen]
-    for found, (missed, steps, worst) in zip(seen, counts):
-        assert steps - counts[0][1] == round(100 * (time_of(found) - time_of(seen[0])))
-        assert 0 <= missed <= steps and worst >= 0.0
-    press(page, "Play")
-    until(page, lambda found: numbers(found["real-time factor"]) == pytest.approx([1.0], abs=0.1))
-    pause(page)
-
-
-def test_samples_are_those_of_what_was_shown(page: Page) -> None:
-    """Which the curves are drawn of."""
-    seen = [*play(page, 1.0), rows(page)]
-    width = page.evaluate("arm.width")
-    samples = np.array(page.evaluate(browser.SAMPLES)).reshape(-1, width)
-    assert len(samples) == round(100 * time_of(seen[-1])) + 1
-    assert samples[:, 0] == pytest.approx(0.01 * np.arange(len(samples)))
-    for moment in seen:
-        k = round(100 * time_of(moment))
-        assert samples[k, 1:3] == pytest.approx(joints(moment), abs=ROUNDED)
-        x, target = oracles.position(samples[k, 1:3]), numbers(moment["target"])[:2]
-        assert np.linalg.norm(x - target) == pytest.approx(
-            numbers(moment["error"])[0], rel=1e-3, abs=1e-9
-        )
-
-
-def test_gains_are_those_of_the_sliders(page: Page) -> None:
-    type_into(page, "x_des[1], m", 0.2)
-    type_into(page, "x_des[2], m", 0.05)
-    type_into(page, "Kp, 1/s2", 80.0)
-    type_into(page, "Kd, 1/s", 12.0)
-    seen = play(page, 1.0)
-    assert_follows(seen, np.array([0.2, 0.05]), kp=80.0, kd=12.0)
-
-
-def test_target_is_dragged_in_the_scene(page: Page) -> None:
-    """With the mouse, and the arm follows."""
+def test_target_is_dragged_and_followed_as_the_closed_form_says(page: Page) -> None:
+    """Under gains of the sliders; time is kept, and the curves' samples are what is shown."""
     x, y = target_place(page)
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x - 60, y + 30, steps=5)
     page.mouse.up()
-    target = np.array(page.evaluate("arm.held('x_des')"))
-    moved = target - (0.2, 0.05)
+    moved = np.array(page.evaluate("arm.held('x_des')")) - (0.2, 0.05)
     assert moved[0] < -0.01 and moved[1] / moved[0] == pytest.approx(0.5, abs=0.02)
-    seen = play(page, 1.0)
-    assert numbers(seen[-1]["target"])[:2] == pytest.approx(target, abs=ROUNDED)
-    assert_follows(seen, target)
+    target = np.array([0.12, 0.17])
+    for i in (1, 2):
+        type_into(page, f"x_des[{i}], m", target[i - 1])
+    type_into(page, "Kp, 1/s2", 80.0)
+    type_into(page, "Kd, 1/s", 12.0)
+    before = picture(page)
+    seen = play(page, 1.5)
+    assert_follows(seen, target, kp=80.0, kd=12.0)
+    counts = [numbers(found["deadlines missed"]) for found in seen]
+    for found, (missed, steps, worst) in zip(seen, counts):
+        assert steps - counts[0][1] == round(100 * (time_of(found) - time_of(seen[0])))
+        assert 0 <= missed <= steps and worst >= 0.0
+    samples = browser.samples(page)
+    assert len(samples) == round(100 * time_of(rows(page))) + 1
+    assert samples[:, 0] == pytest.approx(0.01 * np.arange(len(samples)))
+    for moment in [*seen, rows(page)]:
+        q = samples[round(100 * time_of(moment)), 1:3]
+        assert q == pytest.approx(joints(moment), abs=ROUNDED)
+        assert numbers(moment["target"])[:2] == pytest.approx(target, abs=ROUNDED)
+        error = np.linalg.norm(oracles.position(q) - target)
+        assert error == pytest.approx(numbers(moment["error"])[0], rel=1e-3, abs=1e-9)
+    type_into(page, "x_des[2], m", -0.1)  # away from the arm
+    after, q = picture(page), joints(rows(page))
+    links = [direction(area(after, colour)) for colour in LINKS]
+    assert np.sin(links - np.cumsum(q)) == pytest.approx(0.0, abs=0.015)  # rad
+    assert min(colours(before), colours(after)) > 100
+    assert (before != after).any(axis=-1).mean() > 0.01
+    press(page, "Play")
+    until(page, lambda found: numbers(found["real-time factor"]) == pytest.approx([1.0], abs=0.1))
+    pause(page)
 
 
-def test_two_browsers_see_and_steer_the_same(shown: Browser, command: Served, page: Page) -> None:
-    with opened(shown, command.url) as other:
-        type_into(other, "x_des[1], m", 0.11)
+def test_two_viewers_see_and_steer_the_same(command: Served, page: Page) -> None:
+    """The other is a websocket."""
+    with open_socket(socket_of(command)) as other:
+
+        def sees(condition: Callable[[dict[str, Any]], bool]) -> None:
+            while not condition(json.loads(other.recv(timeout=browser.PATIENCE))):
+                pass
+
+        other.send('["change", {"x_des[1]": 0.11}]')
         until(page, lambda value: value == 0.11, lambda page: page.evaluate("arm.held('x_des')[0]"))
         type_into(page, "Kp, 1/s2", 70.0)
-        until(other, lambda value: value == "70", lambda page: kp(page).input_value())
-        press(other, "Step")
+        sees(lambda news: news["values"]["Kp[2]"] == 70.0)
+        other.send('["step", null]')
         until(page, lambda found: found["time"] == "0.010 s")
         press(page, "Play")
-        other.get_by_role("button", name="Pause").wait_for()
-        pause(other)
+        sees(lambda news: news["playing"] and news["t"] > 0.05)
+        other.send('["play", false]')
         page.get_by_role("button", name="Play").wait_for()
-        assert page.title() == other.title() == "2dof - twodof"
-
-
-def kp(page: Page) -> Locator:
-    return page.get_by_label("Kp, 1/s2", exact=True)
+        other.send('["change", {"Kp": 60.0}]')
+        kp = page.get_by_label("Kp, 1/s2", exact=True)
+        until(page, lambda value: value == "60", lambda page: kp.input_value())
+    assert page.title() == "2dof - twodof"
 
 
 def test_a_parameter_begins_the_run_anew(page: Page) -> None:
@@ -247,124 +218,91 @@ def test_a_parameter_begins_the_run_anew(page: Page) -> None:
     until(page, lambda value: value == 0, lambda page: page.evaluate("arm.values.get('payload')"))
 
 
-@pytest.mark.parametrize(
-    "orders",
-    [
-        ["no order"], ["[]"], ['["leave", 1]'], ['["change", 3]'], ['["change"]'], ["{}"],
-        [b"\xff"], ["x" * 100_000],
-    ],
+ORDERS = (
+    ["no order"], ["[]"], ['["leave", 1]'], ['["change", 3]'], ['["change"]'], ["{}"],
+    [b"\xff"], ["x" * 100_000],
 )  # fmt: skip
-def test_who_gives_no_orders_is_not_listened_to(
-    command: Served, page: Page, orders: list[str | bytes]
-) -> None:
-    with open_socket(socket_of(command)) as connection:
-        for order in orders:
-            connection.send(order)
-        with pytest.raises(ConnectionClosed):
-            while True:
-                connection.recv(timeout=browser.PATIENCE)
+
+
+def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> None:
+    for orders in ORDERS:
+        with open_socket(socket_of(command)) as connection:
+            for order in orders:
+                connection.send(order)
+            with pytest.raises(ConnectionClosed):
+                while True:
+                    connection.recv(timeout=browser.PATIENCE)
     press(page, "Step")
     until(page, lambda found: found["time"] == "0.010 s")
 
 
-@pytest.mark.parametrize("values", [{"q[1]": 1.0}, {"Kp": "much"}, {"Kp": [1]}, {"other": 0}])
-def test_a_setting_that_is_none_is_told(command: Served, page: Page, values: dict) -> None:
-    before = page.evaluate("arm.noted")
-    with open_socket(socket_of(command)) as connection:
-        connection.send(json.dumps(["change", values]))
-        until(page, lambda noted: noted > before, lambda page: page.evaluate("arm.noted"))
-        name = next(iter(values)).split("[")[0]
-        until(page, lambda said: name in said, told)
-        connection.send(json.dumps(["change", {"Kp": 60.0}]))
-        until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
+def test_a_setting_that_is_none_is_told_as_text(command: Served, page: Page) -> None:
+    noted, asked = page.evaluate("arm.noted"), ({"q[1]": 1.0}, {"Kp": "much"}, {browser.HOSTILE: 0})
+    for number, values in enumerate(asked, noted + 1):
+        latest(command, lambda news, number=number: news["noted"] == number, ["change", values])
+        name = next(iter(values)).split("[")[0][:50]
+        until(page, lambda said, name=name: name in said, told)
+    browser.assert_shown_as_text(page)
+    latest(command, lambda news: news["values"]["Kp[1]"] == 60.0, ["change", {"Kp": 60.0}])
+    until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
 
 
-def test_who_never_reads_holds_nothing_up(
-    shown: Browser, native_path: Path, tmp_path: Path
+def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(
+    shown: Browser, fmu_path: Path, tmp_path: Path
 ) -> None:
-    """Neither what others see, nor the end."""
-    with served("live", native_path, cwd=tmp_path) as command:
+    """In the Python flavour; what is beyond the page's own pace is not waited for."""
+    with served("live", fmu_path, cwd=tmp_path) as command:
         deaf = socket.create_connection(command.url.removeprefix("http://").split(":"))
         head = "".join(f"{name}: {value}\r\n" for name, value in browser.UPGRADE)
         deaf.sendall(f"GET /socket HTTP/1.1\r\nHost: localhost\r\n{head}\r\n".encode())
         with opened(shown, command.url) as page:
-            watch(page, time_of(rows(page)) + 1.0)
             press(page, "Record")
             page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
-        status, output, errors = command.interrupt()
-        assert (status, errors) == (130, "") and "bag " in output
+            seen = time_of(watch(page, time_of(rows(page)) + 1.0)[-1])
+        assert end(command, tmp_path, signal.SIGINT) >= seen - 1e-6
         deaf.close()
+
+
+def test_closing_the_last_page_pauses(native_path: Path, tmp_path: Path) -> None:
+    """And another signal ends as Ctrl-C does."""
+
+    def stands() -> bool:
+        """Whether time goes on no more than somebody looks."""
+        left = latest(command, lambda news: True)["t"]
+        time.sleep(0.7)
+        return bool(latest(command, lambda news: True)["t"] < left + 0.3)
+
+    with served("live", native_path, cwd=tmp_path) as command:
+        seen = latest(command, lambda news: news["recorded"] > 20, ["record", True])["t"]
+        wait_until(stands)
+        assert end(command, tmp_path, signal.SIGTERM) >= seen - 1e-6
+
+
+def latest(
+    command: Served, condition: Callable[[dict[str, Any]], bool], *orders: list[Any]
+) -> dict[str, Any]:
+    """News that fulfil a condition, as told to a page that gives orders, and then leaves."""
+    with open_socket(socket_of(command)) as connection:
+        for order in orders:
+            connection.send(json.dumps(order))
+        while not condition(news := json.loads(connection.recv(timeout=browser.PATIENCE))):
+            pass
+    return dict(news)
+
+
+def end(command: Served, folder: Path, number: signal.Signals) -> float:
+    """The last time in the bag of a command that is ended by a signal."""
+    status, output, errors = command.interrupt(number)
+    (bag,) = folder.glob("rosbag2_*")
+    assert (status, errors) == (130, "")
+    assert f"bag   {bag.name}\n" in output
+    assert_consistent(bag, "mcap")
+    made = json.loads((bag / "run.json").read_text())
+    return float(made["start_time"] + (len(read_with_mcap(bag)) - 1) * 0.01)
 
 
 def socket_of(command: Served) -> str:
     return command.url.replace("http:", "ws:") + "/socket"
-
-
-def loop_of(fmu: Path) -> Loop:
-    return Loop(experiment(fmu, stop_time=np.inf))
-
-
-def test_the_end_does_not_wait_for_orders(native_path: Path) -> None:
-    """Some of which take long."""
-    loop, asked = loop_of(native_path), iter([False, True])
-    for _ in range(5):
-        loop.tell("reset")
-    loop.play(lambda: next(asked, True))
-    assert loop.news()["run"] < 5
-
-
-@pytest.mark.parametrize("everything", [False, True])
-def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> None:
-    """What is set before a step holds for it, and what is set after a reset is not reset."""
-    loop = loop_of(native_path)
-    for order, value in (
-        ("change", {"x_des[1]": 0.11}), ("step", None), ("change", {"x_des[1]": 0.12}),
-        ("step", None), ("reset", everything), ("change", {"x_des[2]": 0.07}), ("step", None),
-    ):  # fmt: skip
-        loop.tell(order, value)
-    loop.play(lambda: loop.news()["run"] > 1 and loop.news()["t"] == 0.01)
-    news = loop.news()
-    target = [0.2 if everything else 0.12, 0.07]
-    assert [news["values"][f"x_des[{i}]"] for i in (1, 2)] == target
-    assert news["rows"][-1][-2:] == target
-
-
-def test_there_are_no_news_of_a_run_without_a_sample(native_path: Path) -> None:
-    """While a page asks for them all the time."""
-    loop, ended, counts = loop_of(native_path), Event(), set()
-
-    def ask() -> None:
-        while not ended.is_set():
-            counts.add(len(loop.news()["rows"]))
-
-    asking, interval = Thread(target=ask), sys.getswitchinterval()
-    sys.setswitchinterval(1e-5)
-    try:
-        asking.start()
-        for _ in range(60):
-            loop.tell("reset")
-        loop.play(lambda: loop.news()["run"] > 60)
-    finally:
-        sys.setswitchinterval(interval)
-        ended.set()
-        asking.join()
-    assert counts == {1}
-
-
-def test_a_parameter_that_is_refused_leaves_inputs_as_they_are(native_path: Path) -> None:
-    loop, told = loop_of(native_path), [{"payload": 0.3}, {"x_des[1]": 0.11}, None, {"rtol": 0.0}]
-
-    def stop() -> bool:
-        if told:
-            values = told.pop(0)
-            loop.tell("change" if values else "step", values)
-        return bool(loop.news()["noted"])
-
-    loop.play(stop)
-    news = loop.news()
-    assert news["notes"] == ["rtol = 0 must be > 0"] and news["t"] == 0.0
-    values = [news["values"][name] for name in ("x_des[1]", "payload", "rtol")]
-    assert values == [0.11, 0.3, 1e-3]
 
 
 def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
@@ -391,40 +329,11 @@ def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> 
             " {text: 'document.title = 1'}))",
         ):  # fmt: skip
             page.evaluate(f"() => {{ try {{ {code}; }} catch {{}} }}")
-        page.wait_for_timeout(1000)
+        page.wait_for_timeout(500)
         assert page.title() == "2dof - twodof"
         other.setblocking(False)
         with pytest.raises(BlockingIOError):
             other.accept()
-
-
-def test_single_step_and_reset(page: Page) -> None:
-    for k in range(1, 4):
-        press(page, "Step")
-        until(page, lambda found, k=k: found["time"] == f"{0.01 * k:.3f} s")
-    page.wait_for_timeout(200)
-    assert rows(page)["time"] == "0.030 s"
-    press(page, "Reset")
-    found = until(page, lambda found: found["time"] == "0.000 s")
-    assert joints(found) == pytest.approx(Q_START, abs=ROUNDED)
-
-
-def test_disturbance_pushes_the_arm_away(page: Page) -> None:
-    """At rest J⁻ᵀ τ_ext is balanced by Kp: M (J⁻¹ Kp e) = τ_ext, with the textbook's M."""
-    target, torque, gain = np.array([0.2, 0.05]), np.array([0.05, 0.0]), 80.0
-    type_into(page, "Kp, 1/s2", gain)
-    type_into(page, "Kd, 1/s", 16.0)
-    type_into(page, "x_des[1], m", target[0])
-    type_into(page, "x_des[2], m", target[1])
-    type_into(page, "tau_ext[1], N.m", torque[0])
-    press(page, "Play")
-    until(page, lambda found: time_of(found) > 2.5)
-    pause(page)
-    q, x = (np.array(page.evaluate(f"[...arm.at('{group}')]")) for group in "qx")
-    plant = oracles.TwoLinkArm(Path(__file__).parents[1] / "urdf/2dof.urdf", 9.81)
-    e = -oracles.jacobian(q) @ np.linalg.solve(plant.mass_matrix(q), torque) / gain
-    assert target - x == pytest.approx(e, abs=2e-5)
-    assert np.linalg.norm(e) > 1e-3
 
 
 def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path) -> None:
@@ -475,38 +384,6 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
             sample = again.send(values if due else None)
 
 
-def test_full_disk_ends_the_recording_alone(
-    shown: Browser, native_path: Path, tmp_path: Path, disk: Callable[..., Path]
-) -> None:
-    """One note says so, and a second one that another recording cannot begin."""
-    bag = disk(8192) / "bag"
-    with served("live", native_path, "-o", bag, cwd=tmp_path) as command:
-        with opened(shown, command.url) as page:
-            press(page, "Record")
-            page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
-            watch(page, time_of(rows(page)) + 0.3)
-            with (
-                pytest.raises(OSError, match="No space left"),
-                (bag.parent / "other").open("wb") as other,
-            ):
-                while True:
-                    other.write(bytes(256))
-                    other.flush()
-            said = until(page, lambda said: "The recording has ended" in said, told)
-            page.get_by_role("button", name="Record", exact=True).wait_for()
-            press(page, "Record")
-            until(page, lambda said: "There is no recording" in said, told)
-            watch(page, time_of(rows(page)) + 0.3)
-            assert "ended" not in told(page)
-        status, output, errors = command.interrupt()
-    assert (status, output, errors) == (130, "", "")
-    assert_consistent(bag, "mcap")
-    kept = len(read_with_mcap(bag))
-    assert kept == len(twodof.read_bag(bag).t) > 20
-    assert f"the disk is full; it is closed with its first {kept} samples" in said
-    assert not bag.with_name("bag-2").exists()
-
-
 def told(page: Page) -> str:
     return page.inner_text("#arm-said")
 
@@ -518,7 +395,7 @@ SLIDER = """<robot name="slider">
   <link name="beam"><inertial><origin xyz="0.15 0 0"/><mass value="1"/>
     <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
   <link name="tip"/>
-  <joint name="slide" type="prismatic"><parent link="rail"/><child link="carriage"/>
+  <joint name="_slide" type="prismatic"><parent link="rail"/><child link="carriage"/>
     <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="20" velocity="5"/></joint>
   <joint name="swing" type="revolute"><parent link="carriage"/><child link="beam"/>
     <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="20" velocity="9"/></joint>
@@ -527,80 +404,8 @@ SLIDER = """<robot name="slider">
 </robot>"""
 
 
-def test_joint_that_slides_has_its_own_units(shown: Browser, tmp_path: Path) -> None:
-    """Pushed with a force, it rests where Kp balances it, as in the test of a disturbance."""
-    (tmp_path / "slider.urdf").write_text(SLIDER)
-    options = twodof.FmuOptions(
-        urdf=tmp_path / "slider.urdf", frame="tip", axes="xy", q_start=(0.1, 0.6)
-    )
-    fmu = twodof.build_fmu(tmp_path / "Slider.fmu", options)
-    with served("live", fmu, cwd=tmp_path) as command, opened(shown, command.url) as page:
-        type_into(page, "Kp, 1/s2", 100.0)
-        type_into(page, "Kd, 1/s", 20.0)
-        type_into(page, "x_des[1], m", 0.4)
-        type_into(page, "x_des[2], m", 0.1)
-        type_into(page, "tau_ext[1], N", 2.0)
-        begin = time_of(rows(page))
-        until(page, lambda found: time_of(found) > begin + 1.8)
-        assert page.get_by_label("position, rad or m").count() == 1
-        s, q, *x = page.evaluate("[...arm.at('q'), ...arm.at('x')]")  # of one sample
-        status, _, errors = command.interrupt()
-    assert (status, errors) == (130, "")
-    assert x == pytest.approx([s + 0.3 * np.cos(q), 0.3 * np.sin(q)], abs=1e-9)
-    jacobian = np.array([[1.0, -0.3 * np.sin(q)], [0.0, 0.3 * np.cos(q)]])
-    coupled = -0.15 * np.sin(q)
-    mass = np.array([[3.0, coupled], [coupled, 0.01 + 0.15**2]])
-    e = jacobian @ np.linalg.solve(mass, [2.0, 0.0]) / 100.0
-    assert np.subtract(x, (0.4, 0.1)) == pytest.approx(e, abs=2e-5)
-
-
-def record(shown: Browser, command: Served) -> float:
-    """The last time that was shown of an arm whose motion is being recorded, when the page goes."""
-    with opened(shown, command.url) as page:
-        press(page, "Record")
-        page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
-        return time_of(watch(page, time_of(rows(page)) + 0.3)[-1])
-
-
-def end(command: Served, folder: Path, number: signal.Signals) -> float:
-    """The last time in the bag of a command that is ended by a signal."""
-    status, output, errors = command.interrupt(number)
-    (bag,) = folder.glob("rosbag2_*")
-    assert (status, errors) == (130, "")
-    assert f"bag   {bag.name}\n" in output
-    assert_consistent(bag, "mcap")
-    made = json.loads((bag / "run.json").read_text())
-    return float(made["start_time"] + (len(read_with_mcap(bag)) - 1) * 0.01)
-
-
-def test_ctrl_c_while_recording_closes_the_bag(
-    shown: Browser, fmu_path: Path, tmp_path: Path
-) -> None:
-    """In the Python flavour."""
-    with served("live", fmu_path, cwd=tmp_path) as command:
-        seen = record(shown, command)
-        assert end(command, tmp_path, signal.SIGINT) >= seen - 1e-6
-
-
-def test_closing_the_last_page_pauses(shown: Browser, native_path: Path, tmp_path: Path) -> None:
-    """And another signal ends as Ctrl-C does."""
-
-    def stands() -> bool:
-        """Whether time goes on no more than somebody looks."""
-        with open_socket(socket_of(command)) as connection:
-            left = json.loads(connection.recv())["t"]
-        time.sleep(1.0)
-        with open_socket(socket_of(command)) as connection:
-            return bool(json.loads(connection.recv())["t"] < left + 0.5)
-
-    with served("live", native_path, cwd=tmp_path) as command:
-        seen = record(shown, command)
-        wait_until(stands)
-        assert end(command, tmp_path, signal.SIGTERM) >= seen - 1e-6
-
-
 def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:
-    for i in range(25):
+    for i in range(20):
         connect(command.url)
         if i == 4:
             threads, memory = command.status("Threads"), command.status("VmRSS")
@@ -613,7 +418,8 @@ def test_twenty_reconnects_leak_nothing(command: Served, page: Page) -> None:
     watch(page, left + 0.3)  # one that leaves is not the last
 
 
-def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path) -> None:
+def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_path: Path) -> None:
+    """In the Python flavour; a target orientation of zeros is refused and ends nothing."""
     tree = ET.fromstring(panda)
     for link in tree.findall("link"):
         for part in [*link.findall("visual"), *link.findall("collision")]:
@@ -621,9 +427,8 @@ def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path)
     urdf = tmp_path / "panda.urdf"
     urdf.write_text(ET.tostring(tree, encoding="unicode"))
     options = twodof.FmuOptions(
-        urdf=urdf, frame="panda_hand", name="Panda", native=True,
-        q_start=oracles.REST["panda"],
-    )  # fmt: skip
+        urdf=urdf, frame="panda_hand", control="pose", q_start=oracles.REST["panda"]
+    )
     fmu = twodof.build_fmu(tmp_path / "Panda.fmu", options)
     with served("live", fmu, cwd=tmp_path) as command, opened(shown, command.url) as page:
         pause(page)
@@ -633,6 +438,14 @@ def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path)
         press(page, "Step")
         found = until(page, lambda found: numbers(found["error"])[0] > 0.09)
         assert sum(name.startswith("panda_joint") for name in found) == 7
+        quat = page.evaluate("arm.held('quat_des')")
+        for i in range(4):
+            type_into(page, f"quat_des[{i + 1}], number", 0.0)
+        until(page, lambda said: "quat_des = 0, 0, 0, 0 is no orientation" in said, told)
+        left = page.evaluate("arm.held('quat_des')")
+        assert left == [0.0, 0.0, 0.0, quat[3]]  # without the last
+        latest(command, lambda news: news["noted"] == 1, ["change", {"quat_des": 0}])
+        page.evaluate("(quat) => arm.set('quat_des', quat)", quat)
         begin = time_of(found)
         press(page, "Play")
         found = until(page, lambda found: time_of(found) > begin + 1.0)
@@ -640,27 +453,18 @@ def test_seven_joints_without_a_mesh(shown: Browser, panda: str, tmp_path: Path)
         assert len(pixels(picture(page), LINKS[0])) > 200  # a joint's ball, as dark as link 1
 
 
-def test_text_of_an_fmu_is_text(shown: Browser, tmp_path: Path) -> None:
-    (tmp_path / "arm.urdf").write_bytes(ET.tostring(browser.hostile_arm()))
-    options = twodof.FmuOptions(
-        urdf=tmp_path / "arm.urdf", frame=browser.HOSTILE + "EndEffector", axes="xy"
-    )
-    fmu = twodof.build_fmu(tmp_path / "Arm.fmu", options)
-    bag = browser.HOSTILE.replace("/", "")
-    with (
-        served("live", fmu, "-o", bag, cwd=tmp_path) as command,
-        opened(shown, command.url) as page,
-    ):
-        press(page, "Record")
-        press(page, "Stop recording")
-        page.get_by_text(f"{bag}, ").wait_for()  # the note
-        browser.assert_shown_as_text(page, "joint1", "joint2")
-
-
 def test_a_page_whose_server_ends_goes_on_with_the_next(
     shown: Browser, native_path: Path, tmp_path: Path
 ) -> None:
-    """Which steps another robot, with inputs of its own."""
+    """Which steps another robot, whose joints have units of their own.
+
+    At rest J⁻ᵀ τ_ext is balanced by Kp: M (J⁻¹ Kp e) = τ_ext, with the textbook's M.
+    """
+    (tmp_path / "slider.urdf").write_text(SLIDER)
+    options = twodof.FmuOptions(
+        urdf=tmp_path / "slider.urdf", frame="tip", axes="xy", q_start=(0.1, 0.6)
+    )
+    slider = twodof.build_fmu(tmp_path / "Slider.fmu", options)
     with served("live", native_path, cwd=tmp_path) as command:
         port = int(command.url.rpartition(":")[2])
         with opened(shown, command.url) as page:
@@ -668,60 +472,27 @@ def test_a_page_whose_server_ends_goes_on_with_the_next(
             command.interrupt(signal.SIGKILL)
             until(page, lambda said: "this page waits for it" in said, told)
             press(page, "Play")
-            page.wait_for_timeout(2500)  # it looks for one more than once
+            page.wait_for_timeout(1500)  # it looks for one more than once
             assert "this page waits for it" in told(page)
-            (tmp_path / "slider.urdf").write_text(SLIDER)
-            options = twodof.FmuOptions(urdf=tmp_path / "slider.urdf", frame="tip", axes="xy")
-            slider = twodof.build_fmu(tmp_path / "Slider.fmu", options)
-            with served("live", slider, "--set", "Kp=77", cwd=tmp_path, port=port):
+            with served("live", slider, "--set", "Kp=100", cwd=tmp_path, port=port) as following:
                 page.wait_for_function("() => globalThis.arm?.facts.robot === 'slider'")
-                assert page.evaluate("arm.held('Kp')") == [77, 77]
-                found = until(page, lambda found: time_of(found) > 0.1)
-                assert {"slide", "swing"} <= set(found)
+                assert page.evaluate("arm.held('Kp')") == [100, 100]
+                names = page.locator("#arm-readout td:first-child").all_text_contents()
+                assert names[:2] == ["_slide", "swing"]
                 assert told(page) == ""
-
-
-def test_port_in_use(native_path: Path, tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        done = subprocess.run(
-            [*browser.COMMAND, "live", str(native_path), "--port", f"{port}"],
-            cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
-    assert (done.returncode, done.stdout) == (1, "")
-    assert re.fullmatch(rf"twodof: error: port {port} of 127.0.0.1 is in use[^\n]*\n", done.stderr)
-
-
-def test_port_that_another_is_about_to_serve() -> None:
-    with Server(b"", port=0) as free:
-        port = int(free.url.rpartition(":")[2])
-    first = Server(b"", port=port)
-    with pytest.raises(PageError, match=f"port {port} of 127.0.0.1 is in use"):
-        Server(b"", port=port)
-    with first:
-        assert browser.answer(first.url, ("Host", "localhost")) == 200
-
-
-def test_a_gain_below_0_is_refused_before_it_ends_the_run(native_path: Path) -> None:
-    loop = loop_of(native_path)
-    with pytest.raises(InputError, match=r"Kp\[1\] = -5 is less than 0"):
-        loop.tell("change", {"Kp": -5.0})
-    assert loop.news()["values"]["Kp[1]"] == 50.0
-
-
-@pytest.mark.parametrize("method", ["HEAD", "POST", "DELETE"])
-def test_what_a_page_is_not_asked_for_is_answered(method: str) -> None:
-    """By its own word, as by curl -I."""
-    with Server(b"page", port=0) as server:
-        asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)
-        asking.request(method, "/")
-        answer = asking.getresponse()
-        assert (answer.status, answer.getheader("Allow"), answer.read()) == (405, "GET", b"")
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_page_on_all_addresses_is_opened_as_printed(host: str) -> None:
-    with Server(b"page", host, 0) as server:
-        assert f"//{host}:" not in server.url and "[::]" not in server.url
-        with urllib.request.urlopen(server.url, timeout=10) as answer:
-            assert answer.read() == b"page"
+                type_into(page, "Kd, 1/s", 20.0)
+                type_into(page, "x_des[1], m", 0.4)
+                type_into(page, "x_des[2], m", 0.1)
+                type_into(page, "tau_ext[1], N", 2.0)
+                begin = time_of(rows(page))
+                until(page, lambda found: time_of(found) > begin + 1.8)
+                assert page.get_by_label("position, rad or m").count() == 1
+                s, q, *x = page.evaluate("[...arm.at('q'), ...arm.at('x')]")  # of one sample
+                status, _, errors = following.interrupt()
+    assert (status, errors) == (130, "")
+    assert x == pytest.approx([s + 0.3 * np.cos(q), 0.3 * np.sin(q)], abs=1e-9)
+    jacobian = np.array([[1.0, -0.3 * np.sin(q)], [0.0, 0.3 * np.cos(q)]])
+    coupled = -0.15 * np.sin(q)
+    mass = np.array([[3.0, coupled], [coupled, 0.01 + 0.15**2]])
+    e = jacobian @ np.linalg.solve(mass, [2.0, 0.0]) / 100.0
+    assert np.subtract(x, (0.4, 0.1)) == pytest.approx(e, abs=2e-5)

@@ -6,7 +6,6 @@ the loopback interface, or in network namespaces that lead nowhere.
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 import signal
@@ -39,12 +38,28 @@ from twodof.files import data_file
 from twodof.plots.track import read_tracks
 from twodof.ros.network import LAST_DOMAIN, Network, network
 
+HASHES = {
+    "sensor_msgs JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "std_msgs String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "tf2_msgs TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "geometry_msgs PointStamped": (
+        "4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"
+    ),
+}
+"""Of types, as 'ros2 topic info --verbose' tells them."""
+TYPES = dict(
+    joint_states="sensor_msgs JointState", robot_description="std_msgs String",
+    tf="tf2_msgs TFMessage", tf_static="tf2_msgs TFMessage",
+    target="geometry_msgs PointStamped", end_effector="geometry_msgs PointStamped",
+)  # fmt: skip
+
 
 def test_another_makers_dds_hears_every_field_of_the_bag(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
     length: Callable[[int, int], int],
 ) -> None:  # fmt: skip
-    seconds, before = length(60, 4), 4  # in which a busy machine finds the node
+    """Under the names, types and type hashes of ROS 2, stamped by the wall clock."""
+    seconds, before = length(60, 2), 4  # in which a busy machine finds the node
     node = listen(*STREAMS, *LATCHED)
     bag = tmp_path / "bag"
     options = ["--scene", "--effort", "--stop-time", str(seconds + before), "-o", str(bag)]
@@ -66,77 +81,17 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
     assert re.search(
         rf"deadlines +\d+ of {100 * (seconds + before) + 1} missed, worst [\d.]+ ms", out
     )
-
-
-TYPES = {  # as 'ros2 topic info --verbose' tells them
-    "rt/joint_states": (
-        "sensor_msgs::msg::dds_::JointState_",
-        "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
-    ),
-    "rt/robot_description": (
-        "std_msgs::msg::dds_::String_",
-        "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
-    ),
-    **dict.fromkeys(
-        ("rt/tf", "rt/tf_static"),
-        (
-            "tf2_msgs::msg::dds_::TFMessage_",
-            "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-        ),
-    ),
-    **dict.fromkeys(
-        ("rt/target", "rt/end_effector"),
-        (
-            "geometry_msgs::msg::dds_::PointStamped_",
-            "4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
-        ),
-    ),
-}
-
-
-def test_names_types_and_type_hashes_are_those_of_ros_2(
-    native_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
-    node = listen()
-    with published(number, native_path, "--scene"):
-        node.until(lambda: len(node.told) >= len(TYPES))
-    found = {topic: rest for event, topic, *rest in node.told}
-    assert found == {t: [name, f"typehash=RIHS01_{it};"] for t, (name, it) in TYPES.items()}
-
-
-def test_stamps_are_the_wall_clock(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
-    node = listen("/joint_states")
-    bag = str(tmp_path / "bag")
-    with published(number, native_path, "--stop-time", "3", "-o", bag) as process:
-        ended(process)
-    delays = [it[2] - stamp_of(it[3][0]) for it in node.told if it[0] == "message"]
-    assert len(delays) > 100
+    writers = {topic: rest for event, topic, *rest in node.told if event == "writer"}
+    for topic, kind in TYPES.items():
+        name = kind.replace(" ", "::msg::dds_::") + "_"
+        assert writers.pop(f"rt/{topic}") == [name, f"typehash=RIHS01_{HASHES[kind]};"]
+    assert not writers
+    states = [it for it in node.told if it[:2] == ["message", "/joint_states"]]
+    delays = [it[2] - stamp_of(it[3][0]) for it in states]
     assert 0 < min(delays) < 0.02 * SECOND  # of those that a busy machine did not hold up
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
-def test_the_last_sample_before_a_signal_is_in_the_bag_and_on_the_wire(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
-    ending: signal.Signals,
-) -> None:  # fmt: skip
-    node = listen("/joint_states")
-    bag = tmp_path / "bag"
-    with published(number, native_path, "-o", str(bag)) as process:
-        node.hears(more=30)
-        process.send_signal(ending)
-        out, err = ended(process, 130)
-    assert err == ""
-    truth = recorded(bag)["/joint_states"]
-    node.sees(truth[-1])
-    heard = node.messages("/joint_states")
-    assert heard == truth[-len(heard) :]
-    assert assert_consistent(bag, "mcap") == len(truth)
-    assert "stopped" in out and f"{len(truth)} messages" in out
-
-
-def test_who_comes_late_gets_robot_description_and_fixed_transforms(
+def test_who_comes_late_gets_what_is_latched_and_the_last_sample_before_a_signal(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
     length: Callable[[int, int], int],
 ) -> None:  # fmt: skip
@@ -145,42 +100,51 @@ def test_who_comes_late_gets_robot_description_and_fixed_transforms(
         time.sleep(length(45, 1))
         node = listen(*LATCHED, "/joint_states")
         node.until(lambda: all(map(node.messages, LATCHED)))
-        node.hears()
-        process.send_signal(signal.SIGINT)
-        ended(process, 130)
+        node.hears(more=30)
+        process.send_signal(signal.SIGTERM)
+        out, err = ended(process, 130)
+    assert err == ""
     truth = recorded(bag)
     for topic in LATCHED:
         assert node.messages(topic) == truth[topic]
     assert '<link name="EndEffector"' in truth["/robot_description"][0][0]
+    states = truth["/joint_states"]
+    node.sees(states[-1])
+    heard = node.messages("/joint_states")
+    assert heard == states[-len(heard) :]
+    assert assert_consistent(bag, "mcap") == sum(map(len, truth.values()))
+    assert "stopped" in out and f"{len(states)} messages" in out
 
 
-@pytest.mark.parametrize("frame", ["world", ""])
-@pytest.mark.parametrize("topic", COMMANDS)
 def test_a_point_is_the_target_within_two_steps(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
-    topic: str, frame: str,
-) -> None:  # fmt: skip
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
     bag, step = tmp_path / "bag", 0.2  # long: what the machine does beside this is not tested
-    node = listen("/target", topic)
+    points = {(0.125, 0.17): "world", (0.13, 0.16): "", (0.14, 0.15): "world", (0.15, 0.14): ""}
+    node = listen("/target", *COMMANDS)
     options = ["--scene", "--rate", str(1 / step), "-o", str(bag), "--set", "Kp=80"]
+    delays = []
     with published(number, native_path, *options) as process:
-        node.hears("/target")
-        for _ in range(8):  # one that comes before the run has discovered its sender is lost
-            node.point(topic, frame, 0.125, 0.17, 0.9)
-            node.hears("/target", 10)
-            if node.messages("/target")[-1][1] == [0.125, 0.17, 0]:
-                break
+        node.hears("/target", 1)
+        for topic, (xy, frame) in zip(sorted(COMMANDS * 2), points.items()):
+            for _ in range(8):  # one that comes before the run has discovered its sender is lost
+                node.point(topic, frame, *xy, 0.9)
+                node.hears("/target", 3)
+                heard = [m for m in node.messages("/target") if m[1] == [*xy, 0]]
+                if heard:
+                    break
+            sent = [it[2] for it in node.told if it[0] == "sent"]
+            late = [stamp_of(heard[0][0]) - t for t in sent]
+            delays.append(min(delay for delay in late if delay > 0))
         process.send_signal(signal.SIGINT)
         ended(process, 130)
-    heard = next(m for m in node.messages("/target") if m[1][0] == 0.125)
-    delays = [stamp_of(heard[0]) - it[2] for it in node.told if it[0] == "sent"]
-    assert 0 < min(delay for delay in delays if delay > 0) <= 2 * step * SECOND
-    ((t, values),) = json.loads((bag / "run.json").read_text())["input_changes"]
-    assert values == {"x_des[1]": 0.125, "x_des[2]": 0.17}
+    assert max(delays) <= 2 * step * SECOND
+    changes = json.loads((bag / "run.json").read_text())["input_changes"]
+    assert [tuple(values.values()) for _, values in changes] == [*points]
     states = recorded(bag)["/joint_states"]
-    k = round(t / step)
-    assert k < len(states) - 1
-    # the FMU had it: its own trajectory with that target from that step on
+    # the FMU had it: its own trajectory with those targets from those steps on
+    told = {round(t / step): values for t, values in changes}
+    assert max(told) < len(states) - 1
     run = twodof.samples(
         native_path, step=step, stop_time=(len(states) - 1) * step, settings={"Kp": 80}
     )
@@ -188,14 +152,16 @@ def test_a_point_is_the_target_within_two_steps(
     for state in states:
         assert state[2:4] == [list(sample.q), list(sample.v)]
         if sample.k < len(states) - 1:
-            sample = run.send({"x_des": (0.125, 0.17)} if sample.k == k else None)
+            sample = run.send(told.get(sample.k))
 
 
-def test_points_that_mean_nothing_are_ignored_with_one_warning_each(
+def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
     native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
 ) -> None:
-    node = listen("/target", *COMMANDS)
-    with published(number, native_path, "--scene", "-o", str(tmp_path / "bag")) as process:
+    """The robot is stopped, and follows the next target that it can; one warning a kind."""
+    node = listen("/joint_states", "/target", *COMMANDS)
+    options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
+    with published(number, native_path, *options) as process:
         for _ in range(3):
             node.point("/clicked_point", "world", float("nan"), 0.1, 0.0)
             node.point("/target_command", "", 0.1, float("inf"), 0.0)
@@ -203,40 +169,27 @@ def test_points_that_mean_nothing_are_ignored_with_one_warning_each(
             node.point("/target_command", "map", 0.1, 0.1, 0.0)
             node.point("/target_command", "\udcff", 0.1, 0.1, 0.0)  # no UTF-8
             node.hears("/target")
-        node.point("/target_command", "world", 0.25, 0.0625, 0.0)
-        node.until(lambda: node.messages("/target")[-1][1] == [0.25, 0.0625, 0])
-        process.send_signal(signal.SIGINT)
-        _, err = ended(process, 130)
-    targets = [m[1] for m in node.messages("/target")]
-    assert [xyz for xyz, _ in itertools.groupby(targets)] == [[0.2, 0.05, 0], [0.25, 0.0625, 0]]
-    lines = err.splitlines()
-    assert len(lines) == 3  # whichever topic's was heard first
-    for warning in (
-        r"WARNING: a point on /target_command cannot be read .*",
-        r"WARNING: a point on /\S+ is in frame '(odom|map)', not in 'world': .*",
-        r"WARNING: a point on /\S+ is not finite: .*",
-    ):
-        assert [bool(re.fullmatch(warning, line)) for line in lines].count(True) == 1
-
-
-def test_a_target_that_no_step_can_follow_ends_no_run(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
-) -> None:
-    """The robot is stopped, and follows the next target that it can."""
-    node = listen("/joint_states", "/target", *COMMANDS)
-    options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
-    with published(number, native_path, *options) as process:
-        node.hears("/target")
+        assert [xyz for _, xyz in node.messages("/target")] == [[0.2, 0.05, 0]] * len(
+            node.messages("/target")
+        )
         for x in (1e308, -1e308, 1e200, 1e30):
             node.point("/target_command", "world", x, 1e308, 0.0)
             node.hears("/target", 10)
         node.point("/target_command", "world", 0.25, 0.0625, 0.0)
         node.until(lambda: node.messages("/target")[-1][1] == [0.25, 0.0625, 0])
-        node.hears("/joint_states", 400)
+        node.hears("/joint_states", 300)
         process.send_signal(signal.SIGINT)
         _, err = ended(process, 130)
-    (line,) = err.splitlines()
-    assert re.match(r"WARNING: step \d+ at t = .*: the robot is stopped, and its target is", line)
+    warnings = (
+        r"WARNING: a point on /target_command cannot be read .*",
+        r"WARNING: a point on /\S+ is in frame '(odom|map)', not in 'world': .*",
+        r"WARNING: a point on /\S+ is not finite: .*",  # whichever topic's was heard first
+        r"WARNING: step \d+ at t = .*: the robot is stopped, and its target is .*",
+    )
+    lines = err.splitlines()
+    assert len(lines) == len(warnings)
+    for warning in warnings:
+        assert [bool(re.fullmatch(warning, line)) for line in lines].count(True) == 1
     states = np.array(
         [state[2] + state[3] for state in recorded(tmp_path / "bag")["/joint_states"]]
     )
@@ -245,12 +198,8 @@ def test_a_target_that_no_step_can_follow_ends_no_run(
     np.testing.assert_allclose(bag.x[-1], (0.25, 0.0625), atol=1e-2)
     (track,) = read_tracks([bag])
     assert track.task is not None
-    np.testing.assert_allclose(
-        track.task.error,
-        np.linalg.norm(bag.x - bag.heard.points[:, :2], axis=1),
-        rtol=1e-9,
-        atol=1e-12,
-    )  # type: ignore[union-attr]
+    expected = np.linalg.norm(bag.x - bag.heard.points[:, :2], axis=1)
+    np.testing.assert_allclose(track.task.error, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
@@ -264,16 +213,15 @@ def test_a_subscriber_that_stalls_leaves_or_returns_holds_nothing_up(
         stalled.process.send_signal(signal.SIGSTOP)
         killed.process.kill()
         killed.leave()
-        time.sleep(3.0)
         back = listen(*STREAMS)
-        back.hears()
+        back.hears(more=200)
         stalled.process.send_signal(signal.SIGCONT)
         stalled.hears(more=50)
         process.send_signal(signal.SIGINT)
         out, err = ended(process, 130)
     assert err == ""
     stamps = np.array([stamp_of(state[0]) for state in recorded(bag)["/joint_states"]])
-    assert len(stamps) > 250 and (np.diff(stamps) == SECOND // 100).all()
+    assert len(stamps) > 200 and (np.diff(stamps) == SECOND // 100).all()
     assert re.search(rf"\d+ of {len(stamps)} missed", out)
 
 
@@ -282,7 +230,7 @@ def test_two_publishers_on_one_topic_are_both_heard(
 ) -> None:
     node = listen("/joint_states")
     bags = [tmp_path / "one", tmp_path / "two"]
-    runs = [["--stop-time", "5", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
+    runs = [["--stop-time", "4", "--set", f"Kp={gain}", "-o"] for gain in (50, 90)]
     with (
         published(number, native_path, *runs[0], str(bags[0])) as one,
         published(number, native_path, *runs[1], str(bags[1])) as two,
@@ -293,7 +241,7 @@ def test_two_publishers_on_one_topic_are_both_heard(
         truth = recorded(bag)["/joint_states"]
         node.until(lambda last=truth[-1]: last in node.messages("/joint_states"))
         mine = [message for message in node.messages("/joint_states") if message in truth]
-        assert len(mine) > 200 and mine == truth[-len(mine) :]
+        assert len(mine) > 100 and mine == truth[-len(mine) :]
 
 
 ISOLATED = ("unshare", "--net", "sh", "-c")
@@ -348,10 +296,6 @@ def packets(process: subprocess.Popen[str]) -> int:
         ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "cable0, range OFF (nobody)", False, False),
         (["--subnet"], {}, "cable0, range SUBNET (other hosts too)", True, True),
         (
-            [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
-            "cable0, range SUBNET (other hosts too)", True, True,
-        ),
-        (
             [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"},
             "cable0, range SYSTEM_DEFAULT (other hosts too)", True, True,
         ),
@@ -369,7 +313,7 @@ def test_range(
         if outside:
             wait_until(lambda: packets(process) > 0)
         else:
-            time.sleep(2.5)
+            time.sleep(1.5)
             assert packets(process) == 0
         node = listen(
             "--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid))
@@ -377,7 +321,7 @@ def test_range(
         if local:
             node.hears()
         else:
-            time.sleep(4.0)
+            time.sleep(3.0)
             assert not node.messages("/joint_states")
         process.send_signal(signal.SIGINT)
         assert ended(process, 130)[1] == ""
@@ -405,24 +349,23 @@ print(heard)
 """
 JAZZY = """<Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>{}</Discovery>"""
-SHELLS = {
-    "LOCALHOST": "<General><AllowMulticast>false</AllowMulticast></General>"
+SHELLS = (  # of its ranges LOCALHOST and SUBNET
+    "<General><AllowMulticast>false</AllowMulticast></General>"
     + JAZZY.format('<Peers><Peer address="localhost"/></Peers>'),
-    "SUBNET": JAZZY.format(""),
-}
+    JAZZY.format(""),
+)
 
 
 @pytest.mark.parametrize("variables", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}])
-@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
 def test_cyclone_dds_as_jazzy_configures_it_hears(
-    native_path: Path, number: int, shell: str, variables: dict[str, str]
+    native_path: Path, number: int, variables: dict[str, str]
 ) -> None:
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     with published(number, native_path, inside=isolated(CABLE), **variables) as process:
         enter = ["nsenter", "--net", "--target", str(process.pid)]
-        command = [*enter, sys.executable, "-c", LISTENER, str(number), shell]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        assert int(done.stdout) >= 50
+        command = [*enter, sys.executable, "-c", LISTENER, str(number)]
+        shells = [subprocess.Popen([*command, it], stdout=subprocess.PIPE) for it in SHELLS]
+        assert min(int(shell.communicate()[0]) for shell in shells) >= 50
 
 
 def test_an_interface_can_be_chosen(native_path: Path, number: int) -> None:
@@ -479,7 +422,7 @@ def test_an_hour_has_flat_memory(
     native_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
 ) -> None:
     """Seconds without pace; in full, an hour in real time."""
-    steps = length(360_000, 10_000)
+    steps = length(360_000, 5_000)
     listen("/joint_states", "/tf", "/robot_description")
     command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
     done = subprocess.run(
@@ -513,8 +456,6 @@ def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> 
     ("variables", "culprit"),
     [
         ({"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233', not a number from 0 to 232"),
-        ({"ROS_DOMAIN_ID": "-1"}, "ROS_DOMAIN_ID is '-1'"),
-        ({"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
         ({"ROS_DOMAIN_ID": "²"}, "ROS_DOMAIN_ID is '²'"),
         ({"ROS_LOCALHOST_ONLY": "yes"}, "ROS_LOCALHOST_ONLY is 'yes', not 0 or 1"),
         (
@@ -529,7 +470,6 @@ def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> 
             r"nope0: does not match an available interface.*CYCLONEDDS_URI .*: lo",
         ),
         ({"CYCLONEDDS_URI": "<CycloneDDS></Domain>"}, "parser error.*correct CYCLONEDDS_URI"),
-        ({"CYCLONEDDS_URI": "file:///nowhere.xml"}, "nowhere.xml.*correct CYCLONEDDS_URI"),
         ({"CYCLONEDDS_URI": "<Größe/>"}, "cannot be opened.*correct CYCLONEDDS_URI"),
         ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
     ],
@@ -543,24 +483,6 @@ def test_a_network_that_cannot_be(
     assert main(["publish", str(native_path), "--stop-time", "0.1"]) == 1
     (line,) = capfd.readouterr().err.splitlines()
     assert re.match(f"twodof: error: .*{culprit}", line), line
-
-
-@pytest.mark.parametrize(
-    ("options", "culprit"),
-    [
-        (["--rate", "0"], "--rate 0"),
-        (["--rate", "nan"], "--rate nan"),
-        (["--rate", "inf"], "--rate inf"),
-        (["--overwrite"], "--overwrite does nothing without -o"),
-        (["--stop-time", "0.005"], "no whole number of steps"),
-    ],
-)
-def test_options_that_cannot_be(
-    native_path: Path, capfd: pytest.CaptureFixture[str], options: list[str], culprit: str
-) -> None:
-    assert main(["publish", str(native_path), *options]) == (1 if "step" in culprit else 2)
-    (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith("twodof: error: ") and culprit in line
 
 
 def test_without_cyclone_dds_it_says_what_to_install(native_path: Path) -> None:
@@ -607,8 +529,8 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(
             shipped.replace('mass value="0.18', f'mass value="{mass}')
         )
     robots = ["a=one/arm.urdf", "b=other/arm.urdf"]
-    assert main(["publish", *robots, "--native", "--stop-time", "0.01"]) == 2
-    told = "the FMU of 'other/arm.urdf' would be 'arm-native.fmu' as the robot before it is"
+    assert main(["publish", *robots, "--stop-time", "0.01"]) == 2
+    told = "the FMU of 'other/arm.urdf' would be 'arm.fmu' as the robot before it is"
     assert told in capsys.readouterr().err
 
 

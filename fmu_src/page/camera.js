@@ -71,10 +71,8 @@ class Camera {
     return multiply(projection, seen);
   }
 
-  /**
-   * A point in the picture: x to the right and y downwards, each from 0 to 1.
-   * @param {Numbers} p
-   */
+  /** A point in the picture: x to the right and y downwards, each from 0 to 1. */
+  /** @type {(p: Numbers) => number[]} */
   project(p) {
     const m = this.matrix();
     const w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
@@ -82,35 +80,24 @@ class Camera {
     return [0.5 + x / w / 2, 0.5 - y / w / 2];
   }
 
-  /**
-   * Direction of the ray through a point of the picture.
-   * @param {number} x
-   * @param {number} y
-   */
+  /** Direction of the ray through a point of the picture. */
+  /** @type {(x: number, y: number) => number[]} */
   ray(x, y) {
     const f = 2 * Math.tan(FIELD_OF_VIEW / 2);
     const right = plus([0, 0, 0], (x - 0.5) * f * this.aspect, this.right);
     return unit(plus(plus(right, (0.5 - y) * f, this.up), -1, this.back));
   }
 
-  /**
-   * Where the ray through a point of the picture meets a plane; null where they are nearly parallel.
-   * @param {number} x
-   * @param {number} y
-   * @param {Numbers} point
-   * @param {Numbers} normal
-   */
+  /** Where the ray through a point of the picture meets a plane; null where they are nearly parallel. */
+  /** @type {(x: number, y: number, point: Numbers, normal: Numbers) => number[] | null} */
   meet(x, y, point, normal) {
     const ray = this.ray(x, y), along = dot(ray, normal);
     if (Math.abs(along) < 0.05) return null;
     return plus(this.eye, dot(plus([point[0], point[1], point[2]], -1, this.eye), normal) / along, ray);
   }
 
-  /**
-   * Move around by a part of the picture.
-   * @param {number} dx
-   * @param {number} dy
-   */
+  /** Move around by a part of the picture. */
+  /** @type {(dx: number, dy: number) => void} */
   orbit(dx, dy) {
     this.touched = true;
     const { vertical } = this.view;
@@ -119,11 +106,8 @@ class Camera {
     if (Math.abs(dot(tilted, unit(vertical))) < 0.995) this.back = tilted;
   }
 
-  /**
-   * Move along the picture by a part of it.
-   * @param {number} dx
-   * @param {number} dy
-   */
+  /** Move along the picture by a part of it. */
+  /** @type {(dx: number, dy: number) => void} */
   pan(dx, dy) {
     this.touched = true;
     const height = 2 * this.stretched * Math.tan(FIELD_OF_VIEW / 2);
@@ -136,10 +120,8 @@ class Camera {
     this.distance = Math.min(Math.max(this.distance * factor, this.size / 20), this.size * 20);
   }
 
-  /**
-   * Step back, where what moves has left the picture and the user has not chosen it.
-   * @param {number[]} p
-   */
+  /** Step back, where what moves has left the picture and the user has not chosen it. */
+  /** @type {(p: number[]) => void} */
   follow(p) {
     const [x, y] = this.project(p);
     if (!this.touched && !(Math.min(x, y) > 0.03 && Math.max(x, y) < 0.97) && this.distance < 9 * this.size)

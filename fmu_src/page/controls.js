@@ -11,13 +11,8 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["parameters, which begin the run anew", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
 ]);
 
-/**
- * An element with text, and what it holds.
- * @param {string} tag
- * @param {string} text
- * @param {...Node} inner
- * @returns {HTMLElement}
- */
+/** An element with text, and what it holds. */
+/** @type {(tag: string, text: string, ...inner: Node[]) => HTMLElement} */
 function element(tag, text, ...inner) {
   const made = document.createElement(tag);
   made.textContent = text;
@@ -25,10 +20,7 @@ function element(tag, text, ...inner) {
   return made;
 }
 
-/**
- * @param {string} id
- * @returns {any}
- */
+/** @type {(id: string) => any} */
 function byId(id) {
   return document.getElementById(`arm-${id}`);
 }
@@ -55,10 +47,8 @@ class Controls {
     }
   }
 
-  /**
-   * The sliders of a group: one for all gains, else one for each element.
-   * @param {string} group
-   */
+  /** The sliders of a group: one for all gains, else one for each element. */
+  /** @type {(group: string) => HTMLElement[]} */
   rows(group) {
     const names = /** @type {string[]} */ (this.session.groups.get(group));
     if (GAINS.includes(group)) return [this.row(group, names[0])];
@@ -66,24 +56,21 @@ class Controls {
     return PER_JOINT.includes(group) ? [element("div", group), ...rows] : rows;
   }
 
-  /**
-   * @param {string} name of a variable, or of a group
-   * @param {string} first whose value it shows
-   */
+  /** The row of a variable or group, which shows the value of its first. */
+  /** @type {(name: string, first: string) => HTMLElement} */
   row(name, first) {
     const { session } = this, variable = session.variable(first);
-    const value = /** @type {Value} */ (session.values.get(first));
-    const label = element("span", this.label(name));
+    const value = session.values.get(first);
+    const label = element("span", this.label(name)), [low, high] = this.range(name, Number(value));
     label.title = `${name}: ${variable.description}${variable.unit ? `, ${variable.unit}` : ""}`;
-    if (typeof value === "boolean") return this.checkbox(label, name);
-    const [low, high] = this.range(name, Number(value));
-    const inputs = ["range", "number"].map((type) => {
-      const input = document.createElement("input");
-      Object.assign(input, { type, step: "any", value: String(value) });
-      if (type === "range") Object.assign(input, { min: String(low), max: String(high), value: String(value) });
-      input.setAttribute("aria-label", `${name}, ${type === "range" ? "slider" : variable.unit || "number"}`);
-      input.addEventListener(variable.causality === "parameter" || type === "number" ? "change" : "input", () => {
-        if (input.value !== "") this.told(name, Number(input.value));
+    const inputs = (typeof value === "boolean" ? ["checkbox"] : ["range", "number"]).map((type) => {
+      const input = document.createElement("input"), typed = type === "range" ? "slider" : variable.unit || "number";
+      Object.assign(input, { type, step: "any", checked: value === true });
+      if (type === "range") Object.assign(input, { min: String(low), max: String(high) });
+      if (type !== "checkbox") Object.assign(input, { value: String(value), ariaLabel: `${name}, ${typed}` });
+      input.addEventListener(variable.causality === "parameter" || type !== "range" ? "change" : "input", () => {
+        if (type === "checkbox") this.told(name, input.checked);
+        else if (input.value !== "") this.told(name, Number(input.value));
       });
       return input;
     });
@@ -93,10 +80,8 @@ class Controls {
     return row;
   }
 
-  /**
-   * A variable's name, with that of its joint or axis in place of its number.
-   * @param {string} name
-   */
+  /** A variable's name, with that of its joint or axis in place of its number. */
+  /** @type {(name: string) => string} */
   label(name) {
     const [group, number] = name.replace("]", "").split("["), { axes } = this.session.facts;
     if (number === undefined) return name;
@@ -105,36 +90,17 @@ class Controls {
     return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
   }
 
-  /**
-   * @param {HTMLElement} label
-   * @param {string} name
-   */
-  checkbox(label, name) {
-    const input = document.createElement("input");
-    input.type = "checkbox";
-    input.checked = Boolean(this.session.values.get(name));
-    input.addEventListener("change", () => this.told(name, input.checked));
-    this.fields.set(name, [input]);
-    const row = element("label", "", label, input);
-    row.className = "slider";
-    return row;
-  }
-
-  /**
-   * What a slider goes from and to.
-   * @param {string} name
-   * @param {number} value
-   * @returns {[number, number]}
-   */
+  /** What a slider goes from and to. */
+  /** @type {(name: string, value: number) => [number, number]} */
   range(name, value) {
     const [group, number] = name.replace("]", "").split("["), i = Number(number) - 1;
-    const { joints, axes } = this.session.facts, joint = joints[i];
+    const { reach, session } = this, { joints } = session.facts, joint = joints[i];
     const strongest = Math.max(...joints.map(({ effort }) => effort ?? 0)) || 20;
-    const force = strongest / (this.reach.radius || 1);
+    const force = strongest / (reach.radius || 1);
     if (GAINS.includes(group)) return [0, Math.max(4 * value, 20)];
     if (group === "x_des") {
-      const middle = this.reach.centre["xyz".indexOf(axes[i])];
-      return [middle - 1.1 * this.reach.radius, middle + 1.1 * this.reach.radius];
+      const middle = reach.centre[session.axes[i]];
+      return [middle - 1.1 * reach.radius, middle + 1.1 * reach.radius];
     }
     if (group === "q_des" || group === "q_start") return [joint.low ?? -Math.PI, joint.high ?? Math.PI];
     if (group === "tau_cmd" || group === "tau_ext") return [-(joint.effort ?? strongest), joint.effort ?? strongest];
@@ -158,38 +124,28 @@ class Controls {
   }
 }
 
-/**
- * Units of position, velocity and effort.
- * @param {JointFacts[]} joints
- */
+/** Units of position, velocity and effort. */
+/** @type {(joints: JointFacts[]) => string[]} */
 function unitsOf(joints) {
   const slide = joints.some(({ prismatic }) => prismatic), turns = joints.some(({ prismatic }) => !prismatic);
   if (slide && turns) return ["rad or m", "rad/s or m/s", "N·m or N"];
   return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
 }
 
-/**
- * Names without the whole words that all of them begin and end with.
- * @param {JointFacts[]} joints
- */
+/** Names without the whole words that all of them begin and end with. */
+/** @type {(joints: JointFacts[]) => string[]} */
 function shortNames(joints) {
-  const names = joints.map(({ name }) => name), [first] = names;
-  if (names.length < 2) return names;
-  const most = Math.min(...names.map(({ length }) => length)) - 1; // something is left of each
-  let same = 0, alike = 0;
-  while (same < most && names.every((name) => name[same] === first[same])) same += 1;
-  const begin = Math.max(first.lastIndexOf("_", same - 1), first.lastIndexOf("/", same - 1)) + 1;
-  /** @param {string} name */
-  const last = (name) => name[name.length - 1 - alike];
-  while (alike < most - begin && names.every((name) => last(name) === last(first))) alike += 1;
-  const tail = first.slice(first.length - alike), cut = alike - tail.search(/[_/]|$/);
-  return names.map((name) => name.slice(begin, name.length - cut));
+  const words = joints.map(({ name }) => name.split(/(?<=[_/])/)), [first] = words;
+  /** Whether all begin, or end, with one word, and have others. */
+  /** @type {(at: (own: string[]) => string) => boolean} */
+  const alike = (at) => words.length > 1 && words.every((own) => own.length > 1 && at(own) === at(first));
+  while (alike((own) => own[0])) words.forEach((own) => own.shift());
+  while (alike((own) => own[own.length - 1])) words.forEach((own) => own.splice(-2, 2, own[own.length - 2].slice(0, -1)));
+  return words.map((own) => own.join(""));
 }
 
-/**
- * A number to be read, no zero with a sign.
- * @param {number} value
- */
+/** A number to be read, no zero with a sign. */
+/** @type {(value: number) => string} */
 function digits(value) {
   if (!Number.isFinite(value)) return "\u2013";
   const rounded = value.toFixed(Math.abs(value) < 10 ? 4 : 2);
@@ -224,10 +180,7 @@ class Readout {
     });
   }
 
-  /**
-   * @param {string} name
-   * @param {string} text
-   */
+  /** @type {(name: string, text: string) => void} */
   tell(name, text) {
     let cell = this.more.get(name);
     if (!cell) {
@@ -239,11 +192,8 @@ class Readout {
     cell.textContent = text;
   }
 
-  /**
-   * @param {number} k number of the sample
-   * @param {JointFacts[]} stopped joints at a limit
-   * @param {Record<string, number[]>} places by their names, m
-   */
+  /** Sample k, the joints that are at a limit, and places by their names, m. */
+  /** @type {(k: number, stopped: JointFacts[], places: Record<string, number[]>) => void} */
   show(k, stopped, places) {
     const { session } = this, { joints } = session.facts;
     joints.forEach((joint, i) => {

@@ -38,10 +38,8 @@ class Curves {
     });
   }
 
-  /**
-   * The times that are shown, s.
-   * @returns {[number, number]}
-   */
+  /** The times that are shown, s. */
+  /** @returns {[number, number]} */
   get shown() {
     return this.chosen ?? this.session.span;
   }
@@ -82,10 +80,7 @@ class Curves {
     for (const panel of this.panels) this.drawPanel(panel, inks);
   }
 
-  /**
-   * @param {Curves["panels"][number]} panel
-   * @param {string[]} inks
-   */
+  /** @type {(panel: Curves["panels"][number], inks: string[]) => void} */
   drawPanel(panel, [ink, hair]) {
     const { canvas } = panel, ratio = devicePixelRatio;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -128,11 +123,8 @@ class Curves {
     context.restore();
   }
 
-  /**
-   * Points of the lines that are shown: of each pixel's samples the least and the largest.
-   * @param {Curves["panels"][number]} panel
-   * @param {number} pixels
-   */
+  /** Points of the lines that are shown: of each pixel's samples the least and the largest. */
+  /** @type {(panel: Curves["panels"][number], pixels: number) => Outline[]} */
   rows(panel, pixels) {
     const { session } = this, [from, to] = this.shown;
     const first = Math.max(0, session.nearest(from) - 1), last = Math.min(session.count - 1, session.nearest(to) + 1);
@@ -161,11 +153,7 @@ class Curves {
   }
 }
 
-/**
- * @param {Outline[]} rows
- * @param {boolean} log
- * @returns {[number, number]}
- */
+/** @type {(rows: Outline[], log: boolean) => [number, number]} */
 function range(rows, log) {
   let low = Infinity, high = -Infinity;
   for (const { points } of rows)
@@ -175,22 +163,15 @@ function range(rows, log) {
   return [low - room, high + room];
 }
 
-/**
- * @param {CanvasRenderingContext2D} context
- * @param {number[][]} points
- */
+/** @type {(context: CanvasRenderingContext2D, points: number[][]) => void} */
 function stroke(context, points) {
   context.beginPath();
   points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
   context.stroke();
 }
 
-/**
- * Round values between two, some so many of them.
- * @param {number} low
- * @param {number} high
- * @param {number} count
- */
+/** Round values between two, some so many of them. */
+/** @type {(low: number, high: number, count: number) => number[]} */
 function ticks(low, high, count) {
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = power * ([1, 2, 5, 10].find((factor) => factor * power >= rough) ?? 10);

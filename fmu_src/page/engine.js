@@ -36,11 +36,8 @@ class Engine {
     return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));
   }
 
-  /**
-   * Call a function; what is worse than a warning is thrown, in the FMU's own words.
-   * @param {string} name
-   * @param {number[]} values
-   */
+  /** Call a function; what is worse than a warning is thrown, in the FMU's own words. */
+  /** @type {(name: string, ...values: number[]) => void} */
   call(name, ...values) {
     this.calls.engine_forget();
     if (this.calls[name](...values) >= ERROR) throw new Error(this.said() || name);
@@ -56,20 +53,14 @@ class Engine {
     new Uint32Array(this.memory.buffer, this.references, references.length).set(references);
   }
 
-  /**
-   * @param {number[]} references
-   * @param {number[]} values
-   */
+  /** @type {(references: number[], values: number[]) => void} */
   setReal(references, values) {
     this.prepare(references);
     new Float64Array(this.memory.buffer, this.values, values.length).set(values);
     this.call("engine_set_reals", this.references, references.length, this.values);
   }
 
-  /**
-   * @param {number} reference
-   * @param {boolean} value
-   */
+  /** @type {(reference: number, value: boolean) => void} */
   setBoolean(reference, value) {
     this.call("engine_set_boolean", reference, Number(value));
   }
@@ -91,10 +82,8 @@ class Engine {
     this.call("engine_initialise");
   }
 
-  /**
-   * @param {number} t
-   * @param {number} h s
-   */
+  /** From a time by a step, s. */
+  /** @type {(t: number, h: number) => void} */
   step(t, h) {
     this.call("engine_step", t, h);
   }

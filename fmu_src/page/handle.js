@@ -19,7 +19,7 @@ class Handle {
     this.session = session;
     this.place = place;
     this.told = told;
-    this.axes = session.steered && session.groups.has("x_des") ? session.facts.axes : "";
+    this.axes = session.steered && session.groups.has("x_des") ? session.axes : [];
     this.turns = session.steered && session.groups.has("quat_des");
     /** @type {Map<number, number[]>} where pointers are, in parts of the picture */
     this.pointers = new Map();
@@ -45,11 +45,8 @@ class Handle {
     return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
   }
 
-  /**
-   * Pixels from a point of the picture to one of the scene.
-   * @param {number[]} at
-   * @param {Numbers} p
-   */
+  /** Pixels from a point of the picture to one of the scene. */
+  /** @type {(at: number[], p: Numbers) => number} */
   distance(at, p) {
     const [x, y] = this.camera.project(p);
     return Math.hypot((x - at[0]) * this.canvas.clientWidth, (y - at[1]) * this.canvas.clientHeight);
@@ -64,7 +61,7 @@ class Handle {
     this.drag = null;
     if (this.pointers.size > 1 || event.button !== 0) return;
     const ring = this.turns ? this.nearest(at, grip) : -1;
-    if (this.axes && this.distance(at, this.place()) < GRIP * grip) this.drag = this.carry(at);
+    if (this.axes.length && this.distance(at, this.place()) < GRIP * grip) this.drag = this.carry(at);
     else if (ring >= 0) this.drag = this.turn(at, ring);
   }
 
@@ -84,64 +81,45 @@ class Handle {
     else this.camera.orbit(dx, dy);
   }
 
-  /**
-   * Carry the target in the plane of the picture, or in that of the task axes.
-   * @param {number[]} at
-   */
+  /** Carry the target in the plane of the picture, or in that of the task axes. */
+  /** @type {(at: number[]) => (x: number, y: number) => void} */
   carry(at) {
     const begin = this.place(), { camera, axes } = this;
     let normal = camera.back;
-    if (axes.length < 3) {
-      const free = "xyz".split("").filter((axis) => !axes.includes(axis)).map((axis) => base("xyz".indexOf(axis)));
-      normal = free.length === 1 ? free[0] : unit(plus(camera.back, -dot(camera.back, line(axes)), line(axes)));
-    }
+    if (axes.length === 2) normal = base(this.session.free[0]);
+    if (axes.length === 1) normal = unit(plus(normal, -normal[axes[0]], base(axes[0])));
     const first = camera.meet(at[0], at[1], begin, normal) ?? begin;
     return (/** @type {number} */ x, /** @type {number} */ y) => {
       const met = camera.meet(x, y, begin, normal);
       if (!met) return;
       const place = plus(plus(begin, 1, met), -1, first);
-      this.told("x_des", axes.split("").map((axis) => place["xyz".indexOf(axis)]));
+      this.told("x_des", axes.map((axis) => place[axis]));
     };
   }
 
-  /**
-   * The points of the ring about an axis of the target.
-   * @param {number} axis
-   */
+  /** The points of the ring about an axis of the target. */
+  /** @type {(axis: number) => number[][]} */
   ring(axis) {
-    const place = this.place(), turned = rotation(this.session.held("quat_des"));
-    const [one, two] = [base((axis + 1) % 3), base((axis + 2) % 3)];
-    return Array.from({ length: RING_POINTS + 1 }, (_, i) => {
-      const angle = (2 * Math.PI * i) / RING_POINTS;
-      const p = plus(plus([0, 0, 0], Math.cos(angle), one), Math.sin(angle), two);
-      return plus(place, RING * this.camera.size, transform(turned, p));
-    });
+    const turned = rotation(this.session.held("quat_des"));
+    const [one, two] = [1, 2].map((i) => transform(turned, base((axis + i) % 3)));
+    return circle(this.place(), RING * this.camera.size, one, two, RING_POINTS);
   }
 
-  /**
-   * The axis of the ring that is next to a point of the picture, else -1.
-   * @param {number[]} at
-   * @param {number} grip
-   */
+  /** The axis of the ring that is next to a point of the picture, else -1. */
+  /** @type {(at: number[], grip: number) => number} */
   nearest(at, grip) {
     const distances = [0, 1, 2].map((axis) => Math.min(...this.ring(axis).map((p) => this.distance(at, p))));
     const least = Math.min(...distances);
     return least < GRIP_OF_RING * grip ? distances.indexOf(least) : -1;
   }
 
-  /**
-   * Turn the target about one of its axes.
-   * @param {number[]} at
-   * @param {number} axis
-   */
+  /** Turn the target about one of its axes. */
+  /** @type {(at: number[], axis: number) => (x: number, y: number) => void} */
   turn(at, axis) {
     const place = this.place(), start = this.session.held("quat_des"), turned = rotation(start);
     const normal = transform(turned, base(axis)), one = transform(turned, base((axis + 1) % 3));
     const two = cross(normal, one);
-    /**
-     * @param {number} x
-     * @param {number} y
-     */
+    /** @type {(x: number, y: number) => number | null} */
     const angle = (x, y) => {
       const met = this.camera.meet(x, y, place, normal);
       const arm = met && plus(met, -1, place);
@@ -155,20 +133,4 @@ class Handle {
       this.told("quat_des", compose(start, [...plus([0, 0, 0], Math.sin(half), base(axis)), Math.cos(half)]));
     };
   }
-}
-
-/**
- * @param {number} axis
- * @returns {number[]}
- */
-function base(axis) {
-  return [0, 1, 2].map((i) => Number(i === axis));
-}
-
-/**
- * The direction of a single task axis.
- * @param {string} axes
- */
-function line(axes) {
-  return base("xyz".indexOf(axes));
 }

@@ -4,10 +4,7 @@ const TRAIL = 1.5; // s
 const MOMENTS = 30, PATH_POINTS = 600; // of a replay, that are in the picture at first, and of its path
 const PANEL = 0.1; // s between pictures of curves and numbers, where no cursor asks for more
 
-/**
- * @param {string} id
- * @returns {Promise<ArrayBuffer>}
- */
+/** @type {(id: string) => Promise<ArrayBuffer>} */
 async function unpacked(id) {
   const text = atob(byId(id).textContent), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
@@ -48,58 +45,49 @@ class App {
   makeCamera() {
     const { session, robot } = this, { facts } = session, points = [...this.path];
     for (const k of session.steered ? [session.now] : spread(session.count, MOMENTS)) {
-      points.push(...robot.links(session.at("q", k)).map((link) => transform(link, [0, 0, 0])));
+      points.push(...robot.links(session.at("q", k)).map(originOf));
       if (session.groups.has("x_des")) points.push(this.target(k));
     }
-    const flat = facts.axes.length === 2;
+    const flat = session.axes.length === 2;
     const gravity = [1, 2, 3].map((i) => -Number(session.values.get(`gravity[${i}]`) ?? 0));
     const vertical = base(gravity.map(Math.abs).indexOf(Math.max(...gravity.map(Math.abs), 1e-9)));
     const up = Math.hypot(...gravity) ? vertical.map((n) => n * Math.sign(gravity[vertical.indexOf(1)])) : base(2);
     const { centre, radius } = this.reach;
     if (facts.links.length > 1 && Number.isFinite(radius))
       for (const sign of [-0.5, 0.5])
-        for (const i of flat ? ["x", "y", "z"].filter((c) => facts.axes.includes(c)).map((c) => "xyz".indexOf(c)) : [0, 1])
-          points.push(plus(centre, sign * radius, base(i)));
+        for (const axis of flat ? session.axes : [0, 1]) points.push(plus(centre, sign * radius, base(axis)));
     const across = base((up.findIndex(Boolean) + 1) % 3);
     let view = { front: plus(plus(across, -1, cross(up, across)), 0.55, up), vertical: up };
     if (flat) {
-      const normal = base([0, 1, 2].find((i) => !facts.axes.includes("xyz"[i])) ?? 2);
-      const inside = Math.abs(dot(normal, up)) < 0.5;
-      const upright = inside ? up : base("xyz".indexOf(facts.axes[1]));
+      const normal = base(session.free[0]), inside = Math.abs(dot(normal, up)) < 0.5;
+      const upright = inside ? up : base(session.axes[1]);
       const right = cross(upright, normal);
       view = { front: normal.map((n) => n * (right[0] + right[1] + right[2] > 0 ? 1 : -1)), vertical: upright };
     }
     return new Camera(view, flat, points.filter((point) => point.every(Number.isFinite)));
   }
 
-  /**
-   * Where the end effector is.
-   * @param {number} k number of the sample
-   */
+  /** Where the end effector is in sample k. */
+  /** @type {(k: number) => number[]} */
   end(k) {
-    return transform(this.robot.frame(this.robot.links(this.session.at("q", k))), [0, 0, 0]);
+    return this.robot.end(this.session.at("q", k));
   }
 
   /** Where the target is: on an axis that is not controlled, where the end effector is. */
   target(k = this.session.now) {
     const { session } = this, place = this.end(k), given = session.target("x_des", k);
-    if (given.length) session.facts.axes.split("").forEach((axis, i) => (place["xyz".indexOf(axis)] = given[i]));
+    if (given.length) session.axes.forEach((axis, i) => (place[axis] = given[i]));
     return place;
   }
 
-  /**
-   * Set a variable; a refusal is shown.
-   * @param {string} name
-   * @param {Value | number[]} value
-   */
+  /** Set a variable; a refusal is shown. */
+  /** @type {(name: string, value: Value | number[]) => void} */
   tell(name, value) {
     this.order(() => this.session.set(name, value));
   }
 
-  /**
-   * Do what the user asks for.
-   * @param {() => void} action
-   */
+  /** Do what the user asks for. */
+  /** @type {(action: () => void) => void} */
   order(action) {
     this.session.said = "";
     this.attempt(action);
@@ -145,10 +133,7 @@ class App {
   }
 
   listen() {
-    /**
-     * @param {string} id
-     * @param {() => void} action
-     */
+    /** @type {(id: string, action: () => void) => void} */
     const on = (id, action) => byId(id).addEventListener("click", action);
     const { session } = this, play = () => this.order(() => session.play(!session.playing));
     on("play", play);
@@ -208,11 +193,13 @@ class App {
     const { session, robot, scene, camera } = this, k = this.curves.sample, q = session.at("q", k);
     const links = robot.links(q), style = getComputedStyle(byId("scene").parentElement);
     const colour = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
-    camera.follow(transform(robot.frame(links), [0, 0, 0]));
+    camera.follow(originOf(robot.frame(links)));
     const target = this.target(k);
     if (!this.handle.drag && target.every(Number.isFinite)) camera.follow(target);
     if (scene) {
-      this.addRobot(scene, links);
+      session.facts.shapes.forEach(({ link, place, colour }, i) => {
+        scene.addSolid(i + 1, multiply(links[link], place), [...colour, 1]);
+      });
       this.addTrail(scene, k, links);
       scene.draw(camera, fractions(colour("--scene")), Number(colour("--bright")));
     }
@@ -233,43 +220,26 @@ class App {
     if (byId("said").textContent !== text) byId("said").textContent = text;
   }
 
-  /**
-   * What the readout tells beside the joints, m.
-   * @param {number} k number of the sample
-   * @returns {Record<string, number[]>}
-   */
+  /** What the readout tells of sample k beside the joints, m. */
+  /** @type {(k: number) => Record<string, number[]>} */
   places(k) {
     const { groups, facts } = this.session;
     if (facts.links.length === 1) return {};
     return { "end effector": this.end(k), ...(groups.has("x_des") && { target: this.target(k) }) };
   }
 
-  /**
-   * @param {Scene} scene
-   * @param {Float64Array[]} links
-   */
-  addRobot(scene, links) {
-    this.session.facts.shapes.forEach(({ link, place, colour }, i) => {
-      scene.addSolid(i + 1, multiply(links[link], place), [...colour, 1]);
-    });
-  }
-
-  /**
-   * What is drawn beside the robot.
-   * @param {Scene} scene
-   * @param {number} k
-   * @param {Float64Array[]} links
-   */
+  /** What is drawn beside the robot. */
+  /** @type {(scene: Scene, k: number, links: Float64Array[]) => void} */
   addTrail(scene, k, links) {
     const { session, robot, camera } = this, { facts } = session, size = camera.size;
     const first = session.nearest(session.time(k) - TRAIL), stride = Math.max(1, Math.ceil((k - first) / 60));
     const trail = [];
     for (let i = first; i <= k; i += stride) trail.push(this.end(i));
     scene.addLine(this.path, [0.5, 0.55, 0.6, 0.7], 1);
-    scene.addLine([...trail, transform(robot.frame(links), [0, 0, 0])], [0, 0.447, 0.698, 1], 2);
+    scene.addLine([...trail, originOf(robot.frame(links))], [0, 0.447, 0.698, 1], 2);
     if (facts.links.length > 1 && Number.isFinite(this.reach.radius)) {
-      const planes = facts.axes.length === 2 ? [base([0, 1, 2].find((i) => !facts.axes.includes("xyz"[i])) ?? 2)] : [0, 1, 2].map(base);
-      for (const normal of planes) scene.addLine(circle(this.reach.centre, this.reach.radius, normal), [0.5, 0.55, 0.6, 0.4], 1);
+      const normals = session.axes.length === 2 ? session.free : [0, 1, 2], { centre, radius } = this.reach;
+      for (const axis of normals) scene.addLine(circle(centre, radius, base((axis + 1) % 3), base((axis + 2) % 3)), [0.5, 0.55, 0.6, 0.4], 1);
     }
     if (!session.groups.has("x_des")) return;
     scene.addSolid(0, placed(this.target(k), 0.018 * size), [0.835, 0.369, 0, 0.92]);
@@ -278,24 +248,11 @@ class App {
     AXIS_COLOURS.forEach((axisColour, axis) => {
       if (this.handle.turns) scene.addLine(this.handle.ring(axis), [...axisColour, 0.8], 1.2);
       for (const end of ends) {
-        const from = transform(end, [0, 0, 0]);
+        const from = originOf(end);
         scene.addLine([from, plus(from, 0.09 * size, transform(end, base(axis), 0))], [...axisColour, 1], 1.8);
       }
     });
   }
-}
-
-/**
- * @param {number[]} centre
- * @param {number} radius
- * @param {number[]} normal
- */
-function circle(centre, radius, normal) {
-  const one = [normal[1], normal[2], normal[0]], two = cross(normal, one);
-  return Array.from({ length: 97 }, (_, i) => {
-    const angle = (2 * Math.PI * i) / 96;
-    return plus(plus(centre, radius * Math.cos(angle), one), radius * Math.sin(angle), two);
-  });
 }
 
 /** @param {string} colour as #rrggbb */
@@ -303,20 +260,15 @@ function fractions(colour) {
   return [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16) / 255);
 }
 
-/**
- * Numbers of samples, some so many of them, from the first to the last.
- * @param {number} count
- * @param {number} some
- */
+/** Numbers of samples, some so many of them, from the first to the last. */
+/** @type {(count: number, some: number) => number[]} */
 function spread(count, some) {
   const most = Math.min(count, some);
   return Array.from({ length: most }, (_, i) => Math.round((i * (count - 1)) / Math.max(most - 1, 1)));
 }
 
-/**
- * What moves the robot: an engine or samples in this page, or else its server.
- * @param {Facts} facts
- */
+/** What moves the robot: an engine or samples in this page, or else its server. */
+/** @type {(facts: Facts) => Promise<Session | Replay | Remote>} */
 async function makeSession(facts) {
   if (byId("engine")) return new Session(facts, await Engine.load(new Uint8Array(await unpacked("engine"))));
   if (byId("samples")) return new Replay(facts, await unpacked("samples"));

@@ -4,10 +4,7 @@
  * @typedef {ArrayLike<number>} Numbers
  */
 
-/**
- * @param {Numbers} a
- * @param {Numbers} b
- */
+/** @type {(a: Numbers, b: Numbers) => Float64Array} */
 function multiply(a, b) {
   const c = new Float64Array(16);
   for (let j = 0; j < 4; j++)
@@ -16,20 +13,14 @@ function multiply(a, b) {
   return c;
 }
 
-/**
- * A point, or with w = 0 a direction.
- * @param {Numbers} m
- * @param {Numbers} p
- */
+/** A point, or with w = 0 a direction. */
+/** @type {(m: Numbers, p: Numbers, w?: number) => number[]} */
 function transform(m, p, w = 1) {
   return [0, 1, 2].map((i) => m[i] * p[0] + m[4 + i] * p[1] + m[8 + i] * p[2] + m[12 + i] * w);
 }
 
-/**
- * A turn about an axis of length 1, rad: Rodrigues' formula.
- * @param {Numbers} a
- * @param {number} angle
- */
+/** A turn about an axis of length 1, rad: Rodrigues' formula. */
+/** @type {(a: Numbers, angle: number) => Float64Array} */
 function turn(a, angle) {
   const c = Math.cos(angle), s = Math.sin(angle), d = 1 - c;
   const [x, y, z] = [a[0], a[1], a[2]];
@@ -41,29 +32,21 @@ function turn(a, angle) {
   );
 }
 
-/**
- * @param {Numbers} p
- * @param {number} scale
- */
+/** @type {(p: Numbers, scale?: number) => Float64Array} */
 function placed(p, scale = 1) {
   return Float64Array.of(scale, 0, 0, 0, 0, scale, 0, 0, 0, 0, scale, 0, p[0], p[1], p[2], 1);
 }
 
-/**
- * A rotation from a quaternion (x, y, z, w) of any length.
- * @param {Numbers} quat
- */
+/** A rotation from a quaternion (x, y, z, w) of any length. */
+/** @type {(quat: Numbers) => Float64Array} */
 function rotation(quat) {
   const [x, y, z, w] = Array.from(quat, (value) => value / Math.hypot(...Array.from(quat)));
   const sine = Math.hypot(x, y, z);
   return sine === 0 ? placed([0, 0, 0]) : turn([x / sine, y / sine, z / sine], 2 * Math.atan2(sine, w));
 }
 
-/**
- * The product of two quaternions.
- * @param {Numbers} a
- * @param {Numbers} b
- */
+/** The product of two quaternions. */
+/** @type {(a: Numbers, b: Numbers) => number[]} */
 function compose(a, b) {
   const [x, y, z, w] = Array.from(a), [p, q, r, s] = Array.from(b);
   return [
@@ -72,28 +55,18 @@ function compose(a, b) {
   ];
 }
 
-/**
- * @param {Numbers} a
- * @param {Numbers} b
- */
+/** @type {(a: Numbers, b: Numbers) => number[]} */
 function cross(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-/**
- * @param {Numbers} a
- * @param {Numbers} b
- */
+/** @type {(a: Numbers, b: Numbers) => number} */
 function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-/**
- * a + s b
- * @param {Numbers} a
- * @param {number} s
- * @param {Numbers} b
- */
+/** a + s b */
+/** @type {(a: Numbers, s: number, b: Numbers) => number[]} */
 function plus(a, s, b) {
   return [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
 }
@@ -102,4 +75,24 @@ function plus(a, s, b) {
 function unit(a) {
   const length = Math.hypot(a[0], a[1], a[2]);
   return [a[0] / length, a[1] / length, a[2] / length];
+}
+
+/** @type {(axis: number) => number[]} */
+function base(axis) {
+  return [0, 1, 2].map((i) => Number(i === axis));
+}
+
+/** Where a frame is. */
+/** @type {(m: Numbers) => number[]} */
+function originOf(m) {
+  return [m[12], m[13], m[14]];
+}
+
+/** Points of a circle, from one direction to the other and around. */
+/** @type {(centre: Numbers, radius: number, one: Numbers, two: Numbers, parts?: number) => number[][]} */
+function circle(centre, radius, one, two, parts = 96) {
+  return Array.from({ length: parts + 1 }, (_, i) => {
+    const angle = (2 * Math.PI * i) / parts;
+    return plus(plus(centre, radius * Math.cos(angle), one), radius * Math.sin(angle), two);
+  });
 }

@@ -51,10 +51,8 @@ class Bytes {
     this.length = 0;
   }
 
-  /**
-   * @param {number} size
-   * @returns {number} where room for so many bytes is
-   */
+  /** Where room for so many bytes is. */
+  /** @type {(size: number) => number} */
   room(size) {
     if (this.length + size > this.view.byteLength) {
       const longer = new Uint8Array(2 * (this.length + size));
@@ -69,11 +67,8 @@ class Bytes {
     return new Uint8Array(this.view.buffer, 0, this.length);
   }
 
-  /**
-   * Whole numbers.
-   * @param {number} size in bits
-   * @param {...(number | bigint)} values
-   */
+  /** Whole numbers of so many bits. */
+  /** @type {(size: number, ...values: (number | bigint)[]) => Bytes} */
   put(size, ...values) {
     for (const value of values) {
       const at = this.room(size / 8);
@@ -101,28 +96,20 @@ class Bytes {
     return this;
   }
 
-  /**
-   * A text behind its length.
-   * @param {string} text
-   * @param {string} end
-   */
+  /** A text behind its length. */
+  /** @type {(text: string, end?: string) => Bytes} */
   text(text, end = "") {
     const content = new TextEncoder().encode(text + end);
     return this.put(32, content.length).raw(content);
   }
 
-  /**
-   * Gap before numbers of a size, in CDR, which counts from behind its first 4 bytes.
-   * @param {number} size
-   */
+  /** Gap before numbers of a size, in CDR, which counts from behind its first 4 bytes. */
+  /** @type {(size: number) => Bytes} */
   align(size) {
     return this.raw(new Uint8Array((size - ((this.length - 4) % size)) % size));
   }
 
-  /**
-   * @param {number} opcode
-   * @param {Bytes} content
-   */
+  /** @type {(opcode: number, content: Bytes) => Bytes} */
   record(opcode, content) {
     return this.put(8, opcode).put(64, content.length).raw(content.content);
   }
@@ -135,53 +122,40 @@ function textMap(entries) {
   return new Bytes().put(32, content.length).raw(content.content);
 }
 
-/**
- * A message's beginning.
- * @param {bigint} stamp ns
- * @param {string} frame
- */
+/** A message's beginning; its stamp in ns. */
+/** @type {(stamp: bigint, frame: string) => Bytes} */
 function headed(stamp, frame) {
   const second = 1000000000n;
   return new Bytes().raw([0, 1, 0, 0]).put(32, stamp / second, stamp % second).text(frame, "\0");
 }
 
-/**
- * The messages of a session, in the order of its samples.
- * @param {Session} session
- * @param {Robot} robot
- */
+/** The messages of a session, in the order of its samples. */
+/** @type {(session: Session, robot: Robot) => Generator<{topic: string, stamp: bigint, data: Uint8Array}>} */
 function* messages(session, robot) {
-  const { facts } = session, start = BigInt(session.begun) * 1000000n;
+  const { facts } = session;
   const root = String(facts.provenance.root), names = facts.joints.map((joint) => joint.name);
   for (let k = 0; k < session.count; k++) {
-    const stamp = start + BigInt(Math.round(session.time(k) * 1e9));
+    const stamp = session.stamp(k);
     const state = headed(stamp, "").align(4).put(32, names.length);
     for (const name of names) state.align(4).text(name, "\0");
     for (const group of ["q", "v", "tau"]) state.align(4).put(32, names.length).align(8).doubles(session.at(group, k));
     yield { topic: "/joint_states", stamp, data: state.content };
-    const place = transform(robot.frame(robot.links(session.at("q", k))), [0, 0, 0]);
+    const place = robot.end(session.at("q", k));
     yield { topic: "/end_effector", stamp, data: point(stamp, root, place, session.at("quat", k)) };
     if (session.groups.has("x_des")) {
-      facts.axes.split("").forEach((axis, i) => (place["xyz".indexOf(axis)] = session.at("x_des", k)[i]));
+      session.axes.forEach((axis, i) => (place[axis] = session.at("x_des", k)[i]));
       yield { topic: "/target", stamp, data: point(stamp, root, place, session.at("quat_des", k)) };
     }
   }
 }
 
-/**
- * @param {bigint} stamp
- * @param {string} frame
- * @param {number[]} place
- * @param {Float64Array} quat
- */
+/** @type {(stamp: bigint, frame: string, place: number[], quat: Float64Array) => Uint8Array} */
 function point(stamp, frame, place, quat) {
   return headed(stamp, frame).align(8).doubles(place).doubles(quat).content;
 }
 
-/**
- * Where the session comes from, as a bag's run.json has it.
- * @param {Session} session
- */
+/** Where the session comes from, as a bag's run.json has it. */
+/** @type {(session: Session) => string} */
 function provenance(session) {
   return JSON.stringify({
     format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
@@ -189,28 +163,25 @@ function provenance(session) {
   });
 }
 
-/**
- * The session as an MCAP file.
- * @param {Session} session
- * @param {Robot} robot
- */
+/** The session as an MCAP file. */
+/** @type {(session: Session, robot: Robot) => Uint8Array} */
 function mcap(session, robot) {
   const pose = session.groups.has("quat") ? "geometry_msgs/msg/PoseStamped" : "geometry_msgs/msg/PointStamped";
   const topics = ["/joint_states", "/end_effector", ...(session.groups.has("x_des") ? ["/target"] : [])];
-  const types = ["sensor_msgs/msg/JointState", pose], start = BigInt(session.begun) * 1000000n;
-  const end = start + BigInt(Math.round(session.time(session.k) * 1e9)), described = new Bytes();
+  const types = ["sensor_msgs/msg/JointState", pose], described = new Bytes();
   types.forEach((type, i) =>
     described.record(OP.schema, new Bytes().put(16, i + 1).text(type).text("ros2msg").text(DEFINITIONS[type])));
   topics.forEach((topic, i) =>
     described.record(OP.channel, new Bytes().put(16, i + 1, i ? 2 : 1).text(topic).text("cdr")
       .raw(textMap({ offered_qos_profiles: QOS, topic_type_hash: "" }).content)));
   const file = new Bytes().raw(MAGIC).record(OP.header, new Bytes().text("ros2").text("twodof")).raw(described.content);
-  const indexes = new Bytes(), chunk = new Chunk(topics);
-  let chunks = 0;
+  const indexes = new Bytes();
+  let chunks = 0, chunk = new Chunk(topics);
   const flush = () => {
-    if (chunk.empty) return;
+    if (!chunk.times.length) return;
     indexes.record(OP.chunkIndex, chunk.write(file));
     chunks += 1;
+    chunk = new Chunk(topics);
   };
   for (const { topic, stamp, data } of messages(session, robot)) {
     chunk.add(topics.indexOf(topic) + 1, stamp, data);
@@ -222,7 +193,7 @@ function mcap(session, robot) {
   const metadata = new Bytes().put(64, at, file.length - at).text("twodof");
   file.record(OP.dataEnd, new Bytes().put(32, 0));
   const summary = file.length, statistics = new Bytes();
-  statistics.put(64, session.count * topics.length).put(16, 2).put(32, topics.length, 0, 1, chunks).put(64, start, end);
+  statistics.put(64, session.count * topics.length).put(16, 2).put(32, topics.length, 0, 1, chunks).put(64, session.stamp(0), session.stamp(session.k));
   statistics.put(32, 10 * topics.length);
   topics.forEach((_, i) => statistics.put(16, i + 1).put(64, session.count));
   file.raw(described.content).record(OP.statistics, statistics).raw(indexes.content);
@@ -233,42 +204,24 @@ function mcap(session, robot) {
 /** Messages that are stored together, with where each is. */
 class Chunk {
   records = new Bytes();
-  /** @type {[bigint, number][][]} times and places of each topic's messages */
-  places = [];
   /** @type {bigint[]} */
   times = [];
 
   /** @param {string[]} topics */
   constructor(topics) {
-    this.topics = topics;
-    this.begin();
+    /** @type {[bigint, number][][]} times and places of each topic's messages */
+    this.places = topics.map(() => []);
   }
 
-  begin() {
-    this.records = new Bytes();
-    this.places = this.topics.map(() => []);
-    this.times = [];
-  }
-
-  get empty() {
-    return this.records.length === 0;
-  }
-
-  /**
-   * @param {number} channel
-   * @param {bigint} stamp
-   * @param {Uint8Array} data
-   */
+  /** @type {(channel: number, stamp: bigint, data: Uint8Array) => void} */
   add(channel, stamp, data) {
     this.places[channel - 1].push([stamp, this.records.length]);
     this.times.push(stamp);
     this.records.record(OP.message, new Bytes().put(16, channel).put(32, 0).put(64, stamp, stamp).raw(data));
   }
 
-  /**
-   * Append it and its indexes, and begin anew; the record of where they are.
-   * @param {Bytes} file
-   */
+  /** Append it and its indexes; the record of where they are. */
+  /** @type {(file: Bytes) => Bytes} */
   write(file) {
     const { records, places } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
     const content = new Bytes().put(64, start, end, records.length).put(32, 0).text("").put(64, records.length);
@@ -280,7 +233,6 @@ class Chunk {
       for (const [stamp, place] of entries) index.put(64, stamp, place);
       file.record(OP.messageIndex, index);
     });
-    this.begin();
     return new Bytes().put(64, start, end, at, size).put(32, offsets.length).raw(offsets.content)
       .put(64, file.length - first).text("").put(64, records.length, records.length);
   }

@@ -50,11 +50,8 @@ class Remote extends Samples {
     this.socket = socket;
   }
 
-  /**
-   * That of this page's server, once its first sample is there.
-   * @param {Facts} facts
-   * @returns {Promise<Remote>}
-   */
+  /** That of this page's server, once its first sample is there. */
+  /** @type {(facts: Facts) => Promise<Remote>} */
   static connect(facts) {
     const socket = connection();
     const remote = new Remote(facts, socket);
@@ -101,20 +98,14 @@ class Remote extends Samples {
     while (now - this.past[0][0] > PACE_WINDOW) this.past.shift();
   }
 
-  /**
-   * @param {string} order
-   * @param {unknown} value
-   */
+  /** @type {(order: string, value?: unknown) => void} */
   tell(order, value = null) {
     this.told += 1;
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify([order, value]));
   }
 
-  /**
-   * Set an input from the next step on; a parameter begins the run anew.
-   * @param {string} name of a variable, or of a vector: a number sets all of its elements
-   * @param {Value | number[]} value
-   */
+  /** Set an input from the next step on; a parameter begins the run anew. */
+  /** @type {(name: string, value: Value | number[]) => void} */
   set(name, value) {
     const pairs = this.checked(name, value);
     this.values = new Map([...this.values, ...pairs]);

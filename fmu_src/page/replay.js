@@ -23,10 +23,8 @@ class Replay extends Samples {
     return this.nearest(this.moment);
   }
 
-  /**
-   * All of it.
-   * @returns {[number, number]}
-   */
+  /** All of it. */
+  /** @returns {[number, number]} */
   get span() {
     return [0, this.duration || this.facts.step];
   }
@@ -37,10 +35,8 @@ class Replay extends Samples {
     if (on && this.moment >= this.duration) this.moment = 0;
   }
 
-  /**
-   * @param {number} passed s, by the clock
-   * @param {number} speed
-   */
+  /** Go on by s of the clock. */
+  /** @type {(passed: number, speed: number) => void} */
   advance(passed, speed) {
     this.moment += Math.min(passed, LONGEST) * speed;
     if (this.moment < this.duration) return;

@@ -6,10 +6,8 @@ class Robot {
     this.facts = facts;
   }
 
-  /**
-   * Where all links are in the root frame.
-   * @param {Numbers} q rad or m
-   */
+  /** Where all links are in the root frame, at positions in rad or m. */
+  /** @type {(q: Numbers) => Float64Array[]} */
   links(q) {
     /** @type {Float64Array[]} */
     const places = [placed([0, 0, 0])];
@@ -21,12 +19,16 @@ class Robot {
     return places;
   }
 
-  /**
-   * Where the task frame is.
-   * @param {Float64Array[]} links
-   */
+  /** Where the task frame is. */
+  /** @type {(links: Float64Array[]) => Float64Array} */
   frame(links) {
     return links[this.facts.frameLink];
+  }
+
+  /** Where the end effector is. */
+  /** @type {(q: Numbers) => number[]} */
+  end(q) {
+    return originOf(this.frame(this.links(q)));
   }
 
   /**
@@ -42,20 +44,17 @@ class Robot {
     let radius = 0;
     for (const i of chain.slice(first)) {
       const { place, prismatic, column } = this.facts.links[i];
-      if (i !== chain[first]) radius += Math.hypot(place[12], place[13], place[14]);
+      if (i !== chain[first]) radius += Math.hypot(...originOf(place));
       if (prismatic && column >= 0) {
         const { low, high } = this.facts.joints[column];
         radius += Math.max(Math.abs(low ?? Infinity), Math.abs(high ?? Infinity));
       }
     }
-    return { centre: transform(links[chain[first]], [0, 0, 0]), radius };
+    return { centre: originOf(links[chain[first]]), radius };
   }
 
-  /**
-   * Joints that are at a limit.
-   * @param {Numbers} q
-   * @param {Map<string, Value>} values
-   */
+  /** Joints that are at a limit. */
+  /** @type {(q: Numbers, values: Map<string, Value>) => JointFacts[]} */
   atLimit(q, values) {
     return this.facts.joints.filter((_, i) =>
       ["q_min", "q_max"].some((side) => {

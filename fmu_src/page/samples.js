@@ -56,6 +56,8 @@ class Samples {
    */
   constructor(facts, timed) {
     this.facts = facts;
+    this.axes = [...facts.axes].map((axis) => "xyz".indexOf(axis)); // in which there is a target, and the others
+    this.free = [0, 1, 2].filter((axis) => !this.axes.includes(axis));
     /** @type {Map<string, Variable>} */
     this.variables = new Map(facts.variables.map((variable) => [variable.name, variable]));
     /** @type {Map<string, string[]>} names of a vector's elements, or of the scalar */
@@ -77,48 +79,41 @@ class Samples {
     this.values = this.defaults();
   }
 
-  /**
-   * @param {string} name
-   * @returns {Variable}
-   */
+  /** @type {(name: string) => Variable} */
   variable(name) {
     const variable = this.variables.get(name);
     if (!variable) throw new Error(`there is no variable '${name}'`);
     return variable;
   }
 
-  /**
-   * Inputs and parameters as they are at first.
-   * @returns {Map<string, Value>}
-   */
+  /** Inputs and parameters as they are at first. */
+  /** @returns {Map<string, Value>} */
   defaults() {
     const told = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
     return new Map(told.map((v) => [v.name, /** @type {Value} */ (v.start)]));
   }
 
-  /**
-   * What is to be set, element by element.
-   * @param {string} name of a variable, or of a vector: a number sets all of its elements
-   * @param {Value | number[]} value
-   * @returns {[string, Value][]}
-   */
+  /** What is to be set, element by element; a number by a vector's name sets all of its elements. */
+  /** @type {(name: string, value: Value | number[]) => [string, Value][]} */
   checked(name, value) {
     const names = this.groups.get(name) ?? [name];
     const values = Array.isArray(value) ? value : names.map(() => value);
     if (values.length !== names.length) throw new Error(`${name} has ${names.length} elements`);
-    return names.map((element, i) => {
+    const pairs = names.map((element, i) => {
       const { causality, start } = this.variable(element);
       if (!this.values.has(element)) throw new Error(`${element}, ${causality}, cannot be set`);
       if (typeof values[i] !== typeof start || !Number.isFinite(Number(values[i])))
         throw new Error(`${element} = ${values[i]} is not a ${typeof start}`);
-      return [element, values[i]];
+      return /** @type {[string, Value]} */ ([element, values[i]]);
     });
+    const told = new Map([...this.values, ...pairs]);
+    if (this.groups.get("quat_des")?.every((element) => !told.get(element)))
+      throw new Error("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing");
+    return pairs;
   }
 
-  /**
-   * Take one sample more.
-   * @param {Numbers} sample
-   */
+  /** Take one sample more. */
+  /** @type {(sample: Numbers) => void} */
   append(sample) {
     if ((this.count + 1) * this.width > this.data.length) {
       const longer = new Float64Array(2 * this.data.length);
@@ -139,10 +134,8 @@ class Samples {
     return this.data[k * this.width];
   }
 
-  /**
-   * Number of the sample that is nearest to a time, s.
-   * @param {number} t
-   */
+  /** Number of the sample that is nearest to a time, s. */
+  /** @type {(t: number) => number} */
   nearest(t) {
     let first = 0, last = this.count - 1;
     while (first < last) {
@@ -158,58 +151,41 @@ class Samples {
     return this.count - 1;
   }
 
-  /**
-   * Times that are of interest, s.
-   * @returns {[number, number]}
-   */
+  /** Times that are of interest, s. */
+  /** @returns {[number, number]} */
   get span() {
     const end = this.time(this.now);
     return [Math.max(0, end - WINDOW), Math.max(end, WINDOW)];
   }
 
-  /**
-   * More to tell beside the samples, names and texts.
-   * @returns {[string, string][]}
-   */
+  /** More to tell beside the samples, names and texts. */
+  /** @returns {[string, string][]} */
   remarks() {
     return [];
   }
 
-  /**
-   * A number of a sample; not one where there is none.
-   * @param {string} group
-   * @param {number} k number of the sample
-   * @param {number} i
-   */
+  /** A number of sample k; not one where there is none. */
+  /** @type {(group: string, k: number, i: number) => number} */
   value(group, k, i) {
     const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
     return i < size ? this.data[k * this.width + begin + i] : NaN;
   }
 
-  /**
-   * A vector of a sample, empty where there is none.
-   * @param {string} group
-   * @param {number} k number of the sample
-   */
+  /** A vector of sample k, empty where there is none. */
+  /** @type {(group: string, k?: number) => Float64Array} */
   at(group, k = this.now) {
     const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
     return this.data.subarray(k * this.width + begin, k * this.width + begin + size);
   }
 
-  /**
-   * A vector of inputs or parameters as they are set now.
-   * @param {string} group
-   * @returns {number[]}
-   */
+  /** A vector of inputs or parameters as they are set now. */
+  /** @type {(group: string) => number[]} */
   held(group) {
     return (this.groups.get(group) ?? []).map((name) => Number(this.values.get(name)));
   }
 
-  /**
-   * A target: of the latest sample, what is set by now.
-   * @param {string} group
-   * @param {number} k number of the sample
-   */
+  /** A target in sample k: of the latest, what is set by now. */
+  /** @type {(group: string, k: number) => number[]} */
   target(group, k) {
     return this.steered && k === this.count - 1 ? this.held(group) : [...this.at(group, k)];
   }

@@ -41,7 +41,7 @@ const CREASE = 0.8; // cosine of the angle between faces from which on their edg
 const LINE_SIZE = 11; // numbers of one
 
 class Scene {
-  /** @type {number[]} */
+  /** @type {number[]} to be drawn next */
   lines = [];
   /** @type {{mesh: number, model: Float64Array, colour: number[]}[]} */
   solids = [];
@@ -78,13 +78,9 @@ class Scene {
     });
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
-    this.begin();
   }
 
-  /**
-   * @param {string[]} sources
-   * @returns {WebGLProgram}
-   */
+  /** @type {(sources: string[]) => WebGLProgram} */
   program(sources) {
     const { gl } = this, program = /** @type {WebGLProgram} */ (gl.createProgram());
     sources.forEach((source, i) => {
@@ -99,10 +95,7 @@ class Scene {
     return program;
   }
 
-  /**
-   * @param {Uint16Array} places
-   * @param {Uint32Array} triangles
-   */
+  /** @type {(places: Uint16Array, triangles: Uint32Array) => {array: WebGLVertexArrayObject | null, count: number}} */
   upload(places, triangles) {
     const { gl } = this, array = gl.createVertexArray();
     gl.bindVertexArray(array);
@@ -118,38 +111,20 @@ class Scene {
     return { array, count: indices.length };
   }
 
-  /** Forget what was to be drawn. */
-  begin() {
-    this.lines = [];
-    this.solids = [];
-  }
-
-  /**
-   * A mesh; one that does not cover what is behind it is seen before all that do.
-   * @param {number} mesh
-   * @param {Float64Array} model
-   * @param {number[]} colour red, green, blue, and how much it covers
-   */
+  /** A mesh in red, green, blue, and how much it covers: where not all, it is seen before all that do. */
+  /** @type {(mesh: number, model: Float64Array, colour: number[]) => void} */
   addSolid(mesh, model, colour) {
     this.solids.push({ mesh, model, colour });
   }
 
-  /**
-   * Lines from point to point, of a width in pixels.
-   * @param {number[][]} points
-   * @param {number[]} colour red, green, blue, and how much it covers
-   * @param {number} width
-   */
+  /** Lines from point to point in such a colour, of a width in pixels. */
+  /** @type {(points: number[][], colour: number[], width: number) => void} */
   addLine(points, colour, width) {
     for (let i = 1; i < points.length; i++) this.lines.push(...points[i - 1], ...points[i], ...colour, width);
   }
 
-  /**
-   * Show what was added.
-   * @param {Camera} camera
-   * @param {number[]} background
-   * @param {number} bright how far colours are from their own towards white
-   */
+  /** Show what was added, its colours so far from their own towards white. */
+  /** @type {(camera: Camera, background: number[], bright: number) => void} */
   draw(camera, background, bright) {
     const { gl, canvas } = this;
     const ratio = Math.max(Math.min(devicePixelRatio, 2), this.fineness);
@@ -175,15 +150,10 @@ class Scene {
     gl.uniform2f(gl.getUniformLocation(this.line, "pixel"), ratio / width, ratio / height);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.lines.length / LINE_SIZE);
     gl.disable(gl.BLEND);
-    this.begin();
+    [this.lines, this.solids] = [[], []];
   }
 
-  /**
-   * @param {Scene["solids"]} solids
-   * @param {Float64Array} view
-   * @param {number[]} light
-   * @param {number} bright
-   */
+  /** @type {(solids: Scene["solids"], view: Float64Array, light: number[], bright: number) => void} */
   drawSolids(solids, view, light, bright) {
     const { gl, solid } = this;
     /** @param {string} name */
@@ -239,11 +209,8 @@ function smoothed(places, triangles) {
   return { corners: corners.subarray(0, 4 * made), normals: normals.subarray(0, 4 * made), indices };
 }
 
-/**
- * Normals of triangles, of their areas' length: that of a triangle begins at its first corner.
- * @param {Uint16Array} places
- * @param {Uint32Array} triangles
- */
+/** Normals of triangles, of their areas' length: that of a triangle begins at its first corner. */
+/** @type {(places: Uint16Array, triangles: Uint32Array) => Float64Array} */
 function facesOf(places, triangles) {
   const faces = new Float64Array(triangles.length);
   for (let t = 0; t < triangles.length; t += 3) {
@@ -255,22 +222,15 @@ function facesOf(places, triangles) {
   return faces;
 }
 
-/**
- * Of the angle between two faces; NaN where one has no area.
- * @param {Float64Array} faces
- * @param {number} f
- * @param {number} g
- */
+/** Of the angle between two faces; NaN where one has no area. */
+/** @type {(faces: Float64Array, f: number, g: number) => number} */
 function cosine(faces, f, g) {
   const [x, y, z] = [faces[f], faces[f + 1], faces[f + 2]], [u, v, w] = [faces[g], faces[g + 1], faces[g + 2]];
   return (x * u + y * v + z * w) / Math.sqrt((x * x + y * y + z * z) * (u * u + v * v + w * w));
 }
 
-/**
- * First corners of the triangles about each vertex, and where those of a vertex begin.
- * @param {number} count of vertices
- * @param {Uint32Array} triangles
- */
+/** First corners of the triangles about each of so many vertices, and where those of a vertex begin. */
+/** @type {(count: number, triangles: Uint32Array) => Uint32Array[]} */
 function facesAround(count, triangles) {
   const begins = new Uint32Array(count + 1), around = new Uint32Array(triangles.length);
   for (const vertex of triangles) begins[vertex + 1] += 1;

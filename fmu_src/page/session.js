@@ -25,10 +25,8 @@ class Session extends Samples {
     this.startAgain();
   }
 
-  /**
-   * Begin anew; inputs and parameters as they are, or as the FMU has them.
-   * @param {boolean} all
-   */
+  /** Begin anew; inputs and parameters as they are, or as the FMU has them. */
+  /** @type {(all?: boolean) => void} */
   startAgain(all = false) {
     if (all) this.values = this.defaults();
     this.engine.reset();
@@ -50,11 +48,8 @@ class Session extends Samples {
       if (typeof value === "boolean") this.engine.setBoolean(this.variable(name).reference, value);
   }
 
-  /**
-   * Set an input from the next step on; a parameter begins the run anew.
-   * @param {string} name of a variable, or of a vector: a number sets all of its elements
-   * @param {Value | number[]} value
-   */
+  /** Set an input from the next step on; a parameter begins the run anew. */
+  /** @type {(name: string, value: Value | number[]) => void} */
   set(name, value) {
     const pairs = this.checked(name, value);
     /** @type {Map<string, Value>} */
@@ -85,11 +80,8 @@ class Session extends Samples {
     this.due = this.time(this.k);
   }
 
-  /**
-   * Step as far as the clock is, and there is time for.
-   * @param {number} passed s, by the clock
-   * @param {number} speed
-   */
+  /** Step as far as the clock is, which has gone on by so many s, and there is time for. */
+  /** @type {(passed: number, speed: number) => void} */
   advance(passed, speed) {
     this.due += passed * speed;
     const end = performance.now() + 1000 * Math.max(BUSY, SHARE * passed);
@@ -100,6 +92,12 @@ class Session extends Samples {
   /** @param {number} k */
   time(k) {
     return k * this.facts.step;
+  }
+
+  /** ns since the epoch of a sample. */
+  /** @type {(k: number) => bigint} */
+  stamp(k) {
+    return BigInt(this.begun) * 1000000n + BigInt(Math.round(this.time(k) * 1e9));
   }
 
   /** Some communication steps. */

@@ -19,8 +19,7 @@ from typing import Any
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
 from ..files import free_name
-from ..ros.messages import check_gains
-from ..simulation.experiments import Experiment, Setting, Value, resolve
+from ..simulation.experiments import Experiment, Setting, Value, check_going_on, resolve
 from ..simulation.master import at_rest, samples
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample
@@ -145,7 +144,7 @@ class Loop:
         with self._lock:
             if order == "change":
                 value = resolve(self._run.fmu, value)
-                check_gains(value)
+                check_going_on(self._run.fmu, value, self._values)
                 self._values |= value
             elif order in ("play", "step"):
                 self._playing = order == "play" and bool(value)

@@ -107,10 +107,8 @@ def _variables(track: Track, groups: dict[str, Array]) -> Iterator[dict[str, Any
     starts = track.recording.provenance.get("start_values", {})
     values |= {name: starts[name] for name in starts if name.startswith("gravity[")}
     for name, start in values.items():
-        causality = "output" if start is None else "parameter"
         yield {
-            "name": name, "reference": 0, "causality": causality, "unit": "", "start": start,
-            "description": "",
+            "name": name, "causality": "output" if start is None else "parameter", "start": start,
         }  # fmt: skip
 
 

@@ -29,8 +29,9 @@ class Range:
 NO_RANGE = Range(-math.inf, math.inf, "")
 NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
 POSITIVE = Range(math.nextafter(0.0, 1.0), math.inf, "> 0")
+GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
-    **dict.fromkeys(("Kp", "Kd", "Kp_rot", "Kd_rot", "Kn", "payload"), NOT_NEGATIVE),
+    **dict.fromkeys((*GAINS, "payload"), NOT_NEGATIVE),
     **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),
     "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
 }

@@ -8,10 +8,11 @@ from threading import Lock
 from typing import Any
 
 from ..errors import InputError, PublishError
-from ..simulation.experiments import Experiment, Value, resolve
+from ..plant.variables import GAINS
+from ..simulation.experiments import Experiment, Value, check_going_on, resolve
 from ..simulation.sample import Sample, Sink
 from .cdr import Rows
-from .messages import GAINS, Messages, check_gains, store_of
+from .messages import Messages, store_of
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -67,13 +68,13 @@ class Foxglove(Sink):
 
     def __enter__(self) -> Foxglove:
         context = self._context = Context()  # which its channels do not keep
-        self._channels = {
-            name: Channel(
-                name, message_encoding="cdr", context=context,
-                schema=Schema(name=said.type, encoding="ros2msg", data=_definition(said.type)),
+        self._channels = {}
+        for name, said in self._messages.topics.items():
+            text, _ = store_of(said.type).generate_msgdef(said.type, ros_version=2)
+            schema = Schema(name=said.type, encoding="ros2msg", data=text.encode())
+            self._channels[name] = Channel(
+                name, schema=schema, message_encoding="cdr", context=context
             )
-            for name, said in self._messages.topics.items()
-        }  # fmt: skip
         try:
             self._server = start_server(
                 name="twodof", host=HOST, port=self._port, context=context,
@@ -153,7 +154,7 @@ class _Gains(ServerListener):
                 if parameter.name not in self._groups:
                     raise InputError(f"'{parameter.name:.80}' is no gain of this FMU")
                 asked = resolve(self._fmu, {parameter.name: _numbers(parameter.get_value())})
-                check_gains(asked)
+                check_going_on(self._fmu, asked, self.held)
             except InputError as error:
                 LOG.warning("a parameter that Foxglove set is ignored: %s", error)
                 continue
@@ -167,8 +168,3 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return value[0] if len(value) == 1 else value
     return value
-
-
-def _definition(type_name: str) -> bytes:
-    """The text of a message type with those that it is made of, as in MCAP files."""
-    return store_of(type_name).generate_msgdef(type_name, ros_version=2)[0].encode()

@@ -14,8 +14,9 @@ from typing import Any
 from ..errors import InputError
 from ..files import write_file
 from ..fmu import Fmu, load_fmu
+from ..plant.variables import GAINS
 from ..simulation.experiments import experiment
-from .messages import GAINS, JOINT_STATES, POSE, Messages, check_name
+from .messages import JOINT_STATES, POSE, Messages, check_name
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
 PARTS = {"position": "q", "velocity": "v", "effort": "tau"}

@@ -40,8 +40,6 @@ CLOCK = "/clock"
 POINT = "geometry_msgs/msg/PointStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
-GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
-"""Inputs that are shown and set as parameters."""
 FOREVER = QosTime(9223372036, 854775807)
 
 XYZ = "float64 x\nfloat64 y\nfloat64 z"
@@ -96,17 +94,6 @@ def check_name(argument: str, name: str) -> None:
         raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
 
 
-def check_gains(values: Mapping[str, Value]) -> None:
-    """Refuse gains below 0, with which an FMU ends its run.
-
-    Raises:
-        InputError: naming it.
-    """
-    for name, value in values.items():
-        if name.partition("[")[0] in GAINS and value < 0.0:
-            raise InputError(f"{name} = {value:g} is less than 0")
-
-
 class Topic(NamedTuple):
     """Message type and offered quality of service of a topic."""
 
@@ -114,26 +101,15 @@ class Topic(NamedTuple):
     qos: Qos
 
 
-def _qos(depth: int, durability: QosDurability) -> Qos:
-    return Qos(
-        QosHistory.KEEP_LAST,
-        depth,
-        QosReliability.RELIABLE,
-        durability,
-        FOREVER,
-        FOREVER,
-        QosLiveliness.AUTOMATIC,
-        FOREVER,
-        False,
-    )
-
-
-STREAM = _qos(10, QosDurability.VOLATILE)
-LATCHED = _qos(1, QosDurability.TRANSIENT_LOCAL)
+STREAM = Qos(
+    QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
+    FOREVER, FOREVER, QosLiveliness.AUTOMATIC, FOREVER, False,
+)  # fmt: skip
+LATCHED = STREAM._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 SCENE_TOPICS = {
     "/robot_description": Topic("std_msgs/msg/String", LATCHED),
     "/tf_static": Topic("tf2_msgs/msg/TFMessage", LATCHED),
-    TRANSFORMS: Topic("tf2_msgs/msg/TFMessage", _qos(100, QosDurability.VOLATILE)),
+    TRANSFORMS: Topic("tf2_msgs/msg/TFMessage", STREAM._replace(depth=100)),
     TARGET: Topic(POINT, STREAM),
     END_EFFECTOR: Topic(POINT, STREAM),
 }

@@ -19,7 +19,7 @@ from typing import Any
 from ..errors import InputError
 from ..files import check_file
 from ..fmu import Fmu, load_fmu
-from ..plant.variables import CONTROLS
+from ..plant.variables import CONTROLS, GAINS
 from ..plant.variables import Value as Value
 
 Setting = Any
@@ -231,6 +231,20 @@ def _checked(fmu: Fmu, name: str, value: object) -> Value:
     if not math.isfinite(value):
         raise InputError(f"{name} = {value} is not finite")
     return float(value)
+
+
+def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
+    """Refuse inputs with which an FMU would end its run, and that may come at any time.
+
+    Raises:
+        InputError: a gain below 0, or with the others that are held a quaternion of zeros.
+    """
+    for name, value in asked.items():
+        if name.partition("[")[0] in GAINS and value < 0.0:
+            raise InputError(f"{name} = {value:g} is less than 0")
+    turn = fmu.vector("quat_des")
+    if turn and not any({**held, **asked}[name] for name in turn):
+        raise InputError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing")
 
 
 def _of_another(fmu: Fmu, name: str) -> str:

@@ -1,0 +1,99 @@
+"""The server of a page: whom it answers, and what it refuses."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import urllib.request
+from collections.abc import Sequence
+
+import browser
+import pytest
+
+from twodof.errors import PageError
+from twodof.pages.serving import Server
+
+
+def names_of(*names: str) -> list[str]:
+    """As a browser writes them into Host."""
+    return [f"{name}:{port}" for name in names for port in (80, 9000)] + [*names]
+
+
+LOOPBACK = ("127.0.0.1", "localhost", "LocalHost", "[::1]")
+STRANGERS = (
+    "evil.example",
+    "127.0.0.1.evil.example",
+    "localhost.evil.example",
+    "[::1].example",
+    "",
+)
+ASKED = {
+    "127.0.0.1": (LOOPBACK, (*STRANGERS, "192.0.2.1", "[2001:db8::1]")),
+    "localhost": (LOOPBACK, (*STRANGERS, "192.0.2.1")),
+    "0.0.0.0": ((*LOOPBACK, "192.0.2.1", "[2001:db8::1]", socket.gethostname()), STRANGERS),
+    socket.gethostname(): ((socket.gethostname(),), (*STRANGERS, "192.0.2.1")),
+}
+
+
+@pytest.mark.parametrize(("host", "own", "other"), [(k, *v) for k, v in ASKED.items()], ids=ASKED)
+def test_page_answers_to_its_own_name_and_its_own_page_alone(
+    host: str, own: Sequence[str], other: Sequence[str]
+) -> None:
+    """Requests for the page and for a websocket, with the headers that a browser sends."""
+
+    async def talk(connection: object) -> None:
+        pass
+
+    def answer(url: str, *headers: tuple[str, str]) -> int:
+        return browser.answer(url, *headers, path="/socket" if len(headers) > 4 else "/")
+
+    with Server(b"a page", host, 0, talk) as served:
+        for rest, fine in (((), 200), (browser.UPGRADE, 101)):
+            for name in names_of(*other):
+                asked = ("Host", name), *rest
+                assert answer(served.url, *asked) == 403
+                assert answer(served.url, *asked, ("Origin", f"http://{name}")) == 403
+            for name in names_of(*own):
+                asked = ("Host", name), *rest
+                assert answer(served.url, *asked) == fine  # no browser, or a link
+                assert answer(served.url, *asked, ("Origin", f"http://{name}")) == fine
+                for origin in ("null", "http://[", "http://localhost:3000", "http://evil.example"):
+                    assert answer(served.url, *asked, ("Origin", origin)) == 403
+                assert answer(served.url, *asked, ("Host", name)) == 403
+            assert answer(served.url, *rest) == 403
+
+
+def test_a_server_has_one_page_and_no_socket_that_it_does_not_need() -> None:
+    own = ("Host", "localhost")
+    with Server(b"page", port=0) as server:
+        for path in ("/socket", "/?bag=other", "/run.json", "/../run.json", "//evil.example"):
+            assert browser.answer(server.url, own, path=path) == 404
+            assert browser.answer(server.url, own, *browser.UPGRADE, path=path) == 404
+
+
+def test_port_that_another_is_about_to_serve() -> None:
+    with Server(b"", port=0) as free:
+        port = int(free.url.rpartition(":")[2])
+    first = Server(b"", port=port)
+    with pytest.raises(PageError, match=f"port {port} of 127.0.0.1 is in use"):
+        Server(b"", port=port)
+    with first:
+        assert browser.answer(first.url, ("Host", "localhost")) == 200
+
+
+@pytest.mark.parametrize("method", ["HEAD", "POST", "DELETE"])
+def test_what_a_page_is_not_asked_for_is_answered(method: str) -> None:
+    """By its own word, as by curl -I."""
+    with Server(b"page", port=0) as server:
+        asking = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=10)
+        asking.request(method, "/")
+        answer = asking.getresponse()
+        assert (answer.status, answer.getheader("Allow"), answer.read()) == (405, "GET", b"")
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_a_page_on_all_addresses_is_opened_as_printed(host: str) -> None:
+    with Server(b"page", host, 0) as server:
+        assert f"//{host}:" not in server.url and "[::]" not in server.url
+        with urllib.request.urlopen(server.url, timeout=10) as answer:
+            assert answer.read() == b"page"
