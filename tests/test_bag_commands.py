@@ -169,16 +169,20 @@ def test_what_cannot_be_replayed(
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("last", [np.nan, np.inf])
 def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], last: float
 ) -> None:
+    """Nor does NumPy say anything of it."""
+
     def bag(name: str, last: float) -> str:
         return str(write(tmp_path / name, [
             ("/joint_states", BEGIN + k * STEP, joint_state(0, "ab", (a, 0.1)))
-            for k, a in enumerate((0.1, 0.1, last))
+            for k, a in enumerate((0.1, 0.1, last, last))
         ]))  # fmt: skip
 
-    bags = [bag("real", np.nan), bag("model", 0.1)]
+    bags = [bag("real", last), bag("model", 0.1)]
     assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0
     said = f"model  cannot be told from 'real': a is not finite at {2 * STEP / 1e9:g} s\n"
     assert said in capfd.readouterr().out

@@ -104,6 +104,7 @@ UNRESOLVED = {
     "none": ({"x_des": []}, "x_des has 2 elements, 0 were given"),
     "NaN": ({"Kp": float("nan")}, r"Kp\[1\] = nan is not finite"),
     "infinite": ({"x_des": [0.1, float("-inf")]}, r"x_des\[2\] = -inf is not finite"),
+    "a whole number beyond all": ({"Kp": -(10**5000)}, r"Kp\[1\] = -inf is not finite"),
     "a Boolean for a number": ({"Kp": True}, r"Kp\[1\] = True: expected a number"),
     "a number for a Boolean": ({"limit_effort": 1.0}, "limit_effort = 1.0: expected true or false"),
     "a text": ({"Kn": "5"}, "Kn"),

@@ -206,9 +206,10 @@ def close_outline(values: Array, most: int) -> Any:
 
     Of parts as short as may be the same four, and both sides of the greatest rise and fall.
     """
-    n, rise = len(values), np.diff(values)
+    n, size = len(values), 1
     kept: Any = slice(None)
-    size = 1
+    with np.errstate(all="ignore"):  # between infinities
+        rise = np.diff(values)
     while n > most:
         size = max(2 * size, 2 * n // most)
         lines = [values, np.append(rise, np.nan), np.append(np.nan, rise)]
