@@ -6,9 +6,10 @@ Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
 from __future__ import annotations
 
 import sqlite3
+import struct
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from twodof.simulation.experiments import Experiment
@@ -161,6 +162,40 @@ foreign_readers = pytest.mark.parametrize(("storage", "read"), READERS)
 both_storages = pytest.mark.parametrize("storage", STORAGES)
 
 
+def header(stamp: int, frame: str = "") -> Any:
+    time = STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, SECOND))
+    return STORE.types["std_msgs/msg/Header"](time, frame)
+
+
+def joint_message(
+    stamp: int, names: Sequence[str], *numbers: Sequence[float], frame: str = ""
+) -> Any:
+    """A JointState with positions, velocities and efforts, as far as they are given."""
+    parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
+    return STORE.types["sensor_msgs/msg/JointState"](header(stamp, frame), [*names], *parts)
+
+
+def serialised(message: Any, *, little_endian: bool = True) -> bytes:
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
+
+
+def write_elsewhere(
+    path: Path, messages: Iterable[tuple[str, int, Any]], *, zstd: bool = False, **options: Any
+) -> Path:
+    """A bag that rosbags alone writes, of (topic, log time, message)."""
+    writer = Writer(path, **{"version": 9, **options})
+    if zstd:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, stamp, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], stamp, serialised(message))
+    return path
+
+
 def metadata(bag: Path) -> dict[str, Any]:
     text = (bag / "metadata.yaml").read_text("utf-8")
     return yaml.load(text, yaml.CSafeLoader)["rosbag2_bagfile_information"]
@@ -194,3 +229,39 @@ def assert_consistent(bag: Path, storage: str) -> int:
         assert found["duration"]["nanoseconds"] == max(stamps) - min(stamps)
     assert not (bag / "reserve").exists()
     return len(stamps)
+
+
+# --- MCAP, record by record ---
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def record(opcode: int, *content: bytes) -> bytes:
+    body = b"".join(content)
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def texts(*contents: str | bytes) -> bytes:
+    raw = [content.encode() if isinstance(content, str) else content for content in contents]
+    return b"".join(struct.pack("<I", len(content)) + content for content in raw)
+
+
+def channel(number: int, topic: str, qos: str = "") -> bytes:
+    metadata = texts("offered_qos_profiles", qos) if qos else b""
+    head = struct.pack("<HH", number % 65536, 1)
+    return record(4, head, texts(topic, "cdr", metadata))
+
+
+def message(data: bytes, stamp: int = 1, number: int = 1) -> bytes:
+    return record(5, struct.pack("<HIQQ", number, 0, stamp, stamp), data)
+
+
+def chunk(records: bytes, size: int, compression: str) -> bytes:
+    head = struct.pack("<QQQI", 0, 1, size, 0) + texts(compression)
+    return record(6, head, struct.pack("<Q", len(records)), records)
+
+
+HEADER = MAGIC + record(1, texts("ros2", ""))
+FOOTER = record(2, bytes(20)) + MAGIC
+SCHEMA = record(3, struct.pack("<H", 1), texts("sensor_msgs/msg/JointState", "ros2msg", ""))
+CHANNEL = channel(1, "/joint_states")
