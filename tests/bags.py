@@ -16,10 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import yaml
+from harness import wait_until
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -34,25 +36,30 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 LOGGER = """
-import mmap, sys
+import mmap, sys, time
+import numpy as np
 import twodof
 
-fmu, bag, storage, made, start = sys.argv[1:]
+fmu, bag, storage, clock, start = sys.argv[1:]
 
-class Made(twodof.Sink):
-    \"""How many samples there are, where it outlives the process.\"""
+class Clock(twodof.Sink):
+    \"""When there was each sample, by the time in which the process ran, where it outlives it.
+
+    What is longer than two periods from one to the next is no pace of it, but the machine's.
+    \"""
 
     def __enter__(self):
-        with open(made, "r+b") as file:
-            self.map = mmap.mmap(file.fileno(), 8)
+        self.times, self.t, self.before = np.memmap(clock, "<f8", "r+"), 1.0, time.monotonic()
         return self
 
     def write(self, sample):
-        self.map[:] = (sample.k + 1).to_bytes(8, "little")
+        now = time.monotonic()
+        self.t, self.before = self.t + min(now - self.before, 0.02), now
+        self.times[sample.k] = self.t
 
 try:
     twodof.simulate(
-        fmu, twodof.Bag(bag, storage=storage), Made(), pace=twodof.RealTime(),
+        fmu, twodof.Bag(bag, storage=storage), Clock(), pace=twodof.RealTime(),
         stop_time=1e5, stamp_start=int(start),
     )
 except twodof.TwoDofError as error:
@@ -61,23 +68,32 @@ except twodof.TwoDofError as error:
 
 
 class Logging(NamedTuple):
-    """A run in real time, in a process of its own, that counts its samples."""
+    """A run in real time, in a process of its own, that notes when it makes its samples."""
 
     process: subprocess.Popen[str]
-    count: Path
+    clock: Path
 
     @property
-    def made(self) -> int:
-        """How many samples there are or were."""
-        return int.from_bytes(self.count.read_bytes(), "little")
+    def times(self) -> NDArray[np.float64]:
+        """Of each sample that there was, s of the time in which the process ran."""
+        times = np.fromfile(self.clock, "<f8")
+        return times[times > 0.0]
+
+    def lost(self, kept: int) -> float:
+        """How old the first sample that is not kept was when there was the last, s."""
+        times = self.times
+        return float(times[-1] - times[kept]) if kept < len(times) else 0.0
 
 
 def logging(fmu: Path, bag: Path, storage: str) -> Logging:
-    """Begin a run that has no end."""
-    count = bag.with_name(f"{bag.name}.count")
-    count.write_bytes(bytes(8))
-    command = [sys.executable, "-c", LOGGER, *map(str, (fmu, bag, storage, count, START))]
-    return Logging(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), count)
+    """Begin a run that has no end; its first sample is there."""
+    clock = bag.with_name(f"{bag.name}.clock")
+    clock.write_bytes(bytes(8 * 100_000))
+    command = [sys.executable, "-c", LOGGER, *map(str, (fmu, bag, storage, clock, START))]
+    run = Logging(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), clock)
+    wait_until(lambda: len(run.times) > 0 or run.process.poll() is not None)
+    assert run.process.poll() is None
+    return run
 
 
 class JointState(NamedTuple):
