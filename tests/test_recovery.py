@@ -47,8 +47,8 @@ PAGE = 4096  # bytes, of SQLite
 
 
 @pytest.fixture(scope="module")
-def run(fmu_path: Path) -> Experiment:
-    return twodof.experiment(fmu_path)
+def run(native_path: Path) -> Experiment:
+    return twodof.experiment(native_path)
 
 
 def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
