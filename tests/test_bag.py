@@ -30,6 +30,7 @@ from bags import (
     JointState,
     both_storages,
     foreign_readers,
+    header,
     joint_message,
     joint_state,
     metadata,
@@ -485,6 +486,22 @@ def test_bag_whose_joint_states_name_different_joints_is_refused(
     states = [(["a", "b"], [0.0, 1.0]), (other, [2.0] * len(other))]
     with pytest.raises(BagError, match="joint states of different joints"):
         twodof.read_bag(write_states(tmp_path / "bag", states))
+
+
+@pytest.mark.parametrize(("frames", "known"), [("aaa", "a"), (["a", "a", "bb"], "")])
+def test_targets_are_known_where_they_are_in_one_frame(
+    tmp_path: Path, frames: Sequence[str], known: str
+) -> None:
+    point = STORE.types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0)
+    targets = [STORE.types["geometry_msgs/msg/PointStamped"](header(0, f), point) for f in frames]
+    states = [joint_message(0, "j", [0.0], [0.0]) for _ in frames]
+    messages = [
+        (topic, k, message)
+        for topic, parts in (("/joint_states", states), ("/target", targets))
+        for k, message in enumerate(parts)
+    ]
+    heard = twodof.read_bag(write_elsewhere(tmp_path / "bag", messages)).heard
+    assert (heard.frame if heard else "") == known
 
 
 def joint_states_of_another_writer(rng: np.random.Generator) -> Iterator[tuple[int, bytes]]:

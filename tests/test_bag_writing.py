@@ -26,7 +26,7 @@ from bags import (
     read_with_sqlite3,
     sample,
 )
-from harness import wait_until
+from harness import needs, wait_until
 from mcap.exceptions import EndOfFile
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -307,3 +307,36 @@ def test_memory_does_not_grow_with_the_run(native_path: Path, tmp_path: Path, st
     )
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000
+
+
+@both_storages
+def test_fsync_waits_for_the_disk_at_each_flush(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    """Seen in the system calls of the process."""
+    script = """
+import sys
+import twodof
+from twodof.simulation.sample import Sample
+fmu, path, storage, fsync = sys.argv[1:]
+run = twodof.experiment(fmu)
+inputs = dict(run.start_values)
+with twodof.Bag(path, storage=storage, fsync=fsync == "True").begin(run) as bag:
+    bag.write(Sample(0, 0.0, (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs, 0.0, 0))
+    open(path + "-stored", "w").close()
+"""
+    trace = needs("strace")
+    synced = {}
+    for fsync in (False, True):
+        bag = tmp_path / f"bag{fsync}"
+        log = tmp_path / f"log{fsync}"
+        traced = [trace, "-f", "-y", "-e", "trace=fsync,fdatasync,openat", "-o", str(log)]
+        arguments = [str(run.fmu.path), str(bag), storage, str(fsync)]
+        subprocess.run([*traced, sys.executable, "-c", script, *arguments], check=True)
+        # between the bag's creation, whose last file is the reserve, and the first sample
+        written = log.read_text().partition("-stored")[0].rpartition("/reserve")[2]
+        synced[fsync] = set(re.findall(r"f(?:data)?sync\(\d+<(.*?)>", written))
+    file = tmp_path / "bagTrue" / f"bagTrue.{'mcap' if storage == 'mcap' else 'db3'}"
+    wanted = {file, file.parent, tmp_path, file.parent / "run.json"}
+    assert {str(path) for path in wanted} <= synced[True]
+    assert synced[False] == set()
