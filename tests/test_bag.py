@@ -488,7 +488,9 @@ def test_bag_whose_joint_states_name_different_joints_is_refused(
         twodof.read_bag(write_states(tmp_path / "bag", states))
 
 
-@pytest.mark.parametrize(("frames", "known"), [("aaa", "a"), (["a", "a", "bb"], "")])
+@pytest.mark.parametrize(
+    ("frames", "known"), [("aaa", "a"), (["a", "a", "bb"], ""), (["a", "a", "b" * 9], "")]
+)
 def test_targets_are_known_where_they_are_in_one_frame(
     tmp_path: Path, frames: Sequence[str], known: str
 ) -> None:
