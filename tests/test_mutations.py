@@ -122,7 +122,7 @@ def test_mutated_csv(seed: int, jail: Jail, native_path: Path) -> None:
 # --- bags ---
 
 STORAGE_FILES = {".mcap": mutations.mcap, ".db3": mutations.sqlite}
-BAG_FILES = {**STORAGE_FILES, ".yaml": mutations.yaml, ".json": mutations.json_tree}
+BAG_FILES = {**STORAGE_FILES, ".yaml": mutations.text, ".json": mutations.json_tree}
 BAGS = ("mcap", "mcap scene", "sqlite3", "sqlite3 scene", "mcap zstd", "sqlite3 foreign")
 
 
