@@ -5,6 +5,7 @@ Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import struct
 import subprocess
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
+import twodof
 from twodof.simulation.experiments import Experiment
 from twodof.simulation.sample import Sample
 
@@ -94,6 +96,29 @@ def logging(fmu: Path, bag: Path, storage: str) -> Logging:
     wait_until(lambda: len(run.times) > 0 or run.process.poll() is not None)
     assert run.process.poll() is None
     return run
+
+
+BATCH = 40  # samples between two flushes of one that is left unfinished
+
+
+def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
+    """A bag of n samples in the state in which a killed process leaves it."""
+    living = folder / "living" / "bag"
+    with twodof.Bag(living, storage=storage, **options).begin(run) as bag:
+        for k in range(n):
+            bag.write(sample(run, k))
+            if k % BATCH == 0:
+                bag._store.flush()
+        shutil.copytree(living, folder / "bag")
+    shutil.rmtree(living.parent)
+    return folder / "bag"
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder"
+        for p in folder.rglob("*")
+    }
 
 
 class JointState(NamedTuple):

@@ -18,10 +18,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import (
+    BATCH,
     START,
     STORE,
     assert_consistent,
     both_storages,
+    content,
     joint_state,
     logging,
     metadata,
@@ -29,6 +31,7 @@ from bags import (
     read_with_rosbags,
     read_with_sqlite3,
     sample,
+    unfinished,
 )
 from mcap.exceptions import McapError
 from mcap.records import Message as McapMessage
@@ -40,33 +43,12 @@ from twodof.cli.main import main
 from twodof.errors import BagError
 from twodof.simulation.experiments import Experiment
 
-BATCH = 40  # samples between two flushes
 PAGE = 4096  # bytes, of SQLite
 
 
 @pytest.fixture(scope="module")
 def run(native_path: Path) -> Experiment:
     return twodof.experiment(native_path)
-
-
-def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
-    """A bag of n samples in the state in which a killed process leaves it."""
-    living = folder / "living" / "bag"
-    with twodof.Bag(living, storage=storage, **options).begin(run) as bag:
-        for k in range(n):
-            bag.write(sample(run, k))
-            if k % BATCH == 0:
-                bag._store.flush()
-        shutil.copytree(living, folder / "bag")
-    shutil.rmtree(living.parent)
-    return folder / "bag"
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder"
-        for p in folder.rglob("*")
-    }
 
 
 def streamed(file: Path) -> int:
@@ -520,58 +502,6 @@ def test_bag_that_is_being_recovered_is_left_alone(
     assert len(said) == 3 and all("being written" in line for line in said)
     assert assert_consistent(bag, "mcap") > 0
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
-
-
-# --- names ---
-
-
-def renamed(bag: Path, name: bytes) -> Path:
-    """The bag in a folder of this name, and itself of this name."""
-    path = Path(os.fsdecode(os.fsencode(bag.parent) + b"/" + name + b"/" + name))
-    path.parent.mkdir()
-    bag.rename(path)
-    for file in path.iterdir():
-        if file.stem == bag.name:
-            file.rename(file.with_name(path.name + file.suffix))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("storage", "name"),
-    [
-        ("mcap", b"\xff"),
-        ("mcap", b"a?b"),
-        *[("sqlite3", name) for name in (b"\xff", b"a?b", b"a%41")],
-    ],
-)
-def test_bag_of_a_name_that_none_would_find_again_is_refused(
-    run: Experiment, tmp_path: Path, storage: str, name: bytes
-) -> None:
-    bag = renamed(unfinished(tmp_path, run, storage, 10), name)
-    before = content(tmp_path)
-    if storage == "mcap" and name != b"\xff":
-        twodof.recover(bag)
-        assert assert_consistent(bag, storage) > 0
-        return
-    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
-        twodof.recover(bag)
-    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
-        twodof.Bag(bag.with_name(f"{bag.name}2"), storage=storage)
-    assert content(tmp_path) == before
-
-
-@pytest.mark.parametrize("verb", ["info", "plot"])
-def test_bag_of_a_name_that_is_not_utf8_is_read(run: Experiment, tmp_path: Path, verb: str) -> None:
-    """As on a terminal that knows UTF-8 alone."""
-    with twodof.Bag(tmp_path / "bag").begin(run) as sink:
-        for k in range(3):
-            sink.write(sample(run, k))
-    bag = renamed(sink.path, b"\xff")
-    options = ["-o", "x.svg"] if verb == "plot" else []
-    command = [sys.executable, "-m", "twodof", verb, os.fsencode(bag), *options]
-    terminal = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=terminal)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_bag_is_recovered_from_within(
