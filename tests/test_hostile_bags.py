@@ -138,7 +138,7 @@ def channels(qos: str = "") -> list[bytes]:
 
 
 def hollow(size: int, content: bytes) -> Callable[[Path], None]:
-    """A file of this size, that unpacks to the same over and over, 32 MiB a chunk."""
+    """A file of this size, that unpacks to the same over and over, 32 MiB a chunk, one at least."""
 
     def make() -> bytes:
         chunks = content * (32 * MIB // len(content))
@@ -174,8 +174,8 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
         lambda: mcap_of(chunk(lz4_zeros(2500 * MIB), 1000, "lz4"))
     ),
     "100 kB of joint states of nothing": hollow(100_000, message(nothing(0, 0))),
-    "100 kB of joint states of 40,000 joints": hollow(100_000, message(nothing(40_000, 0))),
-    "100 kB of joint states of 80,000 names": hollow(100_000, message(nothing(0, 80_000))),
+    "32 MB of joint states of 40,000 joints": hollow(0, message(nothing(40_000, 0))),
+    "32 MB of joint states of 80,000 names": hollow(0, message(nothing(0, 80_000))),
     "100 kB of topics of 1 MB": hollow(100_000, channel(1, "/t1", " " * MIB)),
     "a thousand topics with profiles of their own": with_mcap(
         lambda: mcap_of(
@@ -226,5 +226,5 @@ SLOW = {
     "5000 files", "pages in a circle", "10 GB in a chunk of 1 kB", "2.5 GB in a chunk of lz4",
     "250 MB of zeros in a chunk", "250 MB of messages in a chunk", "a message of 700 MB",
     "a message of 300 MB in a database", "60 MB of small records", "60 MB of metadata",
-    "60 MB of provenance", "100 kB of joint states of 40,000 joints",
+    "60 MB of provenance", "a thousand topics with profiles of their own",
 }  # fmt: skip

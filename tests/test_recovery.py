@@ -19,13 +19,18 @@ import numpy as np
 import pytest
 from bags import (
     BATCH,
+    FOOTER,
+    HEADER,
+    SCHEMA,
     START,
     STORE,
     assert_consistent,
     both_storages,
+    channel,
     content,
     joint_state,
     logging,
+    message,
     metadata,
     read_with_mcap,
     read_with_rosbags,
@@ -310,6 +315,23 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
     assert connections["/talk"].ext.offered_qos_profiles == [LATCHED]
     assert connections["/mine"].msgdef.data == DEFINITION
     assert connections["/talk"].digest == STORE.hash_rihs01("std_msgs/msg/String")
+
+
+def test_no_more_profiles_are_read_than_take_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of topics that have each its own; YAML is slow."""
+    (tmp_path / "bag").mkdir()
+    profiles = ["- {depth: [" + "1," * 300 + f"]}}#{i:02}" for i in range(50)]
+    channels = [channel(i, f"/t{i}", qos) for i, qos in enumerate(profiles)]
+    messages = [message(bytes(4), number=i) for i in range(50)]
+    content = b"".join([HEADER, SCHEMA, *channels, *messages, FOOTER])
+    (tmp_path / "bag/bag.mcap").write_bytes(content)
+    read: list[str] = []
+    monkeypatch.setattr("twodof.bag.recovery.parse_qos", lambda text: read.append(text) or [])
+    monkeypatch.setattr("twodof.bag.recovery.MAX_YAML", 2000)
+    assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
+    assert read == profiles[:3]
 
 
 # --- what is said, and what is refused ---
