@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from bags import (
     BATCH,
+    CHANNEL,
     FOOTER,
     HEADER,
     SCHEMA,
@@ -35,7 +36,9 @@ from bags import (
     read_with_mcap,
     read_with_rosbags,
     read_with_sqlite3,
+    record,
     sample,
+    texts,
     unfinished,
 )
 from mcap.exceptions import McapError
@@ -332,6 +335,18 @@ def test_no_more_profiles_are_read_than_take_no_time(
     monkeypatch.setattr("twodof.bag.recovery.MAX_YAML", 2000)
     assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
     assert read == profiles[:3]
+
+
+def test_messages_in_another_form_are_left_out_and_named(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    other = record(4, struct.pack("<HH", 2, 1), texts("/text", "json", ""))
+    content = b"".join(
+        [HEADER, SCHEMA, CHANNEL, other, message(bytes(4)), message(b"{}", number=2)]
+    )
+    (tmp_path / "bag/bag.mcap").write_bytes(content + FOOTER)
+    done = twodof.recover(tmp_path / "bag")
+    assert done.counts == {"/joint_states": 1}
+    assert done.damage == "messages in another form than CDR, on /text"
 
 
 # --- what is said, and what is refused ---
