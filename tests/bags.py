@@ -5,23 +5,28 @@ Readers are rosbags', the MCAP project's own and the standard library's sqlite3.
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import struct
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import yaml
+from harness import wait_until
 from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.rosbag2 import Reader
+from numpy.typing import NDArray
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
+import twodof
 from twodof.simulation.experiments import Experiment
 from twodof.simulation.sample import Sample
 
@@ -33,25 +38,30 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 LOGGER = """
-import mmap, sys
+import mmap, sys, time
+import numpy as np
 import twodof
 
-fmu, bag, storage, made, start = sys.argv[1:]
+fmu, bag, storage, clock, start = sys.argv[1:]
 
-class Made(twodof.Sink):
-    \"""How many samples there are, where it outlives the process.\"""
+class Clock(twodof.Sink):
+    \"""When there was each sample, by the time in which the process ran, where it outlives it.
+
+    What is longer than two periods from one to the next is no pace of it, but the machine's.
+    \"""
 
     def __enter__(self):
-        with open(made, "r+b") as file:
-            self.map = mmap.mmap(file.fileno(), 8)
+        self.times, self.t, self.before = np.memmap(clock, "<f8", "r+"), 1.0, time.monotonic()
         return self
 
     def write(self, sample):
-        self.map[:] = (sample.k + 1).to_bytes(8, "little")
+        now = time.monotonic()
+        self.t, self.before = self.t + min(now - self.before, 0.02), now
+        self.times[sample.k] = self.t
 
 try:
     twodof.simulate(
-        fmu, twodof.Bag(bag, storage=storage), Made(), pace=twodof.RealTime(),
+        fmu, twodof.Bag(bag, storage=storage), Clock(), pace=twodof.RealTime(),
         stop_time=1e5, stamp_start=int(start),
     )
 except twodof.TwoDofError as error:
@@ -60,23 +70,55 @@ except twodof.TwoDofError as error:
 
 
 class Logging(NamedTuple):
-    """A run in real time, in a process of its own, that counts its samples."""
+    """A run in real time, in a process of its own, that notes when it makes its samples."""
 
     process: subprocess.Popen[str]
-    count: Path
+    clock: Path
 
     @property
-    def made(self) -> int:
-        """How many samples there are or were."""
-        return int.from_bytes(self.count.read_bytes(), "little")
+    def times(self) -> NDArray[np.float64]:
+        """Of each sample that there was, s of the time in which the process ran."""
+        times = np.fromfile(self.clock, "<f8")
+        return times[times > 0.0]
+
+    def lost(self, kept: int) -> float:
+        """How old the first sample that is not kept was when there was the last, s."""
+        times = self.times
+        return float(times[-1] - times[kept]) if kept < len(times) else 0.0
 
 
 def logging(fmu: Path, bag: Path, storage: str) -> Logging:
-    """Begin a run that has no end."""
-    count = bag.with_name(f"{bag.name}.count")
-    count.write_bytes(bytes(8))
-    command = [sys.executable, "-c", LOGGER, *map(str, (fmu, bag, storage, count, START))]
-    return Logging(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), count)
+    """Begin a run that has no end; its first sample is there."""
+    clock = bag.with_name(f"{bag.name}.clock")
+    clock.write_bytes(bytes(8 * 100_000))
+    command = [sys.executable, "-c", LOGGER, *map(str, (fmu, bag, storage, clock, START))]
+    run = Logging(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), clock)
+    wait_until(lambda: len(run.times) > 0 or run.process.poll() is not None)
+    assert run.process.poll() is None
+    return run
+
+
+BATCH = 40  # samples between two flushes of one that is left unfinished
+
+
+def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
+    """A bag of n samples in the state in which a killed process leaves it."""
+    living = folder / "living" / "bag"
+    with twodof.Bag(living, storage=storage, **options).begin(run) as bag:
+        for k in range(n):
+            bag.write(sample(run, k))
+            if k % BATCH == 0:
+                bag._store.flush()
+        shutil.copytree(living, folder / "bag")
+    shutil.rmtree(living.parent)
+    return folder / "bag"
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder"
+        for p in folder.rglob("*")
+    }
 
 
 class JointState(NamedTuple):
@@ -161,6 +203,40 @@ foreign_readers = pytest.mark.parametrize(("storage", "read"), READERS)
 both_storages = pytest.mark.parametrize("storage", STORAGES)
 
 
+def header(stamp: int, frame: str = "") -> Any:
+    time = STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, SECOND))
+    return STORE.types["std_msgs/msg/Header"](time, frame)
+
+
+def joint_message(
+    stamp: int, names: Sequence[str], *numbers: Sequence[float], frame: str = ""
+) -> Any:
+    """A JointState with positions, velocities and efforts, as far as they are given."""
+    parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
+    return STORE.types["sensor_msgs/msg/JointState"](header(stamp, frame), [*names], *parts)
+
+
+def serialised(message: Any, *, little_endian: bool = True) -> bytes:
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
+
+
+def write_elsewhere(
+    path: Path, messages: Iterable[tuple[str, int, Any]], *, zstd: bool = False, **options: Any
+) -> Path:
+    """A bag that rosbags alone writes, of (topic, log time, message)."""
+    writer = Writer(path, **{"version": 9, **options})
+    if zstd:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, stamp, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], stamp, serialised(message))
+    return path
+
+
 def metadata(bag: Path) -> dict[str, Any]:
     text = (bag / "metadata.yaml").read_text("utf-8")
     return yaml.load(text, yaml.CSafeLoader)["rosbag2_bagfile_information"]
@@ -194,3 +270,39 @@ def assert_consistent(bag: Path, storage: str) -> int:
         assert found["duration"]["nanoseconds"] == max(stamps) - min(stamps)
     assert not (bag / "reserve").exists()
     return len(stamps)
+
+
+# --- MCAP, record by record ---
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def record(opcode: int, *content: bytes) -> bytes:
+    body = b"".join(content)
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def texts(*contents: str | bytes) -> bytes:
+    raw = [content.encode() if isinstance(content, str) else content for content in contents]
+    return b"".join(struct.pack("<I", len(content)) + content for content in raw)
+
+
+def channel(number: int, topic: str, qos: str = "") -> bytes:
+    metadata = texts("offered_qos_profiles", qos) if qos else b""
+    head = struct.pack("<HH", number % 65536, 1)
+    return record(4, head, texts(topic, "cdr", metadata))
+
+
+def message(data: bytes, stamp: int = 1, number: int = 1) -> bytes:
+    return record(5, struct.pack("<HIQQ", number, 0, stamp, stamp), data)
+
+
+def chunk(records: bytes, size: int, compression: str) -> bytes:
+    head = struct.pack("<QQQI", 0, 1, size, 0) + texts(compression)
+    return record(6, head, struct.pack("<Q", len(records)), records)
+
+
+HEADER = MAGIC + record(1, texts("ros2", ""))
+FOOTER = record(2, bytes(20)) + MAGIC
+SCHEMA = record(3, struct.pack("<H", 1), texts("sensor_msgs/msg/JointState", "ros2msg", ""))
+CHANNEL = channel(1, "/joint_states")

@@ -40,7 +40,8 @@ def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
 
 LONGEST = (
     "native_platforms", "live", "sweep_workers", "sweep", "view", "publish", "page", "mutations",
-    "docs", "plot_files", "plot", "listener", "ends", "native_fmi", "recovery", "states", "slave",
+    "docs", "plot_files", "plot", "listener", "hostile_bags", "ends", "native_fmi", "recovery",
+    "states", "slave", "hostile",
     "bag", "control", "plant", "master", "scene",
 )  # fmt: skip
 

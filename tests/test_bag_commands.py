@@ -4,48 +4,28 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bags import STORE
-from rosbags.rosbag2 import StoragePlugin, Writer
+from bags import STORE, header, joint_message, write_elsewhere
+from rosbags.rosbag2 import StoragePlugin
 
 import twodof
 from twodof.cli.main import main
-from twodof.ros.messages import JOINT_STATE, POINT
+from twodof.ros.messages import POINT
 
 BEGIN = 1_700_000_000_000_000_000
 STEP = 10_000_000  # ns
 
 
-def header(stamp: int, frame: str = "") -> Any:
-    time = STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-    return STORE.types["std_msgs/msg/Header"](time, frame)
-
-
-def joint_state(stamp: int, names: Sequence[str], *numbers: Sequence[float]) -> Any:
-    parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
-    return STORE.types[JOINT_STATE](header(stamp), [*names], *parts)
+ONE = joint_message(0, ("joint1",), (), (), (1.0,))
 
 
 def point(stamp: int, x: float, y: float) -> Any:
     place = STORE.types["geometry_msgs/msg/Point"](x, y, 0.0)
     return STORE.types[POINT](header(stamp, "world"), place)
-
-
-def write(path: Path, messages: Sequence[tuple[str, int, Any]], **options: Any) -> Path:
-    """A bag of (topic, log time, message)."""
-    with Writer(path, version=8, **options) as writer:
-        connections: dict[str, Any] = {}
-        for topic, stamp, message in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], stamp, STORE.serialize_cdr(message, kind))
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -109,14 +89,14 @@ def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: Stora
     """Held from the first communication point at or after each, as a run on the network has it."""
     given = {0: (1.0, 0.5), 3: (-2.0, 0.25), 40: (0.5, -0.5)}
     states = [
-        ("/joint_states", BEGIN + k * STEP, joint_state(0, ("joint1", "joint2"), (0.0, 0.0)))
+        ("/joint_states", BEGIN + k * STEP, joint_message(0, ("joint1", "joint2"), (0.0, 0.0)))
         for k in range(100)
     ]
     commands = [
-        ("/cmd", BEGIN + k * STEP - 7, joint_state(5, ("joint2", "joint1"), (), (), tau[::-1]))
+        ("/cmd", BEGIN + k * STEP - 7, joint_message(5, ("joint2", "joint1"), (), (), tau[::-1]))
         for k, tau in given.items()
     ]
-    bag = write(
+    bag = write_elsewhere(
         tmp_path / "real", sorted(states + commands, key=lambda m: m[1]), storage_plugin=storage
     )
     model = tmp_path / "model"
@@ -133,7 +113,7 @@ def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: Stora
 
 def test_points(native_path: Path, tmp_path: Path) -> None:
     goals = [(BEGIN, point(0, 0.1, 0.2)), (BEGIN + STEP, point(0, 0.2, 0.1))]
-    bag = write(tmp_path / "bag", [("/goal", *goal) for goal in goals])
+    bag = write_elsewhere(tmp_path / "bag", [("/goal", *goal) for goal in goals])
     assert twodof.read_commands(native_path, bag) == [
         (0.0, {"x_des[1]": 0.1, "x_des[2]": 0.2}),
         (0.01, {"x_des[1]": 0.2, "x_des[2]": 0.1}),
@@ -144,24 +124,24 @@ def test_points(native_path: Path, tmp_path: Path) -> None:
     ("messages", "topic", "reason"),
     [
         ([("/a", BEGIN, point(0, 0.1, 0.2))], None, "no commands for this FMU, which follows"),
-        ([("/joint_states", BEGIN, joint_state(0, ("joint1",), (0.1,)))], None, "no commands for"),
-        ([("/a", BEGIN, joint_state(0, ("joint1",), (), (), (1.0,)))], "/b", "no commands on /b"),
+        ([("/joint_states", BEGIN, ONE)], None, "no commands for"),
+        ([("/a", BEGIN, ONE)], "/b", "no commands on /b"),
         (
-            [(name, BEGIN, joint_state(0, ("joint1",), (), (), (1.0,))) for name in ("/a", "/b")],
+            [(name, BEGIN, ONE) for name in ("/a", "/b")],
             None, "several topics that can be commands: /a, /b; choose one",
         ),
         (
-            [("/a", BEGIN, joint_state(0, ("joint1",), (), (), (float("nan"),)))],
+            [("/a", BEGIN, joint_message(0, ("joint1",), (), (), (float("nan"),)))],
             None, "the command at 0 s is not finite",
         ),
-        ([("/a", BEGIN, joint_state(0, ("elbow",), (), (), (1.0,)))], None, "of no joint of this"),
+        ([("/a", BEGIN, joint_message(0, ["elbow"], (), (), (1.0,)))], None, "of no joint of this"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_replayed(
     effort: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
     messages: list[tuple[str, int, Any]], topic: str | None, reason: str,
 ) -> None:  # fmt: skip
-    bag = write(tmp_path / "bag", messages)
+    bag = write_elsewhere(tmp_path / "bag", messages)
     given = f"{bag}:{topic}" if topic else str(bag)
     assert main(["run", str(effort), "--input", given, "-o", str(tmp_path / "none")]) == 1
     (line,) = capfd.readouterr().err.splitlines()
@@ -169,16 +149,20 @@ def test_what_cannot_be_replayed(
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("last", [np.nan, np.inf])
 def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], last: float
 ) -> None:
+    """Nor does NumPy say anything of it."""
+
     def bag(name: str, last: float) -> str:
-        return str(write(tmp_path / name, [
-            ("/joint_states", BEGIN + k * STEP, joint_state(0, "ab", (a, 0.1)))
-            for k, a in enumerate((0.1, 0.1, last))
+        return str(write_elsewhere(tmp_path / name, [
+            ("/joint_states", BEGIN + k * STEP, joint_message(0, "ab", (a, 0.1)))
+            for k, a in enumerate((0.1, 0.1, last, last))
         ]))  # fmt: skip
 
-    bags = [bag("real", np.nan), bag("model", 0.1)]
+    bags = [bag("real", last), bag("model", 0.1)]
     assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0
     said = f"model  cannot be told from 'real': a is not finite at {2 * STEP / 1e9:g} s\n"
     assert said in capfd.readouterr().out
@@ -194,8 +178,8 @@ def test_a_plot_of_two_bags_tells_how_far_they_are_apart(
             t = k * step / 1e9
             return (0.5 * t, 0.1 + off * t)
 
-        return str(write(tmp_path / name, [
-            ("/joint_states", BEGIN + k * step, joint_state(0, "ab", q(k))) for k in range(count)
+        return str(write_elsewhere(tmp_path / name, [
+            ("/joint_states", BEGIN + k * step, joint_message(0, "ab", q(k))) for k in range(count)
         ]))  # fmt: skip
 
     bags = [bag("real", 101, STEP, 0.0), bag("model", 80, 3 * STEP, 0.25)]

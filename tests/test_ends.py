@@ -32,7 +32,7 @@ def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
     while not has_samples(bag):
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
-    time.sleep(0.3)
+    time.sleep(0.1)
     return process
 
 
@@ -64,18 +64,14 @@ SIGNALS = {
 }
 
 
-PAIRS = [  # each two of a signal, a storage and a pace meet
-    pytest.param(signals, storage, pace, id=" ".join([name, storage, pace]).strip())
-    for i, (name, signals) in enumerate(SIGNALS.items())
-    for storage, pace in zip(STORAGES, ("", "--realtime") if i % 2 else ("--realtime", ""))
-]
-
-
-@pytest.mark.parametrize(("signals", "storage", "pace"), PAIRS)
+@pytest.mark.parametrize(
+    ("name", "storage", "pace"),
+    [*zip(SIGNALS, STORAGES * 3, ("--realtime", "", "", "--realtime", "--realtime", ""))],
+)
 def test_signals_leave_a_complete_bag(
-    native_path: Path, tmp_path: Path, signals: list[signal.Signals], storage: str, pace: str
+    native_path: Path, tmp_path: Path, name: str, storage: str, pace: str
 ) -> None:
-    bag = tmp_path / "bag"
+    signals, bag = SIGNALS[name], tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, *pace.split())
     for number in signals:
         process.send_signal(number)
@@ -84,7 +80,7 @@ def test_signals_leave_a_complete_bag(
     assert process.returncode == 130
     assert "Traceback" not in err and len(err.splitlines()) <= 1
     kept = assert_consistent(bag, storage)
-    assert kept  # some 30 where the machine is idle
+    assert kept
     assert {p.suffix for p in bag.iterdir()} <= {".mcap", ".db3", ".yaml", ".json"}
     if len(signals) == 1:
         assert f"({kept} messages" in out
@@ -102,7 +98,7 @@ run = twodof.experiment(fmu, stop_time=1e4)
 inputs = dict(run.start_values)
 k = 0
 try:
-    with twodof.Bag(path, storage=storage, scene=True).begin(run) as bag:
+    with twodof.Bag(path, storage=storage).begin(run) as bag:
         while True:
             if k == 1:  # before, rosbags makes code: CPython ends by SIGINT if it comes in an exec
                 print("open", flush=True)
@@ -119,7 +115,7 @@ def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(
     native_path: Path, tmp_path: Path, storage: str
 ) -> None:
     """Python raises KeyboardInterrupt anywhere, in the middle of a write too."""
-    for i in range(6):
+    for i in range(3):
         bag = tmp_path / f"bag{i}"
         process = subprocess.Popen(
             [sys.executable, "-c", LOOP, str(native_path), str(bag), storage],
@@ -128,7 +124,7 @@ def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(
             text=True,
         )
         assert process.stdout is not None and process.stdout.readline() == "open\n"
-        time.sleep(0.05 + 0.037 * i)
+        time.sleep(0.01 + 0.037 * i)
         process.send_signal(signal.SIGINT)
         said, err = process.communicate(timeout=120)
         assert (process.returncode, err) == (0, "")
@@ -146,7 +142,7 @@ def test_folder_that_goes_under_the_run_ends_it(
     native_path: Path, tmp_path: Path, storage: str, how: str
 ) -> None:
     bag = tmp_path / "bag"
-    process = begin(native_path, bag, "--storage", storage)
+    process = begin(native_path, bag, "--storage", storage, "--realtime")
     if how == "removed":
         shutil.rmtree(bag)
     else:
@@ -159,8 +155,7 @@ def test_folder_that_goes_under_the_run_ends_it(
     if how == "moved":
         assert main(["recover", str(tmp_path / "moved")]) == 0
         kept = assert_consistent(tmp_path / "moved", storage)
-        few = min(kept, 1000)
-        assert read_with_rosbags(tmp_path / "moved")[:few] == whole(native_path, tmp_path, few)
+        assert read_with_rosbags(tmp_path / "moved") == whole(native_path, tmp_path, kept)
 
 
 @pytest.mark.long
@@ -172,19 +167,14 @@ def test_full_disk_costs_a_second_at_most(
     storage: str,
     length: Callable[[int, int], int],
 ) -> None:
-    """Somebody else fills the disk to the last byte under a run in real time.
-
-    No more than 100 of the samples are lost that it had made before.
-    """
+    """Somebody else fills the disk to the last byte under a run in real time."""
     expected = whole(native_path, tmp_path, 1000)
     rng = random.Random(storage)
     lost = []
-    for _ in range(length(20, 3)):
+    for _ in range(length(20, 2)):
         folder = disk(8192)
         bag = folder / "bag"
         run = logging(native_path, bag, storage)
-        while not run.made:
-            time.sleep(0.01)
         time.sleep(rng.uniform(0.0, 2.0))
         with pytest.raises(OSError, match="No space left"), (folder / "other").open("wb") as other:
             while True:
@@ -196,22 +186,21 @@ def test_full_disk_costs_a_second_at_most(
         kept = assert_consistent(bag, storage)
         assert re.search(rf"the disk is full; it is closed with its first {kept} samples", line)
         assert read_with_rosbags(bag) == expected[:kept]
-        lost.append(run.made - kept)
-    print(f"{len(lost)} full disks, {storage}: lost at most {max(lost)} samples")
-    assert max(lost) <= 100
+        lost.append(run.lost(kept))
+    print(f"{len(lost)} full disks, {storage}: lost at most {max(lost):.3f} s")
+    assert max(lost) <= 1.0
 
 
-@both_storages
 def test_reader_of_the_summary_that_leaves_costs_no_sample(
-    native_path: Path, tmp_path: Path, storage: str
+    native_path: Path, tmp_path: Path
 ) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    command = [*TWODOF, "run", str(native_path), "-o", str(tmp_path / "bag"), "--storage", storage]
+    command = [*TWODOF, "run", str(native_path), "-o", str(tmp_path / "bag")]
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writing)
     assert done.stderr == "" and done.returncode == 1
-    assert assert_consistent(tmp_path / "bag", storage) == 501
+    assert assert_consistent(tmp_path / "bag", "mcap") == 501
 
 
 def test_interrupt_while_a_file_is_closed_is_an_interrupt(
@@ -259,7 +248,6 @@ sys.exit(main(["info", FMU]))
     "module, as_c_does, said",
     [
         ("twodof.cli", False, ""),
-        ("argparse", False, ""),
         ("twodof.cli.sweep", False, ""),
         ("fmpy", False, "twodof: error: interrupted\n"),
         ("fmpy", True, "twodof: error: interrupted\n"),

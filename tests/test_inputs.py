@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ from twodof.simulation.sample import Sample
 
 
 @pytest.fixture(scope="module")
-def fmu(fmu_path: Path) -> Fmu:
-    return twodof.load_fmu(fmu_path)
+def fmu(native_path: Path) -> Fmu:
+    return twodof.load_fmu(native_path)
 
 
 # --- constants ---
@@ -90,7 +89,6 @@ def test_setting_gives_values_of_variables(
 
 UNRESOLVED = {
     "unknown, a near name": ({"Kpp": 1}, "no variable 'Kpp'; did you mean 'Kp'"),
-    "unknown, other case": ({"KP": 1}, "no variable 'KP'; did you mean 'Kp'"),
     "unknown, a near vector": ({"xdes": 1}, "no variable 'xdes'; did you mean 'x_des'"),
     "unknown, a near parameter": ({"qstart": 1}, "'qstart'; did you mean 'q_start'"),
     "unknown, nothing near": ({"#####": 1}, "no variable '#####'; there are: .*Kd"),
@@ -103,7 +101,7 @@ UNRESOLVED = {
     "several for an element": ({"x_des[1]": [1, 2]}, r"x_des\[1\] has 1 elements, 2 were given"),
     "none": ({"x_des": []}, "x_des has 2 elements, 0 were given"),
     "NaN": ({"Kp": float("nan")}, r"Kp\[1\] = nan is not finite"),
-    "infinite": ({"x_des": [0.1, float("-inf")]}, r"x_des\[2\] = -inf is not finite"),
+    "a whole number beyond all": ({"Kp": -(10**5000)}, r"Kp\[1\] = -inf is not finite"),
     "a Boolean for a number": ({"Kp": True}, r"Kp\[1\] = True: expected a number"),
     "a number for a Boolean": ({"limit_effort": 1.0}, "limit_effort = 1.0: expected true or false"),
     "a text": ({"Kn": "5"}, "Kn"),
@@ -157,11 +155,8 @@ def test_table_is_read(
 
 BAD_TABLES = {
     "empty": ("", "is empty"),
-    "empty lines only": ("\n\n", "is empty"),
     "no time": ("t,Kn\n0,1\n", "has no column 'time'"),
-    "no header": ("0,1\n1,2\n", "has no column 'time'"),
     "unsorted": ("time,Kn\n0,1\n2,1\n1,1\n", "row 4: time 1 is before"),
-    "row too short": ("time,Kn\n0,1\n1\n", "row 3: 1 cells, expected 2"),
     "row too long": ("time,Kn\n0,1,2\n", "row 2: 3 cells, expected 2"),
     "NaN": ("time,Kn\n0,nan\n", "row 2: Kn = nan is not finite"),
     "infinite": ("time,Kn\n0,1\n1,inf\n", "row 3: Kn = inf is not finite"),
@@ -171,15 +166,12 @@ BAD_TABLES = {
     "column without a name": ("time,\n0,1\n", "no variable ''"),
     "no number": ("time,Kn\n0,high\n", "row 2: Kn = 'high' is not a number"),
     "empty cell": ("time,Kn\n0,\n", "row 2: Kn = '' is not a number"),
-    "semicolons": ("time;Kn\n0;1\n", "has no column 'time'"),
     "two columns of one name": ("time,Kn,Kn\n0,1,1\n", "two columns for 'Kn'"),
-    "two times": ("time,time\n0,1\n", "two columns for 'time'"),
     "parameter": ("time,rtol\n0,1\n", "rtol is not an input"),
     "output": ("time,q[1]\n0,1\n", r"q\[1\] is not an input"),
     "no rows": ("time,Kn\n", "has no rows|is empty"),
     "cell over two lines": ('time,Kn\n0,"1\n1"\n', "row 3: 1 cells, expected 2"),
     "long cell": ("time,Kn\n0," + "x" * 200, "Kn = 'x{50}' is not a number"),
-    "row below an empty line": ("time,Kn\n\n0,high\n", "row 3"),
 }
 
 
@@ -250,25 +242,12 @@ def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: object) -> l
 
 
 def test_run_with_a_table_is_the_run_with_its_rows_set_by_hand(fmu: Fmu, table: Path) -> None:
-    from_table = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0))
-    assert from_table == by_hand(fmu, {k: ROWS[row][1] for k, row in SET_AT.items()})
-    assert len({sample.q for sample in from_table}) == N + 1
-
-
-def test_value_holds_from_its_row_to_the_next(fmu: Fmu, table: Path) -> None:
-    found = list(twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0))
-    # a sample's inputs are those of the step that led to it
-    row = [max(at for at in SET_AT if at <= max(k - 1, 0)) for k in range(N + 1)]
-    for sample, at in zip(found, row):
-        given = ROWS[SET_AT[at]][1]
-        assert {name: sample.inputs[name] for name in given} == given
-        assert sample.inputs["x_des[2]"] == 0.05
-
-
-def test_inputs_of_earlier_samples_do_not_change_later(fmu: Fmu, table: Path) -> None:
     run = twodof.samples(fmu, stop_time=N * STEP, input_file=table, stamp_start=0)
     seen = [(sample, dict(sample.inputs)) for sample in run]
-    assert all(sample.inputs == inputs for sample, inputs in seen)
+    assert all(sample.inputs == inputs for sample, inputs in seen)  # later ones change no earlier
+    from_table = [sample for sample, _ in seen]
+    assert from_table == by_hand(fmu, {k: ROWS[row][1] for k, row in SET_AT.items()})
+    assert len({sample.q for sample in from_table}) == N + 1
 
 
 def test_start_values_hold_before_the_first_row(fmu: Fmu, tmp_path: Path) -> None:
@@ -296,18 +275,6 @@ def test_rows_after_the_end_are_told(
     assert all("are never set" in line for line in caplog.messages)
 
 
-def test_changed_inputs_change_the_trajectory_only_afterwards(fmu: Fmu) -> None:
-    changed = by_hand(fmu, {4: {"x_des[1]": 0.1}})
-    plain = by_hand(fmu, {})
-    same = [a.q == b.q for a, b in zip(changed, plain)]
-    assert same == [True] * 5 + [False] * (N - 4)
-
-
-def test_what_is_sent_may_be_a_vector(fmu: Fmu) -> None:
-    vector = by_hand(fmu, {2: {"x_des": (0.1, 0.07)}})
-    assert vector == by_hand(fmu, {2: {"x_des[1]": 0.1, "x_des[2]": 0.07}})
-
-
 def test_a_parameter_cannot_be_sent(fmu: Fmu) -> None:
     with pytest.raises(twodof.TwoDofError, match="rtol"):
         by_hand(fmu, {2: {"rtol": 1e-4}})
@@ -322,12 +289,6 @@ def test_a_setting_holds_throughout(fmu: Fmu) -> None:
     assert {(sample.inputs["Kp[1]"], sample.inputs["Kp[2]"]) for sample in found} == {(80.0, 80.0)}
 
 
-def test_samples_lie_on_multiples_of_the_step(fmu: Fmu) -> None:
-    found = by_hand(fmu, {})
-    assert [(sample.k, sample.t) for sample in found] == [(k, k * STEP) for k in range(N + 1)]
-    assert all(a.q != b.q for a, b in pairwise(found))
-
-
 TIMES = {
     "step 0": ({"step": 0.0}, "step 0 s must be > 0"),
     "step negative": ({"step": -0.01}, "step -0.01 s must be > 0"),
@@ -339,6 +300,7 @@ TIMES = {
     "stop 0": ({"stop_time": 0.0}, "stop time 0 s must be after the start time 0 s"),
     "stop before start": ({"stop_time": 1.0, "start_time": 2.0}, "stop time 1 s must be after"),
     "stop NaN": ({"stop_time": float("nan")}, "stop time nan"),
+    "stop minus infinite": ({"stop_time": float("-inf")}, "stop time -inf s"),
     "start infinite": ({"start_time": float("-inf")}, "start time -inf"),
 }
 

@@ -14,13 +14,10 @@ from twodof.bag.recording import Array, Recording
 from twodof.plots.track import Track, read_tracks
 
 MOST = 2000
-KINDS = ("mcap", "sqlite3")
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def bag(
-    request: pytest.FixtureRequest, native_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+@pytest.fixture(scope="module")
+def bag(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 20,000 steps whose target, given on a topic too, jumps often; for one step once."""
     folder = tmp_path_factory.mktemp("long")
     table = folder / "targets.csv"
@@ -32,7 +29,7 @@ def bag(
     path = folder / "bag"
     twodof.simulate(
         native_path,
-        twodof.Bag(path, storage=request.param, scene=True),
+        twodof.Bag(path, storage="sqlite3", scene=True),
         stop_time=200.0, step=0.01, input_file=table,
     )  # fmt: skip
     return path

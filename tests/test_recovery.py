@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import random
-import re
 import shutil
 import signal
 import sqlite3
@@ -19,19 +18,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import (
+    BATCH,
+    CHANNEL,
+    FOOTER,
+    HEADER,
+    SCHEMA,
     START,
     STORE,
     assert_consistent,
     both_storages,
+    channel,
+    content,
     joint_state,
     logging,
+    message,
     metadata,
     read_with_mcap,
     read_with_rosbags,
     read_with_sqlite3,
+    record,
     sample,
+    texts,
+    unfinished,
 )
-from harness import needs
 from mcap.exceptions import McapError
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -42,34 +51,12 @@ from twodof.cli.main import main
 from twodof.errors import BagError
 from twodof.simulation.experiments import Experiment
 
-TWODOF = [sys.executable, "-m", "twodof"]
-BATCH = 40  # samples between two flushes
 PAGE = 4096  # bytes, of SQLite
 
 
 @pytest.fixture(scope="module")
-def run(fmu_path: Path) -> Experiment:
-    return twodof.experiment(fmu_path)
-
-
-def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
-    """A bag of n samples in the state in which a killed process leaves it."""
-    living = folder / "living" / "bag"
-    with twodof.Bag(living, storage=storage, **options).begin(run) as bag:
-        for k in range(n):
-            bag.write(sample(run, k))
-            if k % BATCH == 0:
-                bag._store.flush()
-        shutil.copytree(living, folder / "bag")
-    shutil.rmtree(living.parent)
-    return folder / "bag"
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder"
-        for p in folder.rglob("*")
-    }
+def run(native_path: Path) -> Experiment:
+    return twodof.experiment(native_path)
 
 
 def streamed(file: Path) -> int:
@@ -92,7 +79,7 @@ def streamed(file: Path) -> int:
 def test_killed_run_loses_a_second_at_most(
     native_path: Path, tmp_path: Path, storage: str, length: Callable[[int, int], int]
 ) -> None:
-    """Of its own time: no more than 100 of the samples that it had made by then."""
+    """Of the time in which it ran."""
     options = ["--stamp-start", str(START), "--storage", storage]
     undisturbed = tmp_path / "undisturbed"
     assert main(["run", str(native_path), "-o", str(undisturbed), "--stop-time=60", *options]) == 0
@@ -100,13 +87,9 @@ def test_killed_run_loses_a_second_at_most(
     read_with_another = {"mcap": read_with_mcap, "sqlite3": read_with_sqlite3}[storage]
     rng = random.Random(storage)
     lost = []
-    for first in range(0, length(200, 4), 4):
-        bags = [tmp_path / f"bag{i}" for i in range(first, first + 4)]
+    for first in range(0, length(200, 2), 2):
+        bags = [tmp_path / f"bag{i}" for i in range(first, first + 2)]
         runs = [logging(native_path, bag, storage) for bag in bags]
-        for run in runs:
-            while not run.made:
-                assert run.process.poll() is None
-                time.sleep(0.01)
         for bag, run in zip(bags, runs, strict=True):
             time.sleep(rng.uniform(0.0, 1.5))
             run.process.kill()
@@ -116,38 +99,22 @@ def test_killed_run_loses_a_second_at_most(
             kept = assert_consistent(bag, storage)
             assert read_with_rosbags(bag) == read_with_another(bag) == whole[:kept]
             assert content(bag.with_name(f"{bag.name}.unfinished")) == killed
-            lost.append(run.made - kept)
-    print(f"{len(lost)} kills, {storage}: lost {np.mean(lost)} samples, at most {max(lost)}")
-    assert max(lost) <= 100
-    assert max(lost) > 0  # else nothing was tried
-
-
-@both_storages
-def test_slow_step_holds_back_nothing_that_came_before(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
-    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
-        for k in range(50):
-            bag.write(sample(run, k))
-        time.sleep(1.0)  # the FMU takes its time
-        shutil.copytree(tmp_path / "bag", tmp_path / "copy")
-    twodof.recover(tmp_path / "copy")
-    assert assert_consistent(tmp_path / "copy", storage) == 50
+            lost.append(run.lost(kept))
+    print(f"{len(lost)} kills, {storage}: lost {np.mean(lost):.3f} s, at most {max(lost):.3f} s")
+    assert max(lost) <= 1.0
+    assert max(lost) > 0.0  # else nothing was tried
 
 
 # --- what was lost is the end alone ---
 
 
-@pytest.mark.parametrize("scene", [False, True])
-def test_mcap_cut_anywhere_keeps_what_came_before(
-    run: Experiment, tmp_path: Path, scene: bool
-) -> None:
-    bag = unfinished(tmp_path, run, "mcap", 200, scene=scene)
+def test_mcap_cut_anywhere_keeps_what_came_before(run: Experiment, tmp_path: Path) -> None:
+    bag = unfinished(tmp_path, run, "mcap", 200, scene=True)
     whole = (bag / "bag.mcap").read_bytes()
     everything = [joint_state(k, sample(run, k)) for k in range(200)]
     rng = np.random.default_rng(0)
     counts = set()
-    for size in [len(whole), len(whole) - 1, *rng.integers(8, len(whole), 40).tolist()]:
+    for size in [len(whole), len(whole) - 1, *rng.integers(8, len(whole), 12).tolist()]:
         cut = tmp_path / f"cut{size}"
         shutil.copytree(bag, cut)
         (cut / "bag.mcap").write_bytes(whole[:size])
@@ -353,14 +320,42 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
     assert connections["/talk"].digest == STORE.hash_rihs01("std_msgs/msg/String")
 
 
+def test_no_more_profiles_are_read_than_take_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of topics that have each its own; YAML is slow."""
+    (tmp_path / "bag").mkdir()
+    profiles = ["- {depth: [" + "1," * 300 + f"]}}#{i:02}" for i in range(50)]
+    channels = [channel(i, f"/t{i}", qos) for i, qos in enumerate(profiles)]
+    messages = [message(bytes(4), number=i) for i in range(50)]
+    content = b"".join([HEADER, SCHEMA, *channels, *messages, FOOTER])
+    (tmp_path / "bag/bag.mcap").write_bytes(content)
+    read: list[str] = []
+    monkeypatch.setattr("twodof.bag.recovery.parse_qos", lambda text: read.append(text) or [])
+    monkeypatch.setattr("twodof.bag.recovery.MAX_YAML", 2000)
+    assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
+    assert read == profiles[:3]
+
+
+def test_messages_in_another_form_are_left_out_and_named(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    other = record(4, struct.pack("<HH", 2, 1), texts("/text", "json", ""))
+    content = b"".join(
+        [HEADER, SCHEMA, CHANNEL, other, message(bytes(4)), message(b"{}", number=2)]
+    )
+    (tmp_path / "bag/bag.mcap").write_bytes(content + FOOTER)
+    done = twodof.recover(tmp_path / "bag")
+    assert done.counts == {"/joint_states": 1}
+    assert done.damage == "messages in another form than CDR, on /text"
+
+
 # --- what is said, and what is refused ---
 
 
-@both_storages
 def test_unfinished_bag_is_named_with_the_command(
-    run: Experiment, tmp_path: Path, storage: str, capsys: pytest.CaptureFixture[str]
+    run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag = unfinished(tmp_path, run, storage, 10)
+    bag = unfinished(tmp_path, run, "mcap", 10)
     assert main(["info", str(bag)]) == 1
     said = capsys.readouterr().err
     assert "unfinished" in said and f"twodof recover {bag}" in said
@@ -369,11 +364,8 @@ def test_unfinished_bag_is_named_with_the_command(
     assert main(["info", str(bag)]) == 0
 
 
-@both_storages
-def test_bag_that_is_being_written_is_left_alone(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
-    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
+def test_bag_that_is_being_written_is_left_alone(run: Experiment, tmp_path: Path) -> None:
+    with twodof.Bag(tmp_path / "bag", storage="sqlite3").begin(run) as bag:
         bag.write(sample(run, 0))
         for refused in (twodof.recover, twodof.read_bag):
             with pytest.raises(BagError, match="still being written"):
@@ -381,14 +373,13 @@ def test_bag_that_is_being_written_is_left_alone(
         (bag.path / "metadata.yaml").write_text("rosbag2_bagfile_information:")
         with pytest.raises(BagError, match="being written"):
             twodof.Bag(bag.path, overwrite=True)
-    assert assert_consistent(bag.path, storage) == 1
+    assert assert_consistent(bag.path, "sqlite3") == 1
 
 
-@both_storages
 def test_complete_bag_is_left_as_it_is(
-    run: Experiment, tmp_path: Path, storage: str, capsys: pytest.CaptureFixture[str]
+    run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
+    with twodof.Bag(tmp_path / "bag", storage="sqlite3").begin(run) as bag:
         bag.write(sample(run, 0))
     before = content(tmp_path)
     assert main(["recover", str(bag.path)]) == 0
@@ -444,11 +435,10 @@ def test_what_cannot_be_recovered_is_refused_and_left_alone(
     assert content(tmp_path) == before
 
 
-@both_storages
 def test_bag_on_a_disk_without_room_for_another_stays_as_it_was(
-    run: Experiment, tmp_path: Path, disk: Callable[..., Path], storage: str
+    run: Experiment, tmp_path: Path, disk: Callable[..., Path]
 ) -> None:
-    big = unfinished(tmp_path, run, storage, 4000)
+    big = unfinished(tmp_path, run, "mcap", 4000)
     folder = disk(content_size(big) // 1024 + 200)
     shutil.copytree(big, folder / "bag")
     before = content(folder)
@@ -459,31 +449,6 @@ def test_bag_on_a_disk_without_room_for_another_stays_as_it_was(
 
 def content_size(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.iterdir())
-
-
-@both_storages
-def test_recovery_that_is_killed_can_be_begun_again(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
-    bag = unfinished(tmp_path, run, storage, 6000)
-    rng = random.Random(storage)
-    expected = content(bag)
-    for _ in range(4):
-        process = subprocess.Popen([*TWODOF, "recover", str(bag)], stdout=subprocess.DEVNULL)
-        while process.poll() is None and not any(tmp_path.glob(".bag.recovering")):
-            time.sleep(0.001)
-        time.sleep(rng.uniform(0.0, 0.2))
-        process.kill()
-        process.wait()
-        if (bag / "metadata.yaml").exists():
-            break
-        assert content(bag) == expected
-    else:
-        assert main(["recover", str(bag)]) == 0
-        assert {p.name for p in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
-    kept = assert_consistent(bag, storage)
-    assert read_with_rosbags(bag) == [joint_state(k, sample(run, k)) for k in range(kept)]
-    assert kept > 5900
 
 
 KILLED_ANYWHERE = """
@@ -509,14 +474,13 @@ for last, bag in enumerate(bags):
 """
 
 
-@both_storages
 def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(
-    run: Experiment, tmp_path: Path, storage: str
+    run: Experiment, tmp_path: Path
 ) -> None:
-    """Its changes to folders, one after the other; the last few of these have not so many."""
-    living = unfinished(tmp_path, run, storage, 200)
+    """Its changes to folders, one after the other; the last of these have not so many."""
+    living = unfinished(tmp_path, run, "mcap", 200)
     before = content(living)
-    bags = [tmp_path / str(last) / "bag" for last in range(12)]
+    bags = [tmp_path / str(last) / "bag" for last in range(9)]
     for bag in bags:
         shutil.copytree(living, bag)
     command = [sys.executable, "-c", KILLED_ANYWHERE, *map(str, bags)]
@@ -529,7 +493,7 @@ def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(
         twodof.recover(bag)
         assert {path.name for path in bag.parent.iterdir()} == {"bag", "bag.unfinished"}
         assert content(bag.with_name("bag.unfinished")) == before
-        kept = assert_consistent(bag, storage)
+        kept = assert_consistent(bag, "mcap")
         assert read_with_rosbags(bag) == [joint_state(k, sample(run, k)) for k in range(kept)]
         assert kept > 150
     assert gone == 1  # between two renames
@@ -577,53 +541,6 @@ def test_bag_that_is_being_recovered_is_left_alone(
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
 
 
-# --- names ---
-
-
-def renamed(bag: Path, name: bytes) -> Path:
-    """The bag in a folder of this name, and itself of this name."""
-    path = Path(os.fsdecode(os.fsencode(bag.parent) + b"/" + name + b"/" + name))
-    path.parent.mkdir()
-    bag.rename(path)
-    for file in path.iterdir():
-        if file.stem == bag.name:
-            file.rename(file.with_name(path.name + file.suffix))
-    return path
-
-
-@both_storages
-@pytest.mark.parametrize("name", [b"\xff", b"a?b", b"a%41", b"a#b"])
-def test_bag_of_a_name_that_none_would_find_again_is_refused(
-    run: Experiment, tmp_path: Path, storage: str, name: bytes
-) -> None:
-    bag = renamed(unfinished(tmp_path, run, storage, 10), name)
-    before = content(tmp_path)
-    if storage == "mcap" and name != b"\xff":
-        twodof.recover(bag)
-        assert assert_consistent(bag, storage) > 0
-        return
-    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
-        twodof.recover(bag)
-    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
-        twodof.Bag(bag.with_name(f"{bag.name}2"), storage=storage)
-    assert content(tmp_path) == before
-
-
-@pytest.mark.parametrize("verb", ["info", "recover", "plot", "view"])
-def test_bag_of_a_name_that_is_not_utf8_is_read(run: Experiment, tmp_path: Path, verb: str) -> None:
-    """As on a terminal that knows UTF-8 alone."""
-    with twodof.Bag(tmp_path / "bag").begin(run) as sink:
-        for k in range(3):
-            sink.write(sample(run, k))
-    bag = renamed(sink.path, b"\xff")
-    options = {"plot": ["-o", "x.svg"], "view": ["--export", "x.html"]}.get(verb, [])
-    done = subprocess.run(
-        [*TWODOF, verb, os.fsencode(bag), *options], cwd=tmp_path, capture_output=True, text=True,
-        check=False, env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 def test_bag_is_recovered_from_within(
     run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -631,36 +548,3 @@ def test_bag_is_recovered_from_within(
     monkeypatch.chdir(bag)
     assert twodof.recover(".").original == tmp_path / "bag.unfinished"
     assert assert_consistent(bag, "mcap") > 0
-
-
-@both_storages
-def test_fsync_waits_for_the_disk_at_each_flush(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
-    """Seen in the system calls of the process."""
-    script = """
-import sys
-import twodof
-from twodof.simulation.sample import Sample
-fmu, path, storage, fsync = sys.argv[1:]
-run = twodof.experiment(fmu)
-inputs = dict(run.start_values)
-with twodof.Bag(path, storage=storage, fsync=fsync == "True").begin(run) as bag:
-    bag.write(Sample(0, 0.0, (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs, 0.0, 0))
-    open(path + "-stored", "w").close()
-"""
-    trace = needs("strace")
-    synced = {}
-    for fsync in (False, True):
-        bag = tmp_path / f"bag{fsync}"
-        log = tmp_path / f"log{fsync}"
-        traced = [trace, "-f", "-y", "-e", "trace=fsync,fdatasync,openat", "-o", str(log)]
-        arguments = [str(run.fmu.path), str(bag), storage, str(fsync)]
-        subprocess.run([*traced, sys.executable, "-c", script, *arguments], check=True)
-        # between the bag's creation, whose last file is the reserve, and the first sample
-        written = log.read_text().partition("-stored")[0].rpartition("/reserve")[2]
-        synced[fsync] = set(re.findall(r"f(?:data)?sync\(\d+<(.*?)>", written))
-    file = tmp_path / "bagTrue" / f"bagTrue.{'mcap' if storage == 'mcap' else 'db3'}"
-    wanted = {file, file.parent, tmp_path, file.parent / "run.json"}
-    assert {str(path) for path in wanted} <= synced[True]
-    assert synced[False] == set()

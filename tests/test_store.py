@@ -70,6 +70,12 @@ def logged(fmus: dict[str, Path], path: Path, **options: Any) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def three(fmus: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of three robots, to be read."""
+    return logged(fmus, tmp_path_factory.mktemp("three") / "bag", scene=True)
+
+
 @pytest.mark.parametrize("storage", STORAGES)
 def test_each_robot_has_its_topics_as_if_it_were_alone(
     fmus: dict[str, Path], tmp_path: Path, storage: str
@@ -90,9 +96,9 @@ def test_each_robot_has_its_topics_as_if_it_were_alone(
 
 
 def test_a_robot_is_read_by_its_address(
-    fmus: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    fmus: dict[str, Path], three: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag = logged(fmus, tmp_path / "bag", scene=True)
+    bag = three
     for name, fmu in fmus.items():
         run = read_bag(f"{bag}:{name}")
         assert run.provenance["fmu"]["file"] == fmu.name
@@ -121,9 +127,9 @@ def test_a_robot_is_read_by_its_address(
 
 
 def test_which_robot_is_meant_must_be_said(
-    fmus: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    fmus: dict[str, Path], three: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag = logged(fmus, tmp_path / "bag")
+    bag = three
     there = f"'{bag}:fleet/right', '{bag}:fleet_right', '{bag}:left'"
     for of, reason in (("", "is of several robots; give one"), (":no", "has no robot 'no'")):
         with pytest.raises(BagError, match=reason) as refusal:
@@ -164,7 +170,7 @@ def test_a_robot_in_anothers_namespace_has_its_own_topics(
         assert "has several topics of joint states, /a/joint_states, /a/b/joint_states" in warning
 
 
-@pytest.mark.parametrize("names", [("a", "a"), ("a", "/a"), ("", "a"), ("a", "")])
+@pytest.mark.parametrize("names", [("a", "/a"), ("", "a"), ("a", "")])
 def test_robots_need_names_that_differ(
     fmus: dict[str, Path], tmp_path: Path, names: tuple[str, str]
 ) -> None:
@@ -223,8 +229,8 @@ import twodof
 from twodof.simulation.experiments import experiment
 from twodof.simulation.master import Member, simulate_together
 
-path, storage, *fmus = sys.argv[1:]
-bag = twodof.Bag(path, storage=storage)
+path, *fmus = sys.argv[1:]
+bag = twodof.Bag(path)
 simulate_together(
     [Member(experiment(fmu, stop_time=1e5, step=0.01, stamp_start=0), [bag.of(f"robot{i}")],
             lambda: {"f_ext": (0.1, 0.0, 0.0)})
@@ -234,15 +240,14 @@ simulate_together(
 """
 
 
-@pytest.mark.parametrize("storage", STORAGES)
 def test_a_killed_bag_is_recovered_with_all_its_robots(
-    fmus: dict[str, Path], tmp_path: Path, storage: str
+    fmus: dict[str, Path], tmp_path: Path
 ) -> None:
     bag = tmp_path / "bag"
-    command = [sys.executable, "-c", LOGGER, str(bag), storage, *map(str, fmus.values())]
+    command = [sys.executable, "-c", LOGGER, str(bag), *map(str, fmus.values())]
     with subprocess.Popen(command) as process:
-        file = bag / ("bag.mcap" if storage == "mcap" else "bag.db3")
-        wait_until(lambda: file.exists() and file.stat().st_size > 60_000)  # some flushes
+        file = bag / "bag.mcap"
+        wait_until(lambda: file.exists() and file.stat().st_size > 30_000)  # some flushes
         process.send_signal(signal.SIGKILL)
     with pytest.raises(BagError, match=f"twodof recover {bag}'"):
         read_bag(f"{bag}:robot0")
@@ -282,13 +287,11 @@ def test_a_bag_that_is_not_open_takes_no_sample(native_path: Path, tmp_path: Pat
     assert read_bag(tmp_path / "bag").count == bag.count == 1
 
 
-@pytest.mark.parametrize("copy", ["run.left copy.json", "run.left (1).json", "run.left.old.json"])
-def test_a_copy_of_a_robots_provenance_is_no_robot(
-    fmus: dict[str, Path], tmp_path: Path, copy: str
-) -> None:
-    bag = logged(fmus, tmp_path / "bag")
-    (bag / copy).write_bytes((bag / "run.left.json").read_bytes())
-    assert robots_of(bag) == sorted(NAMES)
+def test_a_copy_of_a_robots_provenance_is_no_robot(tmp_path: Path) -> None:
+    files = [f"run.{name}.json" for name in ("left", "a%2Fb", "left copy", "left (1)", "left.old")]
+    for file in files:
+        (tmp_path / file).touch()
+    assert robots_of(tmp_path) == ["a/b", "left"]
 
 
 def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(
@@ -301,8 +304,8 @@ def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(
             read(tmp_path / "bag")
 
 
-def test_a_robots_bag_is_recovered_by_its_folder(fmus: dict[str, Path], tmp_path: Path) -> None:
-    bag = logged(fmus, tmp_path / "bag")
+def test_a_robots_bag_is_recovered_by_its_folder(three: Path, tmp_path: Path) -> None:
+    bag = three
     with pytest.raises(BagError, match=rf"there is no bag '.*:left'; 'twodof recover {bag}' is of"):
         recover(f"{bag}:left")
     with pytest.raises(BagError, match=r"there is no bag '[^']*none'$"):
@@ -313,7 +316,7 @@ def test_each_robot_may_have_its_own_thread(native_path: Path, tmp_path: Path) -
     """They come, begin and leave at one instant."""
     run, names = runs({"robot": native_path}, 0.1)["robot"], ("left", "right")
     samples = list(twodof.samples(run))
-    for trial in range(5):
+    for trial in range(3):
         bag, turn = twodof.Bag(tmp_path / f"{trial}"), Barrier(len(names))
 
         def log(name: str, bag: twodof.Bag = bag, turn: Barrier = turn) -> None:

@@ -8,6 +8,7 @@ import codecs
 import errno
 import fcntl
 import io
+import json
 import os
 import re
 import shutil
@@ -20,6 +21,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from .errors import TwoDofError
 
@@ -31,6 +33,8 @@ MAX_DEPTH = 50  # of folders in folders
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
 TEMPORARY = ".twodof."
 """Prefix of folders whose process has died, or holds their lock."""
+NUMBER = int | float
+VALUES = {str: NUMBER}
 
 
 class UnsafeArchiveError(zipfile.BadZipFile):
@@ -295,3 +299,34 @@ def is_plain_xml(xml: bytes) -> bool:
     ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
     entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
     return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
+
+
+def parsed(text: bytes) -> Any:
+    """JSON from elsewhere.
+
+    Raises:
+        ValueError, RecursionError: it is none, or would take much more memory than its text.
+    """
+    if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
+        raise ValueError("it is damaged")  # an empty one takes 24 times as much memory
+    return json.loads(text.decode("utf-8"))
+
+
+def fits(content: Any, shape: Any) -> bool:
+    """Whether a value of JSON has a shape; numbers are finite.
+
+    [x]: any number of x; (x, y): these two; {str: x}: x by any name; else the type.
+    """
+    if isinstance(shape, list):
+        return isinstance(content, list) and all(fits(element, shape[0]) for element in content)
+    if isinstance(shape, tuple):
+        same = isinstance(content, list) and len(content) == len(shape)
+        return same and all(map(fits, content, shape))
+    if isinstance(shape, dict):
+        keys = content if str in shape else shape
+        return isinstance(content, dict) and all(
+            fits(content.get(key), shape.get(key, shape.get(str))) for key in keys
+        )
+    if shape == NUMBER:
+        return isinstance(content, shape) and abs(content) <= sys.float_info.max
+    return isinstance(content, shape)

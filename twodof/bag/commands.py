@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, repeat
 from math import floor, inf
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from ..files import shown
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import CONTROLS
 from ..ros.cdr import Rows
-from ..ros.commands import LONGEST_NAME, CommandError, Commands
+from ..ros.commands import LONGEST_NAME, Command, CommandError, Commands
 from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY
-from ..ros.trajectories import follow, read_trajectory
+from ..ros.trajectories import Trajectory, follow, read_trajectory
 from ..simulation.experiments import NANOSECONDS, Changes, Setting, Value, default, resolve
 from .contents import read_messages
 from .provenance import KNOWN_UNTIL, read_provenance, robot_in
@@ -29,6 +29,7 @@ LOG = logging.getLogger(__name__)
 MAX_COMMANDS = 1_000_000
 SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of what a robot did
 FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs with which trajectories are followed
+Read = TypeVar("Read", Command, Trajectory)
 Stored = list[tuple[int, str, bytes]]
 """Messages: time when they were recorded, ns since the epoch, type and content."""
 
@@ -76,7 +77,8 @@ def read_commands(
     if commands[0][1] == JOINT_TRAJECTORY:
         step = default(fmu, "stepSize", 0.01) if step is None else step
         return _followed(commands, begin, fmu, resolve(fmu, settings or {}), step, f"'{path}'")
-    return _changes(commands, begin, follows, f"'{path}'")
+    read = _read(commands, begin, lambda _, kind, data: follows.read(kind, data), f"'{path}'")
+    return [((came - begin) / NANOSECONDS, dict(command.inputs)) for came, command in read]
 
 
 def _messages(
@@ -124,32 +126,32 @@ def _only(found: Mapping[str, object], path: Path, topic: str | None, types: Seq
     raise InputError(f"'{path}' has no commands{where} for this FMU, which follows {kinds}")
 
 
-def _changes(commands: Stored, begin: int, follows: Commands, bag: str) -> Changes:
-    changes, strangers = list[tuple[float, dict[str, Value]]](), set[str]()
+def _read(
+    commands: Stored, begin: int, read: Callable[[int, str, bytes], Read], bag: str
+) -> list[tuple[int, Read]]:
+    """When each came, and what it says; the bag is named in what is wrong."""
+    said = []
     for came, kind, data in commands:
-        with _refusing(bag, came - begin):
-            command = follows.read(kind, data)
-        changes.append(((came - begin) / NANOSECONDS, dict(command.inputs)))
-        strangers.update(command.strangers)
-    _tell_strangers(bag, strangers)
-    return changes
-
-
-def _tell_strangers(bag: str, names: set[str]) -> None:
-    if names:
-        told = ", ".join(sorted(names))[:LONGEST_NAME]
-        LOG.warning(f"{bag}: joints that this robot has not are left out: {told!r}")
+        try:
+            said.append((came, read(came, kind, data)))
+        except CommandError as error:
+            t = (came - begin) / NANOSECONDS
+            raise InputError(f"{bag}: the command at {t:g} s {error}") from error
+    if names := {name for _, command in said for name in command.strangers}:
+        strangers = ", ".join(sorted(names))[:LONGEST_NAME]
+        LOG.warning(f"{bag}: joints that this robot has not are left out: {strangers!r}")
+    return said
 
 
 def _followed(
     commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str
 ) -> Changes:
     """Inputs with which joints go along trajectories, where they change from step to step."""
-    trajectories, joints = [], {name: i for i, name in enumerate(fmu.joints)}
-    for came, _, data in commands:
-        with _refusing(bag, came - begin):
-            trajectories.append(read_trajectory(data, joints, came, begin))
-    _tell_strangers(bag, {name for it in trajectories for name in it.strangers})
+    joints = {name: i for i, name in enumerate(fmu.joints)}
+    read = _read(
+        commands, begin, lambda came, _, data: read_trajectory(data, joints, came, begin), bag
+    )
+    trajectories = [trajectory for _, trajectory in read]
     begun, ended = min(it.start for it in trajectories), max(it.times[-1] for it in trajectories)
     if not ended - begun <= MAX_COMMANDS * step < inf:
         told = f"take {ended - begun:g} s, more than {MAX_COMMANDS} steps of {step:g} s"
@@ -166,12 +168,3 @@ def _followed(
     for k in 1 + np.flatnonzero((np.diff(table, axis=0) != 0.0).any(axis=1)):
         changes.append((float(grid[k]), dict(zip(names, table[k].tolist()))))
     return changes
-
-
-@contextmanager
-def _refusing(bag: str, t: int) -> Iterator[None]:
-    """Name the bag, and the time, ns, of a command that is none."""
-    try:
-        yield
-    except CommandError as error:
-        raise InputError(f"{bag}: the command at {t / NANOSECONDS:g} s {error}") from error

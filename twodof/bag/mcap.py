@@ -44,7 +44,13 @@ MANY = 1000  # records outside of chunks
 def mcap_messages(path: Path, allowance: Allowance) -> Iterator[Batch]:
     """All messages of a file; errors as of ``read_messages``."""
     tables = Tables()
-    loose: list[bytes] = []  # records outside of chunks
+    for records in _chunks(path, allowance):
+        yield from messages_in(path, records, tables, allowance)
+
+
+def _chunks(path: Path, allowance: Allowance) -> Iterator[bytes]:
+    """The records of each chunk, and those outside of chunks, many at a time."""
+    loose: list[bytes] = []
     try:
         for opcode, content in _records(path, allowance):
             allowance.left += MAX_RATIO * len(content)
@@ -52,14 +58,13 @@ def mcap_messages(path: Path, allowance: Allowance) -> Iterator[Batch]:
                 loose.append(content)
             if opcode == CHUNK or len(loose) > MANY:
                 before, loose = b"".join(loose), []
-                yield from messages_in(path, before, tables, allowance)
+                yield before
             if opcode == CHUNK:
-                chunk = unpack_chunk(path, content, allowance)
-                yield from messages_in(path, chunk, tables, allowance)
+                yield unpack_chunk(path, content, allowance)
     except DamageError:  # what came before is sound
-        yield from messages_in(path, b"".join(loose), tables, allowance)
+        yield b"".join(loose)
         raise
-    yield from messages_in(path, b"".join(loose), tables, allowance)
+    yield b"".join(loose)
 
 
 def read_metadata(path: Path, name: str, key: str) -> str:

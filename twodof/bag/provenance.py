@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
 from ..errors import BagError
-from ..files import read_file
+from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..simulation.experiments import Changes, Experiment
 from ..version import versions
 from .mcap import read_metadata
@@ -30,8 +29,6 @@ KNOWN_UNTIL = "inputs_known_until"
 MAX_SIZE = 64 * 1024**2
 PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
 
-NUMBER = int | float
-VALUES = {str: NUMBER}
 SHAPE = {
     "fmu": {"name": str, "guid": str, "file": str},
     "robot": str, "frame": str, "root": str, "axes": str,
@@ -43,7 +40,7 @@ SHAPE = {
     "urdf": str | None,
     "input_changes": [(NUMBER, VALUES)],
 }  # fmt: skip
-"""Of what is read back. [x]: any number of x; (x, y): these two; {str: x}: x by any name."""
+"""Of what is read back, as ``fits`` takes it."""
 
 
 class ProvenanceFile:
@@ -184,31 +181,3 @@ def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
     except (OSError, ValueError, RecursionError, DamageError) as error:
         raise BagError(f"cannot read '{file}': {error}") from error
     return {}
-
-
-def parsed(text: bytes) -> Any:
-    """JSON from elsewhere.
-
-    Raises:
-        ValueError, RecursionError: it is none, or would take much more memory than its text.
-    """
-    if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
-        raise ValueError("it is damaged")  # an empty one takes 24 times as much memory
-    return json.loads(text.decode("utf-8"))
-
-
-def fits(content: Any, shape: Any) -> bool:
-    """Whether a value has the shape, written as ``SHAPE`` is; numbers are finite."""
-    if isinstance(shape, list):
-        return isinstance(content, list) and all(fits(element, shape[0]) for element in content)
-    if isinstance(shape, tuple):
-        same = isinstance(content, list) and len(content) == len(shape)
-        return same and all(map(fits, content, shape))
-    if isinstance(shape, dict):
-        keys = content if str in shape else shape
-        return isinstance(content, dict) and all(
-            fits(content.get(key), shape.get(key, shape.get(str))) for key in keys
-        )
-    if shape == NUMBER:
-        return isinstance(content, shape) and abs(content) <= sys.float_info.max
-    return isinstance(content, shape)

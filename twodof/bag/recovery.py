@@ -22,7 +22,7 @@ from ..files import lock, sync
 from . import provenance
 from .contents import read_messages, stated_count, storage_files
 from .records import Allowance, Channel, DamageError
-from .storage import KINDS, BagWriter, check_path
+from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, check_path
 from .summary import read_summary
 
 MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
@@ -145,16 +145,22 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
                 text = (folder / provenance.file_of(robot)).read_text("utf-8").strip()
                 writer.set_custom_data(provenance.key_of(robot), text)
     with writer:
-        topics = _Topics(writer)
+        topics, pending = _Topics(writer), 0
         for file in files:
             try:
                 for channel, stamps, messages in read_messages(file, allowance):
                     if channel.serialization != "cdr":
                         others.add(channel.topic)
                         continue
-                    connection = topics.connection(channel)
-                    for stamp, message in zip(stamps.tolist(), messages):
-                        writer.write(connection, stamp, message.tobytes())
+                    number = topics.connection(channel).id
+                    size = OVERHEAD + messages.shape[1]
+                    most = max(1, BATCH_SIZE // size)
+                    for k in range(0, len(stamps), most):
+                        writer.write_all(stamps[k : k + most], {number: messages[k : k + most]})
+                        pending += size * len(stamps[k : k + most])
+                        if pending > BATCH_SIZE:
+                            writer.flush()
+                            pending = 0
             except DamageError as error:
                 damage.append(str(error))
     if others:

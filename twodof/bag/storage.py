@@ -20,7 +20,6 @@ from typing import Final, Literal
 from zlib import crc32
 
 import numpy as np
-from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
@@ -131,11 +130,7 @@ class Sqlite3Storage(Sqlite3Writer):
         self.conn = sqlite3.connect(self.path, check_same_thread=False)
         self.conn.execute(SYNCHRONOUS[False])
         self.cursor = self.conn.cursor()
-        self._rows: list[tuple[int, int, bytes | memoryview]] = []
-
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Keep a message until the next flush."""
-        self._rows.append((connection.id, timestamp, data))
+        self._rows: list[tuple[int, int, bytes]] = []
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
         """Keep messages until the next flush, of each connection one by each of N stamps."""
@@ -180,21 +175,6 @@ class BagWriter(Writer):
     def __init__(self, path: Path, storage: str, *, fsync: bool = False) -> None:
         super().__init__(path, version=METADATA_VERSION, storage_plugin=STORAGES[storage])
         self._fsync = fsync
-        self._pending = 0
-
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        """Write one message; some hundred KiB are flushed together.
-
-        rosbags' own would look through all topics first, for each.
-        """
-        assert self.storage is not None
-        self.storage.write(connection, timestamp, data)
-        self.counts[connection.id] += 1
-        self.min_timestamp = min(timestamp, self.min_timestamp)
-        self.max_timestamp = max(timestamp, self.max_timestamp)
-        self._pending += OVERHEAD + len(data)
-        if self._pending > BATCH_SIZE:
-            self.flush()
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
         """Write messages, of each connection one by each of N stamps; they wait for a flush."""
@@ -215,7 +195,6 @@ class BagWriter(Writer):
         if not self.storage.path.exists():  # what has lost its name can be written for ever
             raise FileNotFoundError(errno.ENOENT, REMOVED)
         self.storage.flush(self._fsync)
-        self._pending = 0
 
 
 def check_path(path: Path, storage: str) -> None:

@@ -228,9 +228,13 @@ def _checked(fmu: Fmu, name: str, value: object) -> Value:
         return value
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name} = {value!r}: expected a number")
-    if not math.isfinite(value):
-        raise InputError(f"{name} = {value} is not finite")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # of a whole number
+        number = inf if value > 0 else -inf
+    if not isfinite(number):
+        raise InputError(f"{name} = {number} is not finite")
+    return number
 
 
 def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
@@ -304,7 +308,7 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
                 raise InputError(
                     f"'{path}' row {number}: {name} = '{cell:.50}' is not a number"
                 ) from None
-            if not math.isfinite(values[name]):
+            if not isfinite(values[name]):
                 raise InputError(f"'{path}' row {number}: {name} = {cell:.50} is not finite")
         time = values.pop("time")
         if changes and time < changes[-1][0]:

@@ -74,7 +74,8 @@ def samples(
         SimulationError: the FMU refused or failed a call, or gave a value that is not finite.
     """
     run = as_experiment(run, options)
-    inputs, due = _inputs(run), deque(run.changes)
+    kinds, due = run.fmu.variables, deque(run.changes)
+    inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
         instance.initialise(run.start_time, run.time(run.steps), run.given)
         ready()
@@ -118,11 +119,6 @@ def as_experiment(
         beside = ", ".join(options)
         raise InputError(f"{beside} beside an experiment would do nothing; `experiment` takes them")
     return run
-
-
-def _inputs(run: Experiment) -> dict[str, Value]:
-    kinds = run.fmu.variables
-    return {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
 
 
 def _sampler(

@@ -19,9 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bag.provenance import NUMBER, VALUES, fits, parsed
 from ..errors import SweepError
-from ..files import check_file, is_being_written, lock, refusing, write_file
+from ..files import (
+    NUMBER,
+    VALUES,
+    check_file,
+    fits,
+    is_being_written,
+    lock,
+    parsed,
+    refusing,
+    write_file,
+)
 from .design import MAX_RUNS
 from .metrics import METRICS
 from .runner import Row

@@ -1,0 +1,69 @@
+"""Bags of names that are no plain text: read, or refused before they are written."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from bags import assert_consistent, content, sample, unfinished
+
+import twodof
+from twodof.errors import BagError
+from twodof.simulation.experiments import Experiment
+
+
+@pytest.fixture(scope="module")
+def run(native_path: Path) -> Experiment:
+    return twodof.experiment(native_path)
+
+
+def renamed(bag: Path, name: bytes) -> Path:
+    """The bag in a folder of this name, and itself of this name."""
+    path = Path(os.fsdecode(os.fsencode(bag.parent) + b"/" + name + b"/" + name))
+    path.parent.mkdir()
+    bag.rename(path)
+    for file in path.iterdir():
+        if file.stem == bag.name:
+            file.rename(file.with_name(path.name + file.suffix))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("storage", "name"),
+    [
+        ("mcap", b"\xff"),
+        ("mcap", b"a?b"),
+        *[("sqlite3", name) for name in (b"\xff", b"a?b", b"a%41")],
+    ],
+)
+def test_bag_of_a_name_that_none_would_find_again_is_refused(
+    run: Experiment, tmp_path: Path, storage: str, name: bytes
+) -> None:
+    bag = renamed(unfinished(tmp_path, run, storage, 10), name)
+    before = content(tmp_path)
+    if storage == "mcap" and name != b"\xff":
+        twodof.recover(bag)
+        assert assert_consistent(bag, storage) > 0
+        return
+    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
+        twodof.recover(bag)
+    with pytest.raises(BagError, match=r"cannot have|UTF-8"):
+        twodof.Bag(bag.with_name(f"{bag.name}2"), storage=storage)
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("verb", ["info", "plot"])
+def test_bag_of_a_name_that_is_not_utf8_is_read(run: Experiment, tmp_path: Path, verb: str) -> None:
+    """As on a terminal that knows UTF-8 alone."""
+    with twodof.Bag(tmp_path / "bag").begin(run) as sink:
+        for k in range(3):
+            sink.write(sample(run, k))
+    bag = renamed(sink.path, b"\xff")
+    options = ["-o", "x.svg"] if verb == "plot" else []
+    command = [sys.executable, "-m", "twodof", verb, os.fsencode(bag), *options]
+    terminal = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=terminal)
+    assert (done.returncode, done.stderr) == (0, "")

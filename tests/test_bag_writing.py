@@ -1,0 +1,342 @@
+"""A bag while it is written: where, how it ends early, and what it takes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import pytest
+from bags import (
+    PERIOD,
+    SECOND,
+    START,
+    assert_consistent,
+    both_storages,
+    joint_state,
+    read_with_rosbags,
+    read_with_sqlite3,
+    sample,
+)
+from harness import needs, wait_until
+from mcap.exceptions import EndOfFile
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+
+import twodof
+from twodof.bag.storage import BagWriter
+from twodof.errors import BagError
+from twodof.files import is_being_written
+from twodof.simulation.experiments import Experiment
+
+MIB = 1024**2
+
+
+@pytest.fixture(scope="module")
+def run(native_path: Path) -> Experiment:
+    return twodof.experiment(native_path)
+
+
+# --- where it may be written ---
+
+
+def test_existing_bag_is_kept_unless_told_otherwise(run: Experiment, tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    with twodof.Bag(path).begin(run) as bag:
+        bag.write(sample(run, 0))
+    with pytest.raises(BagError, match="exists already"):
+        twodof.Bag(path)
+    assert len(read_with_rosbags(path)) == 1
+    with twodof.Bag(path, overwrite=True).begin(run) as bag:
+        for k in range(3):
+            bag.write(sample(run, k))
+    assert len(read_with_rosbags(path)) == 3
+
+
+@pytest.mark.parametrize("moment", ["remove", "open", "add_connection"])
+def test_of_two_that_overwrite_a_bag_at_once_one_is_refused(
+    run: Experiment, tmp_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second comes just before the first removes the old bag, opens its own, adds a topic."""
+    path = tmp_path / "bag"
+    with twodof.Bag(path).begin(run):
+        pass
+    first, second = (twodof.Bag(path, overwrite=True).begin(run) for _ in range(2))
+    place, name = (shutil, "rmtree") if moment == "remove" else (BagWriter, moment)
+    original, begun = getattr(place, name), []
+
+    def begin(bag: twodof.Bag) -> None:
+        with suppress(BagError):
+            begun.append(bag.__enter__())
+
+    def intruded(*arguments: Any, **named: Any) -> Any:
+        monkeypatch.setattr(place, name, original)
+        begin(second)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(place, name, intruded)
+    begin(first)
+    (winner,) = begun
+    for k in range(3):
+        winner.write(sample(run, k))
+    winner.__exit__(None, None, None)
+    assert assert_consistent(path, "mcap") == 3
+
+
+def test_bag_is_locked_though_another_looks_whether_it_is(
+    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = BagWriter.open
+
+    def looked_at(writer: BagWriter) -> None:
+        opened(writer)
+        folder = os.open(writer.path, os.O_RDONLY)
+        fcntl.flock(folder, fcntl.LOCK_SH)
+        Timer(0.2, os.close, [folder]).start()
+
+    monkeypatch.setattr(BagWriter, "open", looked_at)
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        assert is_being_written(bag.path)
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {},
+        {"notes.txt": "precious"},
+        {"run.json": '{"learning_rate": 0.1}', "notes.txt": "precious"},
+        {"metadata.yaml": "title: precious\n", "notes.txt": "precious"},
+    ],
+    ids=["empty", "other files", "another run.json", "another metadata.yaml"],
+)
+def test_what_is_no_bag_is_never_overwritten(tmp_path: Path, files: dict[str, str]) -> None:
+    """A folder, or a file."""
+    path = tmp_path / "folder"
+    path.mkdir()
+    for name, text in files.items():
+        (path / name).write_text(text)
+    for place in (path, *path.iterdir()):
+        with pytest.raises(BagError, match="not a bag"):
+            twodof.Bag(place, overwrite=True)
+    assert {file.name: file.read_text() for file in path.iterdir()} == files
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_folder_that_appears_before_the_first_sample_is_kept(
+    run: Experiment, tmp_path: Path, overwrite: bool
+) -> None:
+    path = tmp_path / "bag"
+    bag = twodof.Bag(path, overwrite=overwrite).begin(run)
+    path.mkdir()
+    (path / "notes.txt").write_text("precious")
+    with pytest.raises(BagError, match="bag"), bag:
+        pass
+    assert [file.name for file in path.iterdir()] == ["notes.txt"]
+
+
+def test_bag_behind_a_link_is_not_lost(run: Experiment, tmp_path: Path) -> None:
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        bag.write(sample(run, 0))
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "bag")
+    try:
+        with twodof.Bag(link, overwrite=True).begin(run) as bag:
+            bag.write(sample(run, 0))
+    except BagError:
+        pass  # refused, and fine so
+    assert len(read_with_rosbags(tmp_path / "bag")) == 1
+
+
+@both_storages
+@pytest.mark.parametrize("place", ["below a file", "read-only", "long"])
+def test_folder_that_cannot_be_written_is_refused(
+    run: Experiment, tmp_path: Path, disk: Callable[..., Path], storage: str, place: str
+) -> None:
+    if place == "below a file":
+        (tmp_path / "file").write_text("precious")
+        path = tmp_path / "file" / "bag"
+    elif place == "read-only":
+        path = disk(4096, "ro") / "bag"
+    else:
+        path = tmp_path / ("x" * 300)
+    before = sorted(tmp_path.rglob("*"))
+    with (
+        pytest.raises(BagError, match=re.escape(str(path))),
+        twodof.Bag(path, storage=storage).begin(run),
+    ):
+        pass
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+# --- runs that end early ---
+
+
+@both_storages
+@pytest.mark.parametrize(("error", "n"), [(RuntimeError, 0), (KeyboardInterrupt, 137)])
+def test_exception_leaves_a_bag_with_every_sample_so_far(
+    run: Experiment, tmp_path: Path, storage: str, error: type[BaseException], n: int
+) -> None:
+    path = tmp_path / "bag"
+    bag = twodof.Bag(path, storage=storage).begin(run)
+    with pytest.raises(error, match="enough"), bag:
+        for k in range(n):
+            bag.write(sample(run, k))
+        raise error("enough")
+    assert assert_consistent(path, storage) == n
+    assert read_with_rosbags(path) == [joint_state(k, sample(run, k)) for k in range(n)]
+
+
+def fill(bag: twodof.Bag, run: Experiment) -> tuple[str, int]:
+    """Write until the disk is full; what the error says, and how many samples were taken."""
+    taken = 0
+    with pytest.raises(BagError) as caught, bag.begin(run):
+        for k in range(200_000):
+            bag.write(sample(run, k))
+            taken += 1
+    return str(caught.value), taken
+
+
+@both_storages
+@pytest.mark.parametrize("size", [2252, 3072])  # KiB: 2.2 and 3 MiB
+def test_full_disk_ends_in_a_closed_bag_with_every_sample(
+    run: Experiment, disk: Callable[..., Path], storage: str, size: int
+) -> None:
+    path = disk(size) / "bag"
+    said, taken = fill(twodof.Bag(path, storage=storage), run)
+    assert "disk is full" in said
+    kept = assert_consistent(path, storage)
+    assert taken - 1 <= kept <= taken  # one may be handed over while the bag is being closed
+    assert f"closed with its first {kept} samples" in said
+    assert read_with_rosbags(path) == [joint_state(k, sample(run, k)) for k in range(kept)]
+
+
+@both_storages
+def test_disk_too_small_to_begin_with_is_left_as_it_was(
+    run: Experiment, disk: Callable[..., Path], storage: str
+) -> None:
+    refused = 0
+    for size in (4, 16, 512, *range(2048, 2128, 8)):
+        path = disk(size) / "bag"
+        try:
+            with twodof.Bag(path, storage=storage).begin(run):
+                pass
+        except BagError as error:
+            refused += 1
+            assert re.search(r"full|No space", str(error))
+            assert not path.exists()
+        else:
+            assert_consistent(path, storage)
+    assert refused > 1
+
+
+@both_storages
+def test_reserve_is_room_to_close_a_run_that_was_never_flushed(
+    run: Experiment, disk: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, storage: str
+) -> None:
+    monkeypatch.setattr("twodof.bag.store.FLUSH_PERIOD", 1e6)
+    path = disk(2140) / "bag"  # 92 KiB beside the reserve; the messages take 140
+    with twodof.Bag(path, storage=storage).begin(run) as bag:
+        for k in range(1000):
+            bag.write(sample(run, k))
+    assert assert_consistent(path, storage) == 1000
+
+
+# --- long runs ---
+
+
+@both_storages
+def test_messages_reach_the_disk_while_the_fmu_takes_its_time(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    """Fewer than fill a buffer, and no more come."""
+    with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
+        for k in range(50):
+            bag.write(sample(run, k))
+        stamps = [START * SECOND + k * PERIOD for k in range(50)]
+        wait_until(lambda: [*stored(bag.path, storage)] == stamps)
+        shutil.copytree(bag.path, tmp_path / "copy/bag")
+    twodof.recover(tmp_path / "copy/bag")
+    assert assert_consistent(tmp_path / "copy/bag", storage) == 50
+
+
+def stored(bag: Path, storage: str) -> Iterator[int]:
+    """Log times of the messages of a bag that is being written."""
+    if storage == "sqlite3":
+        yield from (state.log_time for state in read_with_sqlite3(bag))
+        return
+    with suppress(EndOfFile), (bag / f"{bag.name}.mcap").open("rb") as content:
+        for record in StreamReader(content).records:
+            if isinstance(record, McapMessage):
+                yield record.log_time
+
+
+MEMORY = """
+import sys
+import twodof
+from sinks import Memory
+from twodof.simulation.sample import Sample
+
+fmu, path, storage = sys.argv[1:]
+run = twodof.experiment(fmu)
+inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
+memory = Memory(1000)
+with twodof.Bag(path, storage=storage).begin(run) as bag:
+    for k in range(20_000):
+        numbers = (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8)
+        sample = Sample(k, run.time(k), *numbers, inputs, 0.0, k * 10_000_000)
+        bag.write(sample)
+        memory.write(sample)
+print(memory.growth)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@both_storages
+def test_memory_does_not_grow_with_the_run(native_path: Path, tmp_path: Path, storage: str) -> None:
+    command = [sys.executable, "-c", MEMORY, str(native_path), str(tmp_path / "bag"), storage]
+    done = subprocess.run(
+        command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 5 * MIB
+    assert assert_consistent(tmp_path / "bag", storage) == 20_000
+
+
+@both_storages
+def test_fsync_waits_for_the_disk_at_each_flush(
+    run: Experiment, tmp_path: Path, storage: str
+) -> None:
+    """Seen in the system calls of the process."""
+    script = """
+import sys
+import twodof
+from twodof.simulation.sample import Sample
+fmu, path, storage, fsync = sys.argv[1:]
+run = twodof.experiment(fmu)
+inputs = dict(run.start_values)
+with twodof.Bag(path, storage=storage, fsync=fsync == "True").begin(run) as bag:
+    bag.write(Sample(0, 0.0, (0.1, 0.2), (0.3, 0.4), (0.5, 0.6), (0.7, 0.8), inputs, 0.0, 0))
+    open(path + "-stored", "w").close()
+"""
+    trace = needs("strace")
+    synced = {}
+    for fsync in (False, True):
+        bag = tmp_path / f"bag{fsync}"
+        log = tmp_path / f"log{fsync}"
+        traced = [trace, "-f", "-y", "-e", "trace=fsync,fdatasync,openat", "-o", str(log)]
+        arguments = [str(run.fmu.path), str(bag), storage, str(fsync)]
+        subprocess.run([*traced, sys.executable, "-c", script, *arguments], check=True)
+        # between the bag's creation, whose last file is the reserve, and the first sample
+        written = log.read_text().partition("-stored")[0].rpartition("/reserve")[2]
+        synced[fsync] = set(re.findall(r"f(?:data)?sync\(\d+<(.*?)>", written))
+    file = tmp_path / "bagTrue" / f"bagTrue.{'mcap' if storage == 'mcap' else 'db3'}"
+    wanted = {file, file.parent, tmp_path, file.parent / "run.json"}
+    assert {str(path) for path in wanted} <= synced[True]
+    assert synced[False] == set()

@@ -1,0 +1,352 @@
+"""Files from elsewhere that mean harm, made by hand: a command refuses them with one clear line, or
+reads them for what they hold, in bounded time and memory."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import mutations
+import pytest
+from jail import MIB, SPECIAL, Jail, refused, without_slow
+from jail import jail as jail
+from jail import the_jail as the_jail
+
+import twodof
+from twodof.errors import FmuError
+
+pytestmark = pytest.mark.long
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    without_slow(metafunc, HOSTILE, SLOW)
+
+
+# --- special files ---
+
+
+ANYWHERE = ("a pipe", "3 GB of zeros")  # the others one function refuses for all
+
+
+@pytest.mark.parametrize(
+    ("what", "kind"),
+    [("fmu", kind) for kind in SPECIAL]
+    + [(what, kind) for what in ("urdf", "csv", "mesh") for kind in ANYWHERE],
+)
+def test_what_is_no_file_of_bearable_size_is_refused(
+    what: str, kind: str, jail: Jail, native_path: Path
+) -> None:
+    make, reason = SPECIAL[kind]
+    path = jail.input / what
+    make(path)
+    (jail.input / "arm.urdf").write_text(robot(tip(inside=shapes(["mesh"]))))
+    build = ["build", "-o", jail.target / "x.fmu", "--frame", "tip", "--urdf"]
+    command = {
+        "fmu": ["run", path, "-o", jail.target / "bag"],
+        "urdf": [*build, path],
+        "csv": ["run", native_path, "--input", path, "-o", jail.target / "bag"],
+        "mesh": [*build, jail.input / "arm.urdf"],
+    }
+    refused(jail, f"mesh .*(not found|leaves its folder|cannot be read)|{reason}", *command[what])
+
+
+# --- FMUs ---
+
+Q_AND_V = "".join(
+    f'<ScalarVariable name="{name}[1]" valueReference="{i}" causality="output"'
+    ' variability="continuous"><Real/></ScalarVariable>'
+    for i, name in enumerate("qv")
+)
+LAUGHS = "<!DOCTYPE r [<!ENTITY l0 'ha'>" + "".join(
+    f"<!ENTITY l{i} '{f'&l{i - 1};' * 10}'>" for i in range(1, 10)
+) + "]>"  # fmt: skip
+EXTERNAL = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+
+
+def description(head: str = "", notes: str = "", variables: str = "") -> str:
+    """The modelDescription.xml of an FMU of another maker."""
+    unknowns = '<Unknown index="1"/><Unknown index="2"/>'
+    return (
+        f'{head}<fmiModelDescription fmiVersion="2.0" modelName="m" guid="g">'
+        f'<CoSimulation modelIdentifier="m"/><VendorAnnotations><Tool name="x">{notes}</Tool>'
+        f"</VendorAnnotations><ModelVariables>{Q_AND_V}{variables}</ModelVariables>"
+        f"<ModelStructure><Outputs>{unknowns}</Outputs>"
+        f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure></fmiModelDescription>"
+    )
+
+
+def variables(count: int) -> str:
+    return "".join(
+        f'<ScalarVariable name="a{i}" valueReference="{i}"><Real/></ScalarVariable>'
+        for i in range(count)
+    )
+
+
+def attributes(count: int) -> str:
+    return f"<a {' '.join(f'a{i}=%r' % '' for i in range(count))}/>"
+
+
+def external(encoding: str, declared: str = "") -> bytes:
+    head = f'<?xml version="1.0" encoding="{declared or encoding}"?>{EXTERNAL}'
+    return description(head, "&a;").encode(encoding)
+
+
+def fmu_of(xml: str | bytes, *more: tuple[str, bytes, int, int]) -> bytes:
+    """An FMU with a library that cannot be loaded: the last of all refusals of a run."""
+    content = {"modelDescription.xml": xml, "binaries/linux64/m.so": b"x"}
+    members = []
+    for name, value in content.items():
+        data = value.encode() if isinstance(value, str) else value
+        packer = zlib.compressobj(1, zlib.DEFLATED, -15)
+        packed = packer.compress(data) + packer.flush()
+        members.append((name, packed, len(data), zlib.crc32(data)))
+    return mutations.raw_zip([*members, *more])
+
+
+def bomb(name: str, declared: int) -> bytes:
+    """An FMU with a member of 10 GB of zeros, of which the directory may say that it is small."""
+    zeros = mutations.deflated_zeros(10_000 * MIB)
+    good = [] if name == "modelDescription.xml" else [description()]
+    member = (name, zeros, declared, zlib.crc32(bytes(declared % 2**20)))
+    return fmu_of(good[0], member) if good else mutations.raw_zip([member])
+
+
+def many_members(count: int, size: int = 0) -> bytes:
+    """An FMU with members that are all the same data."""
+    zeros = mutations.deflated_zeros(size)
+    crc = zlib.crc32(bytes(size))
+    same = [(f"{i:x}", zeros, size, crc) for i in range(count)]
+    return fmu_of(description(), *same)
+
+
+UNPLAIN = "declares entities or is not UTF-8"
+UNLOADED = "cannot be loaded"
+HOSTILE_FMUS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "a billion laughs": (lambda: fmu_of(description(LAUGHS, "&l9;")), UNPLAIN),
+    "an external entity": (lambda: fmu_of(description(EXTERNAL, "&a;")), UNPLAIN),
+    "UTF-16": (lambda: fmu_of(external("utf-16")), UNPLAIN),
+    "UTF-7": (lambda: fmu_of(external("ascii", "utf-7").replace(b"<!", b"+ADwAIQ-")), UNPLAIN),
+    "EBCDIC": (lambda: fmu_of(external("cp037")), UNPLAIN),
+    "100,000 elements deep": (
+        lambda: fmu_of(description(notes="<a>" * 100_000 + "</a>" * 100_000)), "not valid"
+    ),
+    "100 MB of an attribute": (
+        lambda: fmu_of(description(notes=f"<a b='{'x' * 100 * MIB}'/>")), "larger than"
+    ),
+    "8 MB of variables": (lambda: fmu_of(description(variables=variables(105_000))), UNLOADED),
+    "80,000 members": (lambda: many_members(80_000), "cannot unzip"),
+    "a million members": (lambda: many_members(1_000_000), "Too many members"),
+    "40 GB in members that overlap": (lambda: many_members(40_000, MIB), "it exceeds"),
+    "2 GB in members that overlap": (lambda: many_members(2000, MIB), "cannot unzip"),
+    "10 GB of zeros": (lambda: bomb("resources/x", 2**32 - 1), "it exceeds"),
+    "10 GB that are said to be 1 kB": (lambda: bomb("resources/x", 1000), UNLOADED),
+    "10 GB of description": (lambda: bomb("modelDescription.xml", 1000), UNPLAIN),
+    "900 folders deep": (
+        lambda: fmu_of(description(), ("a/" * 900 + "b", b"\3\0", 0, 0)), "nested deeper"
+    ),
+}  # fmt: skip
+
+
+def test_hostile_fmu_is_refused(hostile_fmu: tuple[Callable[[], bytes], str], jail: Jail) -> None:
+    make, reason = hostile_fmu
+    path = jail.input / "x.fmu"
+    path.write_bytes(make())
+    jail.run("info", path)
+    refused(jail, reason, "run", path, "-o", jail.target / "bag")
+    jail.run("run", path, "-o", jail.target / "bag", "--scene")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_fmu_compressed_as_fmi_does_not_allow_is_refused(method: int, jail: Jail) -> None:
+    content = {"modelDescription.xml": description().encode(), "binaries/linux64/m.so": b"x"}
+    path = jail.input / "x.fmu"
+    path.write_bytes(mutations.zip_of(content, method=method))
+    refused(jail, f"compressed by method {method}", "info", path)
+
+
+MODULES_THAT_ARE_NONE = {
+    "no such member": None,
+    "no text": b"\xff\xfe",
+    "empty": b"",
+    "not there": b"gone\n",
+    "too long": b"x" * 5000,
+    "elsewhere": b"../resources/slave_{}\n",
+    "a folder of modules": b"twodof_{}",
+    "with a NUL": b"slave_{}\0\n",
+}
+
+
+@pytest.mark.parametrize("name", MODULES_THAT_ARE_NONE.values(), ids=MODULES_THAT_ARE_NONE)
+def test_python_fmu_without_its_module_is_refused(
+    name: bytes | None, jail: Jail, fmu_path: Path
+) -> None:
+    """pythonfmu's wrapper would crash."""
+    with zipfile.ZipFile(fmu_path) as archive:
+        members = {member: archive.read(member) for member in archive.namelist()}
+    digest = members.pop("resources/slavemodule.txt").strip().removeprefix(b"slave_")
+    if name is not None:
+        members["resources/slavemodule.txt"] = name.replace(b"{}", digest)
+    path = jail.input / "x.fmu"
+    path.write_bytes(mutations.zip_of(members))
+    refused(jail, "slavemodule.txt does not name", "run", path, "-o", jail.target / "bag")
+
+
+def test_fmu_of_any_name_is_read(jail: Jail, native_path: Path) -> None:
+    """FMPy takes a file for a model description where its name says so."""
+    shutil.copyfile(native_path, jail.input / "x.xml")
+    assert jail.run("info", jail.input / "x.xml").status == 0
+
+
+def test_fmu_that_cannot_be_loaded_leaves_the_working_directory(tmp_path: Path) -> None:
+    (tmp_path / "x.fmu").write_bytes(fmu_of(description()))
+    before = Path.cwd()
+    with pytest.raises(FmuError, match="cannot be loaded"):
+        twodof.simulate(tmp_path / "x.fmu")
+    assert Path.cwd() == before
+
+
+# --- URDFs ---
+
+LINK = (
+    '<link name="{0}"><inertial><mass value="{1}"/>'
+    '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>{2}</link>'
+)
+JOINT = (
+    '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/>'
+    '<limit lower="{3}" upper="{4}"/></joint>'
+)
+
+
+def robot(*parts: str) -> str:
+    return f'<robot name="r"><link name="base"/>{"".join(parts)}</robot>'
+
+
+def tip(mass: object = 1, inside: str = "", lower: object = -1, upper: object = 1) -> str:
+    return LINK.format("tip", mass, inside) + JOINT.format("j", "base", "tip", lower, upper)
+
+
+def chain(n: int) -> str:
+    names = ["base", *(f"l{i}" for i in range(n - 1)), "tip"]
+    links = (LINK.format(name, 1, "") for name in names[1:])
+    joints = (JOINT.format(f"j{i}", *names[i : i + 2], -1, 1) for i in range(n))
+    return robot(*links, *joints)
+
+
+def shapes(names: Iterable[str]) -> str:
+    return "".join(
+        f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in names
+    )
+
+
+def meshes(folder: Path) -> None:
+    """Folders, pipes, devices and links in the place of meshes."""
+    (folder / "in/folder").mkdir(parents=True)
+    os.mkfifo(folder / "in/pipe")
+    (folder / "in/zero").symlink_to("/dev/zero")
+    (folder / "in/out").symlink_to("../../secret")
+    (folder / "in/up").symlink_to("../..")
+    (folder / "in/circle").symlink_to("circle")
+    (folder / "in/good.stl").write_bytes(b"good")
+    for i in range(3):
+        with (folder / f"in/large{i}").open("wb") as file:
+            file.truncate(100 * MIB)
+
+
+HOSTILE_URDFS: dict[str, tuple[Callable[[], str], str]] = {
+    "an external entity": (lambda: EXTERNAL + robot(tip()), "document type"),
+    "a million links": (lambda: robot('<link name="a"/>' * 10**6), "File too large"),
+    "8 MB of links": (
+        lambda: robot(*(f'<link name="{i}"/>' for i in range(370_000))), "370001 links; at most"
+    ),
+    "100,000 elements deep": (
+        lambda: robot("<a>" * 100_000 + "</a>" * 100_000, tip()), "nested deeper than 100"
+    ),
+    "a chain of 129 joints": (lambda: chain(129), "129 moving joints"),
+    "a mass of 1e308": (lambda: robot(tip(mass="1e308")), "too large"),
+    "a mass of nan": (lambda: robot(tip(mass="nan")), "not finite"),
+    "a mesh that is a pipe": (lambda: robot(tip(inside=shapes(["pipe"]))), "not found"),
+    "a mesh that is a device": (lambda: robot(tip(inside=shapes(["zero"]))), "not found"),
+    "a device by its own name": (
+        lambda: robot(tip(inside=shapes(["file:///dev/zero"]))), "not found"
+    ),
+    "a mesh that is a link out": (lambda: robot(tip(inside=shapes(["out"]))), "not found"),
+    "a mesh behind a link out": (
+        lambda: robot(tip(inside=shapes(["package://up/secret"]))), "not found"
+    ),
+    "a mesh that is a link to itself": (lambda: robot(tip(inside=shapes(["circle"]))), "circle"),
+    "a mesh of another folder": (
+        lambda: robot(tip(inside=shapes(["../../secret"]))), "not found"
+    ),
+    "meshes of 300 MB": (
+        lambda: robot(tip(inside=shapes(f"large{i}" for i in range(3)))), "File too large"
+    ),
+    "100,000 meshes that are not there": (
+        lambda: robot(tip(inside=shapes(f"package://{i}/x" for i in range(10**5)))), "not found"
+    ),
+}  # fmt: skip
+
+
+def test_hostile_urdf_is_refused(hostile_urdf: tuple[Callable[[], str], str], jail: Jail) -> None:
+    make, reason = hostile_urdf
+    refused(jail, reason, *build_command(jail, make()))
+
+
+def build_command(jail: Jail, text: str) -> list[object]:
+    meshes(jail.input)
+    urdf = jail.input / "x.urdf"
+    urdf.write_text(text, "utf-8")
+    folder = jail.input / "in"
+    output = jail.target / "x.fmu"
+    return ["build", "--frame", "tip", "--urdf", urdf, "--mesh-dir", folder, "-o", output]
+
+
+LARGE_URDFS: dict[str, Callable[[], str]] = {
+    "a chain of 128 joints": lambda: chain(128),
+    "100,000 uses of a mesh": lambda: robot(tip(inside=shapes(["good.stl"] * 10**5))),
+    "200 MB of meshes": lambda: robot(tip(inside=shapes(["large0", "large1"]))),
+    "names with markup": lambda: robot(tip()).replace('"j"', '"&lt;&quot;&#10;%s${x}\\"'),
+}
+
+
+def test_large_urdf_is_built_or_refused(large_urdf: Callable[[], str], jail: Jail) -> None:
+    jail.run(*build_command(jail, large_urdf()))
+
+
+# --- CSVs ---
+
+HOSTILE_CSVS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "60 MB of zero bytes": (lambda: bytes(60 * MIB), "not a CSV file|no column 'time'"),
+    "60 MB of one row": (lambda: b"time,Kn\n" + b"0," * (30 * MIB), "more than 1000000 cells"),
+    "60 MB of one cell": (lambda: b'time,Kn\n0,"' + b"0" * (60 * MIB), "not a CSV file"),
+    "a row of 500,000 cells": (lambda: b"time\n" + b"0," * 500_000, "row 2: 500001 cells"),
+    "a cell of 100,000 digits": (lambda: b"time,Kn\n0," + b"1" * 10**5, "Kn = 1{50} is not finite"),
+    "500,000 columns": (lambda: b"time," + b"x," * 500_000, "x is not an input"),
+    "a column name of 100,000 letters": (lambda: b"time," + b"x" * 10**5, "no variable 'xxx"),
+}
+
+
+def test_hostile_csv_is_refused(
+    hostile_csv: tuple[Callable[[], bytes], str], jail: Jail, native_path: Path
+) -> None:
+    make, reason = hostile_csv
+    path = jail.input / "x.csv"
+    path.write_bytes(make())
+    refused(jail, reason, "run", native_path, "--input", path, "-o", jail.target / "bag")
+
+
+SLOW = {
+    "8 MB of variables", "100 MB of an attribute", "80,000 members", "a million members",
+    "40 GB in members that overlap", "8 MB of links", "100,000 meshes that are not there",
+    "meshes of 300 MB", "200 MB of meshes", "100,000 uses of a mesh", "a chain of 128 joints",
+    "60 MB of one cell",
+}  # fmt: skip
+HOSTILE = {
+    "hostile_fmu": HOSTILE_FMUS,
+    "hostile_urdf": HOSTILE_URDFS,
+    "large_urdf": LARGE_URDFS,
+    "hostile_csv": HOSTILE_CSVS,
+}

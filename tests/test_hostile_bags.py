@@ -1,0 +1,230 @@
+"""Bags from elsewhere that take much, made by hand: read or refused in bounded time and memory.
+
+MCAP files are made record by record after the specification. What is refused for what it says is
+tested in test_records.py.
+"""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import mutations
+import numpy as np
+import pytest
+import zstandard
+from bags import (
+    CHANNEL,
+    FOOTER,
+    HEADER,
+    SCHEMA,
+    channel,
+    chunk,
+    joint_message,
+    message,
+    record,
+    sample,
+    serialised,
+)
+from jail import MIB, SPECIAL, Jail, check_reading, without_slow
+from jail import jail as jail
+from jail import the_jail as the_jail
+
+import twodof
+
+pytestmark = pytest.mark.long
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    without_slow(metafunc, {"hostile_bag": HOSTILE_BAGS}, SLOW)
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> Path:
+    """A folder with a good bag in each storage."""
+    folder = tmp_path_factory.mktemp("bags")
+    run = twodof.experiment(native_path)
+    for storage in ("mcap", "sqlite3"):
+        with twodof.Bag(folder / storage / "bag", storage=storage).begin(run) as bag:
+            for k in range(30):
+                bag.write(sample(run, k))
+    return folder
+
+
+def mcap_of(*records: bytes) -> bytes:
+    """An MCAP file without an index."""
+    return HEADER + b"".join(records) + FOOTER
+
+
+def zipped(content: bytes, times: int = 1) -> bytes:
+    """The same over and over, compressed at once."""
+    packer = zstandard.ZstdCompressor().compressobj()
+    return b"".join([*(packer.compress(content) for _ in range(times)), packer.flush()])
+
+
+def with_mcap(make: Callable[[], bytes]) -> Callable[[Path], None]:
+    def change(bag: Path) -> None:
+        (file,) = bag.glob("*.mcap")
+        file.write_bytes(make())
+
+    return change
+
+
+def with_sql(script: str) -> Callable[[Path], None]:
+    """The database after some SQL, in the place of the MCAP file."""
+
+    def change(bag: Path) -> None:
+        (file,) = bag.glob("*.mcap")
+        file.unlink()
+        data = (bag.parents[1] / "input/good.db3").read_bytes()
+        (bag / "bag.db3").write_bytes(mutations.sqlite_after(data, script))
+
+    return change
+
+
+def instead(name: str, make: Callable[[Path], object]) -> Callable[[Path], None]:
+    def change(bag: Path) -> None:
+        file = next(bag.glob(name))
+        file.unlink()
+        make(file)
+
+    return change
+
+
+def written(content: Callable[[], bytes]) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(content())
+
+
+def many_files(bag: Path) -> None:
+    for i in range(5000):
+        (bag / f"x_{i}.mcap").write_bytes(b"")
+
+
+def circle(bag: Path) -> None:
+    """Rows enough for pages of pages, whose children then are all the same full one."""
+    with_sql(
+        f"{ENDLESS} INSERT INTO messages SELECT i + 99, 1, i, zeroblob(300) FROM r LIMIT 200000"
+    )(bag)
+    file = bag / "bag.db3"
+    pages = bytearray(file.read_bytes())
+    interior = [start for start in range(4096, len(pages), 4096) if pages[start] == 5]
+    assert len(interior) > 2
+    for start in interior:
+        (cells,) = struct.unpack_from(">H", pages, start + 3)
+        (last,) = struct.unpack_from(">I", pages, start + 8)
+        for i in range(cells):
+            (cell,) = struct.unpack_from(">H", pages, start + 12 + 2 * i)
+            struct.pack_into(">I", pages, start + cell, last)
+    file.write_bytes(pages)
+
+
+def lz4_zeros(size: int) -> bytes:
+    packer = lz4.frame.LZ4FrameCompressor()
+    parts = [packer.begin(), *(packer.compress(bytes(MIB)) for _ in range(size // MIB))]
+    return b"".join([*parts, packer.flush()])
+
+
+def nothing(positions: int, names: int) -> bytes:
+    """A joint state that is nearly nothing when packed."""
+    return serialised(joint_message(0, ["a"] * names, np.zeros(positions)))
+
+
+def channels(qos: str = "") -> list[bytes]:
+    """Almost as many as may be, each with a profile of its own."""
+    return [channel(i, f"/t{i}", f"{qos}{i}" if qos else "") for i in range(1, 1000)]
+
+
+def hollow(size: int, content: bytes) -> Callable[[Path], None]:
+    """A file of this size, that unpacks to the same over and over, 32 MiB a chunk, one at least."""
+
+    def make() -> bytes:
+        chunks = content * (32 * MIB // len(content))
+        packed = chunk(zipped(chunks), len(chunks), "zstd")
+        return mcap_of(
+            SCHEMA,
+            *(channel(i, f"/t{i}") for i in range(1, 1000)),
+            *[packed] * (size // len(packed)),
+        )
+
+    return with_mcap(make)
+
+
+ENDLESS = "WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r)"
+HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
+    **{
+        f"{what} instead of {name}": instead(name, SPECIAL[what][0])
+        for name in ("*.mcap", "metadata.yaml", "run.json")
+        for what in ("a pipe", "3 GB of zeros")
+    },
+    "5000 files": many_files,
+    "10 GB in a chunk of 1 kB": with_mcap(
+        lambda: mcap_of(chunk(zipped(bytes(MIB), 10_000), 1000, "zstd"))
+    ),
+    "250 MB of zeros in a chunk": with_mcap(
+        lambda: mcap_of(chunk(zipped(bytes(MIB), 250), 250 * MIB, "zstd"))
+    ),
+    "250 MB of messages in a chunk": with_mcap(
+        lambda: mcap_of(SCHEMA, CHANNEL, chunk(
+            zipped(message(bytes(44)) * 1000, 3500), 75 * 3_500_000, "zstd"))
+    ),
+    "2.5 GB in a chunk of lz4": with_mcap(
+        lambda: mcap_of(chunk(lz4_zeros(2500 * MIB), 1000, "lz4"))
+    ),
+    "100 kB of joint states of nothing": hollow(100_000, message(nothing(0, 0))),
+    "32 MB of joint states of 40,000 joints": hollow(0, message(nothing(40_000, 0))),
+    "32 MB of joint states of 80,000 names": hollow(0, message(nothing(0, 80_000))),
+    "100 kB of topics of 1 MB": hollow(100_000, channel(1, "/t1", " " * MIB)),
+    "a thousand topics with profiles of their own": with_mcap(
+        lambda: mcap_of(
+            SCHEMA,
+            *channels("- {depth: [" + "1," * 200 + "]}#"),
+            *(message(bytes(4), number=i) for i in range(1, 1000)),
+        )
+    ),
+    "a message of 700 MB": with_mcap(
+        lambda: mcap_of(SCHEMA, CHANNEL, message(bytes(700 * MIB)))
+    ),
+    "60 MB of small records": with_mcap(lambda: mcap_of(record(8) * (7 * MIB))),
+    "no topic in CDR": with_sql(
+        "UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"
+    ),
+    "stamps before 1970": with_sql(
+        "UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"
+    ),
+    "pages in a circle": circle,
+    "100,000 topics": with_sql(
+        f"{ENDLESS} INSERT INTO topics SELECT i + 9, 't' || i, 'x', 'cdr', '', '' FROM r"
+        " LIMIT 100000"
+    ),
+    "a message of 300 MB in a database": with_sql(
+        "UPDATE messages SET data = zeroblob(300000000) WHERE id = 1"
+    ),
+    "laughing metadata": instead("metadata.yaml", written(lambda: (
+        "l0: &l0 [x]\n" + "".join(
+            f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 9)
+        ) + "rosbag2_bagfile_information: {compression_format: *l8}"
+    ).encode())),
+    "60 MB of metadata": instead("metadata.yaml", written(lambda: b"[" * (60 * MIB))),
+    "60 MB of provenance": instead("run.json", written(
+        lambda: b'{"format":1,"fmu":[' + b"{}," * (20 * MIB) + b"0]}"
+    )),
+}  # fmt: skip
+
+
+def test_hostile_bag(hostile_bag: Callable[[Path], None], jail: Jail, bags: Path) -> None:
+    bag = jail.target / "bag"
+    shutil.copytree(bags / "mcap/bag", bag)
+    shutil.copyfile(bags / "sqlite3/bag/bag.db3", jail.input / "good.db3")
+    hostile_bag(bag)
+    check_reading(jail, bag)
+
+
+SLOW = {
+    "5000 files", "pages in a circle", "10 GB in a chunk of 1 kB", "2.5 GB in a chunk of lz4",
+    "250 MB of zeros in a chunk", "250 MB of messages in a chunk", "a message of 700 MB",
+    "a message of 300 MB in a database", "60 MB of small records", "60 MB of metadata",
+    "60 MB of provenance", "a thousand topics with profiles of their own",
+}  # fmt: skip
