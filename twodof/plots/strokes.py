@@ -95,7 +95,9 @@ def outline(values: Array, most: int) -> Indices:
     and largest, and both sides of the greatest rise and fall.
     """
     kept: Indices = np.arange(len(values))
-    rise, size = np.diff(values), 1
+    size = 1
+    with np.errstate(all="ignore"):  # between infinities
+        rise = np.diff(values)
     lines = [values, np.append(rise, np.nan), np.append(np.nan, rise)]
     while len(kept) > most:
         size = max(2 * size, ceil(2 * len(kept) / most))
