@@ -68,10 +68,9 @@ FMI2_Export void probe_pseudo_inverse(double J[], double b[], double rcond, doub
 #endif
 
 /* q̈ with stops at a state after an impact, that state, and the joints that rest. */
-FMI2_Export void probe_stopped(double value[], double a[], double held[])
+FMI2_Export void probe_stopped(double value[], const int kept[], double a[], double held[])
 {
     const Plant *plant = (Plant *)value;
-    const int kept[N_JOINTS] = {0};
     Stops stops;
     double y[2 * N_JOINTS];
     memcpy(y, &value[Q], N_JOINTS * sizeof *y);
