@@ -152,7 +152,7 @@ class Recorded:
     The classes' names begin with the version of FMI, which FMPy looks for there.
     """
 
-    def callbacks(self):
+    def functions(self):
         """Of FMI 2.0."""
         self.messages = []
         return fmi2.fmi2CallbackFunctions(

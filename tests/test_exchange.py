@@ -71,7 +71,7 @@ class FMU2Exchange(Recorded, FMU2Model):
             guid=self.description.guid, modelIdentifier=identifier, instanceName="model",
             unzipDirectory=fmpy.extract(str(fmu)),
         )  # fmt: skip
-        self.instantiate(callbacks=self.callbacks())
+        self.instantiate(callbacks=self.functions())
         self.set(**starts)
         self.setupExperiment(startTime=0.0)
         self.enterInitializationMode()

@@ -393,7 +393,7 @@ def test_random_calls_under_sanitizers(length):
     """Legal and illegal calls; in full, 100,000 sequences."""
     count = length(100_000, 3_000)
     program = executable(
-        model("twodof"), HERE / "fuzz.h", HERE / "fuzz3.c", fmi=3,
+        model("twodof"), HERE / "fuzz.c", HERE / "fuzz3.h", fmi=3,
         flags=("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     )  # fmt: skip
     done = subprocess.run([program, str(count), "1"], capture_output=True, text=True)
