@@ -272,7 +272,7 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
             return folder / "program"
         for file, content in files.items():
             (begun / file).write_bytes(content)
-        level = "-O2" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
+        level = "-O1" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
         subprocess.run(
             ["gcc", "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
              "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,

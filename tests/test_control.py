@@ -289,23 +289,12 @@ def test_the_description_is_that_of_the_control(fmus, control):
     of = {
         "task": ["x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "f_ext", "Kn"],
         "pose": [
-            "x_des",
-            "xd_des",
-            "xdd_des",
-            "quat_des",
-            "omega_des",
-            "alpha_des",
-            "Kp",
-            "Kd",
-            "Kp_rot",
-            "Kd_rot",
-            "tau_ext",
-            "f_ext",
-            "Kn",
+            "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des",
+            "Kp", "Kd", "Kp_rot", "Kd_rot", "tau_ext", "f_ext", "Kn",
         ],
         "joint": ["q_des", "v_des", "a_des", "Kp", "Kd", "tau_ext", "f_ext"],
         "effort": ["tau_cmd", "tau_ext", "f_ext"],
-    }
+    }  # fmt: skip
     descriptions = []
     for native in (False, True):
         path = fmus[control, native]

@@ -394,7 +394,7 @@ def test_random_calls_under_sanitizers(length):
     count = length(100_000, 3_000)
     program = executable(
         model("twodof"), HERE / "fuzz.c", HERE / "fuzz3.h", fmi=3,
-        flags=("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
+        flags=("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     )  # fmt: skip
     done = subprocess.run([program, str(count), "1"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

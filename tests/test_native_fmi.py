@@ -422,10 +422,10 @@ def test_no_memory_is_allocated_and_no_global_is_written():
 @pytest.mark.long
 def test_random_calls_under_sanitizers(length):
     """Legal and illegal calls, with NaN, infinities and more."""
-    count = length(100_000, 3_000)
+    count = length(100_000, 6_000)
     program = executable(
         model("twodof"), HERE / "fuzz.c", HERE / "fuzz2.h",
-        flags=("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
+        flags=("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     )  # fmt: skip
     done = subprocess.run([program, str(count), "0"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -159,21 +159,11 @@ Status check_limits(Instance *instance)
     return OK;
 }
 
-/* Take the velocity that points into a limit at the start, as at any other time. */
-static void stop_at_start(Plant *plant)
-{
-    const int kept[N_JOINTS] = {0};
-    double y[2 * N_JOINTS];
-    memcpy(y, &plant->value[Q], N_JOINTS * sizeof *y);
-    memcpy(y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *y);
-    impact(plant, y, kept);
-    memcpy(&plant->value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
-}
-
 Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
+    const int kept[N_JOINTS] = {0};
     if (check_limits(instance) != OK || check_inputs(instance) != OK)
         return ERROR;
     for (int i = 0; i < N_JOINTS; i++) {
@@ -187,7 +177,7 @@ Status initialise(Instance *instance, int warn)
         value[Q + i] = q;
         value[V + i] = value[V_START + i];
     }
-    stop_at_start(&state->plant);
+    impact(&state->plant, &value[Q], kept);
     state->initialised = 1;
     state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
     return OK;
