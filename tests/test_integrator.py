@@ -97,6 +97,18 @@ def test_a_held_joint_is_released_where_its_acceleration_turns(side, h):
     assert q[0] == pytest.approx(side * (0.1 - 0.7**3 / 6), abs=1e-10)
 
 
+def test_a_joint_at_rest_at_its_limit_is_not_let_go_where_nothing_pulls():
+    calls = 0
+
+    def acceleration(q, v):
+        nonlocal calls
+        calls += 1
+        return [0.0]
+
+    moved = advance(smooth(acceleration), [1.0], [0.0], 0.01, [(0.0, 1.0)], 1e-3, 1e-6, 1e-3)
+    assert moved == ([1.0], [0.0]) and calls <= 80  # of ten steps
+
+
 def test_an_excursion_within_one_step_is_found():
     """Thrown up to 1.25 mm past the limit and back within one 10 ms step."""
 
