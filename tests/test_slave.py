@@ -252,7 +252,7 @@ def test_what_is_refused_is_logged_keeps_the_state_and_discards_the_next_step(fm
     for k, (message, refuse) in enumerate(REFUSALS.items()):
         before = driver.outputs()
         read = refuse(driver)
-        assert read is None or np.isnan(read).all()
+        assert not message.startswith("fmi2Get") or np.isnan(read).all()
         assert (ERROR, message) in driver.log, message
         assert driver.step(k * 0.01) == DISCARD, message
         assert (DISCARD, f"step discarded: {message}") in driver.log
