@@ -378,3 +378,11 @@ def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
     q = list(plant.q)
     plant.step(0.01)
     assert plant.q == q and not any(plant.v)
+
+
+def test_what_is_not_said_has_the_documented_start() -> None:
+    task, bare = model("twodof").plant(), model("twodof", "effort").plant()
+    assert (task.rtol, task.atol, task.max_step, task.rcond) == (1e-3, 1e-6, 1e-3, 0.01)
+    assert (
+        bare.tau_cmd == bare.tau_ext == [0.0, 0.0] and bare.f_ext == bare.payload_com == [0.0] * 3
+    )
