@@ -14,6 +14,7 @@ import re
 import site
 import sys
 from copy import deepcopy
+from functools import partialmethod
 from pathlib import Path
 
 PACKAGE = __name__.replace("slave_", "twodof_")
@@ -138,30 +139,6 @@ class TwoDofSlave(fmi.Fmi2Slave):
 
     # --- variables ---
 
-    def get_real(self, vrs):
-        return self._get(vrs, "Real", float("nan"))
-
-    def get_boolean(self, vrs):
-        return self._get(vrs, "Boolean", False)
-
-    def get_integer(self, vrs):
-        return self._get(vrs, "Integer", 0)
-
-    def get_string(self, vrs):
-        return self._get(vrs, "String", "")
-
-    def set_real(self, vrs, values):
-        self._set(vrs, values, "Real")
-
-    def set_boolean(self, vrs, values):
-        self._set(vrs, values, "Boolean")
-
-    def set_integer(self, vrs, values):
-        self._set(vrs, values, "Integer")
-
-    def set_string(self, vrs, values):
-        self._set(vrs, values, "String")
-
     def _get(self, vrs, kind, nothing):
         if self._phase not in ALLOWED["fmi2Get"]:
             # some importers read start values too early: answered by a log line alone
@@ -205,6 +182,15 @@ class TwoDofSlave(fmi.Fmi2Slave):
         else:
             for group in ("tau", "der_v"):
                 self._outputs.pop(group, None)
+
+    get_real = partialmethod(_get, kind="Real", nothing=float("nan"))
+    get_boolean = partialmethod(_get, kind="Boolean", nothing=False)
+    get_integer = partialmethod(_get, kind="Integer", nothing=0)
+    get_string = partialmethod(_get, kind="String", nothing="")
+    set_real = partialmethod(_set, kind="Real")
+    set_boolean = partialmethod(_set, kind="Boolean")
+    set_integer = partialmethod(_set, kind="Integer")
+    set_string = partialmethod(_set, kind="String")
 
     def _settable(self, vr, value, kind):
         variable = self._variable(vr, kind, f"fmi2Set{kind}")

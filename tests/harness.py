@@ -146,6 +146,48 @@ def lives(process):
 _description = functools.cache(fmpy.read_model_description)
 
 
+class Recorded:
+    """A mixin of FMPy's instances: messages are kept, what is refused is seen to change nothing.
+
+    The classes' names begin with the version of FMI, which FMPy looks for there.
+    """
+
+    def functions(self):
+        """Of FMI 2.0."""
+        self.messages = []
+        return fmi2.fmi2CallbackFunctions(
+            logger=fmi2.fmi2CallbackLoggerTYPE(
+                lambda _, name, status, category, text: self.keep(status, text)
+            ),
+            allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(),
+            freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(),
+        )
+
+    def keep(self, status, text):
+        self.messages.append((status, text.decode()))
+
+    def status(self, function, *arguments):
+        try:
+            getattr(self, function)(*arguments)
+        except FMICallException as error:
+            return error.status
+        return 0
+
+    def refused(self, message, function, *arguments):
+        """The call is refused with this message, a pattern, alone."""
+        before, self.messages = self.snapshot(), []
+        assert self.status(function, *arguments) == fmi2.fmi2Error
+        ((status, text),) = self.messages
+        assert status == fmi2.fmi2Error and re.search(message, text), text
+        assert self.snapshot() == before
+
+    def snapshot(self):
+        state = self.getFMUState()
+        blob = bytes(self.serializeFMUState(state))
+        self.freeFMUState(state)
+        return blob
+
+
 class Driver:
     """One instance; ``log`` collects (status, message), ``status`` is that of the last call.
 

@@ -9,8 +9,10 @@ import math
 import os
 import subprocess
 import tempfile
+import uuid
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +31,10 @@ from twodof.plant.variables import Variable, variable_table
 ROOT = Path(__file__).parents[1]
 HERE = Path(__file__).parent / "native"
 GUID = "0123456789abcdef"
-SCRATCH = Path(tempfile.mkdtemp(prefix="twodof-tests-"))
+SCRATCH = Path(tempfile.gettempdir(), "twodof-tests-" + os.environ.get(
+    "PYTEST_XDIST_TESTRUNUID", uuid.uuid4().hex
+))  # fmt: skip
+"""What is compiled, for all processes of a run of the tests."""
 
 
 def robots_folder() -> Path:
@@ -171,12 +176,25 @@ def library(name: str, control: str = "task") -> Path:
 
     Written once: a library that is written anew while it is loaded crashes the next dlopen.
     """
-    path = SCRATCH / name / control / "Arm.so"
-    if not path.exists():
-        content = compile_library(model(name, control).sources(), host_platform(), "Arm")
-        path.parent.mkdir(parents=True)
-        path.write_bytes(content)
-    return path
+    folder = SCRATCH / f"{name}-{control}"
+    with written_once(folder) as begun:
+        if begun:
+            content = compile_library(model(name, control).sources(), host_platform(), "Arm")
+            (begun / "Arm.so").write_bytes(content)
+    return folder / "Arm.so"
+
+
+@contextmanager
+def written_once(folder: Path) -> Iterator[Path | None]:
+    """A folder to write what is to be in another, which it becomes; none where that is there."""
+    if folder.exists():
+        yield None
+        return
+    SCRATCH.mkdir(mode=0o700, exist_ok=True)
+    begun = Path(tempfile.mkdtemp(dir=SCRATCH))
+    yield begun
+    with suppress(OSError):  # another process was sooner
+        begun.rename(folder)
 
 
 class Engine:
@@ -249,20 +267,20 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
     files = of.sources(*more, fmi=fmi)
     digest = hashlib.sha256(repr((flags, sorted(files.items()))).encode()).hexdigest()[:16]
     folder = SCRATCH / digest
-    output = folder / "program"
-    if not output.exists():
-        folder.mkdir(exist_ok=True)
+    with written_once(folder) as begun:
+        if begun is None:
+            return folder / "program"
         for file, content in files.items():
-            (folder / file).write_bytes(content)
-        level = "-O2" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
+            (begun / file).write_bytes(content)
+        level = "-O1" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
         subprocess.run(
             ["gcc", "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
              "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
-             "-o", output, "directional.c",
+             "-o", "program", "directional.c",
              *(path.name for path in more if path.suffix == ".c"), "-lm"],
-            cwd=folder, check=True, env={**os.environ, "LC_ALL": "C"},
+            cwd=begun, check=True, env={**os.environ, "LC_ALL": "C"},
         )  # fmt: skip
-    return output
+    return folder / "program"
 
 
 def deviation(a, b) -> float:

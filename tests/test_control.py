@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from harness import Driver, in_child_process
 from native_models import deviation, engine, loaded, model, random_plant
 from scipy.integrate import solve_ivp
 
@@ -25,24 +25,23 @@ DRIVEN = (
 
 @pytest.mark.parametrize("name", ["twodof", "ur5", "panda"])
 @pytest.mark.parametrize("control", CONTROLS)
-@pytest.mark.parametrize("limit_effort", [False, True])
-@pytest.mark.parametrize("known", [False, True])
-def test_both_flavours_have_the_same_accelerations_and_efforts(name, control, limit_effort, known):
+def test_both_flavours_have_the_same_accelerations_and_efforts(name, control):
     native, rng = engine(name, control), np.random.default_rng(2)
-    for _ in range(50):
-        plant = random_plant(name, control, rng)
-        plant.limit_effort, plant.payload_known = limit_effort, known
-        for group in DRIVEN:
-            if hasattr(plant, group):
-                setattr(plant, group, rng.normal(0, 1, len(getattr(plant, group))).tolist())
-        plant.prepare()
-        values, a = native.values(plant), np.empty(native.n)
-        native.call("acceleration", values, a)
-        q, v = np.array(plant.q), np.array(plant.v)
-        assert deviation(a, plant._equations_of_motion()(q, v)[0]) <= 1e-9
-        native.call("outputs", values)
-        assert deviation(native.group(values, "tau"), plant.tau) <= 1e-10
-        assert deviation(native.group(values, "xd"), plant.xd) <= 1e-12
+    for limit_effort, known in product((False, True), repeat=2):
+        for _ in range(15):
+            plant = random_plant(name, control, rng)
+            plant.limit_effort, plant.payload_known = limit_effort, known
+            for group in DRIVEN:
+                if hasattr(plant, group):
+                    setattr(plant, group, rng.normal(0, 1, len(getattr(plant, group))).tolist())
+            plant.prepare()
+            values, a = native.values(plant), np.empty(native.n)
+            native.call("acceleration", values, a)
+            q, v = np.array(plant.q), np.array(plant.v)
+            assert deviation(a, plant._equations_of_motion()(q, v)[0]) <= 1e-9
+            native.call("outputs", values)
+            assert deviation(native.group(values, "tau"), plant.tau) <= 1e-10
+            assert deviation(native.group(values, "xd"), plant.xd) <= 1e-12
 
 
 @pytest.fixture(scope="module")
@@ -225,19 +224,17 @@ def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
 
 def test_two_stops_that_drive_off_each_other_come_to_rest():
     """As the feet of a rocking block; impacts in turn would never end."""
-    for native in (False, True):
-        of = engine("twodof", "effort")
-        plant = of.model.plant()
-        plant.q_max, plant.q_min, plant.tau_cmd = [0.6, 0.36], [0.4, 0.34], [0.5, -0.1]
-        plant.initialise()
-        values = of.values(plant)
-        for _ in range(200):
-            if native:
-                assert of.call("advance", values, 0.01) == 1
-            else:
-                plant.step(0.01)
-        q, v = (of.group(values, g) for g in "qv") if native else (plant.q, plant.v)
-        assert [*q, *v] == [0.6, 0.34, 0.0, 0.0]
+    of = engine("twodof", "effort")
+    plant = of.model.plant()
+    plant.q_max, plant.q_min, plant.tau_cmd = [0.6, 0.36], [0.4, 0.34], [0.5, -0.1]
+    plant.initialise()
+    values = of.values(plant)
+    for _ in range(100):
+        assert of.call("advance", values, 0.01) == 1
+        plant.step(0.01)
+        native = [*of.group(values, "q"), *of.group(values, "v")]
+        np.testing.assert_allclose([*plant.q, *plant.v], native, atol=1e-9)
+    assert native == [*plant.q, *plant.v] == [0.6, 0.34, 0.0, 0.0]
 
 
 # --- what an FMU has ---
@@ -292,23 +289,12 @@ def test_the_description_is_that_of_the_control(fmus, control):
     of = {
         "task": ["x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "f_ext", "Kn"],
         "pose": [
-            "x_des",
-            "xd_des",
-            "xdd_des",
-            "quat_des",
-            "omega_des",
-            "alpha_des",
-            "Kp",
-            "Kd",
-            "Kp_rot",
-            "Kd_rot",
-            "tau_ext",
-            "f_ext",
-            "Kn",
+            "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des",
+            "Kp", "Kd", "Kp_rot", "Kd_rot", "tau_ext", "f_ext", "Kn",
         ],
         "joint": ["q_des", "v_des", "a_des", "Kp", "Kd", "tau_ext", "f_ext"],
         "effort": ["tau_cmd", "tau_ext", "f_ext"],
-    }
+    }  # fmt: skip
     descriptions = []
     for native in (False, True):
         path = fmus[control, native]
@@ -377,7 +363,7 @@ def test_a_payload_that_is_none_is_refused(fmus, payload):
             [*twodof.samples(fmus["task", native], settings={"payload": payload}, stop_time=0.01)]
 
 
-@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("control", ["pose", "effort"])
 def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, capsys):
     """Bag, figure, replay, sweep and what a page offers, with an FMU of each control."""
     from twodof.cli.main import main
@@ -403,32 +389,3 @@ def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, ca
     told = [values.get(name) for group in RECORDED for name in live.fmu.vector(group)]
     assert len(row) == 1 + len(told)
     assert all(a == b for a, b in zip(row[1:], told) if b is not None)
-
-
-@pytest.mark.parametrize("control", CONTROLS)
-@in_child_process
-def test_states_go_on_bit_for_bit(fmus, control):
-    """Saved while joints rest on rigid stops, restored, serialised, and the whole after a reset."""
-    inputs = {
-        "task": {"x_des": (0.1, 0.25)},
-        "pose": {"quat_des": (0.0, 0.0, 0.3, 0.9), "Kd_rot": (5.0, 4.0, 3.0)},
-        "joint": {"q_des": (1.0, 1.0), "Kp": (300.0, 200.0)},
-        "effort": {"tau_cmd": (3.0, 1.0)},
-    }[control]
-    start = {"q_max": (0.6, 0.5), "rigid_stops": True, "payload": 0.05, "limit_effort": True}
-    for native in (False, True):
-        driver = Driver(fmus[control, native]).initialise(**start, **inputs)
-        first = driver.run(20)
-        state = driver.call("getFMUstate")
-        blob = driver.call("serializeFMUstate", state)
-        then = driver.run(20, 20)
-        assert any(row[0] == 0.6 or row[1] == 0.5 for row in first + then)
-        driver.set(f_ext=(1.0, 2.0, 3.0))
-        driver.run(3, 40)
-        for saved in (state, driver.call("deSerializeFMUstate", blob)):
-            driver.call("setFMUstate", saved)
-            assert driver.run(20, 20) == then
-        driver.call("reset")
-        driver.initialise(**start, **inputs)
-        assert driver.run(40) == first + then and driver.log == []
-        driver.free()

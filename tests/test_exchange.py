@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import xml.etree.ElementTree as ET
 import zipfile
 from dataclasses import replace
@@ -10,16 +11,15 @@ from dataclasses import replace
 import fmpy
 import numpy as np
 import pytest
-from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Model
 from fmpy.validation import validate_fmu
-from harness import Driver
+from harness import Driver, Recorded
 from native_models import robots_folder
 
 from twodof import FmuOptions, build_fmu
 
 UR5_START = (0.3, -1.2, 1.4, -1.0, -1.5, 0.4)
-OK, WARNING, DISCARD, ERROR = range(4)
+WARNING, ERROR = 1, 3
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
 NARROW = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0}
 
@@ -61,9 +61,7 @@ def run(fmu, kind, starts, stop_time=2.0, interval=0.01, **named):
     return np.array([result[name] for name in states(fmu)]).T
 
 
-class FMU2Exchange(FMU2Model):
-    """An instance for Model Exchange that keeps its messages and gives the status of a call."""
-
+class FMU2Exchange(Recorded, FMU2Model):
     def __init__(self, fmu, **starts):
         self.description = fmpy.read_model_description(str(fmu))
         self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
@@ -73,14 +71,7 @@ class FMU2Exchange(FMU2Model):
             guid=self.description.guid, modelIdentifier=identifier, instanceName="model",
             unzipDirectory=fmpy.extract(str(fmu)),
         )  # fmt: skip
-        self.messages = []
-        functions = fmpy.fmi2.fmi2CallbackFunctions()
-        functions.logger = fmpy.fmi2.fmi2CallbackLoggerTYPE(
-            lambda _, name, status, category, text: self.messages.append((status, text.decode()))
-        )
-        functions.allocateMemory = fmpy.fmi2.fmi2CallbackAllocateMemoryTYPE()
-        functions.freeMemory = fmpy.fmi2.fmi2CallbackFreeMemoryTYPE()
-        self.instantiate(callbacks=functions)
+        self.instantiate(callbacks=self.functions())
         self.set(**starts)
         self.setupExperiment(startTime=0.0)
         self.enterInitializationMode()
@@ -127,20 +118,11 @@ class FMU2Exchange(FMU2Model):
         self.enterContinuousTimeMode()
         return changed
 
-    def refused(self, message, call, *arguments):
-        before, self.messages = self.serializeFMUState(self.getFMUState()), []
-        with pytest.raises(FMICallException) as caught:
-            getattr(self, call)(*arguments)
-        assert caught.value.status == ERROR
-        assert [status for status, _ in self.messages] == [ERROR]
-        assert message in self.messages[0][1]
-        assert self.serializeFMUState(self.getFMUState()) == before
+
+Model = FMU2Exchange
 
 
-Model = FMU2Exchange  # FMPy finds the standard's version in the class's name
-
-
-@pytest.mark.parametrize("name", ["task", "pose", "joint", "effort", "ur5"])
+@pytest.mark.parametrize("name", ["task", "pose", "effort", "ur5"])
 def test_the_description_is_valid(fmus, name):
     assert validate_fmu(str(fmus[name])) == []
     description = fmpy.read_model_description(str(fmus[name]))
@@ -163,14 +145,11 @@ def test_the_description_is_valid(fmus, name):
 RUNS = {
     ("effort", "swings into its stops"): {**NARROW, "v_start[1]": 2.0},
     ("effort", "clamped"): {**NARROW, "v_start[1]": 2.0, "rigid_stops": False},
-    ("effort", "tau"): {"tau_cmd[1]": 0.3, "tau_cmd[2]": -0.1, "payload": 0.2},
     ("joint", "stops"): {**NARROW, "q_max[1]": 0.6, "q_des[1]": 0.7, "q_des[2]": 0.9},
     ("joint", "saturated"): {"limit_effort": True, "q_des[1]": 1.0, "Kp[1]": 4e3, "payload": 1.0},
-    ("task", "free"): {},
     ("task", "stops"): {"q_min[1]": -0.2, "q_max[1]": 0.8, "q_min[2]": 0.8, "q_max[2]": 1.9,
                         "q_start[1]": 0.3, "q_start[2]": 1.3, "Kp[1]": 400.0, "Kp[2]": 400.0,
                         "x_des[1]": 0.14, "x_des[2]": -0.03},
-    ("task", "rigid"): {"q_max[1]": 0.52, "v_start[1]": 1.0, "rigid_stops": True},
     ("task", "forces"): {"tau_ext[1]": 0.2, "f_ext[2]": -0.5, "limit_effort": True},
     ("pose", "stops"): {"q_max[1]": 0.7, "x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5,
                         "quat_des[4]": 0.8},
@@ -262,7 +241,7 @@ def test_an_impact_beyond_all_numbers_is_refused_and_changes_nothing(fmus):
     model.go()
     model.y = [1.1, 0.1, 1e308, 1e308]
     model.enterEventMode()
-    model.refused("fmi2NewDiscreteStates: v[2] would not be finite", "newDiscreteStates")
+    model.refused(r"fmi2NewDiscreteStates: v\[2\] would not be finite", "newDiscreteStates")
     assert model.y == [1.1, 0.1, 1e308, 1e308]
 
 
@@ -397,13 +376,13 @@ def test_what_is_out_of_turn_or_wrong_is_refused_and_changes_nothing(fmus):
     assert "fmi2DoStep is a call of co-simulation" in model.messages.pop()[1]
     model.refused("wrong number of values, 4 are wanted", "getDerivatives", four, 3)
     model.refused(
-        "der(q[1]) is computed and cannot be set", "setReal", [model.vr["der(q[1])"]], [0]
+        r"der\(q\[1\]\) is computed and cannot be set", "setReal", [model.vr["der(q[1])"]], [0]
     )
     model.go()
     model.refused("is not allowed in the state 'continuous-time mode'", "newDiscreteStates")
-    model.refused("v[1] is not finite", "setContinuousStates", four, 4)
+    model.refused(r"v\[1\] is not finite", "setContinuousStates", four, 4)
     model.refused("the time is not finite", "setTime", np.nan)
-    model.refused("fmi2Set of a parameter (rcond)", "setReal", [model.vr["rcond"]], [0.1])
+    model.refused(r"fmi2Set of a parameter \(rcond\)", "setReal", [model.vr["rcond"]], [0.1])
 
 
 def test_a_state_is_restored_bit_for_bit_and_is_of_its_kind(fmus):
@@ -451,4 +430,6 @@ def test_a_derivative_of_what_has_none_is_refused(fmus):
         ("limit_effort is of type Boolean", ["x[1]"], ["limit_effort"], [1.0]),
     ]
     for message, unknown, known, seed in refused:
-        model.refused(message, call, [vr[n] for n in unknown], [vr[n] for n in known], seed)
+        model.refused(
+            re.escape(message), call, [vr[n] for n in unknown], [vr[n] for n in known], seed
+        )

@@ -51,7 +51,7 @@ def test_dynamics_are_those_of_pinocchios_mimic_joints(robots: Path, name: str, 
     ours = [own.joints[own.getJointId(joint)].idx_v for joint in robot.joints]
     assert len(robot.joints) == own.nv < robot.model.nv
     rng = np.random.default_rng(1)
-    for _ in range(100):
+    for _ in range(20):
         q, v, a = (rng.normal(size=own.nv) for _ in "qva")
         M = pin.crba(own, data, q)
         M = np.triu(M) + np.triu(M, 1).T
@@ -128,7 +128,7 @@ def test_the_bag_of_either_flavour_moves_all_joints(tmp_path: Path, native: bool
     np.testing.assert_allclose(np.array(placed["tip"])[:, 1], 2.0 * q - 0.4, atol=1e-14)
 
 
-@pytest.mark.parametrize("control", ["task", "joint", "effort"])
+@pytest.mark.parametrize("control", ["task", "effort"])
 def test_flavours_are_equal_under_limits_damping_and_a_payload(
     tmp_path: Path, control: str
 ) -> None:

@@ -12,7 +12,7 @@ from twodof.export.recursions import effort_bounds
 
 # trees, prismatic joints, axes along x, y, z and none of them, joints that mimic others
 EVERY_ROBOT = ("twodof", *ROBOTS)
-STATES = 1000
+STATES = 200
 
 
 def deviation(a, b):
@@ -35,7 +35,7 @@ def test_robots_cover_trees_prismatic_joints_and_every_axis():
 @pytest.mark.parametrize("largest", [1e-8, 1.0, 10.0, 999999.0, 1e12])
 def test_cosine_and_sine_are_right_to_rounding(largest):
     quarters = np.pi / 4 * np.arange(-9, 10)
-    angle = np.append(np.random.default_rng(6).uniform(-largest, largest, 100_000), quarters)
+    angle = np.append(np.random.default_rng(6).uniform(-largest, largest, 20_000), quarters)
     c, s = np.empty((2, len(angle)))
     engine("twodof").call("turn", angle, float(len(angle)), c, s)
     exact = angle.astype(np.longdouble)
@@ -55,8 +55,10 @@ def test_cosine_and_sine_are_right_where_arithmetic_is_not_the_standards(flag):
     assert np.abs(s - np.sin(exact)).max() <= 2.0**-49
 
 
-@pytest.mark.parametrize("control", ["task", "pose"])
-@pytest.mark.parametrize("name", EVERY_ROBOT)
+@pytest.mark.parametrize(
+    ("name", "control"),
+    [*((name, "task") for name in EVERY_ROBOT), ("twodof", "pose"), ("panda", "pose")],
+)
 def test_kinematics_equal_pinocchio(name, control):
     native, robot, (G, c) = engine(name, control), model(name).robot, coupling(name)
     data, frame = robot.model.createData(), robot.frame_id
@@ -150,7 +152,7 @@ def test_controller_equals_pinocchio(name):
         assert deviation(native.group(values, "tau"), tau) <= 1e-11
         assert deviation(native.group(values, "x"), x) == 0.0
         compared += 1
-    assert compared >= 100
+    assert compared >= 20
 
 
 @pytest.mark.parametrize("name", ["finger", "twodof", "ur5"])

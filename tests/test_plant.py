@@ -250,7 +250,7 @@ def test_trajectories_into_limits_do_not_depend_on_the_step():
             assert (i, end) in reference
             assert (i, f"left {end}") in reference
     assert smallest >= 0.05
-    for h in (2e-3, 5e-3, 0.01, 0.02, 0.05):
+    for h in (5e-3, 0.05):
         seen, states, _ = stops_and_releases(h)
         assert set(seen) == set(reference)
         assert np.abs(states - expected)[:, :2].max() <= 1e-4
@@ -260,7 +260,7 @@ def test_trajectories_into_limits_do_not_depend_on_the_step():
 def test_unreachable_targets_and_singularities_never_fail(length):
     rng = np.random.default_rng(5)
     plant = default_arm()
-    for _ in range(length(100, 30)):
+    for _ in range(length(100, 10)):
         plant.q_start = rng.uniform(-np.pi, np.pi, 2).tolist()
         plant.x_des = rng.uniform(-0.5, 0.5, 2).tolist()
         plant.initialise()
@@ -378,3 +378,11 @@ def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
     q = list(plant.q)
     plant.step(0.01)
     assert plant.q == q and not any(plant.v)
+
+
+def test_what_is_not_said_has_the_documented_start() -> None:
+    task, bare = model("twodof").plant(), model("twodof", "effort").plant()
+    assert (task.rtol, task.atol, task.max_step, task.rcond) == (1e-3, 1e-6, 1e-3, 0.01)
+    assert (
+        bare.tau_cmd == bare.tau_ext == [0.0, 0.0] and bare.f_ext == bare.payload_com == [0.0] * 3
+    )

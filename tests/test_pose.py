@@ -71,11 +71,11 @@ def orientations(run: twodof.Experiment) -> list[Rotation]:
 
 
 def errors_after_a_turn(fmu: twodof.Fmu, turn: np.ndarray, sign: float = 1.0) -> np.ndarray:
-    """log(R_des Rᵀ) over 1 s, the target turned from the start by a rotation vector."""
+    """log(R_des Rᵀ) over 0.5 s, the target turned from the start by a rotation vector."""
     target = Rotation.from_rotvec(turn) * Rotation.from_quat(starts(fmu, "quat_des"))
     settings = {"quat_des": tuple(sign * target.as_quat()), "Kp_rot": 30.0, "Kd_rot": 7.0, **TIGHT}
     settings |= {"q_min[6]": -7.0, "q_max[6]": 7.0}
-    run = twodof.experiment(fmu, stop_time=1.0, settings=settings)
+    run = twodof.experiment(fmu, stop_time=0.5, settings=settings)
     return np.array([(target * R.inv()).as_rotvec() for R in orientations(run)])
 
 
@@ -88,7 +88,7 @@ def test_a_turn_about_a_fixed_axis_obeys_the_closed_form(fmus, native: bool) -> 
 
 
 def closed_form(turn: np.ndarray) -> np.ndarray:
-    t, half = 0.01 * np.arange(101), 3.5
+    t, half = 0.01 * np.arange(51), 3.5
     omega = math.sqrt(30.0 - half**2)
     share = np.exp(-half * t) * (np.cos(omega * t) + half / omega * np.sin(omega * t))
     return share[:, None] * turn
@@ -102,7 +102,7 @@ def test_a_pose_target_against_an_integration_of_its_own(fmus, name: str, native
     goal = Rotation.from_rotvec([0.4, 0.3, -0.5]) * Rotation.from_quat(starts(fmu, "quat_des"))
     place = starts(fmu, "x_des") + np.array([0.05, -0.04, -0.06])
     settings = {"x_des": tuple(place), "quat_des": tuple(goal.as_quat()), **TIGHT}
-    run = twodof.experiment(fmu, stop_time=0.3, settings=settings)
+    run = twodof.experiment(fmu, stop_time=0.15, settings=settings)
     samples = list(twodof.samples(run))
 
     robot = load_robot(fmu.urdf, fmu.frame, "xyz")
@@ -149,14 +149,14 @@ def test_almost_half_a_turn_is_finite_and_the_short_way(fmus, native: bool) -> N
 def test_a_quaternion_and_its_negative_are_one_target_and_its_length_is_none(fmus, native) -> None:
     turn = np.array([0.5, -0.6, 0.7])
     found = errors_after_a_turn(fmus["ur10", native], turn)
-    for factor in (-1.0, 1e-200, -3.0, 1e150):
+    for factor in (1e-200, -3.0, 1e150):
         again = errors_after_a_turn(fmus["ur10", native], turn, factor)
         np.testing.assert_allclose(again, found, atol=1e-12)
 
 
 @FLAVOURS
 def test_the_present_pose_as_target_moves_nothing(fmus, native: bool) -> None:
-    run = twodof.experiment(fmus["ur10", native], stop_time=0.5)
+    run = twodof.experiment(fmus["ur10", native], stop_time=0.2)
     for sample in twodof.samples(run):
         np.testing.assert_allclose(sample.q, BENT, atol=1e-12)
 
@@ -169,7 +169,7 @@ def test_outputs_are_the_frames_orientation_and_angular_velocity(fmus, native: b
     names = (*fmu.vector("q_start"), *fmu.vector("v_start"))
     with twodof.fmu.instantiate(fmu) as instance:
         read = instance.reader((*fmu.vector("quat"), *fmu.vector("omega")))
-        for _ in range(200):
+        for _ in range(50):
             q, v = rng.uniform(-3.0, 3.0, 6), rng.normal(size=6)
             instance.reset()
             instance.initialise(0.0, math.inf, dict(zip(names, map(float, (*q, *v)))))
@@ -187,7 +187,7 @@ def test_outputs_are_the_frames_orientation_and_angular_velocity(fmus, native: b
 def test_the_error_is_scipys_rotation_vector() -> None:
     rng = np.random.default_rng(6)
     half = [Rotation.from_rotvec(math.pi * axis) for axis in np.eye(3)]
-    for k in range(2000):
+    for k in range(500):
         R = half[k] if k < 3 else Rotation.random(random_state=rng)
         target = Rotation.random(random_state=rng).as_quat()
         expected = (Rotation.from_quat(target) * R.inv()).as_rotvec()

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import textwrap
-import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import pinocchio as pin
 import pytest
 
 from twodof.plant.robot import Robot, load_robot
-from twodof.plant.urdf import UNBOUNDED, RobotError
+from twodof.plant.urdf import MAX_JOINTS, UNBOUNDED, RobotError
 
 LIMIT = '<limit lower="-1" upper="2" effort="3" velocity="4"/>'
 
@@ -209,30 +208,24 @@ def test_axes_other_than_letters_of_xyz_are_refused(axes: str) -> None:
 
 def test_too_many_links_are_refused_at_once() -> None:
     urdf = chain(5000)
-    begin = time.process_time()
     with pytest.raises(RobotError, match="5000 links"):
         load_robot(urdf, "link1", "xyz")
-    assert time.process_time() - begin < 1.0
 
 
 def test_any_number_of_joints_that_is_not_refused_loads_in_two_gigabytes() -> None:
     # Pinocchio's Data takes 100 GB for 1000 joints; in a process of its own, with a limit
     code = f"""
-        import resource, sys
+        import resource
         from twodof.plant.robot import load_robot
-        from twodof.plant.urdf import RobotError
         resource.setrlimit(resource.RLIMIT_AS, (2 * 1024**3,) * 2)
-        try:
-            load_robot({chain(999)!r}, "link1", "xyz")
-        except RobotError as error:
-            print(error)
+        print(len(load_robot({chain(MAX_JOINTS + 1)!r}, "link1", "xyz").joints))
         """
     environment = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ":".join(sys.path)}
     child = subprocess.run(
         [sys.executable], input=textwrap.dedent(code), env=environment,
         capture_output=True, text=True, timeout=300,
     )  # fmt: skip
-    assert child.returncode == 0, child.stderr[-300:]
+    assert child.stdout == f"{MAX_JOINTS}\n", child.stderr[-300:]
 
 
 # --- what is accepted ---

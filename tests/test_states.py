@@ -375,8 +375,8 @@ class Arm(NamedTuple):
 
 
 ARMS = {
-    "twodof task": (50, 2000), "panda task": (10, 300), "panda pose": (10, 300),
-    "twodof joint": (20, 500), "twodof effort": (20, 500),
+    "twodof task": (50, 2000), "panda task": (5, 300), "panda pose": (5, 300),
+    "twodof joint": (10, 500), "twodof effort": (10, 500),
 }  # fmt: skip
 """A robot and a control, and how many programs are run, without --full and with it."""
 

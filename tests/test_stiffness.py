@@ -86,7 +86,7 @@ def damped_motion(damping: float, gains: tuple[float, float], steps: int) -> np.
 
 @pytest.mark.parametrize("tolerances", [TIGHT, DEFAULT], ids=["tight", "default"])
 @pytest.mark.parametrize("gains", [(50.0, 40.0), (4000.0, 100.0)], ids=["soft", "hard"])
-@pytest.mark.parametrize("damping", [0.1, 1.0, 10.0, 100.0, 600.0, 3000.0, 10_000.0])
+@pytest.mark.parametrize("damping", [1.0, 600.0, 10_000.0])
 def test_damped_arms_move_as_an_implicit_solver_says(damping, gains, tolerances, length):
     of, rtol, atol = damped_arm(damping), *tolerances
     plant = shipped(of, rtol=rtol, atol=atol, **both_axes(gains))
@@ -164,7 +164,7 @@ def test_a_hand_of_small_inertias_and_strong_damping_moves_as_an_implicit_solver
     assert np.abs(found - expected).max() <= 1e-6
 
 
-@pytest.mark.parametrize("name", ["tiago", "panda", "twodof"])
+@pytest.mark.parametrize("name", ["tiago", "twodof"])
 def test_rounding_of_the_target_moves_no_joint(name):
     native = engine(name)
     plant = native.model.plant()

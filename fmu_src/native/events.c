@@ -21,19 +21,12 @@ static const double PULL = 1e-9;
    turn drive each other off would else have events without end. */
 static const double SLOW = 1e-4;
 
-static void get_state(const Plant *plant, double y[N_STATES])
-{
-    memcpy(y, &plant->value[Q], N_JOINTS * sizeof *y);
-    memcpy(y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *y);
-}
-
 void find_stops(const Plant *plant, Stops *stops)
 {
     const int kept[N_JOINTS] = {0};
-    double y[N_STATES], a[N_JOINTS];
-    get_state(plant, y);
-    acceleration(plant, y, y + N_JOINTS, a);
-    hold(plant, y, a, kept, stops);
+    double a[N_JOINTS];
+    acceleration(plant, &plant->value[Q], &plant->value[V], a);
+    hold(plant, &plant->value[Q], a, kept, stops);
 }
 
 /* Distance to a place past a limit, and more where a joint moves away from it, at v: there a solver's
@@ -75,7 +68,7 @@ int handle_event(Plant *plant, Stops *stops)
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     double before[N_STATES], y[N_STATES], fastest = 0.0;
     int kept[N_JOINTS] = {0};
-    get_state(plant, before);
+    memcpy(before, &plant->value[Q], sizeof before);
     memcpy(y, before, sizeof y);
     for (int i = 0; i < N_JOINTS; i++) {
         if (stops->held[i]) { /* whatever a solver's rounding made of it */
@@ -89,8 +82,7 @@ int handle_event(Plant *plant, Stops *stops)
     for (int i = 0; i < N_JOINTS; i++)
         kept[i] = stops->held[i] && fastest < SLOW;
     impact(plant, y, kept);
-    memcpy(&plant->value[Q], y, N_JOINTS * sizeof *y);
-    memcpy(&plant->value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
+    memcpy(&plant->value[Q], y, sizeof y);
     find_stops(plant, stops);
     return memcmp(before, y, sizeof y) != 0;
 }

@@ -1,4 +1,4 @@
-/* Model Exchange: the importer's solver integrates the states q, v, and finds the events. */
+/* Model Exchange: the importer's solver integrates the states q and v, and finds the events. */
 #include <math.h>
 #include <string.h>
 
@@ -9,7 +9,7 @@
 static Instance *enter_with(void *component, Call call, const void *values, size_t count,
                             size_t wanted)
 {
-    Instance *instance = enter(component, call);
+    Instance *instance = enter(component, call, 1);
     if (!instance)
         return NULL;
     if (count != wanted || (wanted > 0 && !values)) {
@@ -43,29 +43,38 @@ Status update_discrete_states(void *component, Boolean *states_changed)
     return OK;
 }
 
-Status complete_integrator_step(void *component, Boolean *enter_event_mode, Boolean *terminate)
+Status STANDARD(EnterEventMode)(void *component)
 {
-    Instance *instance = enter(component, COMPLETED_INTEGRATOR_STEP);
-    if (!instance)
+    return move_on(component, ENTER_EVENT_MODE, EVENT);
+}
+
+Status STANDARD(EnterContinuousTimeMode)(void *component)
+{
+    return move_on(component, ENTER_CONTINUOUS_TIME_MODE, CONTINUOUS_TIME);
+}
+
+Status STANDARD(CompletedIntegratorStep)(void *component, Boolean no_set_state_prior,
+                                         Boolean *enter_event_mode, Boolean *terminate)
+{
+    (void)no_set_state_prior;
+    if (!enter(component, COMPLETED_INTEGRATOR_STEP, enter_event_mode && terminate))
         return ERROR;
-    if (!enter_event_mode || !terminate)
-        return report(instance, ERROR, "%s: null pointer", call_name(COMPLETED_INTEGRATOR_STEP));
     *enter_event_mode = *terminate = 0;
     return OK;
 }
 
-Status set_time(void *component, double time)
+Status STANDARD(SetTime)(void *component, double time)
 {
-    Instance *instance = enter(component, SET_TIME);
+    Instance *instance = enter(component, SET_TIME, 1);
     if (!instance)
         return ERROR;
     if (!isfinite(time))
-        return report(instance, ERROR, "%s: the time is not finite", call_name(SET_TIME));
+        return refuse(instance, SET_TIME, "the time is not finite");
     instance->state.time = time;
     return OK;
 }
 
-Status set_continuous_states(void *component, const double x[], size_t count)
+Status STANDARD(SetContinuousStates)(void *component, const double x[], size_t count)
 {
     Instance *instance = enter_with(component, SET_CONTINUOUS_STATES, x, count, N_STATES);
     if (!instance)
@@ -81,7 +90,7 @@ Status set_continuous_states(void *component, const double x[], size_t count)
     return OK;
 }
 
-Status get_derivatives(void *component, double derivatives[], size_t count)
+Status STANDARD(GetDerivatives)(void *component, double derivatives[], size_t count)
 {
     Instance *instance = enter_with(component, GET_DERIVATIVES, derivatives, count, N_STATES);
     if (!instance)
@@ -96,7 +105,7 @@ Status get_derivatives(void *component, double derivatives[], size_t count)
     return OK;
 }
 
-Status get_event_indicators(void *component, double indicators[], size_t count)
+Status STANDARD(GetEventIndicators)(void *component, double indicators[], size_t count)
 {
     Instance *instance =
         enter_with(component, GET_EVENT_INDICATORS, indicators, count, N_INDICATORS);
@@ -111,7 +120,7 @@ Status get_event_indicators(void *component, double indicators[], size_t count)
     return OK;
 }
 
-Status get_continuous_states(void *component, double x[], size_t count)
+Status STANDARD(GetContinuousStates)(void *component, double x[], size_t count)
 {
     Instance *instance = enter_with(component, GET_CONTINUOUS_STATES, x, count, N_STATES);
     if (!instance)
@@ -120,8 +129,7 @@ Status get_continuous_states(void *component, double x[], size_t count)
     return OK;
 }
 
-Status get_nominals(void *component, double nominals[],
-                                             size_t count)
+Status STANDARD(GetNominalsOfContinuousStates)(void *component, double nominals[], size_t count)
 {
     Instance *instance = enter_with(component, GET_NOMINALS, nominals, count, N_STATES);
     if (!instance)

@@ -3,6 +3,7 @@
 #include "dormand_prince.c"
 #include "integrator.c"
 #include "events.c"
+#include "calls.c"
 #include "instance.c"
 #include "simulation.c"
 #include "exchange.c"
@@ -10,7 +11,6 @@
 #include "saved_state.c"
 #if FMI == 3
 #include "fmi3.c"
-#include "fmi3_unsupported.c"
 #else
 #include "fmi2.c"
 #endif

@@ -1,4 +1,4 @@
-/* The life of an instance: the rules of its calls, messages, and initialisation. */
+/* The life of an instance: its making, messages, and initialisation. */
 #include "instance.h"
 #include "events.h"
 
@@ -7,44 +7,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-
-static const char *const PHASE_NAME[N_PHASES] = {
-    "instantiated", "initialization mode", "step mode", "step failed", "event mode",
-    "continuous-time mode", "terminated"};
-
-static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation"};
-
-const char *call_name(Call call)
-{
-    return rule_of(call)->name;
-}
-
-int allowed(Instance *instance, Call call, const char *culprit)
-{
-    const Rule *rule = rule_of(call);
-    const int phase = instance->state.phase;
-    if (rule->kind != BOTH_KINDS && rule->kind != instance->kind) {
-        report(instance, ERROR, "%s is a call of %s, and the instance is one of %s", rule->name,
-               KIND_NAME[rule->kind], KIND_NAME[instance->kind]);
-        return 0;
-    }
-    if (rule->phases >> phase & 1)
-        return 1;
-    report(instance, ERROR, "%s%s%s%s is not allowed in the state '%s'", rule->name,
-           culprit ? " (" : "", culprit ? culprit : "", culprit ? ")" : "", PHASE_NAME[phase]);
-    return 0;
-}
-
-int can_be_in(Kind kind, int phase)
-{
-    const int other = kind == MODEL_EXCHANGE ? S | F : M | C;
-    return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
-}
-
-Instance *enter(void *component, Call call)
-{
-    return component && allowed(component, call, NULL) ? component : NULL;
-}
 
 Status report(Instance *instance, Status status, const char *format, ...)
 {
@@ -106,11 +68,22 @@ Instance *instantiate(Instance draft, const char *token)
     return instance;
 }
 
-Status set_debug_logging(void *component, int on, size_t count, const char *const categories[])
+void STANDARD(FreeInstance)(void *component)
 {
-    Instance *instance = enter(component, SET_DEBUG_LOGGING);
+    free(component);
+}
+
+const char *STANDARD(GetVersion)(void)
+{
+    return STANDARD(Version);
+}
+
+Status STANDARD(SetDebugLogging)(void *component, Boolean on, size_t count,
+                                 const char *const categories[])
+{
+    Instance *instance = enter(component, SET_DEBUG_LOGGING, count == 0 || categories);
     int all = count == 0;
-    if (!instance || (count > 0 && !categories))
+    if (!instance)
         return ERROR;
     for (size_t i = 0; i < count; i++) {
         const char *category = categories[i] ? categories[i] : "";
@@ -128,7 +101,7 @@ Status set_up(Instance *instance, Call call, const double *tolerance, double sta
               const double *stop)
 {
     if (!isfinite(start))
-        return report(instance, ERROR, "%s: the start time is not finite", call_name(call));
+        return refuse(instance, call, "the start time is not finite");
     if (stop && !(*stop >= start))
         return report(instance, ERROR, "%s: stop time %g < start time %g", call_name(call), *stop,
                       start);
@@ -140,27 +113,23 @@ Status set_up(Instance *instance, Call call, const double *tolerance, double sta
     return OK;
 }
 
-Status exit_initialization(void *component)
+Status STANDARD(ExitInitializationMode)(void *component)
 {
-    Instance *instance = enter(component, EXIT_INITIALIZATION);
+    Instance *instance = enter(component, EXIT_INITIALIZATION, 1);
     if (!instance || initialise(instance, 1) != OK)
         return ERROR;
     instance->state.phase = instance->kind == MODEL_EXCHANGE ? EVENT : STEP;
     return OK;
 }
 
-Status move_on(void *component, Call call, Phase phase)
+Status STANDARD(Terminate)(void *component)
 {
-    Instance *instance = enter(component, call);
-    if (!instance)
-        return ERROR;
-    instance->state.phase = phase;
-    return OK;
+    return move_on(component, TERMINATE, TERMINATED);
 }
 
-Status reset(void *component)
+Status STANDARD(Reset)(void *component)
 {
-    Instance *instance = enter(component, RESET);
+    Instance *instance = enter(component, RESET, 1);
     if (!instance)
         return ERROR;
     reset_state(&instance->state);
@@ -190,21 +159,11 @@ Status check_limits(Instance *instance)
     return OK;
 }
 
-/* Take the velocity that points into a limit at the start, as at any other time. */
-static void stop_at_start(Plant *plant)
-{
-    const int kept[N_JOINTS] = {0};
-    double y[2 * N_JOINTS];
-    memcpy(y, &plant->value[Q], N_JOINTS * sizeof *y);
-    memcpy(y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *y);
-    impact(plant, y, kept);
-    memcpy(&plant->value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
-}
-
 Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
+    const int kept[N_JOINTS] = {0};
     if (check_limits(instance) != OK || check_inputs(instance) != OK)
         return ERROR;
     for (int i = 0; i < N_JOINTS; i++) {
@@ -218,7 +177,7 @@ Status initialise(Instance *instance, int warn)
         value[Q + i] = q;
         value[V + i] = value[V_START + i];
     }
-    stop_at_start(&state->plant);
+    impact(&state->plant, &value[Q], kept);
     state->initialised = 1;
     state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
     return OK;

@@ -1,6 +1,9 @@
-/* One instance of the FMU, what every FMI function does first, and what the functions do that all
-   versions of FMI have. These are given what the importer hands over, refuse what is not allowed and log
-   why. The faces, fmi2.c and fmi3.c, have the functions themselves and the table of their calls. */
+/* One instance of the FMU, what every FMI function does first, and what the functions do that the
+   versions of FMI have with other arguments. All are given what the importer hands over, refuse what is
+   not allowed and log why.
+
+   A function that both versions have with the same arguments is where its subject is, under its name in
+   the version: STANDARD(Reset) is fmi2Reset or fmi3Reset. The faces, fmi2.c and fmi3.c, have the rest. */
 #ifndef INSTANCE_H
 #define INSTANCE_H
 
@@ -12,24 +15,46 @@
 
 #if FMI == 3
 #include "fmi3Functions.h"
+#define OF_VERSION(name) fmi3##name
+#define TEXT_OF_VERSION(name) "fmi3" #name
 #define REAL_NAME "Float64"
+#define OTHER_NAME "another type"
 #define TOKEN "instantiation token"
-typedef fmi3Boolean Boolean;
-typedef fmi3ValueReference Reference;
+/* What it spells in another way. */
+#define DeSerializeFMUstate DeserializeFMUState
+#define FreeFMUstate FreeFMUState
+#define GetDerivatives GetContinuousStateDerivatives
+#define GetFMUstate GetFMUState
+#define NewDiscreteStates UpdateDiscreteStates
+#define SerializeFMUstate SerializeFMUState
+#define SerializedFMUstateSize SerializedFMUStateSize
+#define SetFMUstate SetFMUState
 #else
 #include "fmi2Functions.h"
+#define OF_VERSION(name) fmi2##name
+#define TEXT_OF_VERSION(name) "fmi2" #name
 #define REAL_NAME "Real"
+#define OTHER_NAME "an Integer or String"
 #define TOKEN "GUID"
-typedef fmi2Boolean Boolean;
-typedef fmi2ValueReference Reference;
 #ifdef PREFIX /* FMPy's copy of the header was changed to ignore it */
 #undef fmi2FullName
 #define fmi2FullName(name) PREFIXED(name)
 #endif
 #endif
 
+/* A name of the standard in this version, and as messages say it. */
+#define STANDARD(name) OF_VERSION(name)
+#define CALL_NAME(name) TEXT_OF_VERSION(name)
+
+typedef STANDARD(Status) Status;
+typedef STANDARD(Boolean) Boolean;
+typedef STANDARD(ValueReference) Reference;
+#define OK STANDARD(OK)
+#define WARNING STANDARD(Warning)
+#define DISCARD STANDARD(Discard)
+#define ERROR STANDARD(Error)
+
 /* These have the same numbers in all versions of FMI. */
-typedef enum { OK, WARNING, DISCARD, ERROR } Status;
 typedef enum { BOTH_KINDS, MODEL_EXCHANGE, CO_SIMULATION } Kind;
 
 typedef enum {
@@ -38,11 +63,6 @@ typedef enum {
     EVENT, CONTINUOUS_TIME, /* of Model Exchange */
     TERMINATED, N_PHASES
 } Phase;
-
-/* Sets of phases; M is event mode. */
-enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
-       M = 1 << EVENT, C = 1 << CONTINUOUS_TIME, T = 1 << TERMINATED,
-       ANY = N | I | S | F | M | C | T };
 
 /* All that getFMUstate saves. Plain data without pointers. */
 typedef struct {
@@ -79,35 +99,37 @@ typedef enum {
     GET_DIRECTIONAL_DERIVATIVE, GET_ADJOINT_DERIVATIVE, COUNT_STATES, N_CALLS
 } Call;
 
-/* A call's name, as messages say it, the phases in which it is allowed, and of which kind it is, where of one alone. */
-typedef struct {
-    const char *name;
-    int phases;
-    Kind kind;
-} Rule;
-
 /* --- what a face has --- */
-
-/* The rule of a call. */
-INTERNAL const Rule *rule_of(Call call);
 
 /* Hand a message, of less than 512 bytes, to the importer. */
 INTERNAL void hand_over(const Instance *instance, Status status, const char *category,
                         const char *text);
 
-/* --- instance.c --- */
+/* --- calls.c --- */
 
 /* Name of a call, as messages say it. */
 INTERNAL const char *call_name(Call call);
 
-/* Whether a call is allowed in the instance's phase; where not, logs it. */
-INTERNAL int allowed(Instance *instance, Call call, const char *culprit);
-
 /* Whether an instance of a kind can be in a phase. */
 INTERNAL int can_be_in(Kind kind, int phase);
 
-/* The instance where the call is allowed, else NULL; a refusal is logged. */
-INTERNAL Instance *enter(void *component, Call call);
+/* Whether a call is allowed in the instance's phase; where not, logs it. */
+INTERNAL int allowed(Instance *instance, Call call, const char *culprit);
+
+/* The instance where the call is allowed and has the pointers that it needs, else NULL; a refusal is
+   logged. */
+INTERNAL Instance *enter(void *component, Call call, int has_pointers);
+
+/* Log why a call is refused. */
+INTERNAL Status refuse(Instance *instance, Call call, const char *reason);
+
+/* Where the call is allowed, what it does is to change the phase. */
+INTERNAL Status move_on(void *component, Call call, Phase phase);
+
+/* Refuse a call of what the modelDescription says that there is not. Importers bind every name. */
+INTERNAL Status unsupported(Instance *instance, const char *function);
+
+/* --- instance.c --- */
 
 /* Log a printf message; what is below a warning only where logging is on. Returns the status. */
 INTERNAL Status report(Instance *instance, Status status, const char *format, ...);
@@ -115,19 +137,9 @@ INTERNAL Status report(Instance *instance, Status status, const char *format, ..
 /* A new instance as the draft says; NULL where it has no name or another token. */
 INTERNAL Instance *instantiate(Instance draft, const char *token);
 
-INTERNAL Status set_debug_logging(void *component, int on, size_t count,
-                                  const char *const categories[]);
-
 /* Take over the times of the experiment; its tolerance is told to be ignored. */
 INTERNAL Status set_up(Instance *instance, Call call, const double *tolerance, double start,
                        const double *stop);
-
-INTERNAL Status exit_initialization(void *component);
-
-/* Where the call is allowed, what it does is to change the phase. */
-INTERNAL Status move_on(void *component, Call call, Phase phase);
-
-INTERNAL Status reset(void *component);
 
 /* Whether a variable may have a value; a refusal is logged. */
 INTERNAL Status check_range(Instance *instance, int variable, double value);
@@ -152,25 +164,10 @@ INTERNAL void update_rates(State *state);
 
 INTERNAL Status do_step(void *component, double point, double h);
 
-/* --- exchange.c: q and v are the states --- */
+/* --- exchange.c --- */
 
-/* Whether the states are others is told. */
+/* Whether the states q and v are others is told. */
 INTERNAL Status update_discrete_states(void *component, Boolean *states_changed);
-
-INTERNAL Status complete_integrator_step(void *component, Boolean *enter_event_mode,
-                                         Boolean *terminate);
-
-INTERNAL Status set_time(void *component, double time);
-
-INTERNAL Status set_continuous_states(void *component, const double x[], size_t count);
-
-INTERNAL Status get_continuous_states(void *component, double x[], size_t count);
-
-INTERNAL Status get_derivatives(void *component, double derivatives[], size_t count);
-
-INTERNAL Status get_event_indicators(void *component, double indicators[], size_t count);
-
-INTERNAL Status get_nominals(void *component, double nominals[], size_t count);
 
 /* --- variables.c: each reference is of so many values as EXTENT says, in all n_values --- */
 
@@ -187,34 +184,16 @@ INTERNAL Status set_booleans(void *component, const Reference vr[], size_t count
                              const Boolean value[], size_t n_values);
 
 /* Variables of a type that the FMU does not have: any reference is refused, none is fine. */
-INTERNAL Status other_variables(void *component, Call call, const Reference vr[], size_t count,
-                                const void *value, size_t n_values);
+INTERNAL Status get_others(void *component, const Reference vr[], size_t count, const void *value,
+                           size_t n_values);
+
+INTERNAL Status set_others(void *component, const Reference vr[], size_t count, const void *value,
+                           size_t n_values);
 
 /* The change of the unknowns where the knowns, states and inputs, change by the seed. */
 INTERNAL Status directional_derivative(void *component, const Reference unknown[],
                                        size_t n_unknown, const Reference known[], size_t n_known,
                                        const double seed[], size_t n_seed, double result[],
                                        size_t n_result);
-
-#if FMI == 3
-/* The change of the unknowns, weighted by the seed, for a change of each known by 1. */
-INTERNAL Status adjoint_derivative(void *component, const Reference unknown[], size_t n_unknown,
-                                   const Reference known[], size_t n_known, const double seed[],
-                                   size_t n_seed, double result[], size_t n_result);
-#endif
-
-/* --- saved_state.c --- */
-
-INTERNAL Status save_state(void *component, void **saved);
-
-INTERNAL Status restore_state(void *component, const void *saved);
-
-INTERNAL Status free_state(void *component, void **saved);
-
-INTERNAL Status size_of_state(void *component, const void *saved, size_t *size);
-
-INTERNAL Status serialize_state(void *component, const void *saved, void *bytes, size_t size);
-
-INTERNAL Status deserialize_state(void *component, const void *bytes, size_t size, void **saved);
 
 #endif

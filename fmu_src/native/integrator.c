@@ -253,8 +253,7 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     }
     step.plant = plant;
     step.evaluations = 0;
-    memcpy(step.y, &plant->value[Q], N_JOINTS * sizeof *step.y);
-    memcpy(step.y + N_JOINTS, &plant->value[V], N_JOINTS * sizeof *step.y);
+    memcpy(step.y, &plant->value[Q], sizeof step.y);
     for (int i = 0; i < N_JOINTS; i++) {
         left[i] = -HUGE_VAL;
         keeping[i] = (Keeping){-HUGE_VAL, 0.0};
@@ -290,7 +289,6 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     for (int i = 0; i < N_JOINTS; i++)
         kept[i] = keeping[i].until > h;
     impact(plant, step.y, kept);
-    memcpy(&plant->value[Q], step.y, N_JOINTS * sizeof *step.y);
-    memcpy(&plant->value[V], step.y + N_JOINTS, N_JOINTS * sizeof *step.y);
+    memcpy(&plant->value[Q], step.y, sizeof step.y);
     return 1;
 }

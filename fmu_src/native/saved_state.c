@@ -6,20 +6,14 @@
 
 #include "instance.h"
 
-static Status refuse(Instance *instance, Call call, const char *reason)
-{
-    return report(instance, ERROR, "%s: %s", call_name(call), reason);
-}
-
-static const char NULL_POINTER[] = "null pointer";
 static const char FOREIGN[] = "the state is not one of this FMU";
 static const char UNSOUND[] = "the state is none that an instance can be in";
-
 static const char OTHER_KIND[] = "the state is one of the FMU's other kind of instance";
 
-static int is_own(const State *state)
+/* Whether a state, or its bytes, begin as those of this FMU do. */
+static int is_own(const void *state)
 {
-    return memcmp(state->guid, MODEL_GUID, sizeof MODEL_GUID) == 0;
+    return memcmp(state, MODEL_GUID, sizeof MODEL_GUID) == 0;
 }
 
 /* Serialised, a checksum follows the state: bytes that were changed are refused. FNV-1a, 64 bits;
@@ -85,28 +79,28 @@ static Status take_over(Instance *instance, const void *bytes)
     return runs ? check_limits(instance) : OK;
 }
 
-Status save_state(void *component, void **saved)
+/* Save a state over what was saved before, or in memory of its own. */
+static Status save(Instance *instance, Call call, const State *state, void **saved)
 {
-    Instance *instance = enter(component, GET_STATE);
-    if (!instance)
-        return ERROR;
-    if (!saved)
-        return refuse(instance, GET_STATE, NULL_POINTER);
     if (!*saved)
         *saved = calloc(1, sizeof(State));
     if (!*saved)
-        return refuse(instance, GET_STATE, "no memory");
-    memcpy(*saved, &instance->state, sizeof(State));
+        return refuse(instance, call, "no memory");
+    memcpy(*saved, state, sizeof(State));
     return OK;
 }
 
-Status restore_state(void *component, const void *saved)
+Status STANDARD(GetFMUstate)(void *component, void **saved)
 {
-    Instance *instance = enter(component, SET_STATE);
+    Instance *instance = enter(component, GET_STATE, saved != NULL);
+    return instance ? save(instance, GET_STATE, &instance->state, saved) : ERROR;
+}
+
+Status STANDARD(SetFMUstate)(void *component, void *saved)
+{
+    Instance *instance = enter(component, SET_STATE, saved != NULL);
     if (!instance)
         return ERROR;
-    if (!saved)
-        return refuse(instance, SET_STATE, NULL_POINTER);
     if (!is_own(saved))
         return refuse(instance, SET_STATE, FOREIGN);
     if (!can_be_in(instance->kind, ((const State *)saved)->phase))
@@ -115,64 +109,53 @@ Status restore_state(void *component, const void *saved)
     return OK;
 }
 
-Status free_state(void *component, void **saved)
+Status STANDARD(FreeFMUstate)(void *component, void **saved)
 {
-    Instance *instance = enter(component, FREE_STATE);
-    if (!instance)
+    if (!enter(component, FREE_STATE, 1))
         return ERROR;
-    if (saved && *saved) {
+    if (saved) {
         free(*saved);
         *saved = NULL;
     }
     return OK;
 }
 
-Status size_of_state(void *component, const void *saved, size_t *size)
+Status STANDARD(SerializedFMUstateSize)(void *component, void *saved, size_t *size)
 {
-    Instance *instance = enter(component, SIZE_OF_STATE);
-    if (!instance)
+    if (!enter(component, SIZE_OF_STATE, saved && size))
         return ERROR;
-    if (!saved || !size)
-        return refuse(instance, SIZE_OF_STATE, NULL_POINTER);
     *size = SERIALIZED_SIZE;
     return OK;
 }
 
-Status serialize_state(void *component, const void *saved, void *bytes, size_t size)
+Status STANDARD(SerializeFMUstate)(void *component, void *saved, STANDARD(Byte) bytes[],
+                                   size_t size)
 {
-    Instance *instance = enter(component, SERIALIZE);
+    Instance *instance = enter(component, SERIALIZE, saved && bytes);
     if (!instance)
         return ERROR;
-    if (!saved || !bytes)
-        return refuse(instance, SERIALIZE, NULL_POINTER);
     if (size < SERIALIZED_SIZE)
         return refuse(instance, SERIALIZE, "the buffer is too small");
     const uint64_t sum = checksum(saved);
     memcpy(bytes, saved, sizeof(State));
-    memcpy((char *)bytes + sizeof(State), &sum, sizeof sum);
+    memcpy(bytes + sizeof(State), &sum, sizeof sum);
     return OK;
 }
 
-Status deserialize_state(void *component, const void *bytes, size_t size, void **saved)
+Status STANDARD(DeSerializeFMUstate)(void *component, const STANDARD(Byte) bytes[], size_t size,
+                                     void **saved)
 {
-    Instance *instance = enter(component, DESERIALIZE);
+    Instance *instance = enter(component, DESERIALIZE, bytes && saved);
     uint64_t sum;
     if (!instance)
         return ERROR;
-    if (!bytes || !saved)
-        return refuse(instance, DESERIALIZE, NULL_POINTER);
     if (size != SERIALIZED_SIZE)
         return refuse(instance, DESERIALIZE, FOREIGN);
-    memcpy(&sum, (const char *)bytes + sizeof(State), sizeof sum);
-    if (sum != checksum(bytes) || memcmp(bytes, MODEL_GUID, sizeof MODEL_GUID) != 0)
+    memcpy(&sum, bytes + sizeof(State), sizeof sum);
+    if (sum != checksum(bytes) || !is_own(bytes))
         return refuse(instance, DESERIALIZE, FOREIGN);
     Instance draft = *instance;
     if (take_over(&draft, bytes) != OK)
         return ERROR;
-    if (!*saved)
-        *saved = calloc(1, sizeof(State));
-    if (!*saved)
-        return refuse(instance, DESERIALIZE, "no memory");
-    memcpy(*saved, &draft.state, sizeof(State));
-    return OK;
+    return save(instance, DESERIALIZE, &draft.state, saved);
 }

@@ -36,7 +36,7 @@ static Status discard(Instance *instance, double point, double h, const Obstacle
 
 Status do_step(void *component, double point, double h)
 {
-    Instance *instance = enter(component, DO_STEP);
+    Instance *instance = enter(component, DO_STEP, 1);
     if (!instance)
         return ERROR;
     const char *call = call_name(DO_STEP);

@@ -96,7 +96,7 @@ static void add_reaction(const Contacts *contacts, double columns[N_JOINTS][N_JO
             sum[i] += columns[k][i] * z[k];
 }
 
-void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[N_JOINTS])
+void impact(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS])
 {
     Contacts contacts;
     double *v = y + N_JOINTS, z[N_JOINTS], columns[N_JOINTS][N_JOINTS];
@@ -123,7 +123,7 @@ void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[N_JOINTS]
             v[contacts.joint[k]] = 0.0;
 }
 
-void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
+void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
           const int kept[N_JOINTS], Stops *stops)
 {
     Contacts contacts;

@@ -14,11 +14,11 @@ typedef struct {
 /* Take the velocity that points into a limit, from the state y = (q, v). Joints in kept are not driven
    off by the impact of another: where two in turn drive off each other, as the feet of a rocking
    block, impacts would else not end in finite time. */
-INTERNAL void impact(const Plant *plant, double y[2 * N_JOINTS], const int kept[N_JOINTS]);
+INTERNAL void impact(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS]);
 
 /* Find the joints that rest at y, after an impact; a, q̈ without stops, becomes that with them. Those
    in kept stay whether they are pressed or not. */
-INTERNAL void hold(const Plant *plant, const double y[2 * N_JOINTS], double a[N_JOINTS],
+INTERNAL void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
                    const int kept[N_JOINTS], Stops *stops);
 
 /* Whether a joint is nearer to its upper limit than to its lower one. */

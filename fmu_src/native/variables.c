@@ -16,7 +16,7 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
 {
     size_t wanted = 0;
     if (count > 0 && (!vr || !values)) {
-        report(instance, ERROR, "%s: null pointer", call_name(call));
+        refuse(instance, call, "null pointer");
         return 0;
     }
     for (size_t i = 0; i < count; i++) {
@@ -130,7 +130,7 @@ static Status update(Instance *instance, Reference vr)
 Status get_reals(void *component, const Reference vr[], size_t count, double value[],
                  size_t n_values)
 {
-    Instance *instance = enter(component, GET_REAL);
+    Instance *instance = enter(component, GET_REAL, 1);
     if (!instance || !known(instance, GET_REAL, REAL, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
@@ -148,7 +148,7 @@ Status get_reals(void *component, const Reference vr[], size_t count, double val
 Status set_reals(void *component, const Reference vr[], size_t count, const double value[],
                  size_t n_values)
 {
-    Instance *instance = enter(component, SET_REAL);
+    Instance *instance = enter(component, SET_REAL, 1);
     const double *next = value;
     if (!instance || !known(instance, SET_REAL, REAL, vr, count, value, n_values))
         return ERROR;
@@ -172,7 +172,7 @@ Status set_reals(void *component, const Reference vr[], size_t count, const doub
 Status get_booleans(void *component, const Reference vr[], size_t count, Boolean value[],
                     size_t n_values)
 {
-    Instance *instance = enter(component, GET_BOOLEAN);
+    Instance *instance = enter(component, GET_BOOLEAN, 1);
     if (!instance || !known(instance, GET_BOOLEAN, BOOLEAN, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
@@ -183,7 +183,7 @@ Status get_booleans(void *component, const Reference vr[], size_t count, Boolean
 Status set_booleans(void *component, const Reference vr[], size_t count, const Boolean value[],
                     size_t n_values)
 {
-    Instance *instance = enter(component, SET_BOOLEAN);
+    Instance *instance = enter(component, SET_BOOLEAN, 1);
     if (!instance || !known(instance, SET_BOOLEAN, BOOLEAN, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
@@ -194,11 +194,18 @@ Status set_booleans(void *component, const Reference vr[], size_t count, const B
     return OK;
 }
 
-Status other_variables(void *component, Call call, const Reference vr[], size_t count,
-                       const void *value, size_t n_values)
+Status get_others(void *component, const Reference vr[], size_t count, const void *value,
+                  size_t n_values)
 {
-    Instance *instance = enter(component, call);
-    return instance && known(instance, call, OTHER, vr, count, value, n_values) ? OK : ERROR;
+    Instance *instance = enter(component, GET_OTHER, 1);
+    return instance && known(instance, GET_OTHER, OTHER, vr, count, value, n_values) ? OK : ERROR;
+}
+
+Status set_others(void *component, const Reference vr[], size_t count, const void *value,
+                  size_t n_values)
+{
+    Instance *instance = enter(component, SET_OTHER, 1);
+    return instance && known(instance, SET_OTHER, OTHER, vr, count, value, n_values) ? OK : ERROR;
 }
 
 /* What of the computed variables derivatives of the unknowns by the knowns need; -1, which is logged,
@@ -243,7 +250,7 @@ Status directional_derivative(void *component, const Reference unknown[], size_t
                               size_t n_seed, double result[], size_t n_result)
 {
     const Call call = GET_DIRECTIONAL_DERIVATIVE;
-    Instance *instance = enter(component, call);
+    Instance *instance = enter(component, call, 1);
     double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
     if (!instance || !known(instance, call, REAL, unknown, n_unknown, result, n_result)
         || !known(instance, call, REAL, given, n_given, seed, n_seed))
@@ -268,12 +275,13 @@ Status directional_derivative(void *component, const Reference unknown[], size_t
 }
 
 #if FMI == 3
-Status adjoint_derivative(void *component, const Reference unknown[], size_t n_unknown,
-                          const Reference given[], size_t n_given, const double seed[],
-                          size_t n_seed, double result[], size_t n_result)
+/* The change of the unknowns, weighted by the seed, for a change of each given variable by 1. */
+Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size_t n_unknown,
+                                const Reference given[], size_t n_given, const double seed[],
+                                size_t n_seed, double result[], size_t n_result)
 {
     const Call call = GET_ADJOINT_DERIVATIVE;
-    Instance *instance = enter(component, call);
+    Instance *instance = enter(component, call, 1);
     double weight[FIRST_PARAMETER] = {0}, sum[FIRST_PARAMETER] = {0};
     if (!instance || !known(instance, call, REAL, unknown, n_unknown, seed, n_seed)
         || !known(instance, call, REAL, given, n_given, result, n_result))

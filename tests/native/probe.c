@@ -68,18 +68,13 @@ FMI2_Export void probe_pseudo_inverse(double J[], double b[], double rcond, doub
 #endif
 
 /* q̈ with stops at a state after an impact, that state, and the joints that rest. */
-FMI2_Export void probe_stopped(double value[], double a[], double held[])
+FMI2_Export void probe_stopped(double value[], const int kept[], double a[], double held[])
 {
     const Plant *plant = (Plant *)value;
-    const int kept[N_JOINTS] = {0};
     Stops stops;
-    double y[2 * N_JOINTS];
-    memcpy(y, &value[Q], N_JOINTS * sizeof *y);
-    memcpy(y + N_JOINTS, &value[V], N_JOINTS * sizeof *y);
-    impact(plant, y, kept);
-    acceleration(plant, y, y + N_JOINTS, a);
-    hold(plant, y, a, kept, &stops);
-    memcpy(&value[V], y + N_JOINTS, N_JOINTS * sizeof *y);
+    impact(plant, &value[Q], kept);
+    acceleration(plant, &value[Q], &value[V], a);
+    hold(plant, &value[Q], a, kept, &stops);
     for (int i = 0; i < N_JOINTS; i++)
         held[i] = stops.held[i];
 }

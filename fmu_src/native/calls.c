@@ -1,0 +1,120 @@
+/* The calls of the standard: their names, the phases in which each is allowed, and who is refused. */
+#include "instance.h"
+
+static const char *const PHASE_NAME[N_PHASES] = {
+    "instantiated", "initialization mode", "step mode", "step failed", "event mode",
+    "continuous-time mode", "terminated"};
+
+static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation"};
+
+/* Sets of phases; M is event mode. */
+enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
+       M = 1 << EVENT, C = 1 << CONTINUOUS_TIME, T = 1 << TERMINATED,
+       ANY = N | I | S | F | M | C | T, RUNS = S | F | M | C, READS = I | RUNS | T,
+       SETS = N | I | S | M | C, SOLVES = I | M | C | T };
+
+/* A call's name, the phases in which it is allowed, and of which kind it is, where of one alone. A
+   refused call changes nothing, so there is no error phase.
+   FMI 2.0.4, sections 3.2.3 and 4.2.4; FMI 3.0.2, sections 2.3, 3.2 and 4.2. */
+static const struct {
+    const char *name;
+    int phases;
+    Kind kind;
+} RULE[N_CALLS] = {
+    [INSTANTIATE] = {CALL_NAME(Instantiate), 0},
+    [SET_DEBUG_LOGGING] = {CALL_NAME(SetDebugLogging), ANY},
+    [SETUP_EXPERIMENT] = {CALL_NAME(SetupExperiment), N},
+    [ENTER_INITIALIZATION] = {CALL_NAME(EnterInitializationMode), N},
+    [EXIT_INITIALIZATION] = {CALL_NAME(ExitInitializationMode), I},
+    [TERMINATE] = {CALL_NAME(Terminate), RUNS},
+    [RESET] = {CALL_NAME(Reset), ANY},
+    [DO_STEP] = {CALL_NAME(DoStep), S, CO_SIMULATION},
+    [CANCEL_STEP] = {CALL_NAME(CancelStep), 0, CO_SIMULATION}, /* no step is ever pending */
+    [GET_STATUS] = {CALL_NAME(GetStatus), S | F | T, CO_SIMULATION},
+    [GET_REAL] = {CALL_NAME(Get) REAL_NAME, READS},
+    [GET_BOOLEAN] = {CALL_NAME(GetBoolean), READS},
+    [GET_OTHER] = {CALL_NAME(Get) " of " OTHER_NAME, READS},
+    [SET_REAL] = {CALL_NAME(Set) REAL_NAME, SETS},
+    [SET_BOOLEAN] = {CALL_NAME(SetBoolean), SETS},
+    [SET_OTHER] = {CALL_NAME(Set) " of " OTHER_NAME, SETS},
+    [SET_INPUT] = {CALL_NAME(Set) " of an input", SETS},
+    [SET_PARAMETER] = {CALL_NAME(Set) " of a parameter", N | I},
+    [SET_Q_V] = {CALL_NAME(Set) " of a state", M | C},
+    [GET_STATE] = {CALL_NAME(GetFMUstate), ANY},
+    [SET_STATE] = {CALL_NAME(SetFMUstate), ANY},
+    [FREE_STATE] = {CALL_NAME(FreeFMUstate), ANY},
+    [SIZE_OF_STATE] = {CALL_NAME(SerializedFMUstateSize), ANY},
+    [SERIALIZE] = {CALL_NAME(SerializeFMUstate), ANY},
+    [DESERIALIZE] = {CALL_NAME(DeSerializeFMUstate), ANY},
+    [ENTER_EVENT_MODE] = {CALL_NAME(EnterEventMode), C, MODEL_EXCHANGE},
+    [NEW_DISCRETE_STATES] = {CALL_NAME(NewDiscreteStates), M, MODEL_EXCHANGE},
+    [ENTER_CONTINUOUS_TIME_MODE] = {CALL_NAME(EnterContinuousTimeMode), M, MODEL_EXCHANGE},
+    [COMPLETED_INTEGRATOR_STEP] = {CALL_NAME(CompletedIntegratorStep), C, MODEL_EXCHANGE},
+    [SET_TIME] = {CALL_NAME(SetTime), M | C, MODEL_EXCHANGE},
+    [SET_CONTINUOUS_STATES] = {CALL_NAME(SetContinuousStates), C, MODEL_EXCHANGE},
+    [GET_DERIVATIVES] = {CALL_NAME(GetDerivatives), SOLVES, MODEL_EXCHANGE},
+    [GET_EVENT_INDICATORS] = {CALL_NAME(GetEventIndicators), SOLVES, MODEL_EXCHANGE},
+    [GET_CONTINUOUS_STATES] = {CALL_NAME(GetContinuousStates), SOLVES, MODEL_EXCHANGE},
+    [GET_NOMINALS] = {CALL_NAME(GetNominalsOfContinuousStates), N | SOLVES, MODEL_EXCHANGE},
+    [GET_DIRECTIONAL_DERIVATIVE] = {CALL_NAME(GetDirectionalDerivative), READS},
+    [GET_ADJOINT_DERIVATIVE] = {CALL_NAME(GetAdjointDerivative), READS},
+    [COUNT_STATES] = {CALL_NAME(GetNumberOf), ANY, MODEL_EXCHANGE},
+};
+
+const char *call_name(Call call)
+{
+    return RULE[call].name;
+}
+
+int can_be_in(Kind kind, int phase)
+{
+    const int other = kind == MODEL_EXCHANGE ? S | F : M | C;
+    return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
+}
+
+int allowed(Instance *instance, Call call, const char *culprit)
+{
+    const int phase = instance->state.phase;
+    const Kind kind = RULE[call].kind;
+    if (kind != BOTH_KINDS && kind != instance->kind) {
+        report(instance, ERROR, "%s is a call of %s, and the instance is one of %s",
+               call_name(call), KIND_NAME[kind], KIND_NAME[instance->kind]);
+        return 0;
+    }
+    if (RULE[call].phases >> phase & 1)
+        return 1;
+    report(instance, ERROR, "%s%s%s%s is not allowed in the state '%s'", call_name(call),
+           culprit ? " (" : "", culprit ? culprit : "", culprit ? ")" : "", PHASE_NAME[phase]);
+    return 0;
+}
+
+Instance *enter(void *component, Call call, int has_pointers)
+{
+    if (!component || !allowed(component, call, NULL))
+        return NULL;
+    if (has_pointers)
+        return component;
+    refuse(component, call, "null pointer");
+    return NULL;
+}
+
+Status refuse(Instance *instance, Call call, const char *reason)
+{
+    return report(instance, ERROR, "%s: %s", call_name(call), reason);
+}
+
+Status move_on(void *component, Call call, Phase phase)
+{
+    Instance *instance = enter(component, call, 1);
+    if (!instance)
+        return ERROR;
+    instance->state.phase = phase;
+    return OK;
+}
+
+Status unsupported(Instance *instance, const char *function)
+{
+    if (instance)
+        report(instance, ERROR, "%s is not supported by this FMU", function);
+    return ERROR;
+}

@@ -1,0 +1,102 @@
+"""Compiling: what is refused, what is kept, and libraries for two processors in one file."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pwd
+import struct
+import time
+from pathlib import Path
+
+import pytest
+from native_models import model
+
+from twodof.errors import BuildError
+from twodof.export import compiler
+from twodof.export.compiler import compile_library, universal
+from twodof.files import TEMPORARY
+
+
+def test_compiler_errors():
+    sources = model("twodof").sources()
+    with pytest.raises(BuildError, match="there is no platform 'linux32'; there are linux64"):
+        compile_library(sources, "linux32", "Arm")
+    with pytest.raises(BuildError, match=r"(?s)compiler failed.*error"):
+        compile_library({**sources, "plant.c": b"int main(void) { return x; }"}, "linux64", "Arm")
+
+
+def test_equal_sources_give_equal_libraries():
+    """In another folder too, where the compiler does not know them from before."""
+    sources = model("twodof").sources()
+    first = compile_library(sources, "linux64", "Arm")
+    assert compile_library({**sources, "elsewhere.h": b""}, "linux64", "Arm") == first
+    assert not any(name in first for name in (b"/tmp", b"/zig", TEMPORARY.encode()))
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Folder of what is kept, empty; zig has its C library."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "zig"
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    for name in ("b", "h", "o", "tmp", "z"):
+        (home / name).mkdir(parents=True, exist_ok=True)
+        (cache / name).symlink_to(home / name)
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache))
+    return cache / "twodof"
+
+
+def answer(number):
+    code = b'__attribute__((visibility("default"))) int answer(void) { return %d; }' % number
+    return compile_library({"a.c": code}, "linux64", "Arm", units=["a.c"])
+
+
+def test_a_library_is_kept_for_its_sources(kept):
+    first = answer(1)
+    (file,) = kept.iterdir()
+    second = answer(2)
+    assert first != second and len([*kept.iterdir()]) == 2
+    file.write_bytes(hashlib.sha256(b"the same").digest() + b"the same")
+    assert answer(1) == b"the same" and answer(2) == second
+    file.write_bytes(file.read_bytes()[:-1])  # damaged
+    assert answer(1) == first == answer(1)
+
+
+def test_libraries_that_are_not_used_are_not_kept(kept):
+    answer(1)
+    (used,) = kept.iterdir()
+    answer(2)
+    (unused,) = {*kept.iterdir()} - {used}
+    month = time.time() - 31 * 86400
+    os.utime(used, (month, month))
+    os.utime(unused, (month, month))
+    answer(1)
+    answer(3)
+    assert used.exists() and not unused.exists()
+
+
+def test_no_home_for_the_cache_is_told(monkeypatch, caplog):
+    for name in ("HOME", "XDG_CACHE_HOME", "ZIG_GLOBAL_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # a user without a name
+    assert compiler._cache() is None
+    assert "ZIG_GLOBAL_CACHE_DIR" in caplog.text
+
+
+def test_a_cache_that_cannot_be_is_named(monkeypatch):
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", "/proc/none")
+    with pytest.raises(BuildError, match=r"'/proc/none': .*ZIG_GLOBAL_CACHE_DIR"):
+        compile_library({"a.c": b""}, "linux64", "Arm", units=["a.c"])
+
+
+def test_universal_header():
+    thin = [struct.pack("<III", 0xFEEDFACF, cpu, 3) + b"x" * size
+            for cpu, size in ((0x1000007, 20000), (0x100000C, 5))]  # fmt: skip
+    fat = universal(thin)
+    magic, count = struct.unpack_from(">II", fat)
+    assert (magic, count) == (0xCAFEBABE, 2)
+    for i, library_ in enumerate(thin):
+        cpu, _, offset, size, align = struct.unpack_from(">5I", fat, 8 + 20 * i)
+        assert offset % 2**align == 0 and fat[offset : offset + size] == library_
+        assert cpu == struct.unpack_from("<I", library_, 4)[0]
