@@ -83,7 +83,7 @@ def test_what_is_interrupted_is_resumed(
     for i in range(length(20, 2)):
         path = tmp_path / f"s{i}"
         process = begin(native_path, path, "--workers", "1")
-        while not (path / "part-000000.parquet").exists():
+        while not (path / "part-000001.parquet").exists():
             assert process.poll() is None, process.communicate()
             time.sleep(0.01)
         time.sleep(rng.uniform(0.0, 0.5))
