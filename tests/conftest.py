@@ -39,10 +39,10 @@ def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
 
 
 LONGEST = (
-    "native_platforms", "live", "sweep_workers", "sweep", "view", "publish", "page", "mutations",
-    "docs", "plot_files", "plot", "listener", "hostile_bags", "ends", "native_fmi", "recovery",
-    "states", "slave", "hostile",
-    "bag", "control", "plant", "master", "scene",
+    "native_platforms", "publish", "docs", "native_engine", "states", "live", "fmi3",
+    "sweep_workers", "listener", "view", "stiffness", "directional", "page", "control",
+    "bare_plant", "plot_files", "mutations", "ends", "slave", "pose", "sweep_table", "sweep",
+    "hostile",
 )  # fmt: skip
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from fmpy import read_model_description
 from fmpy.validation import validate_fmu
-from harness import Driver, in_child_process
+from harness import Driver, in_child_process, needs
 from lxml import etree
 
 from twodof import FmuOptions, TwoDofError, build_fmu
+from twodof.export.compiler import host_platform
 from twodof.files import data_file
 
 SHAPES = re.compile(r"<mesh [^>]*>")
@@ -221,6 +222,13 @@ def test_an_fmu_holds_no_file_that_is_none_of_the_robots(tmp_path):
     ):
         build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
     assert list(tmp_path.iterdir()) == [urdf.parent]
+
+
+def test_what_is_compiled_is_said(tmp_path, caplog):
+    needs("ziglang")
+    caplog.set_level("INFO", "twodof.export")
+    build_fmu(tmp_path / "TwoDof.fmu", FmuOptions(native=True))
+    assert set(caplog.messages) == {f"compiling for {host_platform()}", "compiling for the browser"}
 
 
 def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):

@@ -110,6 +110,7 @@ def compile_web_module(
         raise BuildError(
             "cannot compile for the browser: install the package 'ziglang' (the extra 'native')"
         )
+    LOG.info("compiling for the browser")
     exports = [f"-Wl,--export={function}" for function in functions]
     command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *exports, *units]
     return _compile(sources, command, "module.wasm")
