@@ -95,7 +95,7 @@ class Kinematics:
         return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
 
     def _moved(self, joint: Joint, q: ArrayLike) -> Array:
-        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests; at infinity it is nowhere."""
+        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests. Infinity is nowhere."""
         column, ratio, offset = self.column(joint)
         if column is None:
             return np.full((1, 1), offset)
