@@ -213,6 +213,16 @@ def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
     ]
 
 
+def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
+    """Beside limits that are long to tell, and efforts; where they are is told once."""
+    fmu = build(tmp_path, chain_urdf("zyx" * 4, 0.1, low=-1.234, high=2.345), control="joint")
+    bag, target = twodof.Bag(tmp_path / "bag", effort=True), {"q_des": 0.1}
+    twodof.simulate(fmu, bag, stop_time=0.05, settings=target)
+    figure = plot(bag.path)
+    assert_legible(figure)
+    assert "".join(texts(figure)).count("thin dashes: target") == 1
+
+
 def test_a_bag_may_have_the_name_of_a_limit(default: Recording) -> None:
     run = replace(twodof.read_bag(default.bag), path=Path("limit"))
     figure = plot(run)

@@ -33,6 +33,7 @@ import twodof
 from twodof.errors import PlotError, TwoDofError
 from twodof.pages.replay import replay
 from twodof.plots.runs import plot
+from twodof.plots.track import read_tracks
 
 ARM = Path(__file__).parents[1] / "urdf/2dof.urdf"
 
@@ -328,6 +329,20 @@ def test_a_urdf_that_is_wrong_is_named(
     with pytest.raises(PlotError, match=message) as caught:
         plot(bag, urdf=path, **options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_joint_at_infinity_is_nowhere(tmp_path: Path) -> None:
+    """Whether it turns, slides or is followed: a gap in the path and on the replay, no warning."""
+    (tmp_path / "arm.urdf").write_text(chain_urdf("zXy"))
+    t, q, v = waves(3)
+    q[3:6] = np.diag([np.inf, -np.inf, np.inf])
+    bag = elsewhere(tmp_path / "bag", ["j1", "j2", "j3"], t, q, v)
+    track = read_tracks([bag], urdf=tmp_path / "arm.urdf")[0]
+    assert track.motion is not None
+    np.testing.assert_array_equal(np.isnan(track.motion.path).any(axis=1).nonzero()[0], [3, 4, 5])
+    plot(bag, urdf=tmp_path / "arm.urdf")
+    replay(bag, urdf=tmp_path / "arm.urdf")
 
 
 UNSOUND: dict[str, Callable[[dict[str, Any]], Any]] = {

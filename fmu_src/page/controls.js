@@ -67,7 +67,8 @@ class Controls {
       const input = document.createElement("input"), typed = type === "range" ? "slider" : variable.unit || "number";
       Object.assign(input, { type, step: "any", checked: value === true });
       if (type === "range") Object.assign(input, { min: String(low), max: String(high) });
-      if (type !== "checkbox") Object.assign(input, { value: String(value), ariaLabel: `${name}, ${typed}` });
+      if (type !== "checkbox") input.value = String(value);
+      if (type !== "checkbox") input.setAttribute("aria-label", `${name}, ${typed}`);
       input.addEventListener(variable.causality === "parameter" || type !== "range" ? "change" : "input", () => {
         if (type === "checkbox") this.told(name, input.checked);
         else if (input.value !== "") this.told(name, Number(input.value));
@@ -135,7 +136,7 @@ function unitsOf(joints) {
 /** Names without the whole words that all of them begin and end with. */
 /** @type {(joints: JointFacts[]) => string[]} */
 function shortNames(joints) {
-  const words = joints.map(({ name }) => name.split(/(?<=[_/])/)), [first] = words;
+  const words = joints.map(({ name }) => name.split(/([^_/]*[_/])/).filter(Boolean)), [first] = words;
   /** Whether all begin, or end, with one word, and have others. */
   /** @type {(at: (own: string[]) => string) => boolean} */
   const alike = (at) => words.length > 1 && words.every((own) => own.length > 1 && at(own) === at(first));

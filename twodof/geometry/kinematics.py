@@ -95,11 +95,12 @@ class Kinematics:
         return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
 
     def _moved(self, joint: Joint, q: ArrayLike) -> Array:
-        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests."""
+        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests. Infinity is nowhere."""
         column, ratio, offset = self.column(joint)
         if column is None:
             return np.full((1, 1), offset)
-        return offset + ratio * np.asarray(q, dtype=np.float64)[:, column, None]
+        moved = offset + ratio * np.asarray(q, dtype=np.float64)[:, column, None]
+        return np.where(np.isinf(moved), np.nan, moved)
 
     def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
         """Where the root is, and the child of each joint of a chain that begins there."""

@@ -175,7 +175,7 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         top = 1.0 - (row - 1) * (ROW + GAP) / height
         layout[f"yaxis{row}"] = _value_axis(panels, top, top - ROW / height)
         strokes = [stroke for panel in panels for stroke in panel.strokes]
-        if any(stroke.label == "target" and not stroke.kind for stroke in strokes):
+        if any(stroke.is_target for stroke in strokes):
             heading += f"; {TARGET}"
         layout["annotations"].append(_heading(heading, top))
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):

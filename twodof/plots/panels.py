@@ -44,7 +44,7 @@ class Panel(NamedTuple):
         unit: "rad or m" where no robot tells which.
         strokes: curves of each track that has it, which have a kind; behind them targets, limits,
             and what the error is in closed form, where that is in the range.
-        told: targets and limits in words; of an error that is below the range, that it is.
+        told: limits in words; of an error that is below the range, that it is.
         range: that shows the curves, and the limits that are near.
     """
 
@@ -108,7 +108,6 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
         if kind == "q" and joint.target.size:
             thin = Look("target", look.colour, (3, 2))
             targets.append(_curve("target", i, track.t, joint.target, thin, THIN, 1.95, joint=name))
-            words.append(TARGET)
         pair = _limits(kind, joint)
         for limit in pair:
             if limit is not None:

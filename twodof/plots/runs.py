@@ -20,6 +20,7 @@ from .figure import Drawing, drawn
 from .interactive import body
 from .panels import (
     KINDS,
+    TARGET,
     UNITS,
     Looks,
     Panel,
@@ -127,6 +128,8 @@ class _Page:
 
         self.letters = letters = int((self.width - 2 * MARGIN) / LETTER)
         self.settings = textwrap.wrap(common_settings(tracks), letters)
+        if any(stroke.is_target for panel in self.panels for stroke in panel.strokes):
+            self.settings.append(TARGET)
         if len(tracks) == 1 and tracks[0].task:
             self.settings += textwrap.wrap(outcome(tracks[0]), letters)
         self.keys = max(1, letters // (12 + max(len(look.label) for look in bags)))

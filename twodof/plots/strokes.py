@@ -68,6 +68,11 @@ class Stroke(NamedTuple):
         return self.label == "limit" and not self.kind
 
     @property
+    def is_target(self) -> bool:
+        """Whether it is a target over time, and not a curve that is called so."""
+        return self.label == "target" and not self.kind
+
+    @property
     def is_whole(self) -> bool:
         """Whether it is whole lines."""
         return len(self.x) != len(self.y)
