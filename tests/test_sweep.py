@@ -124,9 +124,13 @@ def test_what_is_not_defined_is_null(native_path: Path) -> None:
 
 
 @pytest.mark.parametrize("max_step", [1e-3, 1e-9], ids=["finished", "discarded"])
-def test_a_trace_has_the_numbers_of_the_samples(native_path: Path, max_step: float) -> None:
+@pytest.mark.parametrize("flavour", ["python", "native"])
+def test_a_trace_has_the_numbers_of_the_samples(
+    fmu_path: Path, native_path: Path, flavour: str, max_step: float
+) -> None:
     """To the bit; where a run fails, so do both, at the same step and for the same reason."""
-    run = twodof.experiment(native_path, stop_time=2.0, settings={"max_step": max_step})
+    fmu = {"python": fmu_path, "native": native_path}[flavour]
+    run = twodof.experiment(fmu, stop_time=0.5, settings={"max_step": max_step})
     ends = []
 
     def whole(read: Callable[[Instance], object]) -> object:
