@@ -197,6 +197,8 @@ def _panda_hand(elbow):
         ({"axes": "xyz"}, "the shipped arm moves in the x-y plane"),
         ({"name": "Two Dof"}, "name 'Two Dof' must be an identifier"),
         ({"frame": "hand"}, "no frame 'hand' in the URDF; there are: .*EndEffector"),
+        ({"frame": ""}, "no frame ''"),
+        ({"axes": ""}, "axes ''"),
         ({"q_start": (1.0,)}, "q_start has 1 values, the robot has 2 joints: joint1, joint2"),
         ({"gravity": (0.0, float("nan"), 0.0)}, "gravity .* must be finite"),
         ({"gravity": (0.0, -9.81)}, r"gravity \(0.0, -9.81\) must be three numbers"),
