@@ -202,7 +202,8 @@ def _panda_hand(elbow):
         ({"q_start": (1.0,)}, "q_start has 1 values, the robot has 2 joints: joint1, joint2"),
         ({"gravity": (0.0, float("nan"), 0.0)}, "gravity .* must be finite"),
         ({"gravity": (0.0, -9.81)}, r"gravity \(0.0, -9.81\) must be three numbers"),
-        ({"mesh_dir": Path("nowhere")}, "the mesh folder 'nowhere' does not exist"),
+        ({"mesh_dir": "nowhere"}, "the mesh folder 'nowhere' does not exist"),
+        ({"urdf": ""}, "directory"),
         ({"urdf": Path("nowhere.urdf")}, "cannot read the URDF 'nowhere.urdf'"),
     ],
 )
