@@ -85,8 +85,8 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
     """
     constants, n, axes = joint_tree(robot), len(robot.joints), len(robot.axes)
     sizes = {"q": n, "v": n, **dict.fromkeys(INPUTS, axes), "Kn": 1, "tau_ext": n}
-    made = {name: _vector(name, size) for name, size in sizes.items()}
-    of = {name: vector for name, (_, vector) in made.items()}
+    vectors = {name: _vector(name, size) for name, size in sizes.items()}
+    of = {name: vector for name, (_, vector) in vectors.items()}
     joint = np.array(
         [
             (q, 0.0) if slides else (Symbol(casadi.cos(q.sx)), Symbol(casadi.sin(q.sx)))
@@ -108,7 +108,7 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
             else solve_by_recursion(constants, constants.body, joint, effort)
         )
     result = casadi.vertcat(*(getattr(each, "sx", each) for each in a))
-    given = [sx for sx, _ in made.values()]
+    given = [sx for sx, _ in vectors.values()]
     return casadi.Function("generated", given, [casadi.cse(result)], {"live_variables": False})
 
 

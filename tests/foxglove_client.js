@@ -14,7 +14,8 @@ function tell(...what) {
 }
 
 client.on("advertise", (channels) => {
-  for (const { id, topic, schema } of channels) {
+  for (const { id, topic, schema, encoding, schemaEncoding } of channels) {
+    if (encoding !== "cdr" || schemaEncoding !== "ros2msg") tell("error", topic, encoding, schemaEncoding);
     topics.set(client.subscribe(id), [topic, new MessageReader(parse(schema, { ros2: true }))]);
   }
   tell("advertised");

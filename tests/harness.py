@@ -19,6 +19,7 @@ import zipfile
 from concurrent.futures import ProcessPoolExecutor
 from ctypes import byref
 from pathlib import Path
+from textwrap import dedent, indent
 
 import fmpy
 import pytest
@@ -283,17 +284,23 @@ def cannot_run(reason):
     return pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)
 
 
-def changed_plant(fmu_path, folder, old, new):
-    """The default FMU with other code inside, under another digest."""
+def changed_step(fmu_path, folder, lines):
+    """The default FMU, whose plant does this before each step, or in its place."""
+    body = indent(dedent(lines).strip(), "    ")
+    code = f"step = Plant.step\n\ndef changed(self, h):\n{body}\n    step(self, h)\n"
+    return changed_plant(fmu_path, folder, f"{code}\nPlant.step = changed\n")
+
+
+def changed_plant(fmu_path, folder, code):
+    """The default FMU with code of ours behind that of its plant, under another digest."""
     other = folder / "Changed.fmu"
     with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(other, "w") as changed:
         (tag,) = {m[1] for n in archive.namelist() if (m := re.search(r"slave_(\w+)\.py", n))}
-        own = format(abs(hash((old, new))), "x")
+        own = format(abs(hash(code)), "x")
         for name in archive.namelist():
             content = archive.read(name)
             if name.endswith("plant/plant.py"):
-                assert old in content
-                content = content.replace(old, new)
+                content += b"\n\n" + code.encode()
             if name.endswith("slavemodule.txt"):
                 content = content.replace(tag.encode(), own.encode())
             changed.writestr(name.replace(tag, own), content)

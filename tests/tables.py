@@ -10,13 +10,14 @@ import pandas
 
 COMMAND = [sys.executable, "-m", "twodof"]
 SMALL = {"Kp": (20.0, 60.0, 180.0), "Kd": (8.0, 30.0)}
-BEGUN = b"""        import os, signal
-        with open(os.environ['BEGUN'], 'a') as file:
-            file.write(f'{self.Kp[0]:g} ')
-        if self.Kp[0] % 300 == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        stops = self._stops()"""
-"""In place of its last line: tells which runs are begun, and kills the process of some."""
+BEGUN = """
+import os, signal
+with open(os.environ['BEGUN'], 'a') as file:
+    file.write(f'{self.Kp[0]:g} ')
+if self.Kp[0] % 300 == 0:
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+"""Before a step: tells which runs are begun, and kills the process of some."""
 
 
 def table_of(path: Path) -> pandas.DataFrame:

@@ -80,7 +80,7 @@ def test_no_home_for_the_cache_is_told(monkeypatch, caplog):
     for name in ("HOME", "XDG_CACHE_HOME", "ZIG_GLOBAL_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # a user without a name
-    assert compiler._cache() is None
+    assert compiler.zig_cache() is None
     assert "ZIG_GLOBAL_CACHE_DIR" in caplog.text
 
 

@@ -92,10 +92,14 @@ def test_the_command_line_tells_where_it_listens(native_path: Path, number: int)
 def test_what_is_no_gain_is_ignored(
     native_path: Path, caplog: pytest.LogCaptureFixture, name: str, value: Any, reason: str
 ) -> None:
-    from foxglove import Parameter
-
     viewer = Foxglove(0).begin(twodof.experiment(native_path))
-    viewer._gains.on_set_parameters(None, [Parameter(name, value=value)])
+    asked = {"name": name} if value is None else {"name": name, "value": value}
+    with (
+        viewer,
+        connect(viewer.url, subprotocols=["foxglove.sdk.v1"]) as connection,  # type: ignore[list-item]
+    ):
+        connection.send(json.dumps({"op": "setParameters", "parameters": [asked], "id": "a"}))
+        wait_until(lambda: caplog.records)
     assert viewer.command() == {}
     (record,) = caplog.records
     assert reason in record.message

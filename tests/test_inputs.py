@@ -89,6 +89,7 @@ def test_setting_gives_values_of_variables(
 
 UNRESOLVED = {
     "unknown, a near name": ({"Kpp": 1}, "no variable 'Kpp'; did you mean 'Kp'"),
+    "unknown, other case": ({"KP": 1}, "no variable 'KP'; did you mean 'Kp'"),
     "unknown, a near vector": ({"xdes": 1}, "no variable 'xdes'; did you mean 'x_des'"),
     "unknown, a near parameter": ({"qstart": 1}, "'qstart'; did you mean 'q_start'"),
     "unknown, nothing near": ({"#####": 1}, "no variable '#####'; there are: .*Kd"),
@@ -171,6 +172,7 @@ BAD_TABLES = {
     "output": ("time,q[1]\n0,1\n", r"q\[1\] is not an input"),
     "no rows": ("time,Kn\n", "has no rows|is empty"),
     "cell over two lines": ('time,Kn\n0,"1\n1"\n', "row 3: 1 cells, expected 2"),
+    "row below an empty line": ("time,Kn\n\n0,high\n", "row 3"),
     "long cell": ("time,Kn\n0," + "x" * 200, "Kn = 'x{50}' is not a number"),
 }
 

@@ -219,7 +219,9 @@ def test_a_mesh_used_twice_is_taken_along_once(disk: Path) -> None:
 
 
 def test_nothing_but_the_names_of_meshes_changes(disk: Path) -> None:
-    before = urdf(PACKAGE).replace("<link", "<!-- a 'comment' -->\n<link\n  ")
+    before = urdf(PACKAGE).replace(
+        "<link", '<!-- <mesh filename="package://old/gone.stl"/> -->\n<link\n  '
+    )
     after, _ = collect_meshes(before, disk, disk / "ws")
     expected = before.replace(PACKAGE, "package://meshes/base.stl")
     assert ET.canonicalize(after, with_comments=True) == ET.canonicalize(

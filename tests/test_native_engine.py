@@ -297,7 +297,7 @@ def test_damping_changes_the_motion():
     plant.q, plant.v, plant.tau_ext, plant.limit_effort = [0.3, 0.5], [1.0, -2.0], [1.0, 2.0], True
     a = np.empty(2)
     of.call("acceleration", of.values(plant), a)
-    expected = plant._equations_of_motion()(np.array(plant.q), np.array(plant.v))
+    expected = plant.equations_of_motion()(np.array(plant.q), np.array(plant.v))
     assert deviation(a, np.array(expected[0])) <= 1e-11
 
 

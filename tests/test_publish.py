@@ -442,6 +442,7 @@ def test_an_hour_has_flat_memory(
         ({"ROS_DOMAIN_ID": str(LAST_DOMAIN)}, Network(LAST_DOMAIN)),
         ({"ROS_STATIC_PEERS": "10.0.0.5;localhost;"}, Network(peers=("10.0.0.5", "localhost"))),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, Network(range="OFF")),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, Network(range="SUBNET")),
         (
             {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
             Network(loopback=True),
@@ -456,6 +457,7 @@ def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> 
     ("variables", "culprit"),
     [
         ({"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233', not a number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "-1"}, "ROS_DOMAIN_ID is '-1'"),
         ({"ROS_DOMAIN_ID": "²"}, "ROS_DOMAIN_ID is '²'"),
         ({"ROS_LOCALHOST_ONLY": "yes"}, "ROS_LOCALHOST_ONLY is 'yes', not 0 or 1"),
         (

@@ -26,6 +26,7 @@ from bags import (
     SCHEMA,
     SECOND,
     START,
+    channel,
     chunk,
     joint_message,
     message,
@@ -95,6 +96,14 @@ def test_hostile_mcap_is_refused(
     refused(capsys, bag)
 
 
+def test_mcap_of_more_topics_than_are_read_is_refused(
+    bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    topics = b"".join(channel(i, f"/t{i}") for i in range(2, 1002))
+    (bag / "bag.mcap").write_bytes(TOPIC + topics + FOOTER)
+    assert "has more than 1000 topics" in refused(capsys, bag)
+
+
 COUNT = "WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c)"
 TOPICS = "(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT"
 MESSAGES = "(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
@@ -141,6 +150,10 @@ DATABASES = {
     "two hundred tables": (
         "".join(f"CREATE TABLE t{n} (id);" for n in range(200)),
         "interrupted",
+    ),
+    "more topics than are read": (
+        f"INSERT INTO topics {COUNT} SELECT n + 9, 't' || n, 'x', 'cdr', '' FROM c LIMIT 1000",
+        "has more than 1000 topics",
     ),
     "no messages": ("DROP TABLE messages", "has no messages"),
     "no topics": ("DROP TABLE topics", "has no messages"),

@@ -108,6 +108,12 @@ def swollen(content: bytes) -> bytes:
     return entry.sub(lambda match: match[1] + b"\xfe\xff\xff\xff", content)
 
 
+def encrypted(content: bytes) -> bytes:
+    """A zip whose entries say that they are encrypted."""
+    head = re.compile(rb"(PK\x03\x04..|PK\x01\x02....)\x00", re.DOTALL)
+    return head.sub(lambda match: match[1] + b"\x01", content)
+
+
 def text(name: str, content: str | bytes) -> Callable[[Path], None]:
     data = content.encode() if isinstance(content, str) else content
 
@@ -198,6 +204,7 @@ BAD: dict[str, Case] = {
     "FMU damaged": (fmu(description(), change=damaged), RUN_BAD, "'bad.fmu'"),
     "FMI 1.0": (fmu(FMI1), RUN_BAD, "'bad.fmu' is FMI 1.0 .*FMI 2.0"),
     "FMI 3.0": (fmu(FMI3), RUN_BAD, "'bad.fmu' is FMI 3.0 .*FMI 2.0 or 3.0 co-simulation"),
+    "FMU encrypted": (fmu(description(), change=encrypted), RUN_BAD, "'bad.fmu'.*encrypted"),
     "model exchange": (
         fmu(description(kind="ModelExchange")), RUN_BAD, "'bad.fmu' is FMI 2.0 model exchange",
     ),
@@ -214,6 +221,9 @@ BAD: dict[str, Case] = {
     ),
     "binary that is none": (fmu(description()), RUN_BAD, "'bad.fmu' cannot be loaded"),
     "no outputs q": (fmu(description(outputs=("y",))), RUN_BAD, r"no outputs q\[1\]"),
+    "fewer v than q": (
+        fmu(description(outputs=("q[1]", "q[2]", "v[1]"))), RUN_BAD, r"no outputs q\[1\]",
+    ),
     "q and v not outputs": (fmu(description(causality="local")), INFO, r"no outputs q\[1\]"),
     "q and v not Real": (
         fmu(description().replace("<Real/>", "<Integer/>").replace("continuous", "discrete")),
@@ -224,6 +234,7 @@ BAD: dict[str, Case] = {
         INFO, "'bad.fmu' names 2 joints but has 1 outputs",
     ),
     "zip slip": (fmu(description(), "../evil"), RUN_BAD, "unsafe: its member '../evil' leaves"),
+    "zip slip below": (fmu(description(), "resources/../../evil"), RUN_BAD, "unsafe: .*evil"),
     "zip slip of Windows": (fmu(description(), "..\\evil"), RUN_BAD, "unsafe: .*evil"),
     "absolute member": (fmu(description(), "/tmp/twodof_evil"), RUN_BAD, "unsafe: .*'/tmp/twodof_"),
     "symbolic link": (

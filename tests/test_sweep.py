@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import oracles
 import pytest
-from harness import changed_plant
+from harness import changed_step
 from tables import BEGUN, SMALL, same
 
 import twodof
@@ -124,9 +124,13 @@ def test_what_is_not_defined_is_null(native_path: Path) -> None:
 
 
 @pytest.mark.parametrize("max_step", [1e-3, 1e-9], ids=["finished", "discarded"])
-def test_a_trace_has_the_numbers_of_the_samples(native_path: Path, max_step: float) -> None:
+@pytest.mark.parametrize("flavour", ["python", "native"])
+def test_a_trace_has_the_numbers_of_the_samples(
+    fmu_path: Path, native_path: Path, flavour: str, max_step: float
+) -> None:
     """To the bit; where a run fails, so do both, at the same step and for the same reason."""
-    run = twodof.experiment(native_path, stop_time=2.0, settings={"max_step": max_step})
+    fmu = {"python": fmu_path, "native": native_path}[flavour]
+    run = twodof.experiment(fmu, stop_time=0.5, settings={"max_step": max_step})
     ends = []
 
     def whole(read: Callable[[Instance], object]) -> object:
@@ -264,19 +268,20 @@ def test_a_runner_instantiates_once_and_repeats_to_the_bit(
     assert len(made) == 2  # after a failure a new one, whatever state the old one is in
 
 
-ODD = b"""        if self.Kp[0] == 2.0:
-            raise DiscardError('broken inside')
-        if self.Kp[0] == 3.0:
-            self.v = [float('nan')] * 2; return
-        if self.Kp[0] == 4.0:
-            import os, signal; os.kill(os.getpid(), signal.SIGKILL)
-        if self.Kp[0] == 5.0:
-            raise RuntimeError('fatal, after which the standard allows no call')
-        stops = self._stops()"""
+ODD = """
+if self.Kp[0] == 2.0:
+    raise DiscardError('broken inside')
+if self.Kp[0] == 3.0:
+    self.v = [float('nan')] * 2; return
+if self.Kp[0] == 4.0:
+    import os, signal; os.kill(os.getpid(), signal.SIGKILL)
+if self.Kp[0] == 5.0:
+    raise RuntimeError('fatal, after which the standard allows no call')
+"""
 
 
 def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: Path) -> None:
-    odd = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", ODD)
+    odd = changed_step(fmu_path, tmp_path, ODD)
     grid = {"Kp": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0], "rtol": [1e-3, -1.0]}
     table = sweep(odd, grid=grid, stop_time=0.05)
     wanted = []
@@ -305,7 +310,7 @@ def test_a_run_that_kills_is_given_up_alone(
 
     Those that kill are further apart than a batch is long: in one, the second would not begin.
     """
-    fmu = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", BEGUN)
+    fmu = changed_step(fmu_path, tmp_path, BEGUN)
     monkeypatch.setenv("BEGUN", str(tmp_path / "begun"))
     grid = {"Kp": np.arange(1.0, 601.0)}
     table = sweep(fmu, grid=grid, stop_time=0.01, workers=2)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import asked, changed_plant, children_of, lives, needs, wait_until
+from harness import asked, changed_step, children_of, lives, needs, wait_until
 from tables import BEGUN, COMMAND, same, table_of
 
 import twodof
@@ -163,17 +163,18 @@ def test_workers_that_are_killed_cost_no_run(
 # --- how a sweep ends ---
 
 
-SLEEP = b"""        if self.Kp[0] == 4.0:
-            import os, time
-            open(os.environ['ASLEEP'], 'w').close()
-            time.sleep(1e6)
-        stops = self._stops()"""
+SLEEP = """
+if self.Kp[0] == 4.0:
+    import os, time
+    open(os.environ['ASLEEP'], 'w').close()
+    time.sleep(1e6)
+"""
 
 
 @contextmanager
 def asleep(fmu_path: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """A sweep, in folder/s, whose third run takes days and has begun; and its workers."""
-    fmu = changed_plant(fmu_path, folder, b"        stops = self._stops()", SLEEP)
+    fmu = changed_step(fmu_path, folder, SLEEP)
     grid = ["--grid", "Kp=2:6:5", "--stop-time", "0.05", "--workers", "1"]
     process = subprocess.Popen(
         [*COMMAND, "sweep", str(fmu), *grid, "-o", str(folder / "s")],
@@ -315,7 +316,7 @@ def test_a_run_that_kills_is_given_up_by_a_cluster(
     fmu_path: Path, tmp_path: Path, two_workers: tuple[str, int, Path]
 ) -> None:
     """And not what its worker has in hand beside it, of which Dask thinks no better."""
-    fmu = changed_plant(fmu_path, tmp_path, b"        stops = self._stops()", BEGUN)
+    fmu = changed_step(fmu_path, tmp_path, BEGUN)
     address, _, begun = two_workers
     grid = {"Kp": [298.0, 299.0, 300.0, 301.0]}
     table = sweep(fmu, grid=grid, stop_time=0.01, scheduler=address)

@@ -57,18 +57,18 @@ def read_commands(
         InputError: it has no such commands, or one that is none.
     """
     fmu, path = fmu if isinstance(fmu, Fmu) else load_fmu(fmu), Path(path)
-    run = read_provenance(*robot_in(path)) if topic is None else {}
-    if run:
-        if KNOWN_UNTIL in run:
-            raise InputError(f"'{path}' knows its inputs until {run[KNOWN_UNTIL]:g} s only")
-        start = run["start_time"]
-        changes = [(t - start, resolve(fmu, values)) for t, values in run["input_changes"]]
-        return [(-inf, resolve(fmu, _inputs(fmu, run["start_values"]))), *changes]
+    provenance = read_provenance(*robot_in(path)) if topic is None else {}
+    if provenance:
+        if KNOWN_UNTIL in provenance:
+            raise InputError(f"'{path}' knows its inputs until {provenance[KNOWN_UNTIL]:g} s only")
+        start = provenance["start_time"]
+        changes = [(t - start, resolve(fmu, values)) for t, values in provenance["input_changes"]]
+        return [(-inf, resolve(fmu, _inputs(fmu, provenance["start_values"]))), *changes]
     follows = Commands(fmu)
     types = (*follows.types, *[JOINT_TRAJECTORY] * all(map(fmu.vector, (*FOLLOWING, "q_start"))))
-    found, begins = _messages(path, types, topic)
-    chosen = _only(found, path, topic, types)
-    commands = sorted(found[chosen], key=lambda command: command[0])
+    topics, begins = _messages(path, types, topic)
+    chosen = _only(topics, path, topic, types)
+    commands = sorted(topics[chosen], key=lambda command: command[0])
     begin = min((t for name, t in begins.items() if name != chosen), default=commands[0][0])
     if len(commands) > MAX_COMMANDS:
         raise InputError(f"'{path}' has more than {MAX_COMMANDS} messages on {shown(chosen)}")
@@ -85,7 +85,7 @@ def _messages(
     path: Path, types: Sequence[str], topic: str | None
 ) -> tuple[dict[str, Stored], dict[str, int]]:
     """What may be commands, by topic; and of each topic of joint states the time of the first."""
-    found: dict[str, Stored] = {}
+    topics: dict[str, Stored] = {}
     begins: dict[str, int] = {}
     try:
         files, allowance = whole_bag(path), Allowance()
@@ -96,11 +96,11 @@ def _messages(
                 begins[channel.topic] = min(first, begins.get(channel.topic, first))
             wanted = channel.topic not in SAMPLES if topic is None else channel.topic == topic
             if channel.type in types and wanted:
-                told = zip(stamps.tolist(), repeat(channel.type), map(Rows.tobytes, data))
-                found.setdefault(channel.topic, []).extend(told)
+                rows = zip(stamps.tolist(), repeat(channel.type), map(Rows.tobytes, data))
+                topics.setdefault(channel.topic, []).extend(rows)
     except (OSError, DamageError) as error:
         raise BagError(f"cannot read the bag '{path}': {error}") from error
-    return found, begins
+    return topics, begins
 
 
 def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
@@ -114,11 +114,11 @@ def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in values.items() if commands_it(name)}
 
 
-def _only(found: Mapping[str, object], path: Path, topic: str | None, types: Sequence[str]) -> str:
+def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Sequence[str]) -> str:
     """The topic of the commands."""
-    if len(found) == 1:
-        return next(iter(found))
-    there = ", ".join(sorted(map(shown, found)))
+    if len(topics) == 1:
+        return next(iter(topics))
+    there = ", ".join(sorted(map(shown, topics)))
     if there:
         raise InputError(f"'{path}' has several topics that can be commands: {there}; choose one")
     kinds = " or ".join(types) or "nothing: it has no inputs for them"

@@ -75,8 +75,8 @@ def read_metadata(path: Path, name: str, key: str) -> str:
     """
     with refusing_damage(path):
         for _, content in _records(path, Allowance(), (METADATA,)):
-            found, _, position = fields("sI", content, HEAD.size)
-            if found == name:
+            title, _, position = fields("sI", content, HEAD.size)
+            if title == name:
                 return _entries(content[position:]).get(key, "")
     return ""
 

@@ -58,6 +58,6 @@ def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
     for line in lines:
         line = np.where(np.isfinite(line), line, np.nan)
         for extreme in (np.fmin, np.fmax):
-            found = np.flatnonzero(line == np.repeat(extreme.reduceat(line, starts), sizes))
-            kept[found[np.diff(parts[found], prepend=-1) > 0]] = True
+            places = np.flatnonzero(line == np.repeat(extreme.reduceat(line, starts), sizes))
+            kept[places[np.diff(parts[places], prepend=-1) > 0]] = True
     return np.flatnonzero(kept)

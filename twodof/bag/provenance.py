@@ -122,8 +122,8 @@ def robots_of(folder: Path) -> list[str]:
     if (folder / FILE).exists():
         return [""]
     names = (file.name for file in folder.glob("run.*.json"))  # "run.left (1).json" is a copy
-    found = (re.fullmatch(r"run\.([\w%]+)\.json", name, re.ASCII) for name in names)
-    return sorted(unquote(match[1]) for match in found if match) or [""]
+    matches = (re.fullmatch(r"run\.([\w%]+)\.json", name, re.ASCII) for name in names)
+    return sorted(unquote(match[1]) for match in matches if match) or [""]
 
 
 def robot_in(path: Path) -> tuple[Path, str]:

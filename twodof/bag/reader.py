@@ -310,10 +310,10 @@ class _Targets:
             return
         self._sound &= self._frame in (None, frame)
         self._frame = frame
-        told = np.ones(len(stamps), bool)  # a point that is repeated says nothing new
-        told[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
-        self._stamps.frombytes(stamps[told].tobytes())
-        self._points.frombytes(points[told].tobytes())
+        new = np.ones(len(stamps), bool)  # a point that is repeated says nothing new
+        new[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
+        self._stamps.frombytes(stamps[new].tobytes())
+        self._points.frombytes(points[new].tobytes())
 
     def heard(self, stamps: Stamps) -> Heard | None:
         """The latest by each of these stamps; None where there are none, or not of one frame."""

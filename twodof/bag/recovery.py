@@ -128,8 +128,8 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
     except (OSError, DamageError):
         return None
     summed = sum(sum(summary.counts.values()) for summary in summaries if summary)
-    told = {stated, *([] if None in summaries else [summed])}
-    return dict(counts) if told == {counts.total()} else None
+    totals = {stated, *([] if None in summaries else [summed])}
+    return dict(counts) if totals == {counts.total()} else None
 
 
 def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:

@@ -140,9 +140,9 @@ def _print_fmu(fmu: Fmu) -> None:
         )
         if getattr(simulation, name)
     ]
-    made = ", ".join(filter(None, (fmu.name, fmu.description.generationTool)))
+    origin = ", ".join(filter(None, (fmu.name, fmu.description.generationTool)))
     print_table(
-        ("FMU", f"{fmu.path} ({made})"),
+        ("FMU", f"{fmu.path} ({origin})"),
         ("FMI", fmu.description.fmiVersion),
         ("digest", fmu.guid),
         ("platforms", ", ".join(fmu.platforms) or "none"),

@@ -191,7 +191,7 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
     with temporary_folder() as folder:
         environment, kept = dict(os.environ), None
         if command[: len(ZIG)] == [*ZIG]:
-            cache = _cache()
+            cache = zig_cache()
             environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache or folder / "zig-cache")
             environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # of these sources
             if cache:
@@ -245,7 +245,7 @@ def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -
         )
 
 
-def _cache() -> Path | None:
+def zig_cache() -> Path | None:
     """Where zig keeps the C library that it has compiled; None where home has no room for it.
 
     Raises:

@@ -52,10 +52,11 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
     if options.control not in CONTROLS:
         raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
-    path = Path(options.urdf or data_file("urdf", "2dof.urdf"))
-    mesh_dir = options.mesh_dir if options.urdf else data_file("meshes")
-    if options.mesh_dir is not None and not options.mesh_dir.is_dir():
+    path = data_file("urdf", "2dof.urdf") if options.urdf is None else Path(options.urdf)
+    mesh_dir = None if options.mesh_dir is None else Path(options.mesh_dir)
+    if mesh_dir is not None and not mesh_dir.is_dir():
         raise BuildError(f"the mesh folder '{options.mesh_dir}' does not exist")
+    mesh_dir = data_file("meshes") if options.urdf is None else mesh_dir
     text = read_text(path, mesh_dir)
     text = lock_joints(text, options.lock) if options.lock else text
     if options.frame is None:

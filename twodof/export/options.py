@@ -39,7 +39,7 @@ class FmuOptions:
     """
 
     urdf: str | Path | None = None
-    mesh_dir: Path | None = None
+    mesh_dir: str | Path | None = None
     frame: str | None = None
     lock: Mapping[str, float] = field(default_factory=dict)
     meshes: bool = True

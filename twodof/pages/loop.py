@@ -258,10 +258,12 @@ class Loop:
             except SimulationError as error:
                 self.note(str(error))
 
-    def _starting(self, told: Mapping[str, Value]) -> Experiment:
-        """The run, but for what is told, from the start."""
+    def _starting(self, values: Mapping[str, Value]) -> Experiment:
+        """The run, but for these values, from the start."""
         run = self._run
-        return replace(run, start_values={**run.start_values, **told}, given={**run.given, **told})
+        return replace(
+            run, start_values={**run.start_values, **values}, given={**run.given, **values}
+        )
 
     def _record(self) -> None:
         path = free_name(self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))

@@ -143,7 +143,7 @@ class Plant:
             self.v.append(v)
         y = [*self.q, *self.v]
         with refusing(ParameterError):
-            self._stops().impact(y, [False] * len(self.q))
+            self.stops().impact(y, [False] * len(self.q))
         self.v = y[len(self.q) :]
         return warnings
 
@@ -168,12 +168,12 @@ class Plant:
                 f"max_step = {self.max_step:g} s divides a step of {h:g} s into more than"
                 f" {BUDGET // STAGES} integration steps; enlarge max_step or shorten the step"
             )
-        stops = self._stops()
+        stops = self.stops()
         try:
             # what overflows is refused, without a warning
             with refusing(DiscardError), np.errstate(over="ignore", invalid="ignore"):
                 self.q, self.v = advance(
-                    self._equations_of_motion(), self.q, self.v, h, stops,
+                    self.equations_of_motion(), self.q, self.v, h, stops,
                     self.rtol, self.atol, self.max_step,
                 )  # fmt: skip
         except FloatingPointError as error:
@@ -237,28 +237,13 @@ class Plant:
         """
         self._check_target()
         with refusing(DiscardError):
-            acceleration, _ = self._equations_of_motion()(np.array(self.q), np.array(self.v))
+            acceleration, _ = self.equations_of_motion()(np.array(self.q), np.array(self.v))
             rates = list(acceleration)
-            self._stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
+            self.stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
         return rates
 
-    def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
-        return self._real.observe(np.array(self.q), np.array(self.v))
-
-    def _stops(self) -> Stops:
-        limits = list(zip(self.q_min, self.q_max))
-        return Stops(limits, self._real.inverse_mass if self.rigid_stops else None)
-
-    def _control_effort(self, command: Response, q: Array, v: Array) -> tuple[Array, int]:
-        given, rank = command(q, v)
-        tau: Array = np.array(given)
-        if self._commands == "acceleration":
-            tau = self.known.inverse_dynamics(q, v, tau)
-        if self.limit_effort:
-            tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
-        return tau, rank
-
-    def _equations_of_motion(self) -> Response:
+    def equations_of_motion(self) -> Response:
+        """The function of (q, v) that gives q̈ under the present inputs, and the rank of its J⁺."""
         command: Response = self._law(self)
         damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
         force = np.array(self.f_ext)
@@ -279,6 +264,23 @@ class Plant:
             return self._real.forward_dynamics(q, v, tau + effort).tolist(), rank
 
         return acceleration
+
+    def stops(self) -> Stops:
+        """The limits as the integrator meets them, rigid or not."""
+        limits = list(zip(self.q_min, self.q_max))
+        return Stops(limits, self._real.inverse_mass if self.rigid_stops else None)
+
+    def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
+        return self._real.observe(np.array(self.q), np.array(self.v))
+
+    def _control_effort(self, command: Response, q: Array, v: Array) -> tuple[Array, int]:
+        given, rank = command(q, v)
+        tau: Array = np.array(given)
+        if self._commands == "acceleration":
+            tau = self.known.inverse_dynamics(q, v, tau)
+        if self.limit_effort:
+            tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
+        return tau, rank
 
     def _check_target(self) -> None:
         if self.control == "pose" and not any(self.quat_des):

@@ -180,7 +180,9 @@ def _mass(urdf: Urdf, joint: Joint, odd: list[str]) -> float:
         body.extend(other.child for other in fixed if other.parent == name)
     links = {str(link.get("name")): link for link in urdf.tree.findall("link")}
     inertials = ((name, links[name].find("inertial")) for name in body)
-    return sum(_check_inertia(name, found, odd) for name, found in inertials if found is not None)
+    return sum(
+        _check_inertia(name, inertial, odd) for name, inertial in inertials if inertial is not None
+    )
 
 
 def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:

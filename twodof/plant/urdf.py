@@ -241,7 +241,7 @@ def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:
 
 
 def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
-    found: dict[str, ET.Element] = {}
+    elements: dict[str, ET.Element] = {}
     for element in tree.findall(tag):
         name = element.get("name")
         if not name:
@@ -251,17 +251,17 @@ def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
                 f"the URDF has a <{tag}> whose name has {len(name)} characters;"
                 f" at most {MAX_NAME} are supported"
             )
-        if name in found:
+        if name in elements:
             raise RobotError(f"the URDF has two {tag}s named '{name}'")
-        found[name] = element
-    return found
+        elements[name] = element
+    return elements
 
 
 def _check_numbers(element: ET.Element, owner: str) -> None:
     counts = {"xyz": 3, "rpy": 3}
     for tag in NUMERIC_TAGS:
-        for found in element.iter(tag):
-            for key, text in found.attrib.items():
+        for part in element.iter(tag):
+            for key, text in part.attrib.items():
                 try:
                     numbers = [number(word) for word in text.split()]
                 except ValueError:

@@ -158,7 +158,7 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         rows.setdefault(f"{KINDS[panel.kind]} in {panel.unit}", []).append(panel)
     if error := error_panel(tracks, own):
         heading = f"Distance from the target in {error.unit}"
-        rows[": ".join(filter(None, (heading, error.told)))] = [error]
+        rows[": ".join(filter(None, (heading, error.note)))] = [error]
     height = len(rows) * (ROW + GAP) - GAP
     time = {
         **AXIS, "range": [0.0, duration(tracks)], "title": {"text": "time in s"},

@@ -44,7 +44,7 @@ class Panel(NamedTuple):
         unit: "rad or m" where no robot tells which.
         strokes: curves of each track that has it, which have a kind; behind them targets, limits,
             and what the error is in closed form, where that is in the range.
-        told: limits in words; of an error that is below the range, that it is.
+        note: limits in words; of an error that is below the range, that it is.
         range: that shows the curves, and the limits that are near.
     """
 
@@ -52,7 +52,7 @@ class Panel(NamedTuple):
     joint: str
     unit: str
     strokes: tuple[Stroke, ...]
-    told: str
+    note: str
     range: tuple[float, float]
 
 
@@ -115,7 +115,7 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
                 ends, level = np.array([0.0, duration(tracks)]), np.array([limit, limit])
                 dashed = Look("limit", look.colour, (7, 2, 1.5, 2))
                 lines.append(_curve("limit", i, ends, level, dashed, THIN, 1.9, joint=name))
-        words.append(_told(*pair))
+        words.append(_note(*pair))
     smallest = SMALLEST_EFFORT if kind == "tau" else SMALLEST_RANGE
     low, high = _range([stroke.y for stroke in (*curves, *targets)], smallest)
     near = [x for x in limits if abs(2 * x - low - high) < 1.8 * (high - low)]
@@ -123,8 +123,8 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
     pad = 0.06 * (high - low)
     turning, sliding = UNITS[kind]
     unit = {"rad": turning, "m": sliding}.get(own[0][2].unit, f"{turning} or {sliding}")
-    told = "; ".join(filter(None, dict.fromkeys(words)))
-    return Panel(kind, name, unit, (*lines, *targets, *curves), told, (low - pad, high + pad))
+    note = "; ".join(filter(None, dict.fromkeys(words)))
+    return Panel(kind, name, unit, (*lines, *targets, *curves), note, (low - pad, high + pad))
 
 
 def _curve(
@@ -145,11 +145,11 @@ def _limits(kind: str, joint: JointTrack) -> tuple[float | None, float | None]:
     return None, None
 
 
-def _told(low: float | None, high: float | None) -> str:
-    found = [number(float(f"{limit:.3g}")) for limit in (low, high) if limit is not None]
+def _note(low: float | None, high: float | None) -> str:
+    limits = [number(float(f"{limit:.3g}")) for limit in (low, high) if limit is not None]
     if low is not None and high == -low:
-        return f"limits ±{found[1]}"
-    return f"limit{'s' * (len(found) - 1)} {', '.join(found)}" if found else ""
+        return f"limits ±{limits[1]}"
+    return f"limit{'s' * (len(limits) - 1)} {', '.join(limits)}" if limits else ""
 
 
 def _range(values: Sequence[Array], smallest: float) -> tuple[float, float]:
@@ -171,7 +171,7 @@ def error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
     error = np.concatenate([task.error for _, _, task in tasks])
     low = floor(log10(max(float(error.min()), SMALLEST_ERROR)))
     high = max(low + 1, ceil(log10(max(float(error.max()), SMALLEST_ERROR))))
-    told = "" if error.max() >= 10.0**low else f"less than {10.0**low:g} m throughout"
+    note = "" if error.max() >= 10.0**low else f"less than {10.0**low:g} m throughout"
     disturbances = dict.fromkeys(chain(*(task.disturbances for _, _, task in tasks)))
     name = "closed form" + (f" without {', '.join(disturbances)}" if disturbances else "")
     exact = Look("\n".join(textwrap.wrap(name, 36)), PALE, ())
@@ -182,4 +182,4 @@ def error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
     ]
     for i, t, task in tasks:
         strokes.append(_curve(looks[i, ""].label, i, t, task.error, looks[i, ""], kind="error"))
-    return Panel("error", "", "m", tuple(strokes), told, (10.0**low, 10.0**high))
+    return Panel("error", "", "m", tuple(strokes), note, (10.0**low, 10.0**high))

@@ -258,7 +258,7 @@ def _draw_joint(axes: Axes, panel: Panel) -> None:
     own = [stroke.thinned(POINTS) for stroke in panel.strokes if not stroke.is_limit]
     limits = {stroke.y[0]: stroke for stroke in panel.strokes if stroke.is_limit}
     draw(axes, [*own, *(limit._replace(colour=INK) for limit in limits.values())])
-    _tell(axes, panel.told)
+    _tell(axes, panel.note)
     axes.set_ylim(*panel.range)
     set_ticks(axes.yaxis, 4)
 
@@ -279,4 +279,4 @@ def _draw_error(axes: Axes, panel: Panel) -> None:
     if any(not stroke.kind for stroke in panel.strokes):  # one tells of all closed forms
         axes.legend(handles=axes.get_lines()[:1], loc="lower right", bbox_to_anchor=(1.0, 1.02))
     else:
-        _tell(axes, panel.told)
+        _tell(axes, panel.note)

@@ -18,13 +18,13 @@ UNITS = {
 
 def settings_of(bag: Recording) -> dict[str, str]:
     """What the run was told, vectors and scalars by group, e.g. {"Kp": "50 s⁻²"}; {} if unknown."""
-    run = bag.provenance
-    if not run:
+    provenance = bag.provenance
+    if not provenance:
         return {}
-    step = f"{1e3 * run['step']:g} ms"
-    settings = {"FMU": run["fmu"]["file"], "robot": run["robot"], "step": step}
+    step = f"{1e3 * provenance['step']:g} ms"
+    settings = {"FMU": provenance["fmu"]["file"], "robot": provenance["robot"], "step": step}
     (_, first), *later = bag.schedule
-    given = {name for _, values in run["input_changes"] for name in values}
+    given = {name for _, values in provenance["input_changes"] for name in values}
     varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
     groups: dict[str, list[Any]] = {}
     for name, value in first.items():

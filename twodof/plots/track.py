@@ -153,8 +153,8 @@ def _lines(track: Track) -> list[Array]:
     if track.motion is not None:
         lines += [*track.motion.path.T]
     if track.task is not None:
-        found = (track.task.error, track.task.closed_form, track.task.off)
-        lines += [line for line in found if line is not None]
+        errors = (track.task.error, track.task.closed_form, track.task.off)
+        lines += [line for line in errors if line is not None]
     return lines
 
 

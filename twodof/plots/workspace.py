@@ -48,8 +48,8 @@ class View(NamedTuple):
 
 def workspace_title(tracks: Sequence[Track]) -> str:
     """Whose path, in what."""
-    told = dict.fromkeys(f"{t.motion.frame} in {t.motion.root}" for t in tracks if t.motion)
-    return f"Path of {', '.join(told)}"
+    frames = dict.fromkeys(f"{t.motion.frame} in {t.motion.root}" for t in tracks if t.motion)
+    return f"Path of {', '.join(frames)}"
 
 
 def views(tracks: Sequence[Track], looks: Looks) -> list[View]:

@@ -26,11 +26,11 @@ Inputs = dict[str, float]
 
 def warner(log: logging.Logger) -> Callable[[str, str], None]:
     """A function that warns of each kind of fault once."""
-    told: set[str] = set()
+    warned: set[str] = set()
 
     def warn(kind: str, text: str) -> None:
-        if kind not in told:
-            told.add(kind)
+        if kind not in warned:
+            warned.add(kind)
             log.warning("%s; there may be more like it", text)
 
     return warn
