@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import fmpy
 import numpy as np
 import pytest
-from harness import in_child_process
+from harness import Driver, in_child_process, needs
 from native_models import model
 
 import twodof
@@ -113,6 +114,37 @@ def in_casadi(control: str, fmu: str, expected: list[float], folder: Path) -> No
         x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     end = dict(zip(dae.x(), x))
     np.testing.assert_allclose([end[name] for name in Q], expected, rtol=0.0, atol=1e-8)
+
+
+SMALLEST_ARE_0 = """
+#include <xmmintrin.h>
+__attribute__((constructor)) static void begin(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }
+"""
+"""What any library does that was linked with -ffast-math by a gcc before 13."""
+
+
+@pytest.mark.parametrize("flavour", ["native", "python"])
+def test_a_tolerance_of_0_is_refused_where_the_smallest_numbers_are_0(
+    flavour: str, native_path: Path, fmu_path: Path, tmp_path: Path
+) -> None:
+    fmu = native_path if flavour == "native" else fmu_path
+    where_the_smallest_are_0(str(fmu), tmp_path)
+
+
+@in_child_process
+def where_the_smallest_are_0(fmu: str, folder: Path) -> None:
+    (folder / "csr.c").write_text(SMALLEST_ARE_0)
+    command = [needs("gcc"), "-shared", "-fPIC", "csr.c", "-o", "csr.so"]
+    subprocess.run(command, check=True, cwd=folder)
+    ctypes.CDLL(str(folder / "csr.so"))
+    assert np.float64(5e-324) * np.float64(1.0) == 0.0
+    for name in ("rtol", "atol", "max_step"):
+        driver = Driver(fmu)
+        driver.set(**{name: 0.0})
+        driver.call("setupExperiment")
+        driver.call("enterInitializationMode")
+        driver.call("exitInitializationMode")
+        assert any(f"{name} = 0 must be > 0" in text for _, text in driver.log), name
 
 
 # --- a controller that is an FMU of its own ---

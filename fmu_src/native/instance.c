@@ -38,7 +38,8 @@ Status check_range(Instance *instance, int variable, double value)
     for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
         const int index = variable - RANGE[k].first;
         if (index >= 0 && index < RANGE[k].count
-            && !(value >= RANGE[k].low && value <= RANGE[k].high))
+            && !(value >= RANGE[k].low && value <= RANGE[k].high
+                 && (value > 0.0 || !RANGE[k].positive)))
             return report(instance, ERROR, "%s = %g must be %s", VARIABLE_NAME[variable],
                           value, RANGE[k].words);
     }

@@ -92,14 +92,15 @@ def _value_references(groups: Sequence[str]) -> str:
 
 def _ranges(groups: Sequence[str]) -> str:
     rows = "".join(
-        f"\n    {{{group.upper()}, {groups.count(group)}, {_literal(within.low)},"
-        f" {_literal(within.high)}, {_quoted(within.words)}}},"
+        f"\n    {{{group.upper()}, {groups.count(group)},"
+        f" {_literal(0.0 if within.positive else within.low)},"
+        f" {_literal(within.high)}, {int(within.positive)}, {_quoted(within.words)}}},"
         for group, within in RANGES.items()
         if group in groups
     )
     return (
         "/* Values that variables may have; others may be any number. */\nstatic const struct {\n"
-        "    int first, count;\n    double low, high;\n    const char *words;\n"
+        "    int first, count;\n    double low, high;\n    int positive;\n    const char *words;\n"
         f"}} RANGE[] = {{{rows}\n}};\n"
     )
 

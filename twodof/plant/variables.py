@@ -19,16 +19,21 @@ Value = float | bool
 
 @dataclass(frozen=True)
 class Range:
-    """Values that a variable may have, both ends among them, and how to say it."""
+    """Values that a variable may have, both ends among them, and how to say it.
+
+    Attributes:
+        positive: 0 is not one, also where a process takes the smallest numbers for 0.
+    """
 
     low: float
     high: float
     words: str
+    positive: bool = False
 
 
 NO_RANGE = Range(-math.inf, math.inf, "")
 NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
-POSITIVE = Range(math.nextafter(0.0, 1.0), math.inf, "> 0")
+POSITIVE = Range(math.nextafter(0.0, 1.0), math.inf, "> 0", positive=True)
 GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
     **dict.fromkeys((*GAINS, "payload"), NOT_NEGATIVE),
@@ -79,7 +84,7 @@ class Variable:
     def refusal(self, value: Value) -> str:
         """Why it cannot have a value, "" where it can."""
         within = RANGES.get(self.group, NO_RANGE)
-        fits = within.low <= value <= within.high
+        fits = within.low <= value <= within.high and (value > 0 or not within.positive)
         return "" if fits else f"{self.name} = {value:g} must be {within.words}"
 
 
