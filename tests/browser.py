@@ -21,7 +21,7 @@ import numpy as np
 import websockets.sync.client
 from harness import needs
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
@@ -31,7 +31,7 @@ LINKS = (
 )
 """What colours the default arm's two links have."""
 PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
-VIEWPORT = {"width": 900, "height": 560}
+VIEWPORT: ViewportSize = {"width": 900, "height": 560}
 ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
     "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -153,7 +153,7 @@ class Served:
     def status(self, name: str, pid: int | None = None) -> int:
         """A number of /proc/…/status, e.g. Threads, or VmRSS in KiB."""
         text = Path(f"/proc/{pid or self.process.pid}/status").read_text()
-        return int(re.search(rf"^{name}:\s+(\d+)", text, re.M)[1])
+        return int(re.findall(rf"^{name}:\s+(\d+)", text, re.M)[0])
 
 
 @contextmanager
@@ -182,7 +182,7 @@ UPGRADE = (
 
 def answer(url: str, *headers: tuple[str, str], path: str = "/") -> int:
     """The status of the answer to a request with these headers and no others."""
-    with closing(HTTPConnection(*urlsplit(url).netloc.rsplit(":", 1), timeout=60)) as connection:
+    with closing(HTTPConnection(urlsplit(url).netloc, timeout=60)) as connection:
         connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
         for header in headers:
             connection.putheader(*header)
@@ -198,7 +198,7 @@ def hostile_arm() -> ET.Element:
             element.set(key, HOSTILE + element.attrib[key])
     for mesh in robot.iter("mesh"):
         mesh.tag, mesh.attrib = "sphere", {"radius": "0.02"}
-    first = robot.find("joint")
+    first = robot.findall("joint")[0]
     first.set("name", f"1 {first.get('name')}")  # of names alike, pages show the rest
     return robot
 
@@ -278,6 +278,7 @@ def target_place(page: Page) -> tuple[float, float]:
     """The middle of the target's ball in the window, on a page with an arm in it."""
     ball = pixels(picture(page), lambda r, g, b: (r - b > 100) & (g < 105) & (r < 225))
     box = page.locator("canvas").first.bounding_box()
+    assert box is not None
     x, y = np.median(ball, axis=0)
     return float(box["x"] + x), float(box["y"] + y)
 

@@ -26,6 +26,17 @@ def only(axes: Axes, label: str) -> np.ndarray:
     return points(line)
 
 
+def heights(axes: Axes, label: str) -> list[float]:
+    """Where level lines are, the lowest first."""
+    return sorted(points(line)[0, 1] for line in lines(axes, label))
+
+
+def legend_of(axes: Axes) -> list[str]:
+    found = axes.get_legend()
+    assert found is not None
+    return [text.get_text() for text in found.get_texts()]
+
+
 class Panels(NamedTuple):
     """The panels of a figure, joints in the order of their rows."""
 
@@ -86,7 +97,7 @@ def assert_legible(figure: Figure) -> None:
         np.array([corner(box) for _, box in seen])
         for corner in (lambda box: (box.x0, box.y0), lambda box: (box.x1, box.y1))
     )
-    for text, inside in zip(texts, ((low >= 0) & (high <= (width, height))).all(axis=1)):
+    for text, inside in zip(texts, np.all((low >= 0) & (high <= (width, height)), axis=1)):
         assert inside, f"{text} is cut off"
     common = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
     for i, j in np.argwhere(np.triu((common >= 1.0).all(axis=2), k=1)):

@@ -53,13 +53,14 @@ class TwoLinkArm:
 
     def __init__(self, urdf: Path, gravity: float) -> None:
         self.gravity = gravity
-        links = {link.get("name"): link.find("inertial") for link in ET.parse(urdf).iter("link")}
+        links = {
+            link.get("name"): link.findall("inertial/*") for link in ET.parse(urdf).iter("link")
+        }
         self.links = []
         for name in ("link1", "link2"):
-            inertial = links[name]
-            x, y, _ = map(float, inertial.find("origin").get("xyz").split())
-            mass = float(inertial.find("mass").get("value"))
-            izz = float(inertial.find("inertia").get("izz"))
+            inertial = {part.tag: part.attrib for part in links[name]}
+            x, y, _ = map(float, inertial["origin"]["xyz"].split())
+            mass, izz = float(inertial["mass"]["value"]), float(inertial["inertia"]["izz"])
             self.links.append((mass, x, y, izz))
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ if self.Kp[0] % 300 == 0:
 
 def table_of(path: Path) -> pandas.DataFrame:
     """A sweep's table, as it lies in its files, by another reader of Parquet."""
-    return duckdb.sql(f"select * from '{path}/*.parquet'").df()
+    return duckdb.execute(f"select * from '{path}/*.parquet'").df()
 
 
 def same(found: pandas.DataFrame, expected: pandas.DataFrame) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -234,7 +235,7 @@ def table(tmp_path: Path) -> Path:
     return path
 
 
-def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: object) -> list[Sample]:
+def by_hand(fmu: Fmu, rows: dict[int, dict[str, float]], **options: Any) -> list[Sample]:
     """A run whose inputs are sent at communication points; those of point 0 are set before."""
     run = twodof.samples(fmu, stop_time=N * STEP, settings=rows.get(0), stamp_start=0, **options)
     found = [next(run)]
@@ -308,9 +309,7 @@ TIMES = {
 
 
 @pytest.mark.parametrize(("times", "culprit"), TIMES.values(), ids=TIMES)
-def test_times_that_make_no_run_are_refused(
-    fmu: Fmu, times: dict[str, float], culprit: str
-) -> None:
+def test_times_that_make_no_run_are_refused(fmu: Fmu, times: dict[str, Any], culprit: str) -> None:
     with pytest.raises(InputError, match=culprit):
         twodof.experiment(fmu, **times)
 

@@ -125,8 +125,8 @@ def play(page: Page, until_time: float) -> list[dict[str, str]]:
 
 
 def assert_follows(
-    seen: list[dict[str, str]], target: Sequence[float], *, kp: float = KP, kd: float = KD,
-    rounded: float = ROUNDED,
+    seen: list[dict[str, str]], target: Sequence[float] | np.ndarray, *,
+    kp: float = KP, kd: float = KD, rounded: float = ROUNDED,
 ) -> None:  # fmt: skip
     """The arm goes from its start to the target as the closed form says."""
     t = np.array([time_of(found) for found in seen])
@@ -168,9 +168,9 @@ def test_target_is_dragged_and_followed_as_the_closed_form_says(page: Page) -> N
         error = np.linalg.norm(oracles.position(q) - target)
         assert error == pytest.approx(numbers(moment["error"])[0], rel=1e-3, abs=1e-9)
     type_into(page, "x_des[2], m", -0.1)  # away from the arm
-    after, q = picture(page), joints(rows(page))
+    after, angles = picture(page), joints(rows(page))
     links = [direction(area(after, colour)) for colour in LINKS]
-    assert np.sin(links - np.cumsum(q)) == pytest.approx(0.0, abs=0.015)  # rad
+    assert np.sin(links - np.cumsum(angles)) == pytest.approx(0.0, abs=0.015)  # rad
     assert min(colours(before), colours(after)) > 100
     assert (before != after).any(axis=-1).mean() > 0.01
     press(page, "Play")
@@ -237,11 +237,13 @@ def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> 
 
 
 def test_a_setting_that_is_none_is_told_as_text(command: Served, page: Page) -> None:
-    noted, asked = page.evaluate("arm.noted"), ({"q[1]": 1.0}, {"Kp": "much"}, {browser.HOSTILE: 0})
-    for number, values in enumerate(asked, noted + 1):
-        latest(command, lambda news, number=number: news["noted"] == number, ["change", values])
-        name = next(iter(values)).split("[")[0][:50]
-        until(page, lambda said, name=name: name in said, told)
+    def ask(name: str, value: object, number: int) -> None:
+        latest(command, lambda news: news["noted"] == number, ["change", {name: value}])
+        until(page, lambda said: name.split("[")[0][:50] in said, told)
+
+    asked, noted = (("q[1]", 1.0), ("Kp", "much"), (browser.HOSTILE, 0)), page.evaluate("arm.noted")
+    for number, (name, value) in enumerate(asked, noted + 1):
+        ask(name, value, number)
     browser.assert_shown_as_text(page)
     latest(command, lambda news: news["values"]["Kp[1]"] == 60.0, ["change", {"Kp": 60.0}])
     until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
@@ -252,7 +254,8 @@ def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(
 ) -> None:
     """In the Python flavour; what is beyond the page's own pace is not waited for."""
     with served("live", fmu_path, cwd=tmp_path) as command:
-        deaf = socket.create_connection(command.url.removeprefix("http://").split(":"))
+        host, port = command.url.removeprefix("http://").split(":")
+        deaf = socket.create_connection((host, int(port)))
         head = "".join(f"{name}: {value}\r\n" for name, value in browser.UPGRADE)
         deaf.sendall(f"GET /socket HTTP/1.1\r\nHost: localhost\r\n{head}\r\n".encode())
         with opened(shown, command.url) as page:
@@ -265,14 +268,14 @@ def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(
 
 def test_closing_the_last_page_pauses(native_path: Path, tmp_path: Path) -> None:
     """And another signal ends as Ctrl-C does."""
-
-    def stands() -> bool:
-        """Whether time goes on no more than somebody looks."""
-        left = latest(command, lambda news: True)["t"]
-        time.sleep(0.7)
-        return bool(latest(command, lambda news: True)["t"] < left + 0.3)
-
     with served("live", native_path, cwd=tmp_path) as command:
+
+        def stands() -> bool:
+            """Whether time goes on no more than somebody looks."""
+            left = latest(command, lambda news: True)["t"]
+            time.sleep(0.7)
+            return bool(latest(command, lambda news: True)["t"] < left + 0.3)
+
         seen = latest(command, lambda news: news["recorded"] > 20, ["record", True])["t"]
         wait_until(stands)
         assert end(command, tmp_path, signal.SIGTERM) >= seen - 1e-6

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from browser import (
 from harness import needs
 from mcap_ros2.reader import read_ros2_messages
 from native_models import robots_folder
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, ViewportSize
 from rosbags.rosbag2 import Reader
 
 import twodof
@@ -49,6 +50,9 @@ from twodof.simulation.experiments import resolve
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "fmu_src" / "page"
 
+Script = dict[int, dict[str, Any]]
+"""What is set before steps by number."""
+
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
@@ -57,7 +61,7 @@ def browser() -> Iterator[Browser]:
 
 
 @contextmanager
-def shown(browser: Browser, path: Path, **context: object) -> Iterator[Page]:
+def shown(browser: Browser, path: Path, **context: Any) -> Iterator[Page]:
     """A page from its file, without a network; it asks for nothing and complains of nothing."""
     with browser.new_context(
         viewport=VIEWPORT, offline=True, accept_downloads=True, **context
@@ -95,7 +99,7 @@ def page(alive: Page) -> Page:
     return alive
 
 
-def built(folder: Path, name: str, **options: object) -> Path:
+def built(folder: Path, name: str, **options: Any) -> Path:
     """A native FMU of a robot of the package example-robot-data."""
     urdf = next(robots_folder().rglob(f"{name}.urdf"))
     chosen = twodof.FmuOptions(
@@ -110,7 +114,7 @@ def panda(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(folder, "panda", frame="panda_hand_tcp", control="pose")
 
 
-def stepped(path: Path, parameters: dict, script: dict[int, dict], steps: int) -> np.ndarray:
+def stepped(path: Path, parameters: dict, script: Script, steps: int) -> np.ndarray:
     """Samples by FMPy, N × (q, v, x, tau): inputs set before steps by number."""
     fmu = twodof.load_fmu(path)
     names = [name for group in ("q", "v", "x", "tau") for name in fmu.vector(group)]
@@ -125,7 +129,7 @@ def stepped(path: Path, parameters: dict, script: dict[int, dict], steps: int) -
     return np.array(rows)
 
 
-def played(page: Page, parameters: dict, script: dict[int, dict], steps: int) -> np.ndarray:
+def played(page: Page, parameters: dict, script: Script, steps: int) -> np.ndarray:
     """The same by the page."""
     if page.locator("#arm-play").text_content() == "Pause":
         press(page, "Pause")
@@ -146,7 +150,7 @@ def played(page: Page, parameters: dict, script: dict[int, dict], steps: int) ->
     return np.array(json.loads(columns))
 
 
-SESSION = {
+SESSION: Script = {
     0: {"x_des": [0.22, 0.02]},
     200: {"Kp": 90.0, "Kd": [25.0, 30.0]},
     350: {"f_ext": [2.0, -1.0, 0.0]},
@@ -170,7 +174,7 @@ def test_a_session_has_the_numbers_of_the_fmu(browser, tmp_path, native_path, fm
 
 
 def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
-    script = {
+    script: Script = {
         0: {"x_des": [0.45, 0.2, 0.4], "quat_des": [0.9, 0.1, 0.3, 0.2]},
         200: {"Kp_rot": 80.0, "f_ext": [0.0, 5.0, -20.0]},
     }
@@ -216,7 +220,7 @@ READOUT = """() => {
 """Names in the readout, and how many of its cells do not show all that they hold."""
 
 
-PHONE = {"width": 390, "height": 844}
+PHONE: ViewportSize = {"width": 390, "height": 844}
 CUT = """() => [...document.querySelectorAll("#arm-readout td, .slider span")]
     .filter(name => name.checkVisibility() && name.scrollWidth > name.clientWidth)
     .map(name => name.textContent)"""
@@ -233,6 +237,7 @@ def test_all_is_seen_of_a_robot_and_its_names(browser, tmp_path) -> None:
             scene, bar = (
                 page.locator(f".view > {part}").bounding_box() for part in ("canvas", ".bar")
             )
+            assert scene is not None and bar is not None
             assert scene["y"] + scene["height"] <= bar["y"] + 0.5
             assert bar["y"] + bar["height"] <= size["height"] and scene["height"] > 300
         names = page.locator("#arm-readout td:first-child").all_text_contents()
@@ -365,7 +370,7 @@ def download(page: Page, folder: Path) -> Path:
 def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path, capsys) -> None:
     page_path = twodof.page(panda, tmp_path / "panda.html", settings={"Kd": 30.0})
     with shown(browser, page_path) as page:
-        script = {0: {"x_des": [0.45, 0.2, 0.4]}, 40: {"Kp": 70.0}}
+        script: Script = {0: {"x_des": [0.45, 0.2, 0.4]}, 40: {"Kp": 70.0}}
         played(page, {"payload": 0.5}, script, 1700)
         rows = samples(page)
         path = download(page, tmp_path)
@@ -401,7 +406,7 @@ def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path, capsys) 
 
 def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:
     robot = hostile_arm()
-    robot.find("joint").set("name", "1 " + HOSTILE + "j" * (998 - len(HOSTILE)))
+    robot.findall("joint")[0].set("name", "1 " + HOSTILE + "j" * (998 - len(HOSTILE)))
     (tmp_path / "hostile.urdf").write_text(ET.tostring(robot, encoding="unicode"))
     frame = robot.findall("link")[-1].get("name")
     options = twodof.FmuOptions(
@@ -443,7 +448,7 @@ def test_a_page_without_a_name_replaces_a_page_alone(
 
 def test_the_policy_allows_its_own_script_alone(arm) -> None:
     text = arm.read_text()
-    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    policy = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)[0]
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "://" not in re.sub(r"<script.*?</script>", "", text, flags=re.S)
 

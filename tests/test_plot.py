@@ -12,7 +12,18 @@ import matplotlib
 import numpy as np
 import oracles
 import pytest
-from figures import assert_legible, key, lines, notes, only, panels, points, texts
+from figures import (
+    assert_legible,
+    heights,
+    key,
+    legend_of,
+    lines,
+    notes,
+    only,
+    panels,
+    points,
+    texts,
+)
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from recordings import LINK, Recording, build, chain_urdf, long_run, record
@@ -73,7 +84,8 @@ def test_path_and_arm_are_those_of_the_closed_form(default: Recording, figure: F
     np.testing.assert_allclose(path, oracles.position(q), rtol=0.0, atol=1e-14)
     for label, angle in (("arm at the start", q[0]), ("arm at the end", q[-1])):
         elbow = LINK * np.array([math.cos(angle[0]), math.sin(angle[0])])
-        joints = [(0.0, 0.0), (0.0, 0.0), elbow, oracles.position(angle)]  # root and first joint
+        root, end = (0.0, 0.0), oracles.position(angle)  # where the first joint is too
+        joints = np.array([root, root, elbow, end])
         np.testing.assert_allclose(only(view, label), joints, rtol=0.0, atol=1e-14)
     np.testing.assert_array_equal(only(view, "target"), [(0.2, 0.05)])
     circle = only(view, "reach 0.3 m")
@@ -114,7 +126,7 @@ def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(
     np.testing.assert_allclose(closed[:, 1], np.linalg.norm(expected, axis=1), rtol=1e-12)
     low, high = error.get_ylim()
     assert low <= run[:, 1].min() <= run[:, 1].max() <= high
-    assert [text.get_text() for text in error.get_legend().get_texts()] == ["closed form"]
+    assert legend_of(error) == ["closed form"]
 
 
 def test_what_came_out_is_told(default: Recording, figure: Figure) -> None:
@@ -141,7 +153,7 @@ def test_limits_are_lines_that_are_in_view_where_they_are_near(
     assert recording.q[-1, 1] == 1.2
     found = panels(plot(recording.bag))
     second = found.q[1]
-    assert sorted(line.get_ydata()[0] for line in lines(second, "limit")) == [-math.pi, 1.2]
+    assert heights(second, "limit") == [-math.pi, 1.2]
     low, high = second.get_ylim()
     assert low > -1.0
     assert high > 1.2
@@ -154,7 +166,7 @@ def test_limits_are_lines_that_are_in_view_where_they_are_near(
 
 def test_equal_limits_are_told_once(figure: Figure) -> None:
     first = panels(figure).q[0]
-    assert sorted(line.get_ydata()[0] for line in lines(first, "limit")) == [-math.pi, math.pi]
+    assert heights(first, "limit") == [-math.pi, math.pi]
     assert notes(first) == ["limits ±3.14"]
     low, high = first.get_ylim()
     assert -math.pi < low < high < math.pi  # both far away
@@ -167,7 +179,7 @@ def test_efforts_are_drawn_with_their_limits(fmu_path: Path, tmp_path: Path) -> 
     axes = {axes.get_title("left"): axes for axes in figure.axes}["Effort in N·m"]
     tau = np.array([sample.tau for sample in samples])
     np.testing.assert_array_equal(only(axes, "bag")[:, 1], tau[:, 0])
-    assert sorted(line.get_ydata()[0] for line in lines(axes, "limit")) == [-10.0, 10.0]
+    assert heights(axes, "limit") == [-10.0, 10.0]
     assert notes(axes) == ["limits ±10"]
     assert_legible(figure)
 
@@ -226,7 +238,7 @@ def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
 def test_a_bag_may_have_the_name_of_a_limit(default: Recording) -> None:
     run = replace(twodof.read_bag(default.bag), path=Path("limit"))
     figure = plot(run)
-    curves = [line for line in lines(panels(figure).q[0], "limit") if len(line.get_xdata()) > 2]
+    curves = [line for line in lines(panels(figure).q[0], "limit") if len(points(line)) > 2]
     assert [line.get_color() for line in curves] == [looks(["limit"])[0].colour]
 
 
@@ -295,7 +307,7 @@ def test_the_closed_form_says_what_it_leaves_out(
     away = recording.x[0] - settings["x_des"]
     expected = oracles.task_error(away, 50.0, 40.0, recording.t)
     np.testing.assert_allclose(closed[:, 1], np.linalg.norm(expected, axis=1), rtol=1e-10)
-    assert [text.get_text() for text in error.get_legend().get_texts()] == [label]
+    assert legend_of(error) == [label]
 
 
 @pytest.mark.parametrize(("joints", "control"), [("z", "task"), ("zz", "pose")])
@@ -388,7 +400,7 @@ def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Record
         assert len(seen) == 1
     assert len(lines(found.error, "closed form")) == 3
     assert len(lines(found.views[0], "arm at the start")) == 1  # all start alike
-    words = [text.get_text() for text in found.views[0].get_legend().get_texts()]
+    words = legend_of(found.views[0])
     assert words == ["arm at the start", "arm at the end", "path", "target", "reach 0.3 m"]
 
 

@@ -27,7 +27,7 @@ from recordings import LINK, Recording, chain_urdf, elsewhere, long_run, waves
 import twodof
 from twodof.cli.main import main
 from twodof.errors import PlotError, TwoDofError
-from twodof.plots.figure import file_kind, save
+from twodof.plots.figure import Plot, file_kind, save
 from twodof.plots.panels import with_joints
 from twodof.plots.runs import drawing, plot
 from twodof.plots.track import read_tracks
@@ -84,7 +84,7 @@ def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Pat
 
 def test_notebooks_show_it(default: Recording) -> None:
     figure = plot(twodof.read_bag(default.bag))
-    assert isinstance(figure, Figure)
+    assert isinstance(figure, Figure) and isinstance(figure, Plot)
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 

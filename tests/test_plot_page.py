@@ -91,7 +91,7 @@ class Links(HTMLParser):
         if tag in ("link", "iframe", "object", "embed", "image", "img"):
             self.found.append((tag, ""))
         for name, value in attrs:
-            if name in ("src", "href", "xlink:href", "data", "action") and value[:1] != "#":
+            if name in ("src", "href", "xlink:href", "data", "action") and (value or "")[:1] != "#":
                 self.found.append((tag, str(value)))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
-from figures import lines, only, panels, points, texts
+from figures import heights, legend_of, lines, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from recordings import (
@@ -86,8 +86,7 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_pat
     expected = np.linalg.norm(oracles.task_error(start, 50.0, 40.0, recording.t), axis=1)
     np.testing.assert_allclose(only(found.error, "closed form")[:, 1], expected, rtol=1e-10)
     assert len(found.q) == len(found.v) == 6
-    elbow = [line.get_ydata()[0] for line in lines(found.q[2], "limit")]
-    assert sorted(elbow) == pytest.approx([-math.pi, math.pi], rel=1e-3)
+    assert heights(found.q[2], "limit") == pytest.approx([-math.pi, math.pi], rel=1e-3)
 
 
 def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> None:
@@ -150,7 +149,7 @@ def test_only_what_is_in_the_plane_counts_for_the_circle(tmp_path: Path) -> None
     above, beside = panels(seen(tmp_path, urdf, ["j1", "j2"], *waves(2))).views
     np.testing.assert_allclose(np.hypot(*only(above, "reach 0.8 m").T), 0.8)
     assert not lines(beside, "reach 0.8 m")
-    assert "reach 0.8 m" in [text.get_text() for text in beside.get_legend().get_texts()]
+    assert "reach 0.8 m" in legend_of(beside)
 
 
 def test_joints_that_turn_about_skew_axes_have_no_circle(tmp_path: Path) -> None:
@@ -196,10 +195,8 @@ def test_with_a_urdf_it_has_limits_path_and_arm(foreign: Path, ur5: str, tmp_pat
         columns = ["xyz".index(label[0]) for label in (view.get_xlabel(), view.get_ylabel())]
         np.testing.assert_allclose(only(view, "path"), path[:, columns], rtol=0.0, atol=1e-12)
     assert found.views[0].get_title("left") == "Path of tool0 in world"
-    elbow = sorted(line.get_ydata()[0] for line in lines(found.q[0], "limit"))
-    assert elbow == pytest.approx([-math.pi, math.pi], rel=1e-3)
-    pan = sorted(line.get_ydata()[0] for line in lines(found.q[2], "limit"))
-    assert pan == pytest.approx([-2 * math.pi, 2 * math.pi], rel=1e-3)
+    assert heights(found.q[0], "limit") == pytest.approx([-math.pi, math.pi], rel=1e-3)
+    assert heights(found.q[2], "limit") == pytest.approx([-2 * math.pi, 2 * math.pi], rel=1e-3)
     assert found.q[0].get_title("left") == "Position in rad"
 
 
@@ -258,7 +255,7 @@ def test_a_urdf_may_replace_that_of_the_bag(default: Recording, tmp_path: Path) 
     found = panels(plot(default.bag, urdf=tmp_path / "longer.urdf"))
     path = only(found.views[0], "path")
     np.testing.assert_allclose(path, 2 * oracles.position(default.q), rtol=0.0, atol=1e-14)
-    assert {line.get_ydata()[0] for line in lines(found.q[0], "limit")} == {-math.pi, math.pi}
+    assert {*heights(found.q[0], "limit")} == {-math.pi, math.pi}
     assert found.error is not None
     distance = np.linalg.norm(path - (0.2, 0.05), axis=1)
     np.testing.assert_allclose(only(found.error, "Kp50")[:, 1], distance, rtol=1e-12)

@@ -114,8 +114,8 @@ def moving_joints(urdf: str) -> list[str]:
 
 
 def assert_same_poses(found: Placements, expected: Placements, urdf: str) -> None:
-    children = [joint.find("child").get("link") for joint in ET.fromstring(urdf).findall("joint")]
-    assert sorted(found) == sorted(child for child in children if child is not None)
+    children = [child.attrib["link"] for child in ET.fromstring(urdf).findall("joint/child")]
+    assert sorted(found) == sorted(children)
     for link, matrix in found.items():
         np.testing.assert_allclose(matrix, expected[link], rtol=0.0, atol=1e-12, err_msg=link)
 
@@ -288,7 +288,7 @@ def geometries(urdf: str) -> list[tuple[ET.Element, np.ndarray]]:
                 [float(word) for word in attributes.get(key, "0 0 0").split()]
                 for key in ("xyz", "rpy")
             )
-            shape = part.find("geometry")[0]
+            shape = part.findall("geometry/*")[0]
             found.append((shape, pose(position, Rotation.from_euler("xyz", angles))))
     return found
 
@@ -406,7 +406,8 @@ def test_fit_recovers_a_box_or_a_cylinder(seed: int, kind: str, size: tuple[floa
     if kind == "box":
         mesh = trimesh.creation.box(extents=size, transform=placed(seed))
     else:
-        mesh = trimesh.creation.cylinder(*size, sections=64, transform=placed(seed))
+        radius, height = size
+        mesh = trimesh.creation.cylinder(radius, height, sections=64, transform=placed(seed))
     shape = fitted_shape(mesh)[0]
     assert shape.tag == kind
     words = shape.get("size") or f"{shape.get('radius')} {shape.get('length')}"
@@ -426,6 +427,7 @@ def test_fit_finds_the_axis_of_a_cylinder(axis: int) -> None:
 def fitted_shape(mesh: trimesh.Trimesh, urdf: str = "") -> tuple[ET.Element, np.ndarray]:
     """What stands for a mesh in the description of a URDF, which holds it, and where it is."""
     content, urdf = mesh.export(file_type="stl"), urdf or with_mesh()
+    assert isinstance(content, bytes)
     description = Scene(urdf, [], "thing", lambda _: content).description
     assert_shapes_hold_the_meshes(description, urdf, lambda _: single(mesh.vertices))
     (found,) = geometries(description)

@@ -6,7 +6,9 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import oracles
@@ -17,7 +19,8 @@ from tables import BEGUN, SMALL, same
 import twodof
 from twodof import sweep
 from twodof.cli.main import main
-from twodof.fmu import Instance, instantiate
+from twodof.errors import SimulationError
+from twodof.fmu import Fmu, Instance, instantiate
 from twodof.sweeps import runner as runner_module
 from twodof.sweeps.metrics import METRICS
 from twodof.sweeps.runner import Job, Runner, trace
@@ -70,7 +73,7 @@ def test_metrics_are_those_of_the_closed_form(judged: list[dict[str, float]]) ->
     for (kp, kd), found in zip(gains(), judged):
         phi, _ = response(kp, kd, t)
         error = np.abs(phi) * size
-        close = {"rel": 1e-6, "abs": 1e-9}
+        close: dict[str, Any] = {"rel": 1e-6, "abs": 1e-9}
         assert found["final_error"] == pytest.approx(error[-1], **close)
         assert found["rms_error"] == pytest.approx(np.sqrt((error**2).sum() / 501), **close)
         assert found["overshoot"] == pytest.approx(max(0.0, -phi.min()), **close)
@@ -133,11 +136,11 @@ def test_a_trace_has_the_numbers_of_the_samples(
     run = twodof.experiment(fmu, stop_time=0.5, settings={"max_step": max_step})
     ends = []
 
-    def whole(read: Callable[[Instance], object]) -> object:
+    def whole(read: Callable[[Instance], Any]) -> Any:
         try:
             with instantiate(run.fmu) as instance:
                 return read(instance)
-        except twodof.TwoDofError as error:
+        except SimulationError as error:
             ends.append((str(error), error.k, error.outcome))
             return None
 
@@ -154,7 +157,9 @@ def test_a_trace_has_the_numbers_of_the_samples(
 
 
 def test_design_is_the_product_of_grids_with_the_same_draws(native_path: Path) -> None:
-    options = {"grid": SMALL, "ranges": {"tau_ext[2]": (-0.01, 0.02)}, "random": 4, "seed": 5}
+    options: dict[str, Any] = {
+        "grid": SMALL, "ranges": {"tau_ext[2]": (-0.01, 0.02)}, "random": 4, "seed": 5,
+    }  # fmt: skip
     table = sweep(native_path, stop_time=0.05, **options)
     assert list(table["run"]) == list(range(24))
     draws = np.random.default_rng(5).uniform(-0.01, 0.02, 4)
@@ -246,9 +251,12 @@ def test_a_runner_instantiates_once_and_repeats_to_the_bit(
     """In any order, what a run gives is what a fresh instance gives."""
     made = []
     instantiate = runner_module.instantiate
-    monkeypatch.setattr(
-        runner_module, "instantiate", lambda fmu: made.append(fmu) or instantiate(fmu)
-    )
+
+    def counted(fmu: Fmu) -> AbstractContextManager[Instance]:
+        made.append(fmu)
+        return instantiate(fmu)
+
+    monkeypatch.setattr(runner_module, "instantiate", counted)
     options = {"stop_time": 1.0, "step": STEP, "settings": {}}
     points = [(i, pair) for i, pair in enumerate(gains()[:5])]
     job = Job(native_path.read_bytes(), "a.fmu", ("Kp", "Kd"), options, None)

@@ -8,6 +8,9 @@ from pathlib import Path
 import browser
 import numpy as np
 import pytest
+from figures import points
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from PIL import Image
 from tables import SMALL, table_of
 
@@ -27,10 +30,11 @@ def grid_sweep(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return path
 
 
-def panels(path: Path) -> dict[str, object]:
+def panels(path: Path) -> dict[str, Axes]:
     table, provenance = read_sweep(path)
     figure = drawn(drawing(table, provenance, "a"))
-    return {axes.get_label(): axes for axes in figure.axes if " over " in axes.get_label()}
+    labels = [str(axes.get_label()) for axes in figure.axes]
+    return {label: axes for label, axes in zip(labels, figure.axes) if " over " in label}
 
 
 LINES = """() => [...document.querySelectorAll(".runs td")].map(cell => {
@@ -69,12 +73,14 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Pat
     for label, axes in found.items():
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, s⁻²", "Kd, s⁻¹")
         metric = label.split()[0]
-        (mesh,) = (c for c in axes.collections if hasattr(c, "get_coordinates"))
-        cells = np.ma.filled(mesh.get_array(), np.nan).reshape(16, 20)
+        (mesh,) = (c for c in axes.collections if isinstance(c, QuadMesh))
+        values = mesh.get_array()
+        assert values is not None
+        cells = np.ma.filled(values, np.nan).reshape(16, 20)
         assert np.asarray(cells).T.ravel() == pytest.approx(
             table[metric].to_numpy(), nan_ok=True, abs=0
         )
-        (best,) = axes.collections[-1].get_offsets()
+        (best,) = np.asarray(axes.collections[-1].get_offsets())
         least = table[metric].min()
         chosen = table[(table["Kp"] == best[0]) & (table["Kd"] == best[1])]
         assert chosen[metric].item() == least
@@ -82,7 +88,7 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Pat
         x, y = edges[0, :, 0], edges[:, 0, 1]
         assert (x[:-1] + x[1:]) / 2 == pytest.approx(np.linspace(10, 200, 20))
         assert (y[:-1] + y[1:]) / 2 == pytest.approx(np.linspace(5, 80, 16))
-        critical = axes.get_lines()[0].get_xydata()
+        critical = points(axes.get_lines()[0])
         assert critical[:, 1] ** 2 == pytest.approx(4 * critical[:, 0])
 
 
@@ -102,10 +108,10 @@ def test_map_of_three_variables_is_the_best_over_the_third(
     table = sweep(native_path, grid=grid, stop_time=2.0, output=tmp_path / "s")
     found = panels(tmp_path / "s")
     assert len(found) == 9
-    (mesh,) = (
-        c for c in found["overshoot over Kp and Kd"].collections if hasattr(c, "get_coordinates")
-    )
-    cells = mesh.get_array().reshape(2, 3)
+    (mesh,) = (c for c in found["overshoot over Kp and Kd"].collections if isinstance(c, QuadMesh))
+    values = mesh.get_array()
+    assert values is not None
+    cells = values.reshape(2, 3)
     for i, kd in enumerate(SMALL["Kd"]):
         for j, kp in enumerate(SMALL["Kp"]):
             runs = table[(table["Kp"] == kp) & (table["Kd"] == kd)]

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -36,15 +37,15 @@ def test_table_is_parquet_with_units_and_provenance(native_path: Path, tmp_path:
     assert file.name == "runs.parquet"
     same(table_of(tmp_path / "s"), table)
     unsettled = f"select count(*) from '{file}' where settling_time is null"
-    ((count,),) = duckdb.sql(unsettled).fetchall()
+    ((count,),) = duckdb.execute(unsettled).fetchall()
     assert count == table["settling_time"].isna().sum() > 0
-    pairs = duckdb.sql(f"select key, value from parquet_kv_metadata('{file}')").fetchall()
+    pairs = duckdb.execute(f"select key, value from parquet_kv_metadata('{file}')").fetchall()
     provenance = json.loads(dict(pairs)[b"twodof"])
     assert provenance["fmu"]["guid"] == twodof.load_fmu(native_path).guid
     assert provenance["command_line"] == "by hand"
     assert provenance["design"]["grids"] == {name: list(SMALL[name]) for name in SMALL}
     assert provenance["versions"]["twodof"] == twodof.__version__
-    described = duckdb.sql(f"describe select * from '{file}'").fetchall()
+    described = duckdb.execute(f"describe select * from '{file}'").fetchall()
     types = {name: str(kind) for name, kind, *_ in described}
     assert types["run"] == "BIGINT" and types["outcome"] == types["message"] == "VARCHAR"
     assert {types[name] for name in ("Kp", "Kd", *METRICS, "end_time")} == {"DOUBLE"}
@@ -117,7 +118,9 @@ def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
         if count >= 3:
             stop.set()
 
-    options = {"grid": {"Kp": np.linspace(10, 90, 40)}, "stop_time": 20.0, "output": path}
+    options: dict[str, Any] = {
+        "grid": {"Kp": np.linspace(10, 90, 40)}, "stop_time": 20.0, "output": path,
+    }  # fmt: skip
     table = sweep(native_path, workers=1, progress=progress, stop=stop.is_set, **options)
     assert 3 <= len(table) < 40
     parts = {file: file.read_bytes() for file in path.iterdir()}
@@ -136,7 +139,9 @@ def test_what_is_another_sweep_is_not_resumed(
     native_path: Path, tmp_path: Path, fmu_path: Path
 ) -> None:
     path = tmp_path / "s"
-    options = {"grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True}
+    options: dict[str, Any] = {
+        "grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True,
+    }  # fmt: skip
     sweep(native_path, **{**options, "resume": False})
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     for change, said in (

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def test_nobody_else_can_talk_to_workers(native_path: Path) -> None:
         for worker in children_of(os.getpid()):
             assert (doors(worker), doors(os.getpid())) == ([], before)
             status = Path(f"/proc/{worker}/status").read_text()
-            threads = int(re.search(r"Threads:\s+(\d+)", status)[1])
+            threads = int(re.findall(r"Threads:\s+(\d+)", status)[0])
             environment = Path(f"/proc/{worker}/environ").read_text().split("\0")
             (folder,) = [Path(line[7:]) for line in environment if line.startswith("TMPDIR=")]
             if threads > 1:  # it has started
@@ -306,7 +306,7 @@ def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str,
 def test_a_cluster_gives_the_table_of_local_workers(
     native_path: Path, two_workers: tuple[str, int, Path]
 ) -> None:
-    grid = {"Kp": np.linspace(10.0, 200.0, 30), "Kd": [10.0, 40.0]}
+    grid: dict[str, Iterable[float]] = {"Kp": np.linspace(10.0, 200.0, 30), "Kd": [10.0, 40.0]}
     expected = sweep(native_path, grid=grid)
     for _ in range(2):  # the workers stay, and nothing of a sweep stays with them
         same(sweep(native_path, grid=grid, scheduler=two_workers[0]), expected)
@@ -328,7 +328,8 @@ def test_a_sweep_can_be_stopped_when_its_scheduler_is_suspended(
     native_path: Path, two_workers: tuple[str, int, Path]
 ) -> None:
     address, scheduler, _ = two_workers
-    suspended, looks = [], asked(5)
+    suspended: list[int] = []
+    looks = asked(5)
 
     def suspend(done: int, runs: int) -> None:
         if done and not suspended:
