@@ -101,7 +101,7 @@ def logging(fmu: Path, bag: Path, storage: str) -> Logging:
 BATCH = 40  # samples between two flushes of one that is left unfinished
 
 
-def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: bool) -> Path:
+def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: Any) -> Path:
     """A bag of n samples in the state in which a killed process leaves it."""
     living = folder / "living" / "bag"
     with twodof.Bag(living, storage=storage, **options).begin(run) as bag:
@@ -209,7 +209,7 @@ def header(stamp: int, frame: str = "") -> Any:
 
 
 def joint_message(
-    stamp: int, names: Sequence[str], *numbers: Sequence[float], frame: str = ""
+    stamp: int, names: Sequence[str], *numbers: Sequence[float] | np.ndarray, frame: str = ""
 ) -> Any:
     """A JointState with positions, velocities and efforts, as far as they are given."""
     parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]

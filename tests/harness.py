@@ -20,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from ctypes import byref
 from pathlib import Path
 from textwrap import dedent, indent
+from typing import TYPE_CHECKING, Any
 
 import fmpy
 import pytest
@@ -124,7 +125,7 @@ def wait_until(condition):
 
 def children_of(process):
     """Processes that it has started, and that have not ended."""
-    found = []
+    found: list[int] = []
     for children in Path(f"/proc/{process}/task").glob("*/children"):
         with contextlib.suppress(OSError):
             found += map(int, children.read_text().split())
@@ -152,6 +153,12 @@ class Recorded:
 
     The classes' names begin with the version of FMI, which FMPy looks for there.
     """
+
+    if TYPE_CHECKING:  # what FMPy's class has
+
+        def __init__(self, *arguments: Any, **named: Any) -> None: ...
+
+        def __getattr__(self, name: str) -> Any: ...
 
     def functions(self):
         """Of FMI 2.0."""

@@ -97,7 +97,7 @@ def serve() -> None:
     requests = os.fdopen(os.dup(0), "r")
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    os.fsync = lambda _: None  # the disk is not what is tested
+    os.fsync = lambda fd: None  # the disk is not what is tested
     gc.freeze()  # or every child copies what it looks through
     for line in requests:
         files = [os.memfd_create("out"), os.memfd_create("err")]

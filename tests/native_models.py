@@ -110,7 +110,7 @@ def last_link(name: str) -> str:
     joints = [
         j for j in ET.parse(urdf_path(name)).iter("joint") if j.get("type", "fixed") != "fixed"
     ]
-    return joints[-1].find("child").get("link")
+    return joints[-1].findall("child")[0].attrib["link"]
 
 
 def coupling(name: str, joints: Sequence[str] = ()) -> tuple[np.ndarray, np.ndarray]:
@@ -206,7 +206,7 @@ class Engine:
         self.lib = ctypes.CDLL(str(path))
         self.n, self.m = len(of.robot.joints), len(of.robot.axes)
 
-    def call(self, name: str, *arguments: object) -> int:
+    def call(self, name: str, *arguments: float | np.ndarray) -> int:
         values = (
             ctypes.c_double(a) if isinstance(a, float) else a.ctypes.data_as(ctypes.c_void_p)
             for a in arguments

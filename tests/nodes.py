@@ -151,22 +151,26 @@ def environment(number: int, **variables: str) -> dict[str, str]:
     return {**kept, "ROS_DOMAIN_ID": str(number), "ROS_LOCALHOST_ONLY": "1", **variables}
 
 
+class Publisher(subprocess.Popen[str]):
+    told: list[str]
+
+
 @contextmanager
 def published(
     number: int, fmu: Path, *options: str, inside: tuple[str, ...] = (), **variables: str
-) -> Iterator[subprocess.Popen[str]]:
+) -> Iterator[Publisher]:
     """``twodof publish`` in a process of its own, when it has told that it is on the network."""
-    process = subprocess.Popen(
+    process = Publisher(
         [*inside, *TWODOF, "publish", str(fmu), *options],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=environment(number, **variables),
     )  # fmt: skip
     try:
         assert process.stdout is not None
-        process.told = []  # type: ignore[attr-defined]
-        while not process.told or "ros2 topic echo" not in process.told[-1]:  # type: ignore[attr-defined]
-            process.told.append(process.stdout.readline())  # type: ignore[attr-defined]
-            assert process.told[-1], process.communicate()  # type: ignore[attr-defined]
+        process.told = []
+        while not process.told or "ros2 topic echo" not in process.told[-1]:
+            process.told.append(process.stdout.readline())
+            assert process.told[-1], process.communicate()
         yield process
     finally:
         process.kill()

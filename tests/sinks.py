@@ -11,7 +11,8 @@ from twodof.simulation.sample import Sample, Sink
 class Collector(list[Sample], Sink):
     """The sink that keeps what it is given."""
 
-    write = list.append
+    def write(self, sample: Sample) -> None:
+        self.append(sample)
 
 
 class Memory(Sink):

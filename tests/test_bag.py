@@ -45,7 +45,6 @@ from twodof.bag.reader import read_ends
 from twodof.bag.storage import McapStorage
 from twodof.errors import BagError, InputError
 from twodof.simulation.experiments import Experiment
-from twodof.simulation.sample import Sample
 
 KIB, MIB = 1024, 1024**2
 
@@ -68,7 +67,7 @@ TYPE_HASHES = {
 
 class Recording(NamedTuple):
     run: Experiment
-    samples: list[Sample]
+    samples: Collector
     folder: Path
 
     def bag(self, storage: str, kind: str = "plain") -> Path:
@@ -422,7 +421,7 @@ def test_a_chunk_and_its_index_are_those_of_rosbags(tmp_path: Path) -> None:
         storage.channel_stats = {1: 0, 2: 0}
         for chunk in range(2):
             for k in range(7):
-                topic = SimpleNamespace(id=1 + k % 2)
+                topic: Any = SimpleNamespace(id=1 + k % 2)
                 storage.write(topic, START + 100 * chunk + k, b"message" * k)
             storage.close_chunk()
         storage.bio.close()

@@ -63,7 +63,7 @@ def test_bag_of_a_name_that_is_not_utf8_is_read(run: Experiment, tmp_path: Path,
             sink.write(sample(run, k))
     bag = renamed(sink.path, b"\xff")
     options = ["-o", "x.svg"] if verb == "plot" else []
-    command = [sys.executable, "-m", "twodof", verb, os.fsencode(bag), *options]
+    command: list[str | bytes] = [sys.executable, "-m", "twodof", verb, os.fsencode(bag), *options]
     terminal = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=terminal)
     assert (done.returncode, done.stderr) == (0, "")

@@ -103,7 +103,7 @@ def constrained(M, stopped, right):
 
 def conditions(reference, q, v, a_free, W, a, low, high, held):
     """The complementarity conditions of stops, with M by Pinocchio."""
-    for i in np.flatnonzero((q <= low) | (q >= high)):
+    for i in np.flatnonzero((q <= low) | (q >= high)).tolist():
         side = -1.0 if q[i] >= high[i] else 1.0
         assert side * v[i] >= -1e-12
         if v[i] == 0.0:
@@ -217,7 +217,7 @@ def test_joints_pressed_and_let_go_in_any_order_do_not_depend_on_the_step(name, 
                 rows += [] if k % parts else [[*q, *v]]
         runs.append(rows)
     assert max(map(sum, patterns)) >= together and len(patterns) > native.n
-    np.testing.assert_allclose(*runs, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(runs[0], runs[1], rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", EVERY_ROBOT)

@@ -56,7 +56,7 @@ def test_listing_is_off_by_centimetres_and_an_fmu_is_not(
 def test_robots_are_measured_as_they_come(benchmarks: SimpleNamespace, robots: Path) -> None:
     urdf = ET.parse(robots / "panda_description/urdf/panda.urdf")
     damping = [
-        float(dynamics.get("damping"))
+        float(dynamics.attrib["damping"])
         for joint in urdf.iter("joint")
         if joint.get("type") == "revolute" and (dynamics := joint.find("dynamics")) is not None
     ]

@@ -455,7 +455,7 @@ def test_types_have_quantities_and_angles_are_shown_in_degrees(fmu_path):
             assert (declared.quantity, declared.unit) == (QUANTITY[variable.unit], variable.unit)
             assert declared.displayUnit == ("deg" if variable.unit == "rad" else None)
     (deg,) = [u for unit in description.unitDefinitions for u in unit.displayUnits]
-    assert (deg.name, float(deg.factor)) == ("deg", pytest.approx(np.rad2deg(1.0)))
+    assert deg.name == "deg" and float(deg.factor) == pytest.approx(np.rad2deg(1.0))
     assert description.author and description.copyright
 
 

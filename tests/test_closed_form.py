@@ -58,7 +58,7 @@ def exact(times: list[float], Kp: float, Kd: float) -> Iterator[tuple[float, ...
 def test_responses_are_exact_to_rounding(gains: tuple[float, float]) -> None:
     """Near critical damping, without gains and where the series takes over, too."""
     Kp, Kd = gains
-    stages = np.float32([1e-6, 0.1, 0.49, 0.51, 3.0, 15.0])
+    stages = np.array([1e-6, 0.1, 0.49, 0.51, 3.0, 15.0], np.float32)
     times = np.float64(stages / np.float32(max(abs(Kd), abs(Kp) ** 0.5) or 1.0))  # short fractions
     exactly = exact(times.tolist(), Kp, Kd)
     for t, expected, *found in zip(times, exactly, *responses(times, Kp, Kd), strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -189,13 +190,14 @@ def test_flavours_are_equal_with_limits_of_all_kinds_and_a_force(fmus, control):
         "q_min": (0.2, 0.1), "q_max": (0.7, 0.5), "limit_effort": True, "f_ext": (3.0, -2.0, 1.0),
         "payload": 0.2, "payload_com": (0.01, 0.02, 0.0), "tau_ext": (0.1, -0.1), **TIGHT,
     }  # fmt: skip
-    there, back = {
+    moves: dict[str, Any] = {
         "task": ({"x_des": (0.1, 0.25), "Kp": 5000.0}, {"x_des": (0.28, 0.05)}),
         "pose": ({"x_des": (0.1, 0.25), "Kp": 5000.0, "Kp_rot": 9.0}, {"x_des": (0.28, 0.05)}),
         "joint": ({"q_des": (1.0, 1.0), "Kp": 5000.0}, {"q_des": 0.0}),
         "effort": ({"tau_cmd": (11.0, 2.0)}, {"tau_cmd": -3.0}),
-    }[control]
-    options = {"stop_time": 0.2, "settings": settings | there, "changes": [(0.1, back)]}
+    }
+    there, back = moves[control]
+    options = dict[str, Any](stop_time=0.2, settings=settings | there, changes=[(0.1, back)])
     runs = [list(twodof.samples(fmus[control, native], **options)) for native in (False, True)]
     rows = [np.array([(*s.q, *s.v, *s.x, *s.tau) for s in run]) for run in runs]
     assert (rows[0][:, :2] == [0.7, 0.5]).any() or (rows[0][:, :2] == [0.2, 0.1]).any()

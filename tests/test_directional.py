@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -126,7 +127,7 @@ def test_task_control_at_rest_has_the_poles_of_its_gains():
         assert len(poles) == len(expected) + 2 * extra
 
 
-CASES = {
+CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "twodof task": ("twodof", "task", {}),
     "payload": ("twodof", "task", {"payload": 0.7, "payload_com": [0.02, 0.01, 0.03]}),
     "known payload": ("twodof", "task", {"payload": 0.7, "payload_known": True}),

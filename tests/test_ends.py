@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -46,7 +46,7 @@ def has_samples(bag: Path) -> bool:
         return False
 
 
-def whole(fmu: Path, folder: Path, n: int) -> list[object]:
+def whole(fmu: Path, folder: Path, n: int) -> Sequence[object]:
     """The first n messages of a run that nothing disturbs."""
     stop = str(n * 0.01)
     options = ["--stop-time", stop, "--stamp-start", str(START), "-o", str(folder / "whole")]

@@ -189,7 +189,12 @@ def test_euler_converges_at_first_order_to_the_same_stops_included(fmus):
 def test_a_joint_that_rests_at_its_stop_for_ten_seconds_has_one_event(fmus, monkeypatch):
     events = []
     enter = FMU2Model.enterEventMode
-    monkeypatch.setattr(FMU2Model, "enterEventMode", lambda s: events.append(1) or enter(s))
+
+    def entered(model):
+        events.append(1)
+        return enter(model)
+
+    monkeypatch.setattr(FMU2Model, "enterEventMode", entered)
     run(fmus["effort"], "ModelExchange", {"q_min[1]": 0.0, "q_min[2]": 0.0}, 10.0,
         relative_tolerance=1e-10)  # fmt: skip
     assert 2 <= len(events) <= 6  # two joints, and a bounce or two until both rest
@@ -309,8 +314,17 @@ def test_events_are_at_the_times_of_the_closed_form(fmus, monkeypatch):
     """q = q_des (1 − cos ωt) under joint control without Kd is at 1 where cos ωt = 1 − 1/q_des."""
     time, events = [0.0], []
     enter, set_time = FMU2Model.enterEventMode, FMU2Model.setTime
-    monkeypatch.setattr(FMU2Model, "setTime", lambda s, t: time.append(t) or set_time(s, t))
-    monkeypatch.setattr(FMU2Model, "enterEventMode", lambda s: events.append(time[-1]) or enter(s))
+
+    def timed(model, t):
+        time.append(t)
+        return set_time(model, t)
+
+    def entered(model):
+        events.append(time[-1])
+        return enter(model)
+
+    monkeypatch.setattr(FMU2Model, "setTime", timed)
+    monkeypatch.setattr(FMU2Model, "enterEventMode", entered)
     for side in (1.0, -1.0):  # both ends of both joints
         starts = {"q_start[1]": 0.0, "q_start[2]": 0.0, "q_des[1]": 2.0 * side,
                   "q_des[2]": -2.0 * side, "Kp[1]": 25.0, "Kp[2]": 49.0, "Kd[1]": 0.0, "Kd[2]": 0.0,

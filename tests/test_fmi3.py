@@ -10,6 +10,7 @@ import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import fmpy
 import fmpy.build
@@ -64,7 +65,7 @@ class Calls(Recorded):
         self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
         self.size = {v.valueReference: int(np.prod(v.shape or ()))
                      for v in self.description.modelVariables}  # fmt: skip
-        self.__init__(
+        super().__init__(
             guid=self.description.guid, modelIdentifier="TwoDof", instanceName="arm",
             unzipDirectory=fmpy.extract(str(fmu)),
         )  # fmt: skip
@@ -110,7 +111,8 @@ def elements(description, name):
 def simulated(fmu, kind, starts=(), stop_time=2.0, parts=PARTS, **named):
     """Rows of all values, by either version's names."""
     description = fmpy.read_model_description(str(fmu))
-    start_values, output = {}, [name for part in parts for name in elements(description, part)]
+    start_values: dict[str, Any] = {}
+    output = [name for part in parts for name in elements(description, part)]
     for name, values in dict(starts).items():
         names = elements(description, name)
         whole = names == [name]  # an array, or a scalar
@@ -312,7 +314,7 @@ def test_what_the_description_does_not_have_is_refused(pair):
     a = arm(fmu)
     for kind in ("CoSimulation", "ModelExchange"):
         with zipfile.ZipFile(fmu) as archive:
-            element = ET.fromstring(archive.read("modelDescription.xml")).find(kind)
+            (element,) = ET.fromstring(archive.read("modelDescription.xml")).findall(kind)
         for name in ("hasEventMode", "providesIntermediateUpdate", "providesEvaluateDiscreteStates",
                      "canReturnEarlyAfterIntermediateUpdate"):  # fmt: skip
             assert element.get(name) in (None, "false")
@@ -325,7 +327,7 @@ def test_what_the_description_does_not_have_is_refused(pair):
         assert a.dll[f"fmi3{name}"](ctypes.c_void_p(a.component), *null) == ERROR
         assert a.messages == [(ERROR, f"fmi3{name} is not supported by this FMU")]
     b = exchange(fmu)
-    results = [ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double()]
+    results: list[Any] = [ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double()]
     step = (b.component, 0.0, 0.01, False, *map(ctypes.byref, results))
     b.refused("fmi3DoStep is a call of co-simulation", "fmi3DoStep", *step)
 
@@ -406,9 +408,9 @@ def test_random_calls_under_sanitizers(length):
 FMUS = (("A_", "task", 3), ("B_", "joint", 3), ("C_", "effort", 2))
 
 
-def embedded(pair, folder, *compiler, suffix=""):
+def embedded(pair, folder, *target, suffix=""):
     """The program of embedded.c, and what it is told: three FMUs' tokens and references of q."""
-    compiler, objects, arguments = [*compiler, *FLAGS, "-w"], [], []
+    compiler, objects, arguments = [*target, *FLAGS, "-w"], [], []
     folder.mkdir(exist_ok=True)
     for prefix, control, fmi in FMUS:
         fmu = pair("twodof", control)[fmi - 2]

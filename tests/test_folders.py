@@ -45,7 +45,7 @@ def waiting_run(fmu, folder):
     """A process in the middle of a run whose temporary folder is in this one."""
     command = [sys.executable, "-c", RUN_THAT_WAITS, fmu, folder]
     with subprocess.Popen(command, text=True, stdin=PIPE, stdout=PIPE) as process:
-        assert process.stdout.readline() == "ready\n"
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
         yield process
         process.kill()
 

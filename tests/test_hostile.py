@@ -7,7 +7,7 @@ import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import mutations
@@ -344,7 +344,7 @@ SLOW = {
     "meshes of 300 MB", "200 MB of meshes", "100,000 uses of a mesh", "a chain of 128 joints",
     "60 MB of one cell",
 }  # fmt: skip
-HOSTILE = {
+HOSTILE: dict[str, Mapping[str, object]] = {
     "hostile_fmu": HOSTILE_FMUS,
     "hostile_urdf": HOSTILE_URDFS,
     "large_urdf": LARGE_URDFS,

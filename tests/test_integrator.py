@@ -192,7 +192,7 @@ def test_a_joint_that_answers_to_its_position_is_named_by_the_root_of_it(budget)
             smooth(lambda q, v: [-1e18 * q[0], -1e8 * v[1]]), [1.0, 0.0], [0.0, 1.0], 0.01,
             FREE * 2, 1e-3, 1e-6, 1e-3,
         )  # fmt: skip
-    assert (refused.value.joint, refused.value.rate) == (0, pytest.approx(1e9, rel=1e-6))
+    assert refused.value.joint == 0 and refused.value.rate == pytest.approx(1e9, rel=1e-6)
 
 
 def test_a_value_that_is_not_finite_is_an_error():

@@ -77,7 +77,9 @@ def test_foxglove_draws_what_messages_hold(bag: Path) -> None:
     drawn = []
     for panel in panels.values():
         for path in panel.get("paths", []):
-            topic, field, i = re.fullmatch(r"(\S+)[.](\w+)\[(\d+)\]", path["value"]).groups()
+            found = re.fullmatch(r"(\S+)[.](\w+)\[(\d+)\]", path["value"])
+            assert found is not None
+            topic, field, i = found.groups()
             state = messages[topic][-1]
             assert state[1][int(i)] == path["label"] and len(state[fields[field]]) > int(i)
             drawn.append((field, int(i)))

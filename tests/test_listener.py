@@ -146,7 +146,8 @@ def test_a_controller_in_real_time_misses_nothing(
     node.leave()
     assert node.told[-1] == ["controlled", len(heard)]
     answers = {tuple(answer(7, *state[2:4])): k for k, state in enumerate(states)}
-    held, delays, applied = {}, {}, []
+    held: dict[str, float] = {}
+    delays, applied = {}, []
     for t, values in json.loads((bag / "run.json").read_text())["input_changes"]:
         held |= values
         k = round(t * 100)
@@ -155,7 +156,8 @@ def test_a_controller_in_real_time_misses_nothing(
     assert applied == sorted(set(applied))  # in their order, none twice
     assert min(delays.values()) >= 0
     print(f"{len(applied)} of {len(heard)} answers applied, delays {sorted({*delays.values()})}")
-    first, latest = min(delays), {}
+    first = min(delays)
+    latest: dict[int, int] = {}
     for k in range(steps):
         latest[k] = k - delays[k] if k in delays else latest.get(k - 1, -1)
     truth = closed(fmu, 7, steps, lambda k: k - latest[k] if k >= first else k + 1)

@@ -6,6 +6,7 @@ import threading
 import time
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,7 +164,7 @@ def test_time_that_sinks_take_to_open_is_not_the_runs(native_path, clock):
 
 
 def test_steering_holds_from_the_sample_on_that_it_answers(native_path):
-    answers = {3: {"x_des": (0.1, 0.2)}, 7: {"Kp[2]": 80.0}, 20: {"Kp": 1.0}}
+    answers: dict[int, Any] = {3: {"x_des": (0.1, 0.2)}, 7: {"Kp[2]": 80.0}, 20: {"Kp": 1.0}}
     recorder = Recorder()
     twodof.simulate(
         native_path, recorder, stop_time=0.2, stamp_start=0.0,
@@ -201,9 +202,10 @@ def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
         assert sample.q + sample.v == pytest.approx(expected.q + expected.v, abs=1e-9)
 
 
-def test_what_a_run_goes_on_with_holds_since_then(native_path):
+def test_what_a_run_goes_on_with_holds_since_then(native_path, monkeypatch):
     """Where nothing was set before the step that is discarded."""
-    fmu, broken = twodof.load_fmu(native_path), []
+    fmu = twodof.load_fmu(native_path)
+    broken: list[float] = []
     with instantiate(fmu) as instance:
         step = instance.step
 
@@ -213,7 +215,7 @@ def test_what_a_run_goes_on_with_holds_since_then(native_path):
                 raise SimulationError("too fast", outcome="discarded")
             step(t, h)
 
-        instance.step = breaks
+        monkeypatch.setattr(instance, "step", breaks)
         run = twodof.samples(
             fmu, stop_time=0.1, step=0.01, instance=instance,
             resume=lambda sample, error: at_rest(fmu, sample),
@@ -227,10 +229,10 @@ def test_a_loop_of_ones_own_is_paced(native_path, clock):
         assert clock.now - 1e6 == pytest.approx(sample.t)
 
 
-def test_what_cannot_run_together_opens_no_sink(native_path):
+def test_what_cannot_run_together_opens_no_sink(native_path, monkeypatch):
     recorder = Recorder()
-    recorder.begin = lambda run: pytest.fail("it was opened")
-    options = {"stop_time": 0.1, "stamp_start": 0.0}
+    monkeypatch.setattr(recorder, "begin", lambda run: pytest.fail("it was opened"))
+    options: dict[str, Any] = {"stop_time": 0.1, "stamp_start": 0.0}
     first = Member(twodof.experiment(native_path, **options), [recorder])
     for other, error in (
         ({**options, "stop_time": 0.2}, InputError), ({**options, "start_time": 0.05}, InputError),

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -55,11 +56,12 @@ def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, bool], two
 
 
 def starts(fmu: twodof.Fmu, group: str) -> np.ndarray:
-    return np.array([float(fmu.variables[name].start) for name in fmu.vector(group)])
+    return np.array([float(str(fmu.variables[name].start)) for name in fmu.vector(group)])
 
 
 def orientations(run: twodof.Experiment) -> list[Rotation]:
     """By Pinocchio, at the samples' joint positions."""
+    assert run.fmu.urdf is not None
     robot = load_robot(run.fmu.urdf, run.fmu.frame, "xyz")
     data, G = robot.model.createData(), robot.coupling
     turns = []
@@ -180,7 +182,7 @@ def test_outputs_are_the_frames_orientation_and_angular_velocity(fmus, native: b
                 robot.model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
             ).angular
             np.testing.assert_allclose(
-                found, [*Rotation.from_matrix(turned).as_quat(canonical=True), *spin], atol=1e-12
+                [*found], [*Rotation.from_matrix(turned).as_quat(canonical=True), *spin], atol=1e-12
             )
 
 
@@ -246,7 +248,7 @@ def poses(bag: Path, topic: str) -> np.ndarray:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         rows = []
         for schema, _, _, message in reader.iter_decoded_messages(topics=[topic]):
-            assert schema.name == "geometry_msgs/msg/PoseStamped"
+            assert schema is not None and schema.name == "geometry_msgs/msg/PoseStamped"
             p, q = message.pose.position, message.pose.orientation
             rows.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     return np.array(rows)
@@ -337,6 +339,11 @@ def test_a_pose_on_the_network_is_the_target(
     text = "".join(
         f"({f!r}, {p!r}, {q!r})\n".replace("inf", "float('inf')") for f, p, q in messages
     )
+
+    def hears() -> Any:
+        asked.append(wire.command())
+        return asked[-1]
+
     with (
         caplog.at_level(logging.WARNING, "twodof"), Publisher(scene=True).begin(run) as wire,
         subprocess.Popen(
@@ -347,7 +354,7 @@ def test_a_pose_on_the_network_is_the_target(
         talker.stdin.write(text)
         talker.stdin.close()
         wire.write(next(twodof.samples(run)))
-        wait_until(lambda: asked.append(wire.command()) or asked[-1])
+        wait_until(hears)
         talker.kill()
     assert [command for command in asked if command] == [
         {

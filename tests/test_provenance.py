@@ -14,8 +14,10 @@ import time
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,12 +89,16 @@ def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
     def more(until: Callable[[int], bool]) -> None:
         wait_until(lambda: until(round(100 * loop.news()["t"])))
 
+    def later(begin: list[int], k: int) -> bool:
+        begin.append(k)
+        return k > begin[0] + 15
+
     more(lambda k: k > 5)
     loop.tell("record", True)
     for target in TARGETS.values():
-        more(lambda k, begin=[]: bool(begin.append(k) or k > begin[0] + 15))
+        more(partial(later, []))
         loop.tell("change", {"x_des": target})
-    more(lambda k, begin=[]: bool(begin.append(k) or k > begin[0] + 15))
+    more(partial(later, []))
     ended = True
     thread.join()
     # the recording's own samples are not told: run again with what it says, by the master
@@ -105,7 +111,7 @@ def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
         settings=stored.provenance["start_values"],
     )  # fmt: skip
     due = iter(changes)
-    change = next(due)
+    change: tuple[float, dict[str, Any]] | None = next(due)
 
     def steer() -> dict[str, float] | None:
         nonlocal change
@@ -189,7 +195,7 @@ def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(
                 samples.append(steps.send({"x_des": TARGETS[sample.k]}))
                 sink.write(samples[-1])
     text = (tmp_path / "bag/run.json").read_text().strip()
-    expected = [sample.error for sample in samples]
+    expected = np.array([sample.error for sample in samples], float)
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(json.loads(text)["urdf"])
     (tmp_path / "bag/run.json").write_text(f'{text[:-1]},"inputs_known_until":0.6}}')
@@ -277,7 +283,7 @@ def test_provenance_is_complete(native_path: Path, tmp_path: Path, storage: str)
     }
 
 
-ANSWERS = {2: {"x_des": (0.1, 0.2)}, 4: {"Kp[2]": 80.0}, 5: {"Kp[2]": 80.0}}
+ANSWERS: dict[int, Any] = {2: {"x_des": (0.1, 0.2)}, 4: {"Kp[2]": 80.0}, 5: {"Kp[2]": 80.0}}
 CHANGES = [[0.02, {"x_des[1]": 0.1, "x_des[2]": 0.2}], [0.04, {"Kp[2]": 80.0}]]
 
 

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -197,7 +198,7 @@ def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
     bag = twodof.read_bag(tmp_path / "bag")
     np.testing.assert_allclose(bag.x[-1], (0.25, 0.0625), atol=1e-2)
     (track,) = read_tracks([bag])
-    assert track.task is not None
+    assert track.task is not None and bag.heard is not None
     expected = np.linalg.norm(bag.x - bag.heard.points[:, :2], axis=1)
     np.testing.assert_allclose(track.task.error, expected, rtol=1e-9, atol=1e-12)
 
@@ -239,7 +240,7 @@ def test_two_publishers_on_one_topic_are_both_heard(
         assert ended(one)[1] == ended(two)[1] == ""
     for bag in bags:
         truth = recorded(bag)["/joint_states"]
-        node.until(lambda last=truth[-1]: last in node.messages("/joint_states"))
+        node.until(partial(lambda last: last in node.messages("/joint_states"), truth[-1]))
         mine = [message for message in node.messages("/joint_states") if message in truth]
         assert len(mine) > 100 and mine == truth[-len(mine) :]
 
@@ -261,7 +262,7 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
     options = ["--stop-time", "0.5", "-o", str(bag)]
     inside = isolated("true")
     with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
-        assert "end       after 0.5 s, or Ctrl-C\n" in process.told  # type: ignore[attr-defined]
+        assert "end       after 0.5 s, or Ctrl-C\n" in process.told
         _, err = ended(process)
     assert err.splitlines() == [
         "WARNING: there is no network interface: nobody can hear what is published"

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,6 +45,7 @@ from bags import (
 from mcap.exceptions import McapError
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
+from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 import twodof
@@ -315,7 +317,8 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
         found = [(c.topic, c.msgtype, stamp, bytes(data)) for c, stamp, data in reader.messages()]
         connections = {connection.topic: connection for connection in reader.connections}
     assert sorted(found) == sorted(expected)
-    assert connections["/talk"].ext.offered_qos_profiles == [LATCHED]
+    ext = connections["/talk"].ext
+    assert isinstance(ext, ConnectionExtRosbag2) and ext.offered_qos_profiles == [LATCHED]
     assert connections["/mine"].msgdef.data == DEFINITION
     assert connections["/talk"].digest == STORE.hash_rihs01("std_msgs/msg/String")
 
@@ -331,7 +334,12 @@ def test_no_more_profiles_are_read_than_take_no_time(
     content = b"".join([HEADER, SCHEMA, *channels, *messages, FOOTER])
     (tmp_path / "bag/bag.mcap").write_bytes(content)
     read: list[str] = []
-    monkeypatch.setattr("twodof.bag.recovery.parse_qos", lambda text: read.append(text) or [])
+
+    def parse(text: str) -> list[Any]:
+        read.append(text)
+        return []
+
+    monkeypatch.setattr("twodof.bag.recovery.parse_qos", parse)
     monkeypatch.setattr("twodof.bag.recovery.MAX_YAML", 2000)
     assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
     assert read == profiles[:3]

@@ -451,7 +451,7 @@ def test_example_robot_is_the_one_that_pinocchio_loads(
 ) -> None:
     urdf = (robots / name).read_text("utf-8")
     joints = ET.fromstring(urdf).findall("joint")
-    moved = next(j for j in joints if j.get("type") != "fixed").find("child")
+    (moved,) = next(j for j in joints if j.get("type") != "fixed").findall("child")
     loaded = load_robot(urdf, str(moved.get("link")), "xyz")
     assert n in (None, len(loaded.joints))
     assert_same_mechanism(loaded, urdf)

@@ -79,7 +79,7 @@ def test_different_fmus_run_one_after_the_other_and_interleaved(fmu_path, ur5_fm
         alone.append(driver.run(20))
         driver.free()
     drivers = [Driver(fmu).initialise() for fmu in (fmu_path, ur5_fmu, fmu_path)]
-    rows = [[], [], []]
+    rows: list[list[float]] = [[], [], []]
     for k in range(20):
         for driver, seen in zip(drivers, rows):
             seen += driver.run(1, start=k)
@@ -462,9 +462,9 @@ def test_what_this_flavour_cannot_do_is_told_row_by_row(fmu_path, native_path):
 
 @in_child_process
 def test_a_missing_package_is_named_with_the_remedy(fmu_path):
-    sys.modules["pinocchio"] = None  # as if it were not installed
-    messages = []
-    Driver._log = lambda self, env, name, status, category, text: messages.append(text.decode())
+    patch, messages = pytest.MonkeyPatch(), []
+    patch.setitem(sys.modules, "pinocchio", None)  # as if it were not installed
+    patch.setattr(Driver, "_log", lambda *arguments: messages.append(arguments[-1].decode()))
     with pytest.raises(Exception, match="Failed to instantiate"):
         Driver(fmu_path)
     (message,) = messages
@@ -532,5 +532,5 @@ def test_a_robot_with_one_joint_runs(tmp_path):
     arm = Driver(build_fmu(tmp_path / "One.fmu", options)).initialise(x_des=(0.1,))
     rows = np.array(arm.run(200))
     t = 0.01 * np.arange(1, 201)
-    expected = 0.1 - task_error([0.1], 50.0, 40.0, t)[:, 0]
+    expected = 0.1 - task_error(np.array([0.1]), 50.0, 40.0, t)[:, 0]
     np.testing.assert_allclose(0.3 * np.sin(rows[:, 0]), expected, rtol=0.0, atol=1e-9)

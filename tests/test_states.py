@@ -13,7 +13,7 @@ from collections import Counter
 from functools import partial
 from itertools import chain
 from math import inf, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import fmpy
 import numpy as np
@@ -65,7 +65,7 @@ class Master:
 
     def answer(self, operation):
         """The statuses of the operation's calls, the FMU's complaints, what was read."""
-        self.statuses = []
+        self.statuses: list[int] = []
         self.driver.log.clear()
         name, *arguments = operation
         values = getattr(self, name)(*arguments)
@@ -200,7 +200,8 @@ class Expected(NamedTuple):
 
 
 def expectations(program):
-    history, discards, saved = (), False, {}
+    history: tuple[tuple, ...] = ()
+    discards, saved = False, {}
     for operation in program:
         refused, discards_now = not is_legal(operation, history), discards
         match operation:
@@ -295,7 +296,7 @@ def states(fresh, flavour, program):
     Values by group by history, None before initialisation mode.
     """
     readings = run(fresh, flavour, program)
-    alone = {}
+    alone: dict[tuple, Any] = {}
     histories = dict.fromkeys(expected.history for expected in expectations(program))
     for history in sorted(histories, key=len, reverse=True):
         if history not in alone:  # it is not the beginning of a longer one
@@ -387,7 +388,8 @@ def arm(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(robot)
     if robot == "twodof":
         urdf, frame, axes = data_file("urdf", "2dof.urdf").read_text(), "EndEffector", "xy"
-        rest, options = (0.2, 2.0), {}
+        rest: tuple[float, ...] = (0.2, 2.0)
+        options: dict[str, Any] = {}
     else:
         frame, axes, rest = "panda_hand_tcp", "xyz", REST["panda"]
         # a tool off the last joint's axis: else rounding alone says whether it leaves a limit
@@ -612,7 +614,9 @@ CONTAINED = (
 
 def features(arm, program, values):
     """What a program contains, given the values that its histories lead to."""
-    found, since, history = set(), {}, ()  # since each state was saved: what happened to it
+    since: dict[int, set[str]] = {}  # since each state was saved: what happened to it
+    found: set[str] = set()
+    history: tuple[tuple, ...] = ()
     for operation, expected in zip(program, expectations(program)):
         name, before, history = operation[0], history, expected.history
         found.add(f"refused {name}" if expected.refused else name)
@@ -658,7 +662,7 @@ def worker():
 def test_every_state_is_that_of_its_history_alone(arm, worker, request):
     full = request.config.getoption("full", default=False)
     few, many = ARMS[request.node.callspec.params["arm"]]
-    seen = Counter()
+    seen: Counter[str] = Counter()
 
     @settings(
         max_examples=many if full else few,

@@ -6,9 +6,10 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Barrier
 from typing import Any
@@ -58,13 +59,16 @@ def messages_of(bag: Path) -> dict[str, list[tuple[int, bytes]]]:
     return found
 
 
+def steered(turn: Iterator[int]) -> dict[str, Any] | None:
+    return {"x_des": (0.1, 0.2)} if next(turn) == 20 else None
+
+
 def logged(fmus: dict[str, Path], path: Path, **options: Any) -> Path:
     """A bag of three robots, of which one is steered."""
-    turn = iter(range(10**6))
-    steer = {"fleet/right": lambda: {"x_des": (0.1, 0.2)} if next(turn) == 20 else None}
+    steer = {"fleet/right": partial(steered, iter(range(10**6)))}
     bag = twodof.Bag(path, **options)
     simulate_together([
-        Member(run, [bag.of(name)], *filter(None, [steer.get(name)]))
+        Member(run, [bag.of(name)], steer.get(name, lambda: None))
         for name, run in runs(fmus).items()
     ])  # fmt: skip
     return path
@@ -84,10 +88,8 @@ def test_each_robot_has_its_topics_as_if_it_were_alone(
     together = messages_of(logged(fmus, tmp_path / "bag", storage=storage, scene=True, effort=True))
     topics = set()
     for name, run in runs(fmus).items():
-        alone, turn = twodof.Bag(tmp_path / name, scene=True, effort=True), iter(range(1000))
-        steer: Callable[[], Any] = lambda turn=turn: (  # noqa: E731
-            {"x_des": (0.1, 0.2)} if next(turn) == 20 else None
-        )
+        alone = twodof.Bag(tmp_path / name, scene=True, effort=True)
+        steer = partial(steered, iter(range(1000)))
         twodof.simulate(run, alone, steer=steer if name == "fleet/right" else dict)
         for topic, messages in messages_of(alone.path).items():
             assert together[f"/{name}{topic}"] == messages

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_text_computes_the_expression_and_how_it_varies():
     complexes = re.sub(r"assign\(&(\w+), (\w+), (\w+)\)", r"\1 = \2 + 1j * \3", complexes)
     known = {"creal": np.real, "cimag": np.imag}
     for body, arguments in ((plain, (0.7, -1.3)), (complexes, (0.7 + 2e-20j, -1.3 + 1e-20j))):
-        scope = {**known, "x": arguments[0], "y": arguments[1]}
+        scope: dict[str, Any] = {**known, "x": arguments[0], "y": arguments[1]}
         for line in re.findall(r"(?:const \w+ )?(\w+ = [^;]*);", body):
             exec(line, scope)
         assert scope["z"] == pytest.approx(f(*arguments), rel=1e-14)

@@ -208,8 +208,8 @@ def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path: Path) -> 
         writer.start()
         schema = writer.register_schema("x/msg/Y", "ros2msg", b"")
         channels = [writer.register_channel(f"/{i}", "cdr", schema) for i in range(3)]
-        for channel, k, data in said:
-            writer.add_message(channels[channel], k, data, k)
+        for i, k, data in said:
+            writer.add_message(channels[i], k, data, k)
         writer.finish()
     read: list[tuple[int, int, bytes]] = []
     for channel, stamps, messages in read_messages(file, Allowance()):

@@ -105,7 +105,7 @@ def test_what_is_held_is_the_mean_of_a_spline(arm: Path, tmp_path: Path, parts: 
     """From rest, through three points at times of no step, to rest."""
     knots = [0.0, 0.333, 0.7, 1.111]
     numbers = np.random.default_rng(parts).normal(size=(4, 3, 2))
-    numbers[0] = [START, (0, 0), (0, 0)]
+    numbers[0] = np.array([START, (0, 0), (0, 0)])
     points = [(t, *n[:parts]) for t, n in zip(knots[1:], numbers[1:])]
     bag = write(tmp_path / "bag", (0.0, trajectory(points)))
     table = held(arm, bag, 0.05, 30)
