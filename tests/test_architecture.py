@@ -55,7 +55,7 @@ LIBRARIES = {
     "xacro": {"export"},
 }
 
-MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES = 350, 60, 10
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 75
 
 
 def imported(path: Path) -> set[str]:
@@ -85,6 +85,16 @@ def test_a_room_imports_those_before_it_alone() -> None:
         if room(path) in ROOMS:  # __init__ and __main__ are the door to all
             own = {name.split(".")[1] for name in imported(path) if name.startswith("twodof.")}
             assert own <= {*order[: order.index(room(path)) + 1]}, path
+
+
+def test_rooms_import_few_others() -> None:
+    arrows = {
+        (room(path), other)
+        for path in PYTHON
+        for other in {name.split(".")[1] for name in imported(path) if name.startswith("twodof.")}
+        if path.parts[0] == "twodof" and other in ROOMS and other != room(path)
+    }
+    assert len(arrows) <= MOST_ARROWS
 
 
 def test_modules_import_each_other_in_no_circle() -> None:
