@@ -24,6 +24,7 @@ from tables import BEGUN, COMMAND, same, table_of
 
 import twodof
 from twodof import TwoDofError, sweep
+from twodof.sweeps.batches import MOST_DEATHS
 
 
 def doors(process: int) -> list[str]:
@@ -140,16 +141,18 @@ def test_workers_that_are_killed_cost_no_run(
     native_path: Path, length: Callable[[int, int], int]
 ) -> None:
     runs, pause, part = length(2000, 100), length(5, 0), length(1, 30)
+    most = length(1000, MOST_DEATHS - 1)
     grid = {"Kp": np.linspace(10.0, 200.0, runs)}
     expected = sweep(native_path, grid=grid, stop_time=8)
     killed = [(time.monotonic(), 0)]
     rng = random.Random(1)
 
     def kill(done: int, runs: int) -> None:
-        """Each so many seconds, and runs that are done."""
+        """Each so many seconds, and runs that are done; no run so often that it is given up."""
         now = time.monotonic()
         workers = children_of(os.getpid())
-        if workers and now >= killed[-1][0] + pause and done >= killed[-1][1] + part:
+        due = now >= killed[-1][0] + pause and done >= killed[-1][1] + part
+        if workers and due and len(killed) <= most:
             os.kill(rng.choice(workers), signal.SIGKILL)
             killed.append((now, done))
 
