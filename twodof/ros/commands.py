@@ -83,11 +83,11 @@ def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[
         CommandError: there are none, or it names one twice.
     """
     known = [(joints[name], k) for k, name in enumerate(names) if name in joints]
-    told = f"{', '.join(names)[:LONGEST_NAME]!r}"
+    listed = f"{', '.join(names)[:LONGEST_NAME]!r}"
     if not known:
-        raise CommandError("names", f"is of no joint of this robot: {told}")
+        raise CommandError("names", f"is of no joint of this robot: {listed}")
     if len(dict(known)) < len(known):
-        raise CommandError("names", f"names a joint twice: {told}")
+        raise CommandError("names", f"names a joint twice: {listed}")
     return known
 
 
@@ -147,8 +147,8 @@ class Commands:
     def _of_frame(self, kind: str, message: Any) -> Inputs:
         frame = message.header.frame_id
         if frame not in ("", self._root):
-            told = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
-            raise CommandError("frame", f"is in frame {told}")
+            elsewhere = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
+            raise CommandError("frame", f"is in frame {elsewhere}")
         point = message.pose.position if kind == POSE else message.point
         given = {
             name: getattr(point, axis) for name, axis in zip(self._groups["x_des"], self._axes)

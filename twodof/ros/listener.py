@@ -75,9 +75,9 @@ class Listener:
 
             for command in self._come(name, read, WHAT[kind]):
                 if command.strangers:
-                    told = f"a command on {name} is of joints that this robot has not"
+                    reason = f"a command on {name} is of joints that this robot has not"
                     names = ", ".join(command.strangers)[:LONGEST_NAME]
-                    self._warn("strangers", f"{told}, {names!r}: they are left out")
+                    self._warn("strangers", f"{reason}, {names!r}: they are left out")
                 yield command
 
     def await_go(self, stop: Callable[[], bool], pace: RealTime | None) -> None:

@@ -232,8 +232,8 @@ class Publisher(Sink):
         (name,) = self.commands
         if latest is not None:
             own = self._sample.stamp / NANOSECONDS
-            told = f"the latest on {name} is stamped {latest / NANOSECONDS:.9f} s, not {own:.9f} s"
-            return f"{told}; a command has the stamp of the state that it answers"
+            last = f"the latest on {name} is stamped {latest / NANOSECONDS:.9f} s, not {own:.9f} s"
+            return f"{last}; a command has the stamp of the state that it answers"
         if not self._listener.is_matched(name):
             return f"nobody publishes on {name}"
         if not self._writers[JOINT_STATES].get_matched_subscriptions():
