@@ -16,20 +16,23 @@ class Collector(list[Sample], Sink):
 
 
 class Memory(Sink):
-    """The sink that looks at this process's memory each so many samples.
-
-    Attributes:
-        growth: most that it was above that of the first look, bytes.
-    """
+    """The sink that looks at this process's memory each so many samples."""
 
     def __init__(self, every: int) -> None:
-        self._every, self._first, self.growth = every, 0, 0
+        self._every = every
+        self._looks: list[int] = []
 
     def write(self, sample: Sample) -> None:
-        if sample.k == self._every:
-            self._first = resident()
-        elif sample.k > self._every and sample.k % self._every == 0:
-            self.growth = max(self.growth, resident() - self._first)
+        if sample.k and sample.k % self._every == 0:
+            self._looks.append(resident())
+
+    @property
+    def growth(self) -> int:
+        """By how much it was above that of the first look in both of the last two looks, bytes.
+
+        What waits to be stored comes and goes.
+        """
+        return min(self._looks[-2:]) - self._looks[0]
 
 
 def resident() -> int:
