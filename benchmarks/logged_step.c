@@ -22,7 +22,7 @@ FMI2_Export double logged_cost(double h, int steps, const char *path, int logs)
     enum { COUNT = FIRST_PARAMETER - FIRST_OUTPUT };
     fmi2ValueReference references[COUNT];
     for (int i = 0; i < COUNT; i++)
-        references[i] = FIRST_OUTPUT + i;
+        references[i] = FIRST_OUTPUT + 1 + i;
     double values[COUNT];
     unsigned char record[HEAD + SIZE] = {5};
     const clock_t begin = clock();

@@ -112,7 +112,7 @@ def built(urdf: Path, folder: Path) -> list[str]:
     frame = frame_of(text)
     times = []
     for native in (False, True):
-        options = twodof.FmuOptions(urdf=urdf, frame=frame, native=native, live_documentation=False)
+        options = twodof.FmuOptions(urdf=urdf, frame=frame, native=native)
         fmu = twodof.build_fmu(folder / f"robot{native:d}.fmu", options)
         clock, bag = Clock(), twodof.Bag(folder / "bag", overwrite=True)
         summary = twodof.simulate(fmu, bag, clock, stop_time=1.0, stop=clock.late)
@@ -169,7 +169,6 @@ def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
     for fmi in (2, 3):
         options = twodof.FmuOptions(
             urdf=urdf, frame=frame, control=control, native=True, fmi=fmi, meshes=False,
-            live_documentation=False,
         )  # fmt: skip
         paths.append(twodof.build_fmu(folder / f"fmi{fmi}.fmu", options))
     two, three = map(simulated, paths)

@@ -13,17 +13,19 @@ import json
 import re
 import site
 import sys
+from contextlib import suppress
 from copy import deepcopy
+from dataclasses import replace
 from functools import partialmethod
+from math import isfinite
 from pathlib import Path
 
 PACKAGE = __name__.replace("slave_", "twodof_")
 fmi = importlib.import_module(f"{PACKAGE}.pythonfmu.fmi2slave")
 Status = importlib.import_module(f"{PACKAGE}.pythonfmu.enums").Fmi2Status
 
-INSTANTIATED, INITIALIZATION, STEP, TERMINATED, ERROR = (
-    "instantiated", "initialization mode", "step mode", "terminated", "error",
-)  # fmt: skip
+PHASES = ("instantiated", "initialization mode", "step mode", "terminated", "error")
+INSTANTIATED, INITIALIZATION, STEP, TERMINATED, ERROR = PHASES
 ALLOWED = {
     "fmi2SetupExperiment": {INSTANTIATED},
     "fmi2EnterInitializationMode": {INSTANTIATED},
@@ -34,7 +36,6 @@ ALLOWED = {
     "fmi2Set of a parameter": {INSTANTIATED, INITIALIZATION},
     "fmi2Set of an input": {INSTANTIATED, INITIALIZATION, STEP},
 }
-PHASES = (INSTANTIATED, INITIALIZATION, STEP, TERMINATED, ERROR)
 COMPUTED = ("output", "local")  # causalities
 TIME_TOLERANCE = 1e-9
 MAX_STATE = 64 * 1024  # bytes, of a serialised state; that of 128 joints has half of them
@@ -43,11 +44,10 @@ UNSOUND = "the state is none that an instance can be in"
 
 def import_plant(site_packages: list[str]):
     """The plant module of this FMU; says what to install where a package is missing."""
-    try:
+    with suppress(ModuleNotFoundError):
         return importlib.import_module(f"{PACKAGE}.plant.plant")
-    except ModuleNotFoundError:
-        for folder in site_packages:
-            site.addsitedir(folder)  # with its .pth files: pin keeps its modules behind one
+    for folder in site_packages:
+        site.addsitedir(folder)  # with its .pth files: pin keeps its modules behind one
     try:
         return importlib.import_module(f"{PACKAGE}.plant.plant")
     except ModuleNotFoundError as missing:
@@ -90,7 +90,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
     def setup_experiment(self, start_time, stop_time=None, tolerance=None):
         if not self._allowed("fmi2SetupExperiment"):
             return
-        if not self._finite(start_time):
+        if not isfinite(start_time):
             self._refuse(f"fmi2SetupExperiment: start time {start_time} is not finite")
             return
         if tolerance is not None:
@@ -121,7 +121,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
                 f"fmi2DoStep: the communication point {current_time!r} s is not"
                 f" the time of the FMU, {self._time!r} s"
             )
-        if not (step_size > 0.0 and self._finite(step_size)):
+        if not (step_size > 0.0 and isfinite(step_size)):
             return self._discard(f"fmi2DoStep: the step {step_size!r} s must be finite and > 0")
         try:
             self._plant.step(step_size)
@@ -196,13 +196,22 @@ class TwoDofSlave(fmi.Fmi2Slave):
         variable = self._variable(vr, kind, f"fmi2Set{kind}")
         if variable is None:
             return None
+        if variable.group in ("q", "v") and self._phase in (INSTANTIATED, INITIALIZATION):
+            state = variable.name
+            variable = replace(variable, group=f"{variable.group}_start", causality="parameter")
+            if self._phase == INITIALIZATION:
+                self._refuse(
+                    f"fmi2Set{kind}: {state} follows from {variable.name} in"
+                    " initialization mode: set that"
+                )
+                return None
         if variable.causality in COMPUTED:
             self._refuse(f"fmi2Set{kind}: {variable.name} is computed and cannot be set")
             return None
         article = "a" if variable.causality == "parameter" else "an"
         if not self._allowed(f"fmi2Set of {article} {variable.causality}", variable.name):
             return None
-        if kind == "Real" and not self._finite(value):
+        if kind == "Real" and not isfinite(value):
             self._refuse(f"{variable.name} = {value} is not finite")
             return None
         if variable.causality == "input" and variable.refusal(value):
@@ -211,10 +220,10 @@ class TwoDofSlave(fmi.Fmi2Slave):
         return variable
 
     def _variable(self, vr, kind, call):
-        if not 0 <= vr < len(self._table):
+        if not 1 <= vr <= len(self._table):
             self._refuse(f"{call}: there is no variable with value reference {vr}")
             return None
-        variable = self._table[vr]
+        variable = self._table[vr - 1]
         if variable.type != kind:
             self._refuse(f"{call}: {variable.name} is of type {variable.type}")
             return None
@@ -296,10 +305,6 @@ class TwoDofSlave(fmi.Fmi2Slave):
     def _log(self, message, status):
         # FMI messages are printf formats
         self.log(message.replace("%", "%%"), status)
-
-    @staticmethod
-    def _finite(value):
-        return abs(value) < float("inf")
 
 
 def alike(value, own):

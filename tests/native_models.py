@@ -9,7 +9,6 @@ import math
 import os
 import subprocess
 import tempfile
-import uuid
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,6 +18,8 @@ from pathlib import Path
 import fmpy
 import numpy as np
 import pinocchio as pin
+from scratch import run_folder
+from tools import needs
 
 from twodof.export.compiler import compile_library, host_platform
 from twodof.export.flavours import engine_sources
@@ -31,9 +32,7 @@ from twodof.plant.variables import Variable, variable_table
 ROOT = Path(__file__).parents[1]
 HERE = Path(__file__).parent / "native"
 GUID = "0123456789abcdef"
-SCRATCH = Path(tempfile.gettempdir(), "twodof-tests-" + os.environ.get(
-    "PYTEST_XDIST_TESTRUNUID", uuid.uuid4().hex
-))  # fmt: skip
+SCRATCH = run_folder() / "native"
 """What is compiled, for all processes of a run of the tests."""
 
 
@@ -74,8 +73,11 @@ class Model:
         plant.initialise()
         return plant
 
-    def reference(self, name: str) -> int:
+    def place(self, name: str) -> int:
         return next(i for i, v in enumerate(self.table) if name in (v.name, v.group))
+
+    def reference(self, name: str) -> int:
+        return self.place(name) + 1
 
     def sources(self, *more: Path, fmi: int = 2) -> dict[str, bytes]:
         headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{fmi}*.h")
@@ -261,6 +263,26 @@ def engine(name: str, control: str = "task") -> Engine:
     return Engine(model(name, control))
 
 
+@functools.cache
+def damped_arm(damping: float) -> Engine:
+    """The shipped arm with damped joints."""
+    if not damping:
+        return engine("twodof")
+    urdf = (ROOT / "urdf" / "2dof.urdf").read_text()
+    text = urdf.replace("<limit", f'<dynamics damping="{damping!r}"/><limit')
+    return Engine(from_urdf(text, "EndEffector", "xy"))
+
+
+def shipped(of: Engine, **changes: object) -> Plant:
+    """Return a plant of the shipped arm with its start values, or with others."""
+    plant = of.model.plant()
+    start = {"q_start": [0.5, 0.35], "x_des": [0.2, 0.05], "gravity": [0.0, -9.81, 0.0]}
+    for name, value in {**start, **changes}.items():
+        setattr(plant, name, value)
+    plant.initialise()
+    return plant
+
+
 def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2) -> Path:
     """C files of the tests, which include the FMU's, compiled by the machine's own compiler;
     headers of the tests lie beside."""
@@ -274,7 +296,7 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
             (begun / file).write_bytes(content)
         level = "-O1" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
         subprocess.run(
-            ["gcc", "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
+            [needs("gcc"), "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
              "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
              "-o", "program", "directional.c",
              *(path.name for path in more if path.suffix == ".c"), "-lm"],

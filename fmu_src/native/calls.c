@@ -11,9 +11,9 @@ static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation"};
 enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
        M = 1 << EVENT, C = 1 << CONTINUOUS_TIME, T = 1 << TERMINATED,
        ANY = N | I | S | F | M | C | T, RUNS = S | F | M | C, READS = I | RUNS | T,
-       SETS = N | I | S | M | C, SOLVES = I | M | C | T };
+       GETS = FMI == 3 ? N | READS : READS, SETS = N | I | S | M | C, SOLVES = I | M | C | T };
 
-/* A call's name, the phases in which it is allowed, and of which kind it is, where of one alone. A
+/* A call's name, the phases in which it is allowed, and of which kind it is. A
    refused call changes nothing, so there is no error phase.
    FMI 2.0.4, sections 3.2.3 and 4.2.4; FMI 3.0.2, sections 2.3, 3.2 and 4.2. */
 static const struct {
@@ -21,31 +21,31 @@ static const struct {
     int phases;
     Kind kind;
 } RULE[N_CALLS] = {
-    [INSTANTIATE] = {CALL_NAME(Instantiate), 0},
-    [SET_DEBUG_LOGGING] = {CALL_NAME(SetDebugLogging), ANY},
-    [SETUP_EXPERIMENT] = {CALL_NAME(SetupExperiment), N},
-    [ENTER_INITIALIZATION] = {CALL_NAME(EnterInitializationMode), N},
-    [EXIT_INITIALIZATION] = {CALL_NAME(ExitInitializationMode), I},
-    [TERMINATE] = {CALL_NAME(Terminate), RUNS},
-    [RESET] = {CALL_NAME(Reset), ANY},
+    [INSTANTIATE] = {CALL_NAME(Instantiate), 0, BOTH_KINDS},
+    [SET_DEBUG_LOGGING] = {CALL_NAME(SetDebugLogging), ANY, BOTH_KINDS},
+    [SETUP_EXPERIMENT] = {CALL_NAME(SetupExperiment), N, BOTH_KINDS},
+    [ENTER_INITIALIZATION] = {CALL_NAME(EnterInitializationMode), N, BOTH_KINDS},
+    [EXIT_INITIALIZATION] = {CALL_NAME(ExitInitializationMode), I, BOTH_KINDS},
+    [TERMINATE] = {CALL_NAME(Terminate), RUNS, BOTH_KINDS},
+    [RESET] = {CALL_NAME(Reset), ANY, BOTH_KINDS},
     [DO_STEP] = {CALL_NAME(DoStep), S, CO_SIMULATION},
     [CANCEL_STEP] = {CALL_NAME(CancelStep), 0, CO_SIMULATION}, /* no step is ever pending */
     [GET_STATUS] = {CALL_NAME(GetStatus), S | F | T, CO_SIMULATION},
-    [GET_REAL] = {CALL_NAME(Get) REAL_NAME, READS},
-    [GET_BOOLEAN] = {CALL_NAME(GetBoolean), READS},
-    [GET_OTHER] = {CALL_NAME(Get) " of " OTHER_NAME, READS},
-    [SET_REAL] = {CALL_NAME(Set) REAL_NAME, SETS},
-    [SET_BOOLEAN] = {CALL_NAME(SetBoolean), SETS},
-    [SET_OTHER] = {CALL_NAME(Set) " of " OTHER_NAME, SETS},
-    [SET_INPUT] = {CALL_NAME(Set) " of an input", SETS},
-    [SET_PARAMETER] = {CALL_NAME(Set) " of a parameter", N | I},
-    [SET_Q_V] = {CALL_NAME(Set) " of a state", M | C},
-    [GET_STATE] = {CALL_NAME(GetFMUstate), ANY},
-    [SET_STATE] = {CALL_NAME(SetFMUstate), ANY},
-    [FREE_STATE] = {CALL_NAME(FreeFMUstate), ANY},
-    [SIZE_OF_STATE] = {CALL_NAME(SerializedFMUstateSize), ANY},
-    [SERIALIZE] = {CALL_NAME(SerializeFMUstate), ANY},
-    [DESERIALIZE] = {CALL_NAME(DeSerializeFMUstate), ANY},
+    [GET_REAL] = {CALL_NAME(Get) REAL_NAME, GETS, BOTH_KINDS},
+    [GET_BOOLEAN] = {CALL_NAME(GetBoolean), GETS, BOTH_KINDS},
+    [GET_OTHER] = {CALL_NAME(Get) " of " OTHER_NAME, GETS, BOTH_KINDS},
+    [SET_REAL] = {CALL_NAME(Set) REAL_NAME, SETS, BOTH_KINDS},
+    [SET_BOOLEAN] = {CALL_NAME(SetBoolean), SETS, BOTH_KINDS},
+    [SET_OTHER] = {CALL_NAME(Set) " of " OTHER_NAME, SETS, BOTH_KINDS},
+    [SET_INPUT] = {CALL_NAME(Set) " of an input", SETS, BOTH_KINDS},
+    [SET_PARAMETER] = {CALL_NAME(Set) " of a parameter", N | I, BOTH_KINDS},
+    [SET_Q_V] = {CALL_NAME(Set) " of a state", M | C, BOTH_KINDS},
+    [GET_STATE] = {CALL_NAME(GetFMUstate), ANY, BOTH_KINDS},
+    [SET_STATE] = {CALL_NAME(SetFMUstate), ANY, BOTH_KINDS},
+    [FREE_STATE] = {CALL_NAME(FreeFMUstate), ANY, BOTH_KINDS},
+    [SIZE_OF_STATE] = {CALL_NAME(SerializedFMUstateSize), ANY, BOTH_KINDS},
+    [SERIALIZE] = {CALL_NAME(SerializeFMUstate), ANY, BOTH_KINDS},
+    [DESERIALIZE] = {CALL_NAME(DeSerializeFMUstate), ANY, BOTH_KINDS},
     [ENTER_EVENT_MODE] = {CALL_NAME(EnterEventMode), C, MODEL_EXCHANGE},
     [NEW_DISCRETE_STATES] = {CALL_NAME(NewDiscreteStates), M, MODEL_EXCHANGE},
     [ENTER_CONTINUOUS_TIME_MODE] = {CALL_NAME(EnterContinuousTimeMode), M, MODEL_EXCHANGE},
@@ -56,8 +56,8 @@ static const struct {
     [GET_EVENT_INDICATORS] = {CALL_NAME(GetEventIndicators), SOLVES, MODEL_EXCHANGE},
     [GET_CONTINUOUS_STATES] = {CALL_NAME(GetContinuousStates), SOLVES, MODEL_EXCHANGE},
     [GET_NOMINALS] = {CALL_NAME(GetNominalsOfContinuousStates), N | SOLVES, MODEL_EXCHANGE},
-    [GET_DIRECTIONAL_DERIVATIVE] = {CALL_NAME(GetDirectionalDerivative), READS},
-    [GET_ADJOINT_DERIVATIVE] = {CALL_NAME(GetAdjointDerivative), READS},
+    [GET_DIRECTIONAL_DERIVATIVE] = {CALL_NAME(GetDirectionalDerivative), READS, BOTH_KINDS},
+    [GET_ADJOINT_DERIVATIVE] = {CALL_NAME(GetAdjointDerivative), READS, BOTH_KINDS},
     [COUNT_STATES] = {CALL_NAME(GetNumberOf), ANY, MODEL_EXCHANGE},
 };
 

@@ -5,11 +5,12 @@
 #include "internal.h"
 #include "mechanism.h"
 
-/* What the law makes of a state, inputs held: accelerations q̈_cmd where COMMANDS_ACCELERATION, else
-   efforts τ. The rank of its J⁺, the number of singular values that were not dropped; 0 where it
-   has none. */
+/* The law at a state, inputs held: accelerations q̈_cmd where COMMANDS_ACCELERATION, else efforts τ.
+   The rank of its J⁺ and the margin are those of apply_pseudo_inverse; 0 and 1 where it has none.
+   The margin may be NULL. */
 INTERNAL int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
-                     const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS]);
+                     const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+                     double given[N_JOINTS], double *margin);
 
 #ifdef HAS_RCOND
 /* The singular values of J at a position over the largest, which comes first. */

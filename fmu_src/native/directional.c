@@ -31,6 +31,10 @@ static Real largest_of(const Real change[], int count)
 #undef I     /* a name like others */
 #undef creal /* musl's macros are casts to double, which will be another type */
 #undef cimag
+#ifdef __clang__ /* which functions a robot needs depends on it; a keyword will be a macro */
+#pragma clang diagnostic ignored "-Wunused-function"
+#pragma clang diagnostic ignored "-Wkeyword-macro"
+#endif
 
 static const Real STEP = 1e-100;
 static const double _Complex UNIT = (double _Complex)_Complex_I;
@@ -42,18 +46,6 @@ static inline void assign(double _Complex *x, Real a, Real b)
     ((Real *)x)[1] = b;
 }
 
-/* x + i y, where a function of x has such a value and derivative. */
-static inline double _Complex analytic(double _Complex x, Real value, Real derivative)
-{
-    return value + UNIT * (derivative * cimag(x));
-}
-
-static inline double _Complex complex_sqrt(double _Complex x)
-{
-    const Real root = sqrt(creal(x));
-    return analytic(x, root, root > 0.0 ? 0.5 / root : 0.0);
-}
-
 static inline double _Complex complex_atan2(double _Complex y, double _Complex x)
 {
     const Real a = creal(x), b = creal(y), square = a * a + b * b;
@@ -63,6 +55,12 @@ static inline double _Complex complex_atan2(double _Complex y, double _Complex x
 static inline double _Complex complex_fabs(double _Complex x)
 {
     return creal(x) < 0.0 ? -x : x;
+}
+
+static inline double _Complex complex_sqrt(double _Complex x)
+{
+    const Real root = sqrt(creal(x));
+    return root + UNIT * ((root > 0.0 ? 0.5 / root : 0.0) * cimag(x));
 }
 
 static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
@@ -87,14 +85,14 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 #include "engine.c"
 
 /* Compute what is wanted. */
-static void evaluate(Plant *plant, const int held[N_JOINTS], int wanted)
+static void evaluate(Plant *plant, const int held[N_JOINTS], int rank, int wanted)
 {
     if (wanted & WANTS_X)
         compute_position(plant);
     if (wanted & WANTS_TAU)
-        compute_effort(plant);
+        compute_effort(plant, rank);
     if (wanted & WANTS_RATES) {
-        Stops stops = {.any_held = 0};
+        Stops stops = {.rank = rank};
         for (int i = 0; i < N_JOINTS; i++)
             stops.any_held |= stops.held[i] = held[i];
         compute_rates(plant, &stops);
@@ -102,8 +100,8 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], int wanted)
 }
 
 #if COMPLEX
-void differentiate(const Real value[], const int held[], int wanted, const Real change[],
-                   Real derivative[])
+void differentiate(const Real value[], const int held[], int rank, int wanted,
+                   const Real change[], Real derivative[])
 {
     const Real largest = largest_of(change, X); /* whatever its size, a step is small */
     const Real inverse = 1.0 / largest, up = 1.0 / STEP;
@@ -112,7 +110,7 @@ void differentiate(const Real value[], const int held[], int wanted, const Real 
         plant.value[i] = value[i];
     for (int i = 0; i < X; i++)
         plant.value[i] += UNIT * (change[i] * inverse * STEP);
-    evaluate(&plant, held, wanted);
+    evaluate(&plant, held, rank, wanted);
     for (int i = 0; i < FIRST_PARAMETER; i++)
         derivative[i] = cimag(plant.value[i]) * up * largest;
 }
@@ -120,8 +118,8 @@ void differentiate(const Real value[], const int held[], int wanted, const Real 
 /* ∛ε: where the errors of truncation and rounding are alike. */
 static const Real NUDGE = 6e-6;
 
-void differentiate(const Real value[], const int held[], int wanted, const Real change[],
-                   Real derivative[])
+void differentiate(const Real value[], const int held[], int rank, int wanted,
+                   const Real change[], Real derivative[])
 {
     const Real largest = largest_of(change, X);
     Plant after, before;
@@ -130,8 +128,8 @@ void differentiate(const Real value[], const int held[], int wanted, const Real 
         after.value[i] = value[i] + nudge;
         before.value[i] = value[i] - nudge;
     }
-    evaluate(&after, held, wanted);
-    evaluate(&before, held, wanted);
+    evaluate(&after, held, rank, wanted);
+    evaluate(&before, held, rank, wanted);
     for (int i = 0; i < FIRST_PARAMETER; i++)
         derivative[i] = (after.value[i] - before.value[i]) / (2.0 * NUDGE) * largest;
 }

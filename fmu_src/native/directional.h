@@ -8,10 +8,10 @@
 /* Which computed variables are wanted. */
 enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4 };
 
-/* How all variables change at value, by value reference, where inputs and states do as in change.
-   Those that hold are the joints at rest at a limit, which stay there. */
-#define differentiate PREFIXED(differentiate)
-HIDDEN void differentiate(const double value[], const int held[], int wanted,
+/* How all variables change at value, by place, where inputs and states do as in change.
+   Those that hold are the joints at rest at a limit, which stay there; the rank is that of J⁺. */
+#define differentiate PREFIXED(twodof_differentiate)
+HIDDEN void differentiate(const double value[], const int held[], int rank, int wanted,
                           const double change[], double derivative[]);
 
 #endif

@@ -4,6 +4,7 @@
 #include "dormand_prince.h"
 
 #include <math.h>
+#include <stddef.h>
 #include <string.h>
 
 /* Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution. */
@@ -28,10 +29,13 @@ static const double P[STAGES + 1][4] = {
     {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
 };
 
-int evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS])
+void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double pressed[N_JOINTS],
+              double *margin)
 {
     step->evaluations++;
-    return acceleration(step->plant, y, y + N_JOINTS, a);
+    acceleration(step->plant, y, y + N_JOINTS, step->stops.rank, a, margin);
+    if (step->stops.any_held)
+        restrain(step->plant, &step->stops, y, a, pressed);
 }
 
 double dormand_prince(Step *step)
@@ -39,7 +43,7 @@ double dormand_prince(Step *step)
     const double rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
     double *y_new = step->y_new, sum = 0.0;
     for (int stage = 1; stage <= STAGES; stage++) {
-        double weight[STAGES], *a = step->K[stage] + N_JOINTS;
+        double weight[STAGES];
         for (int s = 0; s < stage; s++)
             weight[s] = step->size * A[stage - 1][s];
         for (int i = 0; i < N_STATES; i++) {
@@ -49,11 +53,8 @@ double dormand_prince(Step *step)
             y_new[i] = step->y[i] + change;
         }
         memcpy(step->K[stage], y_new + N_JOINTS, N_JOINTS * sizeof *y_new);
-        step->rank[stage] = evaluate(step, y_new, a);
-        if (step->stops.any_held) {
-            double pressed[N_JOINTS];
-            restrain(step->plant, &step->stops, y_new, a, pressed);
-        }
+        evaluate(step, y_new, step->K[stage] + N_JOINTS, step->pressed[stage],
+                 stage == STAGES ? &step->margin_new : NULL);
     }
     for (int i = 0; i < N_STATES; i++) {
         double error = 0.0;
@@ -77,12 +78,11 @@ void interpolate(Step *step)
         }
 }
 
-void dense_output(const Step *step, double passed, double y[N_STATES])
+double dense_output(const Step *step, double passed, int component)
 {
-    const double x = passed / step->size;
-    for (int i = 0; i < N_STATES; i++) {
-        const double *c = step->Q[i];
-        const double slope = c[0] + c[1] * x + c[2] * (x * x) + c[3] * (x * x * x);
-        y[i] = passed == step->size ? step->y_new[i] : step->y[i] + step->size * x * slope;
-    }
+    const double x = passed / step->size, *c = step->Q[component];
+    const double slope = c[0] + c[1] * x + c[2] * (x * x) + c[3] * (x * x * x);
+    if (passed == step->size)
+        return step->y_new[component];
+    return step->y[component] + step->size * x * slope;
 }

@@ -4,9 +4,12 @@
 #include <string.h>
 
 int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
-            const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
+            const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+            double given[N_JOINTS], double *margin)
 {
-    (void)joint, (void)q, (void)v;
+    (void)joint, (void)q, (void)v, (void)rank;
+    if (margin)
+        *margin = 1.0;
     memcpy(given, &value[TAU_CMD], N_JOINTS * sizeof *given);
     return 0;
 }

@@ -24,9 +24,9 @@ static const double SLOW = 1e-4;
 void find_stops(const Plant *plant, Stops *stops)
 {
     const int kept[N_JOINTS] = {0};
-    double a[N_JOINTS];
-    acceleration(plant, &plant->value[Q], &plant->value[V], a);
-    hold(plant, &plant->value[Q], a, kept, stops);
+    double a[N_JOINTS], pressed[N_JOINTS];
+    stops->rank = acceleration(plant, &plant->value[Q], &plant->value[V], ANY_RANK, a, NULL);
+    hold(plant, &plant->value[Q], a, kept, stops, pressed);
 }
 
 /* Distance to a place past a limit, and more where a joint moves away from it, at v: there a solver's
@@ -43,7 +43,7 @@ void event_indicators(const Plant *plant, const Stops *stops, double indicator[N
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     double a[N_JOINTS], pressed[N_JOINTS];
     if (stops->any_watched) {
-        acceleration(plant, q, v, a);
+        acceleration(plant, q, v, stops->rank, a, NULL);
         restrain(plant, stops, q, a, pressed);
     }
     for (int i = 0; i < N_JOINTS; i++) {
@@ -56,7 +56,7 @@ void event_indicators(const Plant *plant, const Stops *stops, double indicator[N
             *at[is_above(plant, q[i], i) ? 0 : 1] = pressed[i] + PULL;
     }
 #ifdef HAS_RCOND
-    double ratio[N_INDICATORS - 2 * N_JOINTS + 1];
+    double ratio[N_ROWS];
     conditioning(q, ratio);
     for (int k = 2 * N_JOINTS; k < N_INDICATORS; k++)
         indicator[k] = ratio[k - 2 * N_JOINTS + 1] - plant->value[RCOND];

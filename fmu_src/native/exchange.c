@@ -32,7 +32,8 @@ Status update_discrete_states(void *component, Boolean *states_changed)
         return ERROR;
     State draft = instance->state;
     update_stops(&draft);
-    const int changed = handle_event(&draft.plant, &draft.stops);
+    const int taken = take_passed_stop(&draft.passage, &draft.plant, &draft.stops, draft.time);
+    const int changed = handle_event(&draft.plant, &draft.stops) || taken;
     for (int i = 0; i < N_STATES; i++) /* an impact of speeds that are too large for numbers */
         if (!isfinite(draft.plant.value[Q + i]))
             return report(instance, ERROR, "%s: %s would not be finite",
@@ -50,16 +51,36 @@ Status STANDARD(EnterEventMode)(void *component)
 
 Status STANDARD(EnterContinuousTimeMode)(void *component)
 {
-    return move_on(component, ENTER_CONTINUOUS_TIME_MODE, CONTINUOUS_TIME);
+    if (move_on(component, ENTER_CONTINUOUS_TIME_MODE, CONTINUOUS_TIME) != OK)
+        return ERROR;
+    State *state = &((Instance *)component)->state;
+    update_rates(state);
+    begin_passage(&state->passage, &state->plant, state->time);
+    return OK;
 }
 
 Status STANDARD(CompletedIntegratorStep)(void *component, Boolean no_set_state_prior,
                                          Boolean *enter_event_mode, Boolean *terminate)
 {
+    static const char remedy[] = "the motion goes on without the stop; shorten the solver's steps";
+    Instance *instance = enter(component, COMPLETED_INTEGRATOR_STEP, enter_event_mode && terminate);
     (void)no_set_state_prior;
-    if (!enter(component, COMPLETED_INTEGRATOR_STEP, enter_event_mode && terminate))
+    if (!instance)
         return ERROR;
-    *enter_event_mode = *terminate = 0;
+    const char *call = call_name(COMPLETED_INTEGRATOR_STEP);
+    State *state = &instance->state;
+    Passage *passage = &state->passage;
+    if (passage->joint)
+        report(instance, WARNING, "%s: joint '%s' was at a limit at %.12g s, between two steps of the"
+               " solver, and %s was not called at %.12g s: %s", call, JOINT_NAME[passage->joint - 1],
+               passage->stop_time, call_name(ENTER_EVENT_MODE), passage->time, remedy);
+    update_rates(state);
+    const int failed = find_passed_stop(passage, &state->plant, &state->stops, state->time);
+    if (failed)
+        report(instance, WARNING, "%s: joint '%s' turned at a limit in the solver's step to %.12g s, which"
+               " the FMU cannot integrate: %s", call, JOINT_NAME[failed - 1], state->time, remedy);
+    *enter_event_mode = passage->joint != 0;
+    *terminate = 0;
     return OK;
 }
 

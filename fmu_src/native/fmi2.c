@@ -29,9 +29,9 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     Instance draft = {.kind = type == fmi2ModelExchange ? MODEL_EXCHANGE : CO_SIMULATION,
                       .log = (void (*)(void))functions->logger,
                       .environment = functions->componentEnvironment,
-                      .name = name ? name : "", .verbose = logging_on};
+                      .name = name ? name : ""};
     if (type == fmi2ModelExchange || type == fmi2CoSimulation)
-        return instantiate(draft, guid);
+        return instantiate(draft, guid, logging_on);
     report(&draft, ERROR, "fmi2Instantiate: the type is neither co-simulation nor Model Exchange");
     return NULL;
 }

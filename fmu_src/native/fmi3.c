@@ -16,9 +16,9 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
 {
     (void)resources, (void)visible, (void)early_return, (void)required, (void)intermediate_update;
     Instance draft = {.kind = CO_SIMULATION, .log = (void (*)(void))log,
-                      .environment = environment, .name = name, .verbose = logging_on};
+                      .environment = environment, .name = name};
     if (!event_mode && n_required == 0)
-        return instantiate(draft, token);
+        return instantiate(draft, token, logging_on);
     report(&draft, ERROR, "fmi3InstantiateCoSimulation: this FMU has no %s",
            event_mode ? "event mode in co-simulation" : "intermediate update");
     return NULL;
@@ -31,8 +31,7 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
 {
     (void)resources, (void)visible;
     return instantiate((Instance){.kind = MODEL_EXCHANGE, .log = (void (*)(void))log,
-                                  .environment = environment, .name = name,
-                                  .verbose = logging_on}, token);
+                                  .environment = environment, .name = name}, token, logging_on);
 }
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolerance_defined,

@@ -1,8 +1,10 @@
 /* All of the FMU but the derivatives: its files together, for their functions are static. */
 #include "engine.c"
 #include "dormand_prince.c"
+#include "event_search.c"
 #include "integrator.c"
 #include "events.c"
+#include "passed_stops.c"
 #include "calls.c"
 #include "instance.c"
 #include "simulation.c"

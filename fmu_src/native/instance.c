@@ -8,13 +8,20 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* By status; all of them are on with the first. */
+static const char *const CATEGORY[] = {
+    "logAll", "logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"};
+enum { N_CATEGORIES = sizeof CATEGORY / sizeof *CATEGORY, EVERY_CATEGORY = (1 << N_CATEGORIES) - 1 };
+
+/* Categories where logging is off: in FMI 3.0 none, in 2.0, where this is debug logging, all but
+   information. */
+enum { CATEGORIES_OFF = FMI == 3 ? 0 : EVERY_CATEGORY - 1 };
+
 Status report(Instance *instance, Status status, const char *format, ...)
 {
-    static const char *const CATEGORY[] = {
-        "logAll", "logStatusWarning", "logStatusDiscard", "logStatusError"};
     char text[512];
     va_list arguments;
-    if (!instance->log || (status == OK && !instance->verbose))
+    if (!instance->log || instance->silent >> status & 1)
         return status;
     va_start(arguments, format);
     vsnprintf(text, sizeof text, format, arguments);
@@ -38,15 +45,14 @@ Status check_range(Instance *instance, int variable, double value)
     for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
         const int index = variable - RANGE[k].first;
         if (index >= 0 && index < RANGE[k].count
-            && !(value >= RANGE[k].low && value <= RANGE[k].high
-                 && (value > 0.0 || !RANGE[k].positive)))
+            && !(value >= RANGE[k].low && value <= RANGE[k].high))
             return report(instance, ERROR, "%s = %g must be %s", VARIABLE_NAME[variable],
                           value, RANGE[k].words);
     }
     return OK;
 }
 
-Instance *instantiate(Instance draft, const char *token)
+Instance *instantiate(Instance draft, const char *token, int logging_on)
 {
     const char *function = call_name(INSTANTIATE), *name = draft.name;
     if (!name || !*name) {
@@ -64,6 +70,7 @@ Instance *instantiate(Instance draft, const char *token)
         return NULL;
     }
     *instance = draft;
+    instance->silent = logging_on ? 0 : EVERY_CATEGORY - CATEGORIES_OFF;
     instance->name = strcpy((char *)(instance + 1), name);
     reset_state(&instance->state);
     return instance;
@@ -83,18 +90,20 @@ Status STANDARD(SetDebugLogging)(void *component, Boolean on, size_t count,
                                  const char *const categories[])
 {
     Instance *instance = enter(component, SET_DEBUG_LOGGING, count == 0 || categories);
-    int all = count == 0;
+    int chosen = count == 0 ? EVERY_CATEGORY : 0;
     if (!instance)
         return ERROR;
     for (size_t i = 0; i < count; i++) {
         const char *category = categories[i] ? categories[i] : "";
-        if (strcmp(category, "logAll") == 0)
-            all = 1;
-        else if (strncmp(category, "logStatus", 9) != 0)
+        int k = 0;
+        while (k < N_CATEGORIES && strcmp(category, CATEGORY[k]) != 0)
+            k++;
+        if (k == N_CATEGORIES)
             return report(instance, ERROR, "%s: there is no category '%s'",
                           call_name(SET_DEBUG_LOGGING), category);
+        chosen |= k == 0 ? EVERY_CATEGORY : 1 << k;
     }
-    instance->verbose = on && all;
+    instance->silent = EVERY_CATEGORY - (on ? chosen : CATEGORIES_OFF);
     return OK;
 }
 

@@ -10,6 +10,7 @@
 #include <stddef.h>
 
 #include "internal.h"
+#include "passed_stops.h"
 #include "plant.h"
 #include "stops.h"
 
@@ -64,12 +65,16 @@ typedef enum {
     TERMINATED, N_PHASES
 } Phase;
 
+/* In FMI 3.0 co-simulation may go on after a step that was discarded. */
+enum { AFTER_DISCARD = FMI == 3 ? STEP : STEP_FAILED };
+
 /* All that getFMUstate saves. Plain data without pointers. */
 typedef struct {
     char guid[sizeof MODEL_GUID + 8 - sizeof MODEL_GUID % 8]; /* of the model that it belongs to */
     Plant plant;
     double time;      /* s */
     double stop_time; /* s, HUGE_VAL where there is none */
+    Passage passage;  /* in Model Exchange: the importer's step */
     Stops stops;      /* in Model Exchange a discrete state, which events alone change */
     int phase;
     int initialised;  /* the outputs q and v are those of the parameters and the state */
@@ -85,7 +90,7 @@ typedef struct {
     void (*log)(void); /* the importer's callback, as the face knows it */
     void *environment; /* which that is given */
     const char *name;
-    int verbose;
+    int silent; /* the categories of messages that are off, a bit each; none before it is made */
 } Instance;
 
 /* The calls; setting variables has three rows, by what they are. */
@@ -131,11 +136,11 @@ INTERNAL Status unsupported(Instance *instance, const char *function);
 
 /* --- instance.c --- */
 
-/* Log a printf message; what is below a warning only where logging is on. Returns the status. */
+/* Log a printf message, where the status's category is on. Returns the status. */
 INTERNAL Status report(Instance *instance, Status status, const char *format, ...);
 
 /* A new instance as the draft says; NULL where it has no name or another token. */
-INTERNAL Instance *instantiate(Instance draft, const char *token);
+INTERNAL Instance *instantiate(Instance draft, const char *token, int logging_on);
 
 /* Take over the times of the experiment; its tolerance is told to be ignored. */
 INTERNAL Status set_up(Instance *instance, Call call, const double *tolerance, double start,
@@ -169,7 +174,7 @@ INTERNAL Status do_step(void *component, double point, double h);
 /* Whether the states q and v are others is told. */
 INTERNAL Status update_discrete_states(void *component, Boolean *states_changed);
 
-/* --- variables.c: each reference is of so many values as EXTENT says, in all n_values --- */
+/* --- variables.c: each reference is of so many values as PLACE says, in all n_values --- */
 
 INTERNAL Status get_reals(void *component, const Reference vr[], size_t count, double value[],
                           size_t n_values);

@@ -7,147 +7,36 @@
 #include "integrator.h"
 
 #include <math.h>
+#include <stddef.h>
 #include <string.h>
 
 #include "dormand_prince.h"
+#include "event_search.h"
 #include "stops.h"
 
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
-/* As a part of the first step, 2⁻⁸: where J⁺ drops a singular value the right-hand side jumps, and no
-   step across that passes the error test. One of this size, whose stages had different ranks, is
-   taken. */
-static const double JUMP_STEP = 1.0 / 256.0;
-/* As parts of the largest step, and of that: a joint that is back at its limit sooner than the one
-   after leaving it is kept there for the other, and each time that this is so again twice as long.
-   Where its acceleration only grazes zero, as it may at a singularity, or where joints drive each
-   other off, it would else leave and return without end; where it returns but once, nothing is
-   changed. */
-static const double PATIENCE = 0.25, FIRST_WAIT = 1.0 / 1073741824.0; /* 2⁻³⁰ */
-static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
+/* As parts of the largest step, of PATIENCE, of the last hold, and of PATIENCE. Anti-chatter: where a
+   joint is back at its limit sooner than PATIENCE after it left, it is held there for FIRST_HOLD, and
+   at each repetition LONGER; from HOLD_OF_ALL on, with all joints at limits. Where an acceleration only
+   grazes zero, or where impacts drive joints off each other's limits, they would else leave and return
+   without end; joints that return but once or twice are not disturbed. The rank of J⁺ is held in the
+   same way where it drops soon after a rise: the motion leads back to the jump from both sides, and
+   slides along it. A higher rank is never held, as its J⁺ has no bound. */
+static const double PATIENCE = 0.5, FIRST_HOLD = 1.0 / 1073741824.0, LONGER = 8.0,
+                    HOLD_OF_ALL = 1.0 / 32768.0;
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
 
 /* Set out at y, where joints may rest at a limit. */
-static void set_out(Step *step, const int kept[N_JOINTS])
+static void set_out(Step *step, const int kept[N_JOINTS], int rank_held)
 {
+    double *a = step->K[0] + N_JOINTS;
     impact(step->plant, step->y, kept);
-    step->rank[0] = evaluate(step, step->y, step->K[0] + N_JOINTS);
-    hold(step->plant, step->y, step->K[0] + N_JOINTS, kept, &step->stops);
+    step->evaluations++;
+    step->stops.rank = acceleration(step->plant, step->y, step->y + N_JOINTS,
+                                    rank_held ? step->stops.rank : ANY_RANK, a, &step->margin);
+    hold(step->plant, step->y, a, kept, &step->stops, step->pressed[0]);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
-}
-
-/* Mark the free joints that are past a limit and the watched joints that are let go, at y; whether there are any. */
-static int events(Step *step, const double y[N_STATES], int found[N_JOINTS])
-{
-    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
-    const double *q = y, *v = y + N_JOINTS;
-    double a[N_JOINTS], pressed[N_JOINTS];
-    int any = 0;
-    if (step->stops.any_watched) {
-        evaluate(step, y, a);
-        restrain(step->plant, &step->stops, q, a, pressed);
-    }
-    for (int i = 0; i < N_JOINTS; i++) {
-        found[i] = (q[i] >= high[i] && (q[i] > high[i] || v[i] > 0.0))
-                   || (q[i] <= low[i] && (q[i] < low[i] || v[i] < 0.0));
-        if (step->stops.watched[i])
-            found[i] |= pressed[i] < 0.0;
-        any |= found[i];
-    }
-    return any;
-}
-
-/* What may happen within a step: an event, or a joint's turning back. */
-typedef int Happened(Step *step, double passed, int joint);
-
-static int event_happened(Step *step, double passed, int joint)
-{
-    double y[N_STATES];
-    int found[N_JOINTS];
-    (void)joint;
-    dense_output(step, passed, y);
-    return events(step, y, found);
-}
-
-static int joint_turned(Step *step, double passed, int joint)
-{
-    double y[N_STATES];
-    dense_output(step, passed, y);
-    return y[N_JOINTS + joint] * step->y[N_JOINTS + joint] <= 0.0;
-}
-
-/* First time in (0, latest] at which it has happened, to the last bits of the step. */
-static double bisect(Step *step, Happened *happened, int joint, double latest)
-{
-    double before = 0.0;
-    while (latest - before > TIME_RESOLUTION * step->size) {
-        const double middle = 0.5 * (before + latest);
-        if (!(before < middle && middle < latest))
-            break;
-        if (happened(step, middle, joint))
-            latest = middle;
-        else
-            before = middle;
-    }
-    return latest;
-}
-
-/* When a joint is furthest past a limit, where it is so within the step and back at its end; the
-   earliest such time, 0 where there is none. */
-static double excursion(Step *step)
-{
-    double earliest = 0.0;
-    for (int i = 0; i < N_JOINTS; i++) {
-        const double q = step->y[i], v = step->y[N_JOINTS + i];
-        const double limit = step->plant->value[(v > 0.0 ? Q_MAX : Q_MIN) + i];
-        if (!(v * step->y_new[N_JOINTS + i] < 0.0 && fabs(v) * step->size > fabs(limit - q)))
-            continue;
-        double y[N_STATES];
-        const double turn = bisect(step, joint_turned, i, step->size);
-        dense_output(step, turn, y);
-        if ((y[i] - limit) * v > 0.0 && (earliest == 0.0 || turn < earliest))
-            earliest = turn;
-    }
-    return earliest;
-}
-
-/* First time in (0, size] at which a limit is reached or left, y_new the state from there on; 0
-   where there is none. */
-static double first_event(Step *step)
-{
-    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
-    int found[N_JOINTS];
-    const int at_the_end = events(step, step->y_new, found);
-    int turned = 0;
-    for (int i = 0; i < N_JOINTS; i++)
-        turned |= step->y[N_JOINTS + i] * step->y_new[N_JOINTS + i] < 0.0;
-    if (!at_the_end && !turned)
-        return 0.0;
-    interpolate(step);
-    double latest = at_the_end ? step->size : excursion(step);
-    if (latest == 0.0)
-        return 0.0;
-    latest = bisect(step, event_happened, 0, latest);
-    double reached[N_STATES];
-    dense_output(step, latest, reached);
-    events(step, reached, found);
-    for (int i = 0; i < N_JOINTS; i++) {
-        step->stopped[i] = found[i] && !step->stops.held[i];
-        step->let_go[i] = found[i] && step->stops.held[i];
-        if (step->stopped[i])
-            reached[i] = fmin(fmax(reached[i], low[i]), high[i]);
-    }
-    memcpy(step->y_new, reached, sizeof reached);
-    return latest;
-}
-
-/* Whether the stages of a step had different ranks: it straddles a jump of J⁺. */
-static int ranks_differ(const Step *step)
-{
-    for (int stage = 1; stage <= STAGES; stage++)
-        if (step->rank[stage] != step->rank[0])
-            return 1;
-    return 0;
 }
 
 static int is_finite(const Step *step)
@@ -163,15 +52,15 @@ static int is_finite(const Step *step)
    the largest of |∂q̈ᵢ/∂vᵢ| and |∂q̈ᵢ/∂qᵢ|½. */
 static void find_fastest(Step *step, Obstacle *obstacle)
 {
-    double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS];
-    evaluate(step, step->y, a);
+    double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS], pressed[N_JOINTS];
+    evaluate(step, step->y, a, pressed, NULL);
     obstacle->joint = 0;
     obstacle->rate = -1.0;
     for (int i = 0; i < N_STATES; i++) {
         const int joint = i % N_JOINTS;
         memcpy(nudged, step->y, sizeof nudged);
         nudged[i] += NUDGE;
-        evaluate(step, nudged, answer);
+        evaluate(step, nudged, answer, pressed, NULL);
         double rate = fabs(answer[joint] - a[joint]) / NUDGE;
         rate = !isfinite(rate) ? HUGE_VAL : i < N_JOINTS ? sqrt(rate) : rate;
         if (rate > obstacle->rate) {
@@ -181,23 +70,20 @@ static void find_fastest(Step *step, Obstacle *obstacle)
     }
 }
 
-/* Integrate from the time t, at y, until a joint reaches or leaves a limit, or until the end: the
-   time reached, y being the state there; NaN where that cannot be done. */
-static double until_event(Step *step, double t, double end, Obstacle *obstacle)
+/* Integrate from the time t, at y, until an event or until the end: the time reached, y being the
+   state there; NaN where that cannot be done. */
+static double until_event(Step *step, double t, double end, int rank_held, Event *event,
+                          Obstacle *obstacle)
 {
     const double max_step = step->plant->value[MAX_STEP];
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
-    const double jump_step = JUMP_STEP * next;
-    memset(step->stopped, 0, sizeof step->stopped);
-    memset(step->let_go, 0, sizeof step->let_go);
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
-        const int small = next <= jump_step; /* also where stretched to the end */
         step->size = last ? end - t : next;
         const double norm = dormand_prince(step);
         double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
-        if (norm < 1.0 || (small && isfinite(norm) && ranks_differ(step))) {
-            const double passed = first_event(step);
+        if (norm < 1.0) {
+            const double passed = first_event(step, rank_held, event);
             memcpy(step->y, step->y_new, sizeof step->y);
             if (last && (passed == 0.0 || passed == step->size))
                 return end;
@@ -205,16 +91,15 @@ static double until_event(Step *step, double t, double end, Obstacle *obstacle)
                 return t + passed;
             t += step->size;
             memcpy(step->K[0], step->K[STAGES], sizeof step->K[0]);
-            step->rank[0] = step->rank[STAGES];
-            factor = fmax(MIN_FACTOR, fmin(growth, factor));
-            if (norm < 1.0) /* else the error says nothing about the next step */
-                next = fmin(max_step, step->size * factor);
+            if (step->stops.any_held)
+                memcpy(step->pressed[0], step->pressed[STAGES], sizeof step->pressed[0]);
+            step->margin = step->margin_new;
+            next = fmin(max_step, step->size * fmax(MIN_FACTOR, fmin(growth, factor)));
             growth = MAX_FACTOR;
         } else {
-            factor = isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR;
-            next = small ? step->size * factor : fmax(jump_step, step->size * factor);
+            next = step->size * (isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
-            if (next < 10.0 * (nextafter(t, HUGE_VAL) - t)) {
+            if (next < 10.0 * (nextafter(end, HUGE_VAL) - end)) {
                 obstacle->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
                 find_fastest(step, obstacle);
                 return NAN;
@@ -226,25 +111,48 @@ static double until_event(Step *step, double t, double end, Obstacle *obstacle)
     return NAN;
 }
 
-/* How a joint is kept at its limit: until when, and for how long. */
+/* How long joints are held at their limits, or the rank of J⁺. */
 typedef struct {
     double until, wait;
-} Keeping;
+} Hold;
 
-static void keep_for_a_while(Keeping *keeping, double t, double patience)
+static void hold_for_a_while(Hold *hold, double t, double patience)
 {
-    const int again = t - keeping->until < patience;
-    keeping->wait = again ? fmin(2.0 * keeping->wait, patience) : FIRST_WAIT * patience;
-    keeping->until = t + keeping->wait;
+    const int again = t - hold->until < patience;
+    hold->wait = again ? fmin(LONGER * hold->wait, patience) : FIRST_HOLD * patience;
+    hold->until = t + hold->wait;
 }
 
-int advance_plant(Plant *plant, double h, Obstacle *obstacle)
+static int is_at_limit(const Step *step, int i)
 {
-    const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
+    const double *value = step->plant->value;
+    return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
+}
+
+/* Hold joints that chatter at t, and with those that do so for long all at limits. Joints are kept while
+   they are held. */
+static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *hold, double t,
+                        double patience, int kept[N_JOINTS])
+{
+    int any = 0;
+    for (int i = 0; i < N_JOINTS; i++)
+        any |= chattering[i];
+    if (any)
+        hold_for_a_while(hold, t, patience);
+    else if (hold->until > t)
+        return;
+    const int all = any && hold->wait >= HOLD_OF_ALL * patience;
+    for (int i = 0; i < N_JOINTS; i++)
+        kept[i] = all ? is_at_limit(step, i) : chattering[i];
+}
+
+int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle *obstacle)
+{
     const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
-    double left[N_JOINTS];       /* when each joint last left its limit */
-    Keeping keeping[N_JOINTS];
-    int kept[N_JOINTS], let_go[N_JOINTS] = {0};
+    double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
+    Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0};
+    int kept[N_JOINTS] = {0}, chattering[N_JOINTS] = {0};
+    Event event = {{0}, {0}, 0};
     Step step;
     double t = 0.0;
     if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
@@ -253,41 +161,47 @@ int advance_plant(Plant *plant, double h, Obstacle *obstacle)
     }
     step.plant = plant;
     step.evaluations = 0;
+    step.stops.rank = N_ROWS;
     memcpy(step.y, &plant->value[Q], sizeof step.y);
     for (int i = 0; i < N_JOINTS; i++) {
         left[i] = -HUGE_VAL;
-        keeping[i] = (Keeping){-HUGE_VAL, 0.0};
+        if (stopped_at)
+            stopped_at[i] = HUGE_VAL;
     }
     while (t < h) {
-        double end = h;
-        int held_again = 0;
+        const int before = step.stops.rank, rank_held = rank.until > t;
+        double end = rank_held ? fmin(h, rank.until) : h;
+        int again = 0;
+        hold_joints(&step, chattering, &joints, t, patience, kept);
+        if (joints.until > t)
+            end = fmin(end, joints.until);
+        set_out(&step, kept, rank_held);
         for (int i = 0; i < N_JOINTS; i++) {
-            kept[i] = keeping[i].until > t;
-            if (kept[i])
-                end = fmin(end, keeping[i].until);
-        }
-        set_out(&step, kept);
-        for (int i = 0; i < N_JOINTS; i++) {
-            if (!step.stops.held[i] && !(low[i] < step.y[i] && step.y[i] < high[i]))
+            if (!step.stops.held[i] && is_at_limit(&step, i))
                 left[i] = t;
-            if (step.stops.watched[i] && let_go[i]) { /* it is pressed again, by rounding */
-                keep_for_a_while(&keeping[i], t, patience);
-                held_again = 1;
-            }
-            let_go[i] = 0;
+            chattering[i] = step.stops.watched[i] && event.released[i]; /* pressed again, by rounding */
+            again |= chattering[i];
         }
-        if (held_again)
+        memset(&event, 0, sizeof event);
+        if (again)
             continue;
-        t = until_event(&step, t, end, obstacle);
-        memcpy(let_go, step.let_go, sizeof let_go);
-        for (int i = 0; i < N_JOINTS; i++)
-            if (step.stopped[i] && t - left[i] < patience)
-                keep_for_a_while(&keeping[i], t, patience);
+        if (step.stops.rank > before)
+            risen = t;
+        if (step.stops.rank < before && t - risen < patience) {
+            hold_for_a_while(&rank, t, patience);
+            continue;
+        }
+        t = until_event(&step, t, end, rank_held, &event, obstacle);
+        for (int i = 0; i < N_JOINTS; i++) {
+            chattering[i] = event.stopped[i] && t - left[i] < patience;
+            if (stopped_at && event.stopped[i])
+                stopped_at[i] = fmin(stopped_at[i], t);
+        }
     }
     if (isnan(t))
         return 0;
-    for (int i = 0; i < N_JOINTS; i++)
-        kept[i] = keeping[i].until > h;
+    if (!(joints.until > h))
+        memset(kept, 0, sizeof kept);
     impact(plant, step.y, kept);
     memcpy(&plant->value[Q], step.y, sizeof step.y);
     return 1;

@@ -19,7 +19,8 @@ typedef struct {
 } Obstacle;
 
 /* Advance the plant's state by h seconds, inputs held: Dormand–Prince 5(4) with located
-   joint-limit stops. False, and the plant unchanged, where that cannot be done. */
-INTERNAL int advance_plant(Plant *plant, double h, Obstacle *obstacle);
+   joint-limit stops. False, and the plant unchanged, where that cannot be done. stopped_at, which may be
+   NULL, has the time within the step at which each joint first reached a limit, HUGE_VAL where none did. */
+INTERNAL int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle *obstacle);
 
 #endif

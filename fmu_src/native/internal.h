@@ -1,15 +1,28 @@
 /* What all files of the FMU share. Other code of the process, the C library and other FMUs among it, has
-   functions of the same names: those of the FMU are static, but those of the standard and `differentiate`,
-   which carry the prefix of a program that has the FMU as sources. */
+   functions of the same names: those of the FMU are static, but those of the standard and
+   `twodof_differentiate`, which carry the prefix of a program that has the FMU as sources. */
 #ifndef INTERNAL_H
 #define INTERNAL_H
 
+#include "model.h"
+
 #define INTERNAL static
 
-#if defined FMI3_FUNCTION_PREFIX
+#if defined __FAST_MATH__ || defined _M_FP_FAST || (defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__)
+#error "compile without -ffast-math, -ffinite-math-only and /fp:fast: they remove the checks for NaN and inf"
+#endif
+
+/* The prefix, by the rules of the standard's headers, of which older ones know no override. */
+#if FMI == 3
+#if defined FMI3_FUNCTION_PREFIX && !defined FMI3_OVERRIDE_FUNCTION_PREFIX
 #define PREFIX FMI3_FUNCTION_PREFIX
-#elif defined FMI2_FUNCTION_PREFIX
+#elif defined FMI3_ACTUAL_FUNCTION_PREFIX
+#define PREFIX FMI3_ACTUAL_FUNCTION_PREFIX
+#endif
+#elif defined FMI2_FUNCTION_PREFIX && !defined FMI2_OVERRIDE_FUNCTION_PREFIX
 #define PREFIX FMI2_FUNCTION_PREFIX
+#elif defined FMI2_ACTUAL_FUNCTION_PREFIX
+#define PREFIX FMI2_ACTUAL_FUNCTION_PREFIX
 #endif
 
 #ifdef PREFIX
@@ -25,6 +38,9 @@
 #else
 #define HIDDEN
 #endif
+
+/* As the rank of J⁺: that which its singular values give. */
+enum { ANY_RANK = -1 };
 
 /* The real part of what is compared: numbers are complex where the engine is compiled for derivatives. */
 #define RE(x) (x)

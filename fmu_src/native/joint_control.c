@@ -3,9 +3,12 @@
 #include "control.h"
 
 int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
-            const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
+            const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+            double given[N_JOINTS], double *margin)
 {
-    (void)joint;
+    (void)joint, (void)rank;
+    if (margin)
+        *margin = 1.0;
     for (int i = 0; i < N_JOINTS; i++)
         given[i] = value[A_DES + i] + value[KD + i] * (value[V_DES + i] - v[i])
                    + value[KP + i] * (value[Q_DES + i] - q[i]);

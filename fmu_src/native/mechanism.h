@@ -55,6 +55,14 @@ INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const Carrier *
                             const double v[N_JOINTS], const double a[N_JOINTS],
                             const double gravity[3], double bound[N_JOINTS]);
 
+/* a and λ of M(q) a = τ + λ. Of free joints, 1, τ is given, and λ is 0; of the others, 0, a is given, and
+   τ is 0. Derivatives do without. */
+#ifndef IS_COMPLEX
+INTERNAL void hybrid_dynamics(const JointPosition joint[N_BODIES], const Carrier *carrier,
+                              const double free[N_JOINTS], const double given[N_JOINTS],
+                              double a[N_JOINTS], double reaction[N_JOINTS]);
+#endif
+
 /* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */
 INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const Carrier *carrier,
                                      const double tau[N_JOINTS], double a[N_JOINTS]);

@@ -8,6 +8,7 @@
    M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ where it is known. */
 #include "plant.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "control.h"
@@ -99,8 +100,8 @@ static void add_excess(const double value[N_VARIABLES], const JointPosition join
         sum[i] += tau[i] - needed[i];
 }
 
-int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                 double a[N_JOINTS])
+int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+                 double a[N_JOINTS], double *margin)
 {
     const double *value = plant->value, *force = &value[F_EXT];
     JointPosition joint[N_BODIES];
@@ -108,7 +109,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     double *given = COMMANDS_ACCELERATION ? a : effort;
     int acts = 0;
     place_joints(q, joint);
-    const int rank = command(value, joint, q, v, given);
+    rank = command(value, joint, q, v, rank, given, margin);
     for (int i = 0; i < N_JOINTS; i++) {
         if (!COMMANDS_ACCELERATION)
             a[i] = 0.0;
@@ -133,6 +134,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     return rank;
 }
 
+#ifdef IS_COMPLEX
 void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
                   const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS])
 {
@@ -146,6 +148,17 @@ void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
         acceleration_of_effort(joint, &carrier, unit, columns[k]);
     }
 }
+#else
+void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double free[N_JOINTS],
+                   const double given[N_JOINTS], double a[N_JOINTS], double reaction[N_JOINTS])
+{
+    JointPosition joint[N_BODIES];
+    Carrier carrier;
+    place_joints(q, joint);
+    body(plant->value, 0, &carrier);
+    hybrid_dynamics(joint, &carrier, free, given, a, reaction);
+}
+#endif
 
 void compute_position(Plant *plant)
 {
@@ -163,12 +176,12 @@ void compute_position(Plant *plant)
 #endif
 }
 
-void compute_effort(Plant *plant)
+void compute_effort(Plant *plant, int rank)
 {
     double *value = plant->value, given[N_JOINTS];
     JointPosition joint[N_BODIES];
     place_joints(&value[Q], joint);
-    command(value, joint, &value[Q], &value[V], given);
+    command(value, joint, &value[Q], &value[V], rank, given, NULL);
     wanted_effort(value, joint, &value[V], given, &value[TAU]);
     limit_effort(value, &value[TAU]);
 }

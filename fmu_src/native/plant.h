@@ -13,19 +13,26 @@ typedef struct {
 
 enum { N_STATES = 2 * N_JOINTS }; /* q and v follow each other in the table, their derivatives too */
 
-/* q̈ of the equations of motion at a state, joint limits left out; the rank that J⁺ was given, the
-   number of its singular values that were not dropped. */
+/* q̈ of the equations of motion at a state, joint limits left out, with a J⁺ of this rank. Returns the
+   rank; the margin, which may be NULL, is negative where the singular values give another. */
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                          double a[N_JOINTS]);
+                          int rank, double a[N_JOINTS], double *margin);
 
 /* The outputs x and xd, and quat and omega where there are such, at the plant's state. */
 INTERNAL void compute_position(Plant *plant);
 
+#ifdef IS_COMPLEX
 /* Columns of M(q)⁻¹, of so many joints: what an effort of 1 there does to all. */
 INTERNAL void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
                            const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS]);
+#else
+/* a and λ of M(q) a = τ + λ, as hybrid_dynamics has them. */
+INTERNAL void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double free[N_JOINTS],
+                            const double given[N_JOINTS], double a[N_JOINTS],
+                            double reaction[N_JOINTS]);
+#endif
 
-/* The output tau, the control effort applied, at the plant's state and inputs. */
-INTERNAL void compute_effort(Plant *plant);
+/* The output tau, the control effort applied, at the plant's state and inputs, J⁺ being of this rank. */
+INTERNAL void compute_effort(Plant *plant, int rank);
 
 #endif

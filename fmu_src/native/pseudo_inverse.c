@@ -18,18 +18,22 @@ static double dot(const double a[N_JOINTS], const double b[N_JOINTS])
     return total;
 }
 
-/* y = (J Jᵀ)⁻¹ b by cofactors; false where a singular value may have to be dropped. */
+/* y = (J Jᵀ)⁻¹ b by cofactors; false where a singular value may have to be dropped. Bound is a lower
+   bound of (σ_min/σ_max)², where asked for. */
 static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_ROWS],
-                                  double smallest, double y[N_ROWS])
+                                  double smallest, double y[N_ROWS], double *bound)
 {
 #if N_ROWS == 2
     const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g11 = dot(J[1], J[1]);
     const double determinant = g00 * g11 - g01 * g01;
     const double trace = g00 + g11;
-    if (!(RE(determinant) > RE(smallest * trace * trace))) /* ≤ σ_min²/σ_max² */
+    const double scale = trace * trace; /* ≥ σ_max⁴ */
+    if (!(RE(determinant) > RE(smallest * scale)))
         return 0;
     y[0] = (g11 * b[0] - g01 * b[1]) / determinant;
     y[1] = (g00 * b[1] - g01 * b[0]) / determinant;
+    if (bound)
+        *bound = determinant / scale;
     return 1;
 #elif N_ROWS == 3
     const double g00 = dot(J[0], J[0]), g01 = dot(J[0], J[1]), g02 = dot(J[0], J[2]);
@@ -39,14 +43,17 @@ static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_R
     const double c12 = g01 * g02 - g00 * g12, c22 = g00 * g11 - g01 * g01;
     const double determinant = g00 * c00 + g01 * c01 + g02 * c02;
     const double trace = g00 + g11 + g22;
-    if (!(RE(4.0 * determinant) > RE(smallest * trace * trace * trace))) /* as λ₁λ₂ ≤ (λ₁ + λ₂)²/4 */
+    const double scale = 0.25 * trace * trace * trace; /* ≥ σ_max⁴ σ₂²/σ_max², as λ₁λ₂ ≤ (λ₁ + λ₂)²/4 */
+    if (!(RE(determinant) > RE(smallest * scale)))
         return 0;
     y[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant;
     y[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant;
     y[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / determinant;
+    if (bound)
+        *bound = determinant / scale;
     return 1;
 #else
-    (void)J, (void)b, (void)smallest, (void)y;
+    (void)J, (void)b, (void)smallest, (void)y, (void)bound;
     return 0;
 #endif
 }
@@ -111,28 +118,68 @@ static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double squa
 }
 #endif
 
-int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
-                         double result[N_JOINTS])
+/* The singular values of orthogonal rows over the largest, in descending order; index says where each row
+   is among them. */
+static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double ratio[N_ROWS],
+                      int index[N_ROWS])
 {
-    double y[N_ROWS]; /* J⁺ b = Jᵀ y */
-    int rank = N_ROWS;
-    if (!solve_normal_equations(J, b, fmax(rcond * rcond, WELL_CONDITIONED), y)) {
-        double square[N_ROWS], largest = 0.0;
-        int kept[N_ROWS];
-        orthogonalise(J, b);
-        for (int k = 0; k < N_ROWS; k++) {
-            square[k] = dot(J[k], J[k]);
-            largest = fmax(largest, square[k]);
-        }
-        for (int k = 0; k < N_ROWS; k++) {
-            kept[k] = RE(square[k]) > RE(rcond * rcond * largest);
-            rank -= !kept[k];
-        }
+    double largest = 0.0;
+    for (int k = 0; k < N_ROWS; k++) {
+        square[k] = dot(J[k], J[k]);
+        largest = fmax(largest, square[k]);
+        index[k] = 0;
+        for (int j = 0; j < k; j++)
+            index[RE(square[j]) < RE(square[k]) ? j : k]++;
+    }
+    for (int k = 0; k < N_ROWS; k++)
+        ratio[index[k]] = RE(largest) > 0.0 ? sqrt(square[k] / largest) : 0.0;
+}
+
+double rank_margin(const double ratio[N_ROWS], double rcond, int rank)
+{
+    double margin = 1.0;
+    if (rank > 0)
+        margin = ratio[rank - 1] - rcond;
+    if (rank < N_ROWS && RE(rcond - ratio[rank]) < RE(margin))
+        margin = rcond - ratio[rank];
+    return margin;
+}
+
+/* y of J⁺ b = Jᵀ y, J and b being made orthogonal; the other arguments are those of apply_pseudo_inverse. */
+static int solve_by_singular_values(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
+                                    int rank, double y[N_ROWS], double *margin)
+{
+    double square[N_ROWS], ratio[N_ROWS];
+    int index[N_ROWS], kept[N_ROWS];
+    orthogonalise(J, b);
+    sort_rows(J, square, ratio, index);
+    if (rank == ANY_RANK)
+        for (rank = 0; rank < N_ROWS && RE(ratio[rank]) > RE(rcond);)
+            rank++;
+    if (margin)
+        *margin = rank_margin(ratio, rcond, rank);
+    for (int k = 0; k < N_ROWS; k++)
+        kept[k] = index[k] < rank;
 #ifdef IS_COMPLEX
-        vary(J, b, square, kept);
+    vary(J, b, square, kept);
 #endif
-        for (int k = 0; k < N_ROWS; k++)
-            y[k] = kept[k] ? b[k] / square[k] : 0.0;
+    for (int k = 0; k < N_ROWS; k++)
+        y[k] = kept[k] ? b[k] / square[k] : 0.0;
+    return rank;
+}
+
+int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond, int rank,
+                         double result[N_JOINTS], double *margin)
+{
+    const double smallest = fmax(rcond * rcond, WELL_CONDITIONED);
+    double y[N_ROWS];
+    if ((rank == ANY_RANK || rank == N_ROWS)
+        && solve_normal_equations(J, b, smallest, y, margin)) {
+        rank = N_ROWS;
+        if (margin)
+            *margin = sqrt(*margin) - rcond;
+    } else {
+        rank = solve_by_singular_values(J, b, rcond, rank, y, margin);
     }
     for (int i = 0; i < N_JOINTS; i++) {
         result[i] = y[0] * J[0][i];
@@ -144,15 +191,8 @@ int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rc
 
 void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
 {
-    double nothing[N_ROWS] = {0};
+    double nothing[N_ROWS] = {0}, square[N_ROWS];
+    int index[N_ROWS];
     orthogonalise(J, nothing);
-    for (int k = 0; k < N_ROWS; k++) { /* by insertion, the largest first */
-        const double sigma = sqrt(dot(J[k], J[k]));
-        int place = k;
-        for (; place > 0 && RE(ratio[place - 1]) < RE(sigma); place--)
-            ratio[place] = ratio[place - 1];
-        ratio[place] = sigma;
-    }
-    for (int k = N_ROWS - 1; k >= 0; k--)
-        ratio[k] = RE(ratio[0]) > 0.0 ? ratio[k] / ratio[0] : 0.0;
+    sort_rows(J, square, ratio, index);
 }

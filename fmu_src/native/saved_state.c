@@ -41,7 +41,7 @@ static int are_booleans(const double value[])
 /* Whether the joints that are said to rest are so by truth values; what these amount to is counted. */
 static int are_stops(Stops *stops)
 {
-    int sound = 1;
+    int sound = stops->rank >= 0 && stops->rank <= N_ROWS;
     stops->any_held = stops->any_watched = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         const int held = stops->held[i], watched = stops->watched[i];
@@ -49,6 +49,17 @@ static int are_stops(Stops *stops)
         stops->any_held |= held;
         stops->any_watched |= watched;
     }
+    return sound;
+}
+
+/* Whether an importer's step is one that can be. */
+static int is_passage(const Passage *passage)
+{
+    int sound = isfinite(passage->time) && isfinite(passage->stop_time) && passage->joint >= 0
+                && passage->joint <= N_JOINTS && (passage->begun == 0 || passage->begun == 1);
+    for (int i = 0; i < N_STATES; i++)
+        sound = sound && isfinite(passage->y[i]) && isfinite(passage->reached[i])
+                && (!passage->begun || isfinite(passage->a[i % N_JOINTS]));
     return sound;
 }
 
@@ -61,7 +72,7 @@ static Status take_over(Instance *instance, const void *bytes)
     memcpy(state, bytes, sizeof *state);
     int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
                 && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN])
-                && are_stops(&state->stops);
+                && are_stops(&state->stops) && is_passage(&state->passage);
     const int runs = state->phase >= STEP; /* before, what is wrong is told where it begins */
     const int steps = runs && instance->kind == CO_SIMULATION; /* solvers try what they like */
     for (int i = 0; i < N_VARIABLES; i++)

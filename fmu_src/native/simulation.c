@@ -19,8 +19,8 @@ static Status discard(Instance *instance, double point, double h, const Obstacle
     const char *call = call_name(DO_STEP);
     const double *value = instance->state.plant.value;
     if (obstacle->reason == NOT_FINITE)
-        return report(instance, DISCARD, "%s at %.12g s: the equations of motion gave"
-                      " a value that is not finite", call, point);
+        return report(instance, DISCARD, "%s at %.12g s: the equations of motion gave a value"
+                      " that is not finite: inputs, payload or speeds are too large", call, point);
     if (obstacle->reason == MANY_STEPS)
         return report(instance, DISCARD, "%s at %.12g s: max_step = %g s divides a step"
                       " of %g s into more than %d integration steps; enlarge max_step or shorten"
@@ -53,8 +53,8 @@ Status do_step(void *component, double point, double h)
     if (check_inputs(instance) != OK)
         return ERROR;
     Obstacle obstacle;
-    if (!advance_plant(&state->plant, h, &obstacle)) {
-        state->phase = STEP_FAILED;
+    if (!advance_plant(&state->plant, h, NULL, &obstacle)) {
+        state->phase = AFTER_DISCARD;
         return discard(instance, point, h, &obstacle);
     }
     state->time = point + h;

@@ -5,21 +5,25 @@
 #include "internal.h"
 #include "plant.h"
 
-/* Joints at rest at a limit, and those of them that leave it when they are no longer pressed. */
+/* The regime of the motion, which only an event changes: joints at rest at a limit, those of them that
+   leave it when they are no longer pressed, and the rank of J⁺. */
 typedef struct {
     int held[N_JOINTS], watched[N_JOINTS];
     int any_held, any_watched;
+    int rank;
 } Stops;
 
-/* Take the velocity that points into a limit, from the state y = (q, v). Joints in kept are not driven
-   off by the impact of another: where two in turn drive off each other, as the feet of a rocking
-   block, impacts would else not end in finite time. */
+#ifndef IS_COMPLEX
+/* Take the velocity that points into a limit, from the state y = (q, v). Joints in kept stop there,
+   whichever way they move: where two in turn drive off each other, as the feet of a rocking block,
+   impacts would else not end in finite time. */
 INTERNAL void impact(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS]);
 
 /* Find the joints that rest at y, after an impact; a, q̈ without stops, becomes that with them. Those
-   in kept stay whether they are pressed or not. */
+   in kept stay whether they are pressed or not. Pressed is that of restrain. */
 INTERNAL void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
-                   const int kept[N_JOINTS], Stops *stops);
+                   const int kept[N_JOINTS], Stops *stops, double pressed[N_JOINTS]);
+#endif
 
 /* Whether a joint is nearer to its upper limit than to its lower one. */
 INTERNAL int is_above(const Plant *plant, double q, int i);

@@ -41,7 +41,8 @@ static void law(const double value[N_VARIABLES], TaskFrame *task, Row row[N_ROWS
 static const double ROUNDING = 1.0 / 281474976710656.0;
 
 int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
-            const double q[N_JOINTS], const double v[N_JOINTS], double given[N_JOINTS])
+            const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+            double given[N_JOINTS], double *margin)
 {
     TaskFrame task;
     Row row[N_ROWS];
@@ -56,7 +57,7 @@ int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES]
         wanted[k] = value[row[k].xdd_des] + value[row[k].Kd] * (value[row[k].xd_des] - task.xd[k])
                     + value[row[k].Kp] * row[k].error - task.drift[k] + Kn * task.xd[k];
     }
-    const int rank = apply_pseudo_inverse(task.J, wanted, value[RCOND], given);
+    rank = apply_pseudo_inverse(task.J, wanted, value[RCOND], rank, given, margin);
     for (int i = 0; i < N_JOINTS; i++)
         given[i] -= Kn * v[i];
     return rank;

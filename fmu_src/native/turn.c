@@ -15,7 +15,7 @@ static const double WHOLE = 6755399441055744.0; /* 1.5 · 2⁵²: what is added 
 enum { LARGEST = 1000000 };                     /* rad: k has 20 bits */
 
 /* A sum to be rounded as it is written: by itself only where arithmetic is that of the standard. */
-#if defined __FAST_MATH__ || defined _M_FP_FAST || FLT_EVAL_METHOD != 0
+#if FLT_EVAL_METHOD != 0
 #define ROUNDED volatile
 #else
 #define ROUNDED

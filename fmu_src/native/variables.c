@@ -10,6 +10,11 @@
 typedef enum { REAL, BOOLEAN, OTHER } Type;
 static const char *const TYPE_NAME[] = {REAL_NAME, "Boolean"};
 
+static size_t size_of(Reference vr)
+{
+    return (size_t)(PLACE[vr + 1] - PLACE[vr]);
+}
+
 /* Whether the references are of variables of a type, of so many values in all. */
 static int known(Instance *instance, Call call, Type type, const Reference vr[], size_t count,
                  const void *values, size_t n_values)
@@ -20,18 +25,18 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
         return 0;
     }
     for (size_t i = 0; i < count; i++) {
-        if (vr[i] >= N_VARIABLES || EXTENT[vr[i]] == 0) {
+        if (vr[i] == 0 || vr[i] > N_REFERENCES) {
             report(instance, ERROR, "%s: there is no variable with value reference %lu",
                    call_name(call), (unsigned long)vr[i]);
             return 0;
         }
-        const Type actual = vr[i] >= FIRST_BOOLEAN ? BOOLEAN : REAL;
+        const Type actual = PLACE[vr[i]] >= FIRST_BOOLEAN ? BOOLEAN : REAL;
         if (actual != type) {
             report(instance, ERROR, "%s: %s is of type %s", call_name(call),
-                   VARIABLE_NAME[vr[i]], TYPE_NAME[actual]);
+                   VARIABLE_NAME[PLACE[vr[i]]], TYPE_NAME[actual]);
             return 0;
         }
-        wanted += (size_t)EXTENT[vr[i]];
+        wanted += size_of(vr[i]);
     }
     if (wanted != n_values) {
         report(instance, ERROR, "%s: %lu values for variables of %lu", call_name(call),
@@ -41,47 +46,47 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
     return 1;
 }
 
-/* Before the run q and v are guesses, by their start attributes: what they begin with is theirs to
-   compute. */
-static int is_guess(const Instance *instance, Reference vr)
+static int is_state(int variable)
 {
-    return vr >= Q && vr < X && instance->state.phase <= INITIALIZATION;
+    return variable >= Q && variable < X;
 }
 
 /* Whether a variable may be set now. */
-static int settable(Instance *instance, Call call, Reference vr)
+static int settable(Instance *instance, Call call, int variable)
 {
-    if (is_guess(instance, vr))
+    const int phase = instance->state.phase;
+    if (is_state(variable) && phase == INSTANTIATED)
         return 1;
-    if (vr >= Q && vr < X && instance->kind == MODEL_EXCHANGE)
-        return allowed(instance, SET_Q_V, VARIABLE_NAME[vr]);
-    if (vr >= FIRST_OUTPUT && vr < FIRST_PARAMETER) {
-        report(instance, ERROR, "%s: %s is computed and cannot be set", call_name(call),
-               VARIABLE_NAME[vr]);
+    if (is_state(variable) && phase == INITIALIZATION) {
+        report(instance, ERROR, "%s: %s follows from %s in initialization mode: set that",
+               call_name(call), VARIABLE_NAME[variable], VARIABLE_NAME[variable - Q + Q_START]);
         return 0;
     }
-    return allowed(instance, vr < FIRST_OUTPUT ? SET_INPUT : SET_PARAMETER, VARIABLE_NAME[vr]);
+    if (is_state(variable) && instance->kind == MODEL_EXCHANGE)
+        return allowed(instance, SET_Q_V, VARIABLE_NAME[variable]);
+    if (variable >= FIRST_OUTPUT && variable < FIRST_PARAMETER) {
+        report(instance, ERROR, "%s: %s is computed and cannot be set", call_name(call),
+               VARIABLE_NAME[variable]);
+        return 0;
+    }
+    return allowed(instance, variable < FIRST_OUTPUT ? SET_INPUT : SET_PARAMETER,
+                   VARIABLE_NAME[variable]);
 }
 
-/* Take over a value; outputs that follow from it are computed anew when they are read. */
-static void set(Instance *instance, Reference vr, double value)
+/* Take over a value; outputs that follow from it are computed anew when they are read. That of q or v
+   before the run is their start. */
+static void set(Instance *instance, int variable, double value)
 {
     State *state = &instance->state;
-    if (is_guess(instance, vr)) {
-        const int start = Q_START + (int)vr - Q;
-        if (value != state->plant.value[start])
-            report(instance, WARNING, "%s = %g is ignored before the run: the start is %s = %g",
-                   VARIABLE_NAME[vr], value, VARIABLE_NAME[start], state->plant.value[start]);
-        return;
-    }
-    const int is_state = vr >= Q && vr < X;
-    state->plant.value[vr] = value;
+    if (is_state(variable) && state->phase == INSTANTIATED)
+        variable += Q_START - Q;
+    state->plant.value[variable] = value;
     state->has_tau = state->has_rates = 0;
-    if (is_state)
+    if (is_state(variable))
         state->has_x = 0;
-    if (is_state || instance->kind == CO_SIMULATION) /* there a stop is decided at each point */
+    if (is_state(variable) || instance->kind == CO_SIMULATION) /* there each point decides */
         state->has_stops = 0;
-    if (vr >= FIRST_PARAMETER)
+    if (variable >= FIRST_PARAMETER)
         state->initialised = 0;
 }
 
@@ -103,27 +108,30 @@ static void update_others(State *state)
 #endif
 
 /* Make an output right for the present state, inputs and parameters. */
-static Status update(Instance *instance, Reference vr)
+static Status update(Instance *instance, int variable)
 {
     State *state = &instance->state;
     if (!state->initialised && initialise(instance, 0) != OK)
         return ERROR;
-    if (vr >= TAU && check_inputs(instance) != OK)
+    if (variable >= TAU && check_inputs(instance) != OK)
         return ERROR;
-    if (vr >= END_OF_RATES) {
+    if (variable >= END_OF_RATES) {
         update_others(state);
-    } else if (vr >= DER_Q) {
+    } else if (variable >= DER_Q) {
         update_rates(state);
-    } else if (vr >= X && vr < TAU && !state->has_x) {
+    } else if (variable >= X && variable < TAU && !state->has_x) {
         compute_position(&state->plant);
         state->has_x = 1;
-    } else if (vr >= TAU && !state->has_tau) {
-        compute_effort(&state->plant);
+    } else if (variable >= TAU && !state->has_tau) {
+        if (instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
+            update_stops(state);
+        compute_effort(&state->plant,
+                       instance->kind == MODEL_EXCHANGE ? state->stops.rank : ANY_RANK);
         state->has_tau = 1;
     }
-    if (!isfinite(state->plant.value[vr]))
+    if (!isfinite(state->plant.value[variable]))
         return report(instance, DISCARD, "%s: %s is not finite", call_name(GET_REAL),
-                      VARIABLE_NAME[vr]);
+                      VARIABLE_NAME[variable]);
     return OK;
 }
 
@@ -134,14 +142,14 @@ Status get_reals(void *component, const Reference vr[], size_t count, double val
     if (!instance || !known(instance, GET_REAL, REAL, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        for (int e = 0; e < EXTENT[vr[i]]; e++)
-            if (vr[i] >= FIRST_OUTPUT && vr[i] < FIRST_PARAMETER) {
-                const Status status = update(instance, vr[i] + (Reference)e);
+        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+            if (k >= FIRST_OUTPUT && k < FIRST_PARAMETER) {
+                const Status status = update(instance, k);
                 if (status != OK)
                     return status;
             }
-    for (size_t i = 0; i < count; value += EXTENT[vr[i++]])
-        memcpy(value, &instance->state.plant.value[vr[i]], (size_t)EXTENT[vr[i]] * sizeof *value);
+    for (size_t i = 0; i < count; value += size_of(vr[i++]))
+        memcpy(value, &instance->state.plant.value[PLACE[vr[i]]], size_of(vr[i]) * sizeof *value);
     return OK;
 }
 
@@ -153,19 +161,19 @@ Status set_reals(void *component, const Reference vr[], size_t count, const doub
     if (!instance || !known(instance, SET_REAL, REAL, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++) {
-        if (!settable(instance, SET_REAL, vr[i]))
+        if (!settable(instance, SET_REAL, PLACE[vr[i]]))
             return ERROR;
-        for (int e = 0; e < EXTENT[vr[i]]; e++, next++) {
+        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++, next++) {
             if (!isfinite(*next))
-                return report(instance, ERROR, "%s = %s is not finite", VARIABLE_NAME[vr[i] + e],
+                return report(instance, ERROR, "%s = %s is not finite", VARIABLE_NAME[k],
                               isnan(*next) ? "nan" : *next > 0.0 ? "inf" : "-inf");
-            if (check_range(instance, (int)vr[i] + e, *next) != OK)
+            if (check_range(instance, k, *next) != OK)
                 return ERROR;
         }
     }
     for (size_t i = 0; i < count; i++)
-        for (int e = 0; e < EXTENT[vr[i]]; e++)
-            set(instance, vr[i] + (Reference)e, *value++);
+        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+            set(instance, k, *value++);
     return OK;
 }
 
@@ -176,7 +184,7 @@ Status get_booleans(void *component, const Reference vr[], size_t count, Boolean
     if (!instance || !known(instance, GET_BOOLEAN, BOOLEAN, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        value[i] = instance->state.plant.value[vr[i]] != 0.0;
+        value[i] = instance->state.plant.value[PLACE[vr[i]]] != 0.0;
     return OK;
 }
 
@@ -187,10 +195,10 @@ Status set_booleans(void *component, const Reference vr[], size_t count, const B
     if (!instance || !known(instance, SET_BOOLEAN, BOOLEAN, vr, count, value, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
-        if (!settable(instance, SET_BOOLEAN, vr[i]))
+        if (!settable(instance, SET_BOOLEAN, PLACE[vr[i]]))
             return ERROR;
     for (size_t i = 0; i < count; i++)
-        set(instance, vr[i], value[i] ? 1.0 : 0.0);
+        set(instance, PLACE[vr[i]], value[i] ? 1.0 : 0.0);
     return OK;
 }
 
@@ -215,18 +223,18 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
 {
     int wants = 0;
     for (size_t i = 0; i < n_unknown; i++) {
-        const Reference vr = unknown[i];
-        if (vr < FIRST_OUTPUT || vr >= END_OF_RATES) {
+        const int k = PLACE[unknown[i]];
+        if (k < FIRST_OUTPUT || k >= END_OF_RATES) {
             report(instance, ERROR, "%s: %s is not computed, it has no derivative", call_name(call),
-                   VARIABLE_NAME[vr]);
+                   VARIABLE_NAME[k]);
             return -1;
         }
-        wants |= vr >= DER_Q ? WANTS_RATES : vr >= TAU ? WANTS_TAU : vr >= X ? WANTS_X : 0;
+        wants |= k >= DER_Q ? WANTS_RATES : k >= TAU ? WANTS_TAU : k >= X ? WANTS_X : 0;
     }
     for (size_t i = 0; i < n_given; i++)
-        if (given[i] >= X) {
+        if (PLACE[given[i]] >= X) {
             report(instance, ERROR, "%s: %s is neither a state nor an input", call_name(call),
-                   VARIABLE_NAME[given[i]]);
+                   VARIABLE_NAME[PLACE[given[i]]]);
             return -1;
         }
     if (!instance->state.initialised && initialise(instance, 0) != OK)
@@ -239,9 +247,9 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
 static const char *culprit(const Reference vr[], size_t count, const double value[])
 {
     for (size_t i = 0; i < count; i++)
-        for (int e = 0; e < EXTENT[vr[i]]; e++)
+        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
             if (!isfinite(*value++))
-                return VARIABLE_NAME[vr[i] + e];
+                return VARIABLE_NAME[k];
     return NULL;
 }
 
@@ -262,15 +270,15 @@ Status directional_derivative(void *component, const Reference unknown[], size_t
     if (wants < 0)
         return ERROR;
     for (size_t i = 0; i < n_given; i++)
-        for (int e = 0; e < EXTENT[given[i]]; e++)
-            change[given[i] + e] += *seed++;
-    differentiate(instance->state.plant.value, instance->state.stops.held, wants, change,
-                  derivative);
+        for (int k = PLACE[given[i]]; k < PLACE[given[i] + 1]; k++)
+            change[k] += *seed++;
+    differentiate(instance->state.plant.value, instance->state.stops.held,
+                  instance->state.stops.rank, wants, change, derivative);
     for (size_t i = 0; i < n_unknown; i++)
-        if ((name = culprit(&unknown[i], 1, &derivative[unknown[i]])))
+        if ((name = culprit(&unknown[i], 1, &derivative[PLACE[unknown[i]]])))
             return report(instance, DISCARD, "%s: that of %s is not finite", call_name(call), name);
-    for (size_t i = 0; i < n_unknown; result += EXTENT[unknown[i++]])
-        memcpy(result, &derivative[unknown[i]], (size_t)EXTENT[unknown[i]] * sizeof *result);
+    for (size_t i = 0; i < n_unknown; result += size_of(unknown[i++]))
+        memcpy(result, &derivative[PLACE[unknown[i]]], size_of(unknown[i]) * sizeof *result);
     return OK;
 }
 
@@ -293,14 +301,14 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
     if (wants < 0)
         return ERROR;
     for (size_t i = 0; i < n_unknown; i++)
-        for (int e = 0; e < EXTENT[unknown[i]]; e++)
-            weight[unknown[i] + e] += *seed++;
+        for (int k = PLACE[unknown[i]]; k < PLACE[unknown[i] + 1]; k++)
+            weight[k] += *seed++;
     for (size_t i = 0; i < n_given; i++) /* a column of the Jacobian for each value */
-        for (Reference k = given[i]; k < given[i] + (Reference)EXTENT[given[i]]; k++) {
+        for (int k = PLACE[given[i]]; k < PLACE[given[i] + 1]; k++) {
             double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
             change[k] = 1.0;
-            differentiate(instance->state.plant.value, instance->state.stops.held, wants, change,
-                          derivative);
+            differentiate(instance->state.plant.value, instance->state.stops.held,
+                          instance->state.stops.rank, wants, change, derivative);
             sum[k] = 0.0;
             for (int u = FIRST_OUTPUT; u < END_OF_RATES; u++)
                 if (weight[u] != 0.0)
@@ -309,8 +317,8 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
                 return report(instance, DISCARD, "%s: that by %s is not finite", call_name(call),
                               VARIABLE_NAME[k]);
         }
-    for (size_t i = 0; i < n_given; result += EXTENT[given[i++]])
-        memcpy(result, &sum[given[i]], (size_t)EXTENT[given[i]] * sizeof *result);
+    for (size_t i = 0; i < n_given; result += size_of(given[i++]))
+        memcpy(result, &sum[PLACE[given[i]]], size_of(given[i]) * sizeof *result);
     return OK;
 }
 #endif

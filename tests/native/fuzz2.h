@@ -24,13 +24,13 @@ static fmi2Status variables(Instance *c)
     int whole[MANY];
     fmi2String text[MANY] = {"", "", "", "", "", ""};
     const size_t count = pick(MANY + 1);
-    const unsigned range = pick(10) ? N_VARIABLES : pick(2) ? N_VARIABLES + 2 : 0xffffffffu;
+    const unsigned range = pick(10) ? N_REFERENCES : pick(2) ? N_REFERENCES + 2 : 0xffffffffu;
     for (size_t i = 0; i < MANY; i++) {
-        vr[i] = pick(range);
+        vr[i] = pick(40) ? 1 + pick(range) : 0;
         real[i] = number();
         whole[i] = (int)pick(3) - 1;
         /* the master's choice alone: how long a step takes */
-        if (vr[i] == MAX_STEP && real[i] > 0.0 && real[i] < 1e-3)
+        if (vr[i] == MAX_STEP + 1 && real[i] > 0.0 && real[i] < 1e-3)
             real[i] = 1e-3;
     }
     const fmi2ValueReference *place = pick(30) ? vr : NULL;
@@ -85,8 +85,8 @@ static fmi2Status question(Instance *c)
 /* A derivative, or what there is none of. */
 static fmi2Status derivatives(Instance *c)
 {
-    const fmi2ValueReference unknown = pick(N_VARIABLES + 1), known = pick(N_VARIABLES + 1);
-    const int right = unknown >= FIRST_OUTPUT && unknown < FIRST_PARAMETER && known < X;
+    const fmi2ValueReference unknown = pick(N_REFERENCES + 2), known = pick(N_REFERENCES + 2);
+    const int right = unknown > FIRST_OUTPUT && unknown <= FIRST_PARAMETER && known > 0 && known <= X;
     const double seed = number();
     double result;
     if (pick(4) == 0)

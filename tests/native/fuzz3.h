@@ -17,21 +17,28 @@ static Instance *create(void)
                                                  NULL, 0, NULL, log_message, NULL);
 }
 
-/* References, mostly of vectors, and how many values they stand for; 0 where one is wrong. */
+static Reference of_place(int place)
+{
+    Reference vr = 1;
+    while (PLACE[vr] != place)
+        vr++;
+    return vr;
+}
+
+/* References, mostly right, and how many values they stand for; 0 where one is wrong. */
 static size_t references(Reference vr[MANY], size_t *count)
 {
     size_t size = 0;
     int right = 1;
     *count = pick(MANY + 1);
     for (size_t i = 0; i < MANY; i++) {
-        do
-            vr[i] = pick(N_VARIABLES);
-        while (pick(20) && EXTENT[vr[i]] == 0);
+        vr[i] = 1 + pick(N_REFERENCES);
         if (pick(40) == 0)
-            vr[i] = pick(2) ? N_VARIABLES + pick(3) : pick(1u << 31) << 1;
+            vr[i] = pick(2) ? (N_REFERENCES + pick(3)) * pick(2) : pick(1u << 31) << 1;
         if (i < *count) {
-            right = right && vr[i] < N_VARIABLES && EXTENT[vr[i]] > 0;
-            size += vr[i] < N_VARIABLES ? (size_t)EXTENT[vr[i]] : 0;
+            const int exists = vr[i] > 0 && vr[i] <= N_REFERENCES;
+            right = right && exists;
+            size += exists ? size_of(vr[i]) : 0;
         }
     }
     return right ? size : 0;
@@ -57,8 +64,8 @@ static fmi3Status variables(Instance *c)
     bool *truth = array(size, 1);
     const Reference *place = pick(30) ? vr : NULL;
     fmi3Status status = fmi3Error;
-    for (size_t i = 0, k = 0; i < count && right; k += (size_t)EXTENT[vr[i++]])
-        if (vr[i] == MAX_STEP && k < size && !(real[k] < 0.0) && real[k] < 1e-3)
+    for (size_t i = 0, k = 0; i < count && right; k += size_of(vr[i++]))
+        if (PLACE[vr[i]] == MAX_STEP && k < size && !(real[k] < 0.0) && real[k] < 1e-3)
             real[k] = 1e-3; /* the master's choice alone: how long a step takes */
     switch (pick(8)) {
     case 0: status = fmi3GetBoolean(c, place, count, truth, size); break;
@@ -88,7 +95,7 @@ static fmi3Status derivatives(Instance *c)
     const size_t n_seed = (adjoint ? rows : columns) + wrong, n = adjoint ? columns : rows;
     double *change = array(n_seed, sizeof *change), *result = array(n, sizeof *result);
     if (pick(2)) /* what has a derivative */
-        unknown[0] = X, known[0] = Q, n_unknown = n_known = 1;
+        unknown[0] = of_place(X), known[0] = of_place(Q), n_unknown = n_known = 1;
     const fmi3Status status =
         (adjoint ? fmi3GetAdjointDerivative : fmi3GetDirectionalDerivative)(
             c, unknown, n_unknown, known, n_known, change, n_seed, result, n);

@@ -63,7 +63,7 @@ FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau
 #ifdef HAS_RCOND
 FMI2_Export void probe_pseudo_inverse(double J[], double b[], double rcond, double result[])
 {
-    apply_pseudo_inverse((double(*)[N_JOINTS])J, b, rcond, result);
+    apply_pseudo_inverse((double(*)[N_JOINTS])J, b, rcond, ANY_RANK, result, NULL);
 }
 #endif
 
@@ -72,9 +72,10 @@ FMI2_Export void probe_stopped(double value[], const int kept[], double a[], dou
 {
     const Plant *plant = (Plant *)value;
     Stops stops;
+    double pressed[N_JOINTS];
     impact(plant, &value[Q], kept);
-    acceleration(plant, &value[Q], &value[V], a);
-    hold(plant, &value[Q], a, kept, &stops);
+    acceleration(plant, &value[Q], &value[V], ANY_RANK, a, NULL);
+    hold(plant, &value[Q], a, kept, &stops, pressed);
     for (int i = 0; i < N_JOINTS; i++)
         held[i] = stops.held[i];
 }
@@ -83,14 +84,20 @@ FMI2_Export void probe_acceleration(const double value[], double a[])
 {
     Plant plant;
     memcpy(plant.value, value, sizeof plant.value);
-    acceleration(&plant, &plant.value[Q], &plant.value[V], a);
+    acceleration(&plant, &plant.value[Q], &plant.value[V], ANY_RANK, a, NULL);
+}
+
+static int rank_of(const double value[])
+{
+    double a[N_JOINTS];
+    return acceleration((const Plant *)value, &value[Q], &value[V], ANY_RANK, a, NULL);
 }
 
 static Obstacle obstacle;
 
 FMI2_Export int probe_advance(double value[], double h)
 {
-    return advance_plant((Plant *)value, h, &obstacle);
+    return advance_plant((Plant *)value, h, NULL, &obstacle);
 }
 
 FMI2_Export void probe_obstacle(double result[])
@@ -103,14 +110,14 @@ FMI2_Export void probe_obstacle(double result[])
 FMI2_Export void probe_outputs(double value[])
 {
     compute_position((Plant *)value);
-    compute_effort((Plant *)value);
+    compute_effort((Plant *)value, ANY_RANK);
 }
 
 /* How all computed variables change where q, v and inputs do. */
 FMI2_Export void probe_differentiate(const double value[], const int held[], const double change[],
                                      double derivative[])
 {
-    differentiate(value, held, WANTS_X | WANTS_TAU | WANTS_RATES, change, derivative);
+    differentiate(value, held, rank_of(value), WANTS_X | WANTS_TAU | WANTS_RATES, change, derivative);
     for (int i = 0; i < N_JOINTS; i++) {
         derivative[Q + i] = change[Q + i];
         derivative[V + i] = change[V + i];
@@ -120,9 +127,9 @@ FMI2_Export void probe_differentiate(const double value[], const int held[], con
 /* All computed variables. */
 FMI2_Export void probe_compute(double value[], const int held[])
 {
-    Stops stops = {.any_held = 1};
+    Stops stops = {.any_held = 1, .rank = rank_of(value)};
     memcpy(stops.held, held, sizeof stops.held);
     compute_position((Plant *)value);
-    compute_effort((Plant *)value);
+    compute_effort((Plant *)value, ANY_RANK);
     compute_rates((Plant *)value, &stops);
 }

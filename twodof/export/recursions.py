@@ -12,15 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from .bodies import Array, Body, JointTree, symmetric
+from .bodies import Array, Body, JointTree, cross, symmetric
 
 
 def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]]:
     """R(q), p(q) of each joint's frame in its parent's: a = R b + p.
 
-    Args:
-        robot: its joints.
-        joint: N × 2, cosine and sine of a joint's angle, or the displacement of one that slides.
+    ``joint`` is N × 2: cosine and sine of a joint's angle, or the displacement of one that slides.
     """
     rotations, origins = [], []
     for R, p, slides, (c, s) in zip(robot.R, robot.p, robot.prismatic, joint):
@@ -63,9 +61,9 @@ def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, 
         if robot.prismatic[i]:
             columns[i, :3] = z
         else:
-            columns[i] = [*np.cross(z, x - o), *z]
-            alpha, omega = alpha + np.cross(omega, turning), omega + turning
-        a = a + np.cross(before + omega, columns[i, :3] * rates[i])
+            columns[i] = [*cross(z, x - o), *z]
+            alpha, omega = alpha + cross(omega, turning), omega + turning
+        a = a + cross(before + omega, columns[i, :3] * rates[i])
     return x, R.dot(robot.frame_R), columns.T.dot(robot.G), np.array([*a, *alpha])
 
 
@@ -87,7 +85,7 @@ def inverse_dynamics(
     for i, parent in enumerate(robot.parent):
         omega, alpha, linear = motions[parent] if parent >= 0 else (zero, zero, -gravity)
         R, p = rotations[i], origins[i]
-        linear = linear + np.cross(alpha, p) + np.cross(omega, np.cross(omega, p))
+        linear = linear + cross(alpha, p) + cross(omega, cross(omega, p))
         omega, alpha, linear = (R.T.dot(each) for each in (omega, alpha, linear))
         coriolis = np.array([omega[1] * rates[i], -omega[0] * rates[i], 0.0])
         along = np.array([0.0, 0.0, 1.0])
@@ -98,12 +96,8 @@ def inverse_dynamics(
             omega = omega + along * rates[i]
         motions.append((omega, alpha, linear))
         b = body[i]
-        f = linear * b.mass + np.cross(alpha, b.moment) + np.cross(omega, np.cross(omega, b.moment))
-        n = (
-            b.inertia.dot(alpha)
-            + np.cross(omega, b.inertia.dot(omega))
-            + np.cross(b.moment, linear)
-        )
+        f = linear * b.mass + cross(alpha, b.moment) + cross(omega, cross(omega, b.moment))
+        n = b.inertia.dot(alpha) + cross(omega, b.inertia.dot(omega)) + cross(b.moment, linear)
         force.append(f)
         moment.append(n)
     tau = np.zeros(len(robot.parent), dtype=object)
@@ -113,7 +107,7 @@ def inverse_dynamics(
         if parent >= 0:
             f = rotations[i].dot(force[i])
             force[parent] = force[parent] + f
-            moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + np.cross(origins[i], f)
+            moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + cross(origins[i], f)
     effort: Array = robot.G.T.dot(tau)
     return effort
 
@@ -176,45 +170,73 @@ def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array) -> Array:
             if robot.parent[k] < 0:
                 break
             f, t = rotations[k].dot(f), rotations[k].dot(t)
-            t = t + np.cross(origins[k], f)
+            t = t + cross(origins[k], f)
             k = robot.parent[k]
         if robot.parent[i] >= 0:
             composite[robot.parent[i]] += b.moved(rotations[i], origins[i])
+    if np.array_equal(robot.G, np.eye(n)):
+        return M  # products with G are n³
     reduced: Array = robot.G.T.dot(M).dot(robot.G)
     return reduced
 
 
-def solve_by_factors(M: Array, tau: Array) -> Array:
-    """M⁻¹τ by M = Lᵀ D L, from the last joint inwards: between branches of a tree all stays 0.
+def operations_of_factors(parent: Sequence[int]) -> int:
+    """Operations that factorise the M of a tree, without zeros in it: n³/3 of a chain."""
+    ancestors: list[int] = []
+    for above in parent:
+        ancestors.append(ancestors[above] + 1 if above >= 0 else 0)
+    return sum(count * (count + 1) for count in ancestors)
 
-    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.5.
+
+def solve_by_factors(M: Array, tau: Array) -> Array:
+    """M⁻¹τ by the factors of ``hybrid_by_factors``."""
+    return hybrid_by_factors(M, tau, np.ones(len(tau)), np.zeros(len(tau)))[0]
+
+
+def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, tau: Array) -> Array:
+    """M⁻¹τ by articulated bodies; no joint mimics another."""
+    n = len(tau)
+    return hybrid_by_recursion(robot, body, joint, tau, np.ones(n), np.zeros(n))[0]
+
+
+def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[Array, Array]:
+    """a and λ of M a = τ + λ, where free joints have no λ and the others the acceleration held.
+
+    By M = Lᵀ D L of the free joints, from the last joint inwards: between branches of a tree all
+    stays 0. Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 6.5 and 9.2.
+
+    ``tau`` is τ of the free joints, ``held`` a of the others, ``free`` 1 of the free joints; where
+    they do not apply they are 0.
     """
-    L, a = M.copy(), np.array(tau, dtype=object)  # M, row by row replaced by L
-    n = len(a)
-    inverse = [0.0] * n
+    n = len(tau)
+    L, u = M.copy(), np.array(tau, dtype=object)  # M, row by row replaced by D L
+    a, reaction, inverse = np.zeros(n, dtype=object), np.zeros(n, dtype=object), [0.0] * n
     for k in reversed(range(n)):
-        inverse[k] = 1.0 / L[k, k]
+        inverse[k] = free[k] / L[k, k]
+        push = u[k] * inverse[k] + held[k]
         for i in reversed(range(k)):
             share = L[k, i] * inverse[k]
             for j in range(i + 1):
                 L[i, j] = L[i, j] - share * L[k, j]
-            a[i] = a[i] - share * a[k]
-            L[k, i] = share
+            u[i] = u[i] - L[k, i] * push
     for k in range(n):
-        a[k] = a[k] * inverse[k]
-        for i in range(k):
-            a[k] = a[k] - L[k, i] * a[i]
-    return a
+        rest = u[k] - L[k, :k].dot(a[:k])
+        a[k] = rest * inverse[k] + held[k]
+        reaction[k] = L[k, k] * a[k] - rest
+    return a, reaction
 
 
-def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, tau: Array) -> Array:
-    """M⁻¹τ by articulated bodies, without velocities and gravity; no joint mimics another.
+def hybrid_by_recursion(
+    robot: JointTree, body: Sequence[Body], joint: Array, tau: Array, free: Array, held: Array
+) -> tuple[Array, Array]:
+    """a and λ as those of ``hybrid_by_factors``, by articulated bodies; no joint mimics another.
 
         n = A α + B a,  f = Bᵀ α + C a                    what a joint feels, inwards
         U = I s,  D = sᵀ U,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
         q̈ = (u − Uᵀ a)/D                                                 outwards
 
-    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 7.3.
+    Without velocities and gravity. Through a joint that is not free all of I passes, and U q̈.
+    Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 7.3 and 9.2.
     """
     rotations, origins = placements(robot, joint)
     n = len(robot.parent)
@@ -228,38 +250,53 @@ def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, tau
         slides, parent = robot.prismatic[i], robot.parent[i]
         angular, linear = (B[i][:, 2], C[i][:, 2]) if slides else (A[i][:, 2], B[i][2])
         U[i] = angular, linear
-        inverse[i] = 1.0 / U[i][slides][2]
+        inverse[i] = free[i] / U[i][slides][2]
         u[i] = tau[i] - bias[i][slides][2]
+        push = u[i] * inverse[i] + held[i]
         if parent < 0:
             continue
-        per_angular, per_linear = angular * inverse[i], linear * inverse[i]
-        left = (
-            A[i] - np.outer(per_angular, angular),
-            B[i] - np.outer(per_angular, linear),
-            C[i] - np.outer(per_linear, linear),
-        )
-        if slides:  # along its axis a joint passes nothing on
-            left[1][:, 2] = left[2][:, 2] = left[2][2] = 0.0
-        else:
-            left[0][:, 2] = left[0][2] = left[1][2] = 0.0
+        left = _passed_on((A[i], B[i], C[i]), slides, inverse[i], free[i])
         b_angular, b_linear = bias[i]
-        f = rotations[i].dot(b_linear + per_linear * u[i])
-        t = rotations[i].dot(b_angular + per_angular * u[i]) + np.cross(origins[i], f)
+        f = rotations[i].dot(b_linear + linear * push)
+        t = rotations[i].dot(b_angular + angular * push) + cross(origins[i], f)
         bias[parent] = bias[parent][0] + t, bias[parent][1] + f
         moved = _moved_articulated(left, rotations[i], origins[i])
         A[parent], B[parent], C[parent] = (
             whole + part for whole, part in zip((A[parent], B[parent], C[parent]), moved)
         )
-    a = np.zeros(n, dtype=object)
+    a, reaction = np.zeros(n, dtype=object), np.zeros(n, dtype=object)
     motion: list[tuple[Array, Array]] = []
     for i, parent in enumerate(robot.parent):
         alpha, linear = motion[parent] if parent >= 0 else (np.zeros(3), np.zeros(3))
-        linear = rotations[i].T.dot(linear + np.cross(alpha, origins[i]))
+        linear = rotations[i].T.dot(linear + cross(alpha, origins[i]))
         alpha = rotations[i].T.dot(alpha)
-        a[i] = (u[i] - U[i][0].dot(alpha) - U[i][1].dot(linear)) * inverse[i]
+        rest = u[i] - U[i][0].dot(alpha) - U[i][1].dot(linear)
+        a[i] = rest * inverse[i] + held[i]
+        reaction[i] = U[i][robot.prismatic[i]][2] * a[i] - rest
         along = np.array([0.0, 0.0, 1.0]) * a[i]
         motion.append((alpha, linear + along) if robot.prismatic[i] else (alpha + along, linear))
-    return a
+    return a, reaction
+
+
+def _passed_on(
+    blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, free: Any
+) -> tuple[Array, Array, Array]:
+    """I − U Uᵀ/D of a body; along its axis a free joint passes on nothing, another all."""
+    A, B, C = blocks
+    angular, linear = (B[:, 2], C[:, 2]) if slides else (A[:, 2], B[2])
+    left = (
+        A - np.outer(angular * inverse, angular),
+        B - np.outer(angular * inverse, linear),
+        C - np.outer(linear * inverse, linear),
+    )
+    passed = 1.0 - free
+    if slides:
+        left[1][:, 2] = B[:, 2] * passed
+        left[2][:, 2] = left[2][2] = C[:, 2] * passed
+    else:
+        left[0][:, 2] = left[0][2] = A[:, 2] * passed
+        left[1][2] = B[2] * passed
+    return left
 
 
 def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -> list[Array]:

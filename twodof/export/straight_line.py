@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 WIDTH = 100
 """Characters of a line."""
+STRUCTS = {"turn": "JointPosition"}
+"""Types of functions of C that return no number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +95,8 @@ def varied(
     """Real parts of values, and how these vary, by the rules of differentiation.
 
     Complex numbers are x + i h dx with an h whose square vanishes, so that real parts are computed
-    as such.
-
-    Args:
-        results: the values.
-        parts: those of variables, by name; of others they are the real and the imaginary part.
-        held: what names of variables begin with that have no imaginary part.
+    as such. ``parts`` has those of variables by name; of others they are the real and the imaginary
+    part, but for names that begin as one of ``held``, which have no imaginary part.
     """
     nodes, places = _ordered(results)
     pairs: list[Varied] = []
@@ -130,13 +128,9 @@ def varied(
 def c_function(
     head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None
 ) -> str:
-    """A function that assigns each result to the variable of its name, real or complex.
+    """A function that assigns each result to its lvalue, which is a variable of no result.
 
-    Args:
-        head: of the function.
-        results: values by lvalue; no lvalue may be a variable of one of the values.
-        complexes: of each result, if numbers are complex, the real part and how it varies; by
-            default what is assigned is the same.
+    If numbers are complex, ``complexes`` has of each result the real part and how it varies.
     """
     body = _statements(results, "double")
     if complexes is not None:
@@ -166,7 +160,8 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
     for place, (operation, operands) in enumerate(nodes):
         text = _c(operation, [texts[operand] for operand in operands])
         if operands and (uses[place] > 1 or len(text) > WIDTH - 40):
-            lines.append(f"    const {kind} t{place} = {_bare(text)};")
+            own = STRUCTS.get(operation, kind)
+            lines.append(f"    const {own} t{place} = {_bare(text)};")
             text = f"t{place}"
         texts.append(text)
     lines += [

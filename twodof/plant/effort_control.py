@@ -5,17 +5,18 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
-from .integrator import Array, Response
+from .integrator import Array, Ratios, Response
 
 
-def command(plant: Any) -> Response:
-    """τ as a function of the state, n values; inputs held."""
+def command(plant: Any) -> tuple[Response, Ratios]:
+    """τ as a function of the state, n values; inputs held. It has no J⁺."""
     tau = list(plant.tau_cmd)
 
-    def effort(q: Array, v: Array) -> tuple[list[float], int]:
+    def effort(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:
         del q, v
-        return tau, 0
+        return tau, rank or 0, inf
 
-    return effort
+    return effort, lambda q: []

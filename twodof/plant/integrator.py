@@ -4,42 +4,66 @@ The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "S
 II.4). Every communication step begins afresh with the step min(max_step, h), so that no integrator
 state outlives it.
 
-A joint that reaches a limit is set onto it and stays there until it is released (``stops``).
+A step is integrated in one regime: the joints that rest at a limit (``stops``) and the rank of J⁺.
+What ends it is an event, located within the step (``event_search``), at which the step ends and the
+next one begins in another regime. A step is accepted only if its error test passes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass
 from itertools import chain, product
-from math import inf, isfinite, ulp
+from math import inf, isfinite, nan, ulp
 from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .dormand_prince import State, dormand_prince, error_norm, interpolant
+from . import event_search as events
+from .dormand_prince import P, State, dormand_prince, error_norm, interpolant
+from .pseudo_inverse import rank_margin
 from .stops import Stops
 
 Array = NDArray[np.float64]
-Response = Callable[[Array, Array], tuple[Sequence[float], int]]
-"""At (q, v), joint limits left out: q̈ of the equations of motion, or what a control law gives, n
-values, and the rank of the law's J⁺, the number of its singular values that were not dropped."""
+Response = Callable[[Array, Array, int | None], tuple[Sequence[float], int, float]]
+"""At (q, v), joint limits left out, with a J⁺ of a rank (None: that of its singular values): q̈ of
+the equations of motion, or what a control law gives, n values; the rank, and its margin, negative
+where the singular values give another."""
+Ratios = Callable[[Array], list[float]]
+"""σ/σ_max of the task Jacobian at q, in descending order; none of a law without J⁺."""
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The equations of motion of a plant, inputs held.
+
+    Attributes:
+        acceleration: q̈.
+        ratios: singular values of J that decide its rank.
+        rcond: up to which J⁺ drops them.
+        swing: per joint, a bound on how fast it changes them, 1/rad or 1/m.
+    """
+
+    acceleration: Response
+    ratios: Ratios
+    rcond: float
+    swing: Sequence[float]
+
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
-JUMP_STEP = 2.0**-8
-"""As a part of the first step: where J⁺ drops a singular value the right-hand side jumps, and no
-step across that passes the error test. One of this size, whose stages had different ranks, is
-taken."""
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-PATIENCE, FIRST_WAIT = 0.25, 2.0**-30
-"""As parts of the largest step, and of that: a joint that is back at its limit sooner than the one
-after leaving it is kept there for the other, and each time that this is so again twice as long.
-Where its acceleration only grazes zero, as it may at a singularity, or where joints drive each
-other off, it would else leave and return without end; where it returns but once, nothing is
-changed."""
-TIME_RESOLUTION = 2.0**-52
+PATIENCE, FIRST_HOLD, LONGER, HOLD_OF_ALL = 0.5, 2.0**-30, 8.0, 2.0**-15
+"""As parts of the largest step, of PATIENCE, of the last hold, and of PATIENCE. Anti-chatter: where
+a joint is back at its limit sooner than PATIENCE after it left, it is held there for FIRST_HOLD,
+and at each repetition LONGER; from HOLD_OF_ALL on, with all joints at limits. Where an acceleration
+only grazes zero, or where impacts drive joints off each other's limits, they would else leave and
+return without end; joints that return but once or twice are not disturbed. The rank of J⁺ is held
+in the same way where it drops soon after a rise: the motion leads back to the jump from both sides,
+and slides along it. A higher rank is never held, as its J⁺ has no bound."""
+MOST_ROWS = 6
+"""Rows of a task's Jacobian at most: three axes and three of an orientation."""
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
 
 
@@ -58,85 +82,112 @@ class StepError(ArithmeticError):
 
 
 class _Motion:
-    """The equations of motion as a system of first order, with stops, and how often they were
-    evaluated."""
+    """The equations of motion as a system of first order in one regime.
+
+    Attributes:
+        rank: of J⁺ in this regime.
+        rank_held: the rank does not rise in this regime.
+        evaluations: of the right-hand side so far.
+        pressed, margins: how joints at rest are pressed into their limits, and the margin of the
+            rank, at each stage of the present step.
+    """
 
     def __init__(
-        self, acceleration: Response, stops: Stops, rtol: float, atol: float, max_step: float
+        self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float
     ) -> None:
         n = len(stops.limits)
-        self._acceleration = acceleration
+        self._equations = equations
         state = np.empty(2 * n)
         self._write = Struct(f"{2 * n}d").pack_into  # quicker than numpy at this size
         self._buffer, self._q, self._v = state.data, state[:n], state[n:]
         self.n, self.evaluations = n, 0
         self.stops, self.rtol, self.atol, self.max_step = stops, rtol, atol, max_step
+        self.rank = MOST_ROWS
+        self.rank_held = False
+        self.pressed: list[list[float]] = []
+        self.margins: list[float] = []
 
-    def acceleration(self, y: State) -> tuple[list[float], int]:
-        """q̈ at y, and its rank."""
+    def set_out(self, y: State, keep: Sequence[bool], rank_held: bool) -> State:
+        """Find the regime at a state after an impact; ẏ in it.
+
+        Args:
+            y: the state (q, v).
+            keep: joints that stay at their limits, whether they are pressed or not.
+            rank_held: the rank stays what it is.
+        """
+        self.rank_held = rank_held
+        a, self.rank, margin = self._acceleration(y, self.rank if rank_held else None)
+        pressed = self.stops.hold(y, a, keep)
+        self.pressed, self.margins = [pressed], [margin]
+        return y[self.n :] + a
+
+    def acceleration(self, y: State) -> tuple[list[float], list[float], float]:
+        """q̈ at y in the regime, how joints at rest are pressed, and the margin of the rank."""
+        a, _, margin = self._acceleration(y, self.rank)
+        return a, self.stops.restrain(y, a), margin
+
+    def _acceleration(self, y: State, rank: int | None) -> tuple[list[float], int, float]:
         self.evaluations += 1
         self._write(self._buffer, 0, *y)
-        a, rank = self._acceleration(self._q, self._v)
-        return list(a), rank
+        a, rank, margin = self._equations.acceleration(self._q, self._v, rank)
+        return list(a), rank, margin
 
-    def rates(self, ranks: list[int], y: State) -> State:
-        """ẏ at y with the joints held that are; the rank is added to ranks."""
-        a, rank = self.acceleration(y)
-        if self.stops.held:
-            self.stops.restrain(y, a)
-        ranks.append(rank)
+    def rates(self, y: State) -> State:
+        """ẏ at a stage of a step; not a number where the equations have no answer there."""
+        try:
+            a, pressed, margin = self.acceleration(y)
+        except np.linalg.LinAlgError:
+            a, pressed, margin = [nan] * self.n, [nan] * self.n, nan
+        self.pressed.append(pressed)
+        self.margins.append(margin)
         return y[self.n :] + a
 
     def until_event(
-        self, y: State, f: list[float], rank: int, t: float, end: float
-    ) -> tuple[float, State, list[int], list[int]]:
-        """Integrate from t until a joint reaches or leaves a limit, or until the end.
+        self, y: State, rates: State, t: float, end: float
+    ) -> tuple[float, State, events.Event]:
+        """Integrate from t until an event or until the end: the time, the state, the event.
 
-        Returns the time, the state there, the joints that reached a limit, and those that leave
-        theirs. f is q̈ at y, of this rank.
+        rates is ẏ at y.
         """
         step = min(self.max_step, end - t)
-        jump_step = JUMP_STEP * step
-        rates = [*y[self.n :], *f]
         growth = MAX_FACTOR
         while True:
             last = t + step * (1 + 1e-9) >= end
-            small = step <= jump_step  # also where it is stretched to the end
             if last:
                 step = end - t
-            ranks = [rank]
-            y_new, K = dormand_prince(partial(self.rates, ranks), y, step, rates)
+            del self.pressed[1:], self.margins[1:]
+            y_new, K = dormand_prince(self.rates, y, step, rates)
             norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
             factor = MIN_FACTOR
             if isfinite(norm):
                 factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
-            at_jump = small and isfinite(norm) and min(ranks) < max(ranks)
-            if norm < 1.0 or at_jump:
-                event = self._first_event(y, y_new, step, K)
-                if event is not None:
-                    passed, y, stopped, let_go = event
-                    return end if last and passed == step else t + passed, y, stopped, let_go
+            if norm < 1.0:
+                found = self._first_event(y, y_new, step, K)
+                if found is not None:
+                    passed, y, event = found
+                    return end if last and passed == step else t + passed, y, event
                 if last:
-                    return end, y_new, [], []
-                t, y, rates, rank = t + step, y_new, K[-1], ranks[-1]
-                if norm < 1.0:  # else the error says nothing about the next step
-                    step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
+                    return end, y_new, events.Event()
+                t, y, rates = t + step, y_new, K[-1]
+                self.pressed[0], self.margins[0] = self.pressed[-1], self.margins[-1]
+                step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
                 growth = MAX_FACTOR
             else:
-                shorter = step * max(MIN_FACTOR, factor)
-                step = shorter if small else max(jump_step, shorter)
+                step *= max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
-                if step < 10 * ulp(t):
+                if step < 10 * ulp(end):
                     if not all(map(isfinite, chain(*K))):
-                        text = "the equations of motion gave a value that is not finite"
-                        raise FloatingPointError(text)
+                        raise FloatingPointError(
+                            "the equations of motion gave a value that is not finite:"
+                            " inputs, payload or speeds are too large"
+                        )
                     raise self._too_fast(y, too_fine=True)
             if self.evaluations > BUDGET:
                 raise self._too_fast(y, too_fine=False)
 
     def _too_fast(self, y: State, *, too_fine: bool) -> StepError:
-        """Names the joint whose own acceleration answers most to its position or velocity at y."""
-        a, _ = self.acceleration(y)
+        """Name the joint whose own acceleration answers most to its position or velocity at y."""
+        a, _, _ = self.acceleration(y)
         rates = []
         for i, order in product(range(self.n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
             nudged = y.copy()
@@ -148,64 +199,81 @@ class _Motion:
 
     def _first_event(
         self, y: State, y_new: State, step: float, K: list[State]
-    ) -> tuple[float, State, list[int], list[int]] | None:
-        """First time in (0, step] at which a limit is reached or left.
-
-        Returns that time, the state from there on, the joints that reached a limit, and those that
-        leave theirs.
-        """
+    ) -> tuple[float, State, events.Event] | None:
+        """First time in (0, step] at which the regime ends, the state there, and the event."""
         n, stops = self.n, self.stops
-        if not stops.watched:
-            for (low, high), q, v, before in zip(stops.limits, y_new, y_new[n:], y[n:]):
-                if not low < q < high or v * before < 0.0:
-                    break
-            else:  # all are inside, and none has turned
-                return None
-        state = interpolant(y, y_new, K, step)
-        latest = step if self._events(y_new) else self._excursion(y, y_new, state, step)
-        if latest is None:
+        reach = [events.REACH * step * max(map(abs, speeds)) for speeds in zip(*(k[:n] for k in K))]
+        near = [
+            i for i, (q, change, (low, high)) in enumerate(zip(y, reach, stops.limits))
+            if not (q - change > low and q + change < high) and i not in stops.held
+        ]  # fmt: skip
+        sweep = sum(map(float.__mul__, self._equations.swing, reach))
+        near_rank = not max(self.margins[0], self.margins[-1]) > sweep
+        doubtful = [i for i in stops.watched if events.may_vanish([p[i] for p in self.pressed])]
+        if not near and not near_rank and not doubtful:
             return None
-        latest = _bisect(lambda passed: bool(self._events(state(passed))), latest, step)
-        y = state(latest).copy()
-        events = self._events(y)
-        stopped = [i for i in events if i not in stops.held]
-        for i in stopped:
-            low, high = stops.limits[i]
-            y[i] = min(max(y[i], low), high)
-        return latest, y, stopped, [i for i in events if i in stops.held]
+        state = interpolant(y, y_new, K, step)
+        first = inf
+        for i in near:
+            slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(P).tolist())]
+            first = min(first, events.first_crossing(state, i, stops.limits[i], slope, step))
 
-    def _events(self, y: State) -> list[int]:
-        """Free joints that are past a limit and watched joints that are let go, at y."""
-        events = []
-        for i, ((low, high), q, v) in enumerate(zip(self.stops.limits, y, y[self.n :])):
-            if (q >= high and (q > high or v > 0.0)) or (q <= low and (q < low or v < 0.0)):
-                events.append(i)
+        def press(passed: float) -> list[float]:
+            return self.acceleration(state(passed))[1]
+
+        def singular_margin(passed: float) -> float:
+            return self._singular_margin(state(passed))
+
+        if doubtful:
+            at_ends = self.pressed[0], self.pressed[-1]
+            released = events.first_release(press, at_ends, doubtful, stops.watched, step, first)
+            first = min(first, released)
+        if near_rank:
+            a, b = singular_margin(0.0), singular_margin(step)
+            pace = events.PACE / events.REACH * sweep / step
+            first = min(first, events.search(singular_margin, pace, 0.0, a, step, b, step))
+        if first == inf:
+            return None
+        return first, *self._event(state(first))
+
+    def _event(self, y: State) -> tuple[State, events.Event]:
+        """The event at a state, which is put onto the limits that it is past."""
+        y = list(y)
+        event = events.Event()
         if self.stops.watched:
-            a, _ = self.acceleration(y)
-            events += self.stops.released(y, a)
-        return events
-
-    def _excursion(
-        self, y: State, y_new: State, state: Callable[[float], State], step: float
-    ) -> float | None:
-        """When a joint is furthest past a limit, where it is so in one step and back at its end."""
-        times = []
+            pressed = self.acceleration(y)[1]
+            event.released = [i for i in self.stops.watched if pressed[i] < 0.0]
         for i, (low, high) in enumerate(self.stops.limits):
-            q, v, component = y[i], y[self.n + i], self.n + i
-            limit = high if v > 0.0 else low
-            if v * y_new[component] < 0.0 and abs(v) * step > abs(limit - q):
-                turn = _turn(state, component, v, step)
-                if (state(turn)[i] - limit) * v > 0.0:
-                    times.append(turn)
-        return min(times, default=None)
+            if i not in self.stops.held and not low <= y[i] <= high:
+                event.stopped.append(i)
+                y[i] = min(max(y[i], low), high)
+        return y, event
+
+    def _singular_margin(self, y: State) -> float:
+        """The margin of the rank; of one that is held only that against a lower one."""
+        self.evaluations += 1
+        ratios, rank = self._equations.ratios(np.array(y[: self.n])), self.rank
+        if self.rank_held:
+            return ratios[rank - 1] - self._equations.rcond if rank else 1.0
+        return rank_margin(ratios, self._equations.rcond, rank)
 
 
-def _turn(state: Callable[[float], State], component: int, v: float, step: float) -> float:
-    return _bisect(lambda passed: state(passed)[component] * v <= 0.0, step, step)
+@dataclass
+class _Hold:
+    """Hold of joints at their limits, or of the rank of J⁺: its end and its length, s."""
+
+    until: float = -inf
+    wait: float = 0.0
+
+    def again(self, t: float, patience: float) -> None:
+        """Hold from t on, longer than the last time where that was within the patience."""
+        repeated = t - self.until < patience
+        self.wait = min(LONGER * self.wait, patience) if repeated else FIRST_HOLD * patience
+        self.until = t + self.wait
 
 
 def advance(
-    acceleration: Response,
+    equations: Equations,
     q: Sequence[float],
     v: Sequence[float],
     h: float,
@@ -217,7 +285,7 @@ def advance(
     """State one communication step later.
 
     Args:
-        acceleration: q̈(q, v); autonomous, as inputs are held over the step.
+        equations: of motion; autonomous, as inputs are held over the step.
         q, v: state at the beginning, n each; q within the limits.
         h: communication step, s, > 0.
         stops: at the joints' limits.
@@ -231,53 +299,45 @@ def advance(
         FloatingPointError: the equations gave a value that is not finite.
         StepError: they change too fast.
     """
-    limits = stops.limits
-    motion = _Motion(acceleration, stops, rtol, atol, max_step)
-    y, t = [*q, *v], 0.0
-    patience = PATIENCE * min(max_step, h)
-    left = [-inf] * len(limits)  # when each joint last left its limit
-    kept = [-inf] * len(limits)  # until when each joint is kept at its limit,
-    wait = [0.0] * len(limits)  # and for how long
-    let_go: list[int] = []
+    n = len(q)
+    y = _regimes(_Motion(equations, stops, rtol, atol, max_step), [*q, *v], h)
+    return y[:n], y[n:]
+
+
+def _regimes(motion: _Motion, y: State, h: float) -> State:
+    """The state after h, integrated from one event to the next."""
+    n, stops, t = motion.n, motion.stops, 0.0
+    patience = PATIENCE * min(motion.max_step, h)
+    joint_hold, rank_hold = _Hold(), _Hold()
+    left, risen = [-inf] * n, -inf  # when each joint left its limit, when the rank rose
+    event, chattering, keep = events.Event(), [False] * n, [False] * n
     while t < h:
-        end = min((until for until in kept if until > t), default=h)
-        keep = [until > t for until in kept]
+        if any(chattering):
+            joint_hold.again(t, patience)
+            keep = chattering
+            if joint_hold.wait >= HOLD_OF_ALL * patience:
+                keep = stops.at_limits(y)
+        elif joint_hold.until <= t:
+            keep = [False] * n
+        rank, rank_held = motion.rank, rank_hold.until > t
+        end = min((hold.until for hold in (joint_hold, rank_hold) if hold.until > t), default=h)
         stops.impact(y, keep)
-        f, rank = motion.acceleration(y)
-        stops.hold(y, f, keep)
-        for i, (low, high) in enumerate(limits):
-            if i not in stops.held and not low < y[i] < high:
+        rates = motion.set_out(y, keep, rank_held)
+        for i, at_limit in enumerate(stops.at_limits(y)):
+            if at_limit and i not in stops.held:
                 left[i] = t
-        again = [i for i in let_go if i in stops.watched]  # it is pressed again, by rounding
-        for i in again:
-            wait[i] = _wait(wait[i], t - kept[i], patience)
-            kept[i] = t + wait[i]
-        let_go = []
-        if again:
+        chattering = [i in event.released and i in stops.watched for i in range(n)]  # by rounding
+        event = events.Event()
+        if any(chattering):
             continue
-        t, y, stopped, let_go = motion.until_event(y, f, rank, t, min(end, h))
-        for i in stopped:
-            if t - left[i] < patience:
-                wait[i] = _wait(wait[i], t - kept[i], patience)
-                kept[i] = t + wait[i]
-    stops.impact(y, [until > h for until in kept])
-    return y[: len(q)], y[len(q) :]
-
-
-def _wait(last: float, since: float, patience: float) -> float:
-    """How long a joint is kept at its limit, s; last time it was so long, and ended so long ago."""
-    return min(2.0 * last, patience) if since < patience else FIRST_WAIT * patience
-
-
-def _bisect(happened: Callable[[float], bool], latest: float, step: float) -> float:
-    """First time in (0, latest] at which it has happened, to the last bits of the step."""
-    before = 0.0
-    while latest - before > TIME_RESOLUTION * step:
-        middle = 0.5 * (before + latest)
-        if not before < middle < latest:  # of two neighbouring numbers
-            break
-        if happened(middle):
-            latest = middle
-        else:
-            before = middle
-    return latest
+        if motion.rank > rank:
+            risen = t
+        if motion.rank < rank and t - risen < patience:
+            rank_hold.again(t, patience)
+            continue
+        t, y, event = motion.until_event(y, rates, t, min(end, h))
+        chattering = [i in event.stopped and t - left[i] < patience for i in range(n)]
+    if joint_hold.until <= h:
+        keep = [False] * n
+    stops.impact(y, keep)
+    return y

@@ -7,17 +7,21 @@ Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2.
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
-from .integrator import Array, Response
+from .integrator import Array, Ratios, Response
 
 
-def command(plant: Any) -> Response:
-    """q̈_cmd as a function of the state, n values; inputs held."""
+def command(plant: Any) -> tuple[Response, Ratios]:
+    """q̈_cmd as a function of the state, n values; inputs held. It has no J⁺."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 
-    def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
+    def commanded_acceleration(
+        q: Array, v: Array, rank: int | None
+    ) -> tuple[list[float], int, float]:
         state = zip(law, q.tolist(), v.tolist())
-        return [a + Kd * (vd - vi) + Kp * (qd - qi) for (a, vd, qd, Kd, Kp), qi, vi in state], 0
+        given = [a + Kd * (vd - vi) + Kp * (qd - qi) for (a, vd, qd, Kd, Kp), qi, vi in state]
+        return given, rank or 0, inf
 
-    return commanded_acceleration
+    return commanded_acceleration, lambda q: []

@@ -19,7 +19,7 @@ import numpy as np
 
 from . import effort_control, joint_control, task_control
 from .dormand_prince import STAGES
-from .integrator import BUDGET, Array, Response, StepError, advance
+from .integrator import BUDGET, Array, Equations, Response, StepError, advance
 from .mechanism import Mechanism
 from .orientation import quaternion
 from .robot import Robot
@@ -118,6 +118,7 @@ class Plant:
         self.q = list(self.q_start)
         self.v = list(self.v_start)
         self._axes = ["xyz".index(axis) for axis in robot.axes]
+        self._swing = robot.swing()
         self.prepare()
 
     def initialise(self) -> list[str]:
@@ -219,7 +220,8 @@ class Plant:
             DiscardError: an input that the control law cannot follow.
         """
         self._check_target()
-        effort, _ = self._control_effort(self._law(self), np.array(self.q), np.array(self.v))
+        command, _ = self._law(self)
+        effort = self._control_effort(command, np.array(self.q), np.array(self.v), None)[0]
         tau: list[float] = effort.tolist()
         return tau
 
@@ -237,14 +239,20 @@ class Plant:
         """
         self._check_target()
         with refusing(DiscardError):
-            acceleration, _ = self.equations_of_motion()(np.array(self.q), np.array(self.v))
-            rates = list(acceleration)
+            equations = self.equations_of_motion()
+            rates = list(equations.acceleration(np.array(self.q), np.array(self.v), None)[0])
             self.stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
         return rates
 
-    def equations_of_motion(self) -> Response:
-        """The function of (q, v) that gives q̈ under the present inputs, and the rank of its J⁺."""
-        command: Response = self._law(self)
+    def equations_of_motion(self) -> Equations:
+        """The equations of motion under the present inputs."""
+        command, ratios = self._law(self)
+        acceleration = self._acceleration(command)
+        rcond = self.rcond if "rcond" in CONTROLS[self.control].parameters else 0.0
+        return Equations(acceleration, ratios, rcond, self._swing)
+
+    def _acceleration(self, command: Response) -> Response:
+        """q̈ under a control law."""
         damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
         force = np.array(self.f_ext)
         # q̈ = q̈_cmd + M⁻¹(…): rounding of M q̈_cmd + h − h would move joints that are at rest
@@ -253,15 +261,17 @@ class Plant:
         if cancels and not (damping.any() or external.any() or force.any()):
             return command
 
-        def acceleration(q: Array, v: Array) -> tuple[list[float], int]:
+        def acceleration(
+            q: Array, v: Array, rank: int | None
+        ) -> tuple[Sequence[float], int, float]:
             effort = external - damping * v
             if force.any():
                 effort += force @ np.array(self._real.observe(q, v)[1][:3])
             if cancels:
-                given, rank = command(q, v)
-                return np.add(given, self._real.inverse_mass(q) @ effort).tolist(), rank
-            tau, rank = self._control_effort(command, q, v)
-            return self._real.forward_dynamics(q, v, tau + effort).tolist(), rank
+                given, rank, margin = command(q, v, rank)
+                return np.add(given, self._real.inverse_mass(q) @ effort).tolist(), rank, margin
+            tau, rank, margin = self._control_effort(command, q, v, rank)
+            return self._real.forward_dynamics(q, v, tau + effort).tolist(), rank, margin
 
         return acceleration
 
@@ -273,14 +283,16 @@ class Plant:
     def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
         return self._real.observe(np.array(self.q), np.array(self.v))
 
-    def _control_effort(self, command: Response, q: Array, v: Array) -> tuple[Array, int]:
-        given, rank = command(q, v)
+    def _control_effort(
+        self, command: Response, q: Array, v: Array, rank: int | None
+    ) -> tuple[Array, int, float]:
+        given, rank, margin = command(q, v, rank)
         tau: Array = np.array(given)
         if self._commands == "acceleration":
             tau = self.known.inverse_dynamics(q, v, tau)
         if self.limit_effort:
             tau = np.clip(tau, -np.array(self.robot.effort), self.robot.effort)
-        return tau, rank
+        return tau, rank, margin
 
     def _check_target(self) -> None:
         if self.control == "pose" and not any(self.quat_des):

@@ -7,7 +7,7 @@ rows are plain lists of floats.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 
@@ -21,33 +21,36 @@ PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 
 
 def apply_pseudo_inverse(
-    rows: list[list[float]], b: list[float], rcond: float
-) -> tuple[list[float], int]:
-    """J⁺b and the rank of J⁺, singular values σ ≤ rcond·σ_max dropped.
-
-    The rule is that of ``numpy.linalg.pinv``.
+    rows: list[list[float]], b: list[float], rcond: float, rank: int | None = None
+) -> tuple[list[float], int, float]:
+    """J⁺b, where J⁺ keeps as many of the largest singular values as its rank says.
 
     Args:
         rows: J, m rows of n.
         b: m values.
         rcond: in [0, 1).
+        rank: of J⁺; None keeps σ > rcond·σ_max, the rule of ``numpy.linalg.pinv``.
 
     Returns:
-        n values, the least-squares solution of smallest norm; and how many singular values of the
-        m were not dropped.
+        n values, the least-squares solution of smallest norm; the rank; and its margin, that of
+        ``rank_margin`` or, where positive, a lower bound of it.
     """
     smallest = max(rcond * rcond, WELL_CONDITIONED)
-    if len(rows) == 2:
+    if rank is not None and rank < len(rows):
+        pass
+    elif len(rows) == 2:
         r0, r1 = rows
         g00 = g01 = g11 = 0.0
         for x0, x1 in zip(r0, r1):
             g00, g01, g11 = g00 + x0 * x0, g01 + x0 * x1, g11 + x1 * x1
         determinant = g00 * g11 - g01 * g01
         trace = g00 + g11
-        if determinant > smallest * trace * trace:  # ≤ σ_min²/σ_max²: nothing is dropped
+        scale = trace * trace  # ≥ σ_max⁴
+        if determinant > smallest * scale:
             y0 = (g11 * b[0] - g01 * b[1]) / determinant
             y1 = (g00 * b[1] - g01 * b[0]) / determinant
-            return [y0 * x0 + y1 * x1 for x0, x1 in zip(r0, r1)], 2
+            result = [y0 * x0 + y1 * x1 for x0, x1 in zip(r0, r1)]
+            return result, 2, sqrt(determinant / scale) - rcond
     elif len(rows) == 3:
         r0, r1, r2 = rows
         g00 = g01 = g02 = g11 = g12 = g22 = 0.0
@@ -57,28 +60,65 @@ def apply_pseudo_inverse(
         c00, c01, c02 = g11 * g22 - g12 * g12, g02 * g12 - g01 * g22, g01 * g12 - g02 * g11
         determinant = g00 * c00 + g01 * c01 + g02 * c02
         trace = g00 + g11 + g22
-        if 4.0 * determinant > smallest * trace * trace * trace:  # as λ₁λ₂ ≤ (λ₁ + λ₂)²/4
+        scale = 0.25 * trace * trace * trace  # ≥ σ_1⁴ σ_2², as λ₁λ₂ ≤ (λ₁ + λ₂)²/4
+        if determinant > smallest * scale:
             c11, c12, c22 = g00 * g22 - g02 * g02, g01 * g02 - g00 * g12, g00 * g11 - g01 * g01
             y0 = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant
             y1 = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / determinant
             y2 = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / determinant
-            return [y0 * x0 + y1 * x1 + y2 * x2 for x0, x1, x2 in zip(r0, r1, r2)], 3
-    elif len(rows) > 3:
-        U, sigma, Vt = np.linalg.svd(rows, full_matrices=False)
-        kept = sigma > rcond * sigma[0]
-        y = (U.T @ b)[kept] / sigma[kept]
-        return (y @ Vt[kept]).tolist(), int(kept.sum())
-    return _by_singular_values(list(rows), list(b), rcond)
+            result = [y0 * x0 + y1 * x1 + y2 * x2 for x0, x1, x2 in zip(r0, r1, r2)]
+            return result, 3, sqrt(determinant / scale) - rcond
+    rows, b = _orthogonal(list(rows), list(b))
+    squares = [_dot(row, row) for row in rows]
+    ratios = _ratios(squares)
+    if rank is None:
+        rank = sum(ratio > rcond for ratio in ratios)
+    result = [0.0] * len(rows[0])
+    for k in sorted(range(len(rows)), key=squares.__getitem__, reverse=True)[:rank]:
+        factor = b[k] / squares[k] if squares[k] else inf
+        result = [r + factor * x for r, x in zip(result, rows[k])]
+    return result, rank, rank_margin(ratios, rcond, rank)
 
 
-def _by_singular_values(
-    rows: list[list[float]], b: list[float], rcond: float
-) -> tuple[list[float], int]:
-    """The same by one-sided Jacobi rotations (Hestenes, J. SIAM 6(1), 1958); changes its arguments.
+def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
+    """Return the distance of the singular values next to a rank from rcond, as ratios to σ_max.
 
-    Rotations from the left make the rows orthogonal: row k becomes σ_k v_kᵀ and b_k becomes
-    u_kᵀb, so J⁺b = Σ_k row_k b_k / |row_k|² over the singular values that are kept.
+    It is negative where the rule σ > rcond·σ_max gives another rank.
+
+    Args:
+        ratios: σ/σ_max in descending order.
+        rcond: in [0, 1).
+        rank: of J⁺.
     """
+    margins = [1.0]
+    if rank > 0:
+        margins.append(ratios[rank - 1] - rcond)
+    if rank < len(ratios):
+        margins.append(rcond - ratios[rank])
+    return min(margins)
+
+
+def singular_ratios(rows: Sequence[Sequence[float]]) -> list[float]:
+    """σ/σ_max of a matrix in descending order; 0 where all are 0."""
+    orthogonal, _ = _orthogonal([list(row) for row in rows], [0.0] * len(rows))
+    return _ratios([_dot(row, row) for row in orthogonal])
+
+
+def _ratios(squares: Sequence[float]) -> list[float]:
+    largest = max(squares)
+    return [sqrt(square / largest) if largest else 0.0 for square in sorted(squares, reverse=True)]
+
+
+def _orthogonal(rows: list[list[float]], b: list[float]) -> tuple[list[list[float]], list[float]]:
+    """Rows and b after rotations from the left that make the rows orthogonal.
+
+    Row k becomes σ_k v_kᵀ and b_k becomes u_kᵀb, so J⁺b = Σ_k row_k b_k / |row_k|² over the
+    singular values that are kept. Up to three rows by one-sided Jacobi rotations (Hestenes,
+    J. SIAM 6(1), 1958), which change the arguments; more by LAPACK.
+    """
+    if len(rows) > 3:
+        U, sigma, Vt = np.linalg.svd(rows, full_matrices=False)
+        return (sigma[:, np.newaxis] * Vt).tolist(), (U.T @ b).tolist()
     for _ in range(MAX_SWEEPS):
         rotated = False
         for i, j in PAIRS[len(rows)]:
@@ -96,14 +136,7 @@ def _by_singular_values(
                 b[i], b[j] = c * b[i] - s * b[j], s * b[i] + c * b[j]
         if not rotated:
             break
-    squares = [_dot(row, row) for row in rows]
-    smallest = rcond * rcond * max(squares)
-    result, rank = [0.0] * len(rows[0]), 0
-    for row, bk, square in zip(rows, b, squares):
-        if square > smallest:
-            rank += 1
-            result = [r + bk / square * x for r, x in zip(result, row)]
-    return result, rank
+    return rows, b
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:

@@ -68,11 +68,25 @@ class Robot:
 
     def moves_frame(self) -> tuple[bool, ...]:
         """Per joint, whether it lies between the root and the task frame."""
+        return tuple(bool(column.any()) for column in self._path().T)
+
+    def swing(self) -> tuple[float, ...]:
+        """Per joint, a bound on how fast it changes σ/σ_max of the task Jacobian, 1/rad or 1/m.
+
+        A joint i of a chain changes column j of the Jacobian by the cross product of an axis with
+        column max(i, j), so that ‖∂J/∂q_i‖ ≤ √n σ_max for n joints; by Weyl's inequality no
+        singular value changes by more, and their ratio by at most twice as much of σ_max. With
+        fewer than three task axes the columns are projections, and it is an estimate.
+        """
+        path = self._path()
+        bound = 2.0 * math.sqrt(len(path)) * np.abs(path).sum(axis=0)
+        return tuple(bound.tolist())
+
+    def _path(self) -> NDArray[np.float64]:
+        """The rows of the coupling of joints between the root and the task frame."""
         support = list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
-        path = [i - 1 for i in support]
-        if self.coupling is None:
-            return tuple(i in path for i in range(len(self.joints)))
-        return tuple(bool(column.any()) for column in self.coupling[path].T)
+        coupling = np.eye(len(self.joints)) if self.coupling is None else self.coupling
+        return coupling[[i - 1 for i in support]]
 
 
 def load_robot(text: str, frame: str, axes: str) -> Robot:

@@ -14,13 +14,15 @@ from __future__ import annotations
 from operator import mul
 from typing import Any
 
-from .integrator import Array, Response
+import numpy as np
+
+from .integrator import Array, Ratios, Response
 from .orientation import rotation_error
-from .pseudo_inverse import apply_pseudo_inverse
+from .pseudo_inverse import apply_pseudo_inverse, singular_ratios
 
 
-def command(plant: Any) -> Response:
-    """q̈_cmd as a function of the state, n values, and the rank of its J⁺; inputs held."""
+def command(plant: Any) -> tuple[Response, Ratios]:
+    """q̈_cmd as a function of the state, and the singular values of its J; inputs held."""
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]
     law = list(zip(axes, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))
@@ -31,7 +33,9 @@ def command(plant: Any) -> Response:
         law.extend(zip((3, 4, 5), *turn))
     Kn, rcond = plant.Kn, plant.rcond
 
-    def commanded_acceleration(q: Array, v: Array) -> tuple[list[float], int]:
+    def commanded_acceleration(
+        q: Array, v: Array, rank: int | None
+    ) -> tuple[list[float], int, float]:
         x, jacobian, drift = observe(q, v)
         velocity = v.tolist()
         errors = [x_des - x[axis] for axis, x_des in place]
@@ -43,7 +47,11 @@ def command(plant: Any) -> Response:
             xd = sum(map(mul, row, velocity))
             rows.append(row)
             command.append(xdd_des + Kd * (xd_des - xd) + Kp * error - drift[axis] + Kn * xd)
-        qdd, rank = apply_pseudo_inverse(rows, command, rcond)
-        return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd, rank
+        qdd, rank, margin = apply_pseudo_inverse(rows, command, rcond, rank)
+        return [a - Kn * vi for a, vi in zip(qdd, velocity)] if Kn else qdd, rank, margin
 
-    return commanded_acceleration
+    def ratios(q: Array) -> list[float]:
+        jacobian = observe(q, np.zeros(len(q)))[1]
+        return singular_ratios([jacobian[row[0]] for row in law])
+
+    return commanded_acceleration, ratios

@@ -17,8 +17,11 @@ UNBOUNDED = 1.7976931348623157e308
 
 NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
+SHAPES = ("visual", "collision")
 MAX_LINKS = 1000
 MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
+MAX_SHAPES = 5000  # visuals and collisions; a page holds each
+MAX_ELEMENTS = 100_000
 MAX_DEPTH = 100  # of elements in elements
 MAX_NAME = 1000  # characters; a string literal of C holds 4095 bytes
 LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
@@ -41,7 +44,7 @@ class Joint:
         xyz, rpy: of its frame in the parent's at q = 0, m and rad about the fixed axes x, y, z.
         axis: in its frame, of length 1.
         low, high: position limits, rad or m; ∓UNBOUNDED where there is none.
-        effort: limit, N·m or N; infinite where the URDF has 0 or none.
+        effort, velocity: limits, N·m or N, rad/s or m/s; infinite where the URDF has 0 or none.
         damping: viscous, N·m·s/rad or N·s/m.
         leader: the joint that it mimics, and that mimics none: q = ratio·q_leader + offset; its
             own name where it moves on its own.
@@ -58,6 +61,7 @@ class Joint:
     low: float
     high: float
     effort: float
+    velocity: float
     damping: float
     leader: str
     ratio: float = 1.0
@@ -124,9 +128,12 @@ def read_urdf(text: str) -> Urdf:
     links = _by_name(tree, "link")
     elements = _by_name(tree, "joint")
     moving = [name for name, joint in elements.items() if joint.get("type") != "fixed"]
-    for what, names, most in (("links", links, MAX_LINKS), ("moving joints", moving, MAX_JOINTS)):
-        if len(names) > most:
-            raise RobotError(f"the URDF has {len(names)} {what}; at most {most} are supported")
+    shapes = sum(len(link.findall(kind)) for kind in SHAPES for link in links.values())
+    counts = {"links": (len(links), MAX_LINKS), "moving joints": (len(moving), MAX_JOINTS),
+              "visuals and collisions": (shapes, MAX_SHAPES)}  # fmt: skip
+    for what, (count, most) in counts.items():
+        if count > most:
+            raise RobotError(f"the URDF has {count} {what}; at most {most} are supported")
     for tag, named in (("link", links), ("joint", elements)):
         for name, element in named.items():
             _check_numbers(element, f"{tag} '{name}'")
@@ -134,10 +141,17 @@ def read_urdf(text: str) -> Urdf:
     joints = {name: _joint(name, element) for name, element in elements.items()}
     joints = {name: _following(joint, joints) for name, joint in joints.items()}
     frictional = [n for n, e in elements.items() if attribute(e, "dynamics", "friction", 0.0)]
-    warnings = (f"friction is not modelled and is ignored: {_listed('joint', frictional)}",)
-    return Urdf(
-        tree.get("name", ""), root, tuple(links), joints, tree, warnings if frictional else ()
-    )
+    warnings = []
+    if frictional:
+        warnings.append(f"friction is not modelled and is ignored: {_listed('joint', frictional)}")
+    if frozen := [
+        n for n, joint in joints.items() if joint.leader == n and joint.low == joint.high
+    ]:
+        warnings.append(
+            "lower and upper limit are equal or missing, so that nothing moves"
+            f" {_listed('joint', frozen)}: give limits, or type 'continuous' for none"
+        )
+    return Urdf(tree.get("name", ""), root, tuple(links), joints, tree, tuple(warnings))
 
 
 def _listed(what: str, names: Sequence[str]) -> str:
@@ -154,9 +168,11 @@ def _parse(urdf: str) -> ET.Element:
         raise RobotError(f"the URDF is not XML: {error}") from error
     if tree.tag != "robot":
         raise RobotError(f"the URDF's root element is <{tree.tag}>, expected <robot>")
-    depth, level = 1, [tree]
+    depth, level, count = 1, [tree], 1
     while level := [child for element in level for child in element]:
-        depth += 1
+        depth, count = depth + 1, count + len(level)
+        if count > MAX_ELEMENTS:
+            raise RobotError(f"the URDF has more than {MAX_ELEMENTS} elements")
         if depth > MAX_DEPTH:  # what writes XML goes down by recursion
             raise RobotError(f"the URDF's elements are nested deeper than {MAX_DEPTH}")
     return tree
@@ -177,6 +193,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
         if low > high:
             raise RobotError(f"joint '{name}': lower limit {low:g} > upper limit {high:g}")
     effort = attribute(element, "limit", "effort", 0.0)
+    velocity = attribute(element, "limit", "velocity", 0.0)
     damping = attribute(element, "dynamics", "damping", 0.0)
     for key, value in (("effort", effort), ("damping", damping)):
         if kind != "fixed" and value < 0:
@@ -200,6 +217,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
         low=low,
         high=high,
         effort=effort or math.inf,
+        velocity=velocity if velocity > 0.0 else math.inf,
         damping=damping,
         **_mimicry(name, element if kind != "fixed" else None),
     )

@@ -1,12 +1,13 @@
 """The one table of FMI variables, from which the slave and both flavours' XML are made.
 
-Names are FMI structured names with 1-based indices; a variable's place in the table is its
-value reference.
+Names are FMI structured names with 1-based indices; a variable's place in the table, from 1 on, is
+its value reference.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -19,21 +20,18 @@ Value = float | bool
 
 @dataclass(frozen=True)
 class Range:
-    """Values that a variable may have, both ends among them, and how to say it.
-
-    Attributes:
-        positive: 0 is not one, also where a process takes the smallest numbers for 0.
-    """
+    """Values that a variable may have, both ends among them, and how to say it."""
 
     low: float
     high: float
     words: str
-    positive: bool = False
 
 
 NO_RANGE = Range(-math.inf, math.inf, "")
 NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
-POSITIVE = Range(math.nextafter(0.0, 1.0), math.inf, "> 0", positive=True)
+POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
+"""From the smallest normal number on: C++ cannot read smaller ones, and processors may take them
+for 0."""
 GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
     **dict.fromkeys((*GAINS, "payload"), NOT_NEGATIVE),
@@ -84,7 +82,7 @@ class Variable:
     def refusal(self, value: Value) -> str:
         """Why it cannot have a value, "" where it can."""
         within = RANGES.get(self.group, NO_RANGE)
-        fits = within.low <= value <= within.high and (value > 0 or not within.positive)
+        fits = within.low <= value <= within.high
         return "" if fits else f"{self.name} = {value:g} must be {within.words}"
 
 

@@ -1,0 +1,335 @@
+/* Find the first event within an integration step, on its dense output. The rules are those of
+   plant/event_search.py.
+
+   An event is where a margin becomes negative: the distance of a joint to a limit, the force that presses
+   a joint at rest into its limit, or the margin of the rank of J⁺. Positions are polynomials, whose
+   turning points are known; the other margins are looked at as often as their rates of change ask for. */
+#include "event_search.h"
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#ifdef HAS_RCOND
+#include "control.h"
+#include "pseudo_inverse.h"
+#endif
+
+/* Of Dormand and Prince's interpolant, which weighs the derivatives of the stages: the largest sum of
+   the weights' magnitudes, and that of their rates. */
+static const double REACH = 1.66, PACE = 3.72;
+/* A force that presses a joint falls below what the stages show of it by less than its range there. It is
+   looked at this often in a step where that may be below zero, and again at a minimum of the polynomial
+   through these looks that is lower than so much of their range. */
+enum { LOOKS = 4 };
+static const double DOUBT = 0.25;
+/* Halvings of a step in the search; a shorter excursion is none. */
+enum { HALVINGS = 7 };
+static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
+
+/* What is negative once a regime has ended, at a time within the step. */
+typedef double Margin(Step *step, double passed, int joint);
+
+static void interpolated(const Step *step, double passed, double y[N_STATES])
+{
+    for (int i = 0; i < N_STATES; i++)
+        y[i] = dense_output(step, passed, i);
+}
+
+/* Distance to the nearer limit. */
+static double limit_margin(Step *step, double passed, int joint)
+{
+    const double q = dense_output(step, passed, joint);
+    const double *value = step->plant->value;
+    return fmin(value[Q_MAX + joint] - q, q - value[Q_MIN + joint]);
+}
+
+/* How joints at rest are pressed into their limits. */
+static void press(Step *step, double passed, double pressed[N_JOINTS])
+{
+    double y[N_STATES], a[N_JOINTS];
+    interpolated(step, passed, y);
+    evaluate(step, y, a, pressed, NULL);
+}
+
+static double least_pressed(const Step *step, const double pressed[N_JOINTS])
+{
+    double least = HUGE_VAL;
+    for (int i = 0; i < N_JOINTS; i++)
+        if (step->stops.watched[i])
+            least = fmin(least, pressed[i]);
+    return least;
+}
+
+static double release_margin(Step *step, double passed, int joint)
+{
+    double pressed[N_JOINTS];
+    (void)joint;
+    press(step, passed, pressed);
+    return least_pressed(step, pressed);
+}
+
+/* The margin of the rank; of one that is held only that against a lower one. */
+static double singular_margin(Step *step, double passed, int rank_held)
+{
+#ifdef HAS_RCOND
+    const double rcond = step->plant->value[RCOND];
+    const int rank = step->stops.rank;
+    double y[N_STATES], ratio[N_ROWS];
+    interpolated(step, passed, y);
+    conditioning(y, ratio);
+    step->evaluations++;
+    if (rank_held)
+        return rank > 0 ? ratio[rank - 1] - rcond : 1.0;
+    return rank_margin(ratio, rcond, rank);
+#else
+    (void)step, (void)passed, (void)rank_held;
+    return 1.0;
+#endif
+}
+
+/* First time in (a, b] at which a margin is negative, as it is at b, to the last bits of the step. The
+   interpolation is kept near the middle, so that it never needs many more looks than bisection.
+   Source: Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020. */
+static double locate(Step *step, Margin *margin, int joint, double a, double at_a, double b,
+                     double at_b)
+{
+    const double resolution = TIME_RESOLUTION * step->size, k = 0.2 / (b - a);
+    double slack = b - a; /* of the interval, beyond what bisection would have left of it */
+    while (b - a > resolution) {
+        const double middle = 0.5 * (a + b), half = 0.5 * (b - a);
+        double x = at_a > at_b ? (b * at_a - a * at_b) / (at_a - at_b) : middle;
+        const double shift = fmin(k * (b - a) * (b - a), fabs(middle - x));
+        x += middle > x ? shift : -shift;
+        if (fabs(x - middle) > slack - half)
+            x = middle + (x > middle ? slack - half : half - slack);
+        if (!(a < x && x < b))
+            x = middle;
+        if (!(a < x && x < b)) /* two neighbouring numbers */
+            break;
+        const double at_x = margin(step, x, joint);
+        if (at_x < 0.0) {
+            b = x;
+            at_b = at_x;
+        } else {
+            a = x;
+            at_a = at_x;
+        }
+        slack = fmax(0.5 * slack, resolution);
+    }
+    return b;
+}
+
+/* First time in (a, b] at which a margin is negative, HUGE_VAL where it is not. Its values at the ends
+   and its largest rate of change say where it need not be looked for. */
+static double search(Step *step, Margin *margin, int joint, double rate, double a, double at_a,
+                     double b, double at_b, int halvings)
+{
+    if (at_b >= 0.0 && (halvings == 0 || at_a + at_b >= rate * (b - a)))
+        return HUGE_VAL;
+    if (halvings == 0)
+        return locate(step, margin, joint, a, at_a, b, at_b);
+    const double middle = 0.5 * (a + b), at_middle = margin(step, middle, joint);
+    double first = search(step, margin, joint, rate, a, at_a, middle, at_middle, halvings - 1);
+    if (first == HUGE_VAL)
+        first = search(step, margin, joint, rate, middle, at_middle, b, at_b, halvings - 1);
+    return first;
+}
+
+double polynomial(const double c[], int degree, double x)
+{
+    double sum = c[degree];
+    for (int k = degree - 1; k >= 0; k--)
+        sum = sum * x + c[k];
+    return sum;
+}
+
+int sign_changes(const double c[], int degree, double root[])
+{
+    double slope[4], turn[5], left = 0.0;
+    int turns = 0, count = 0;
+    if (degree == 0)
+        return 0;
+    for (int k = 1; k <= degree; k++)
+        slope[k - 1] = k * c[k];
+    turns = sign_changes(slope, degree - 1, turn);
+    turn[turns] = 1.0;
+    for (int k = 0; k <= turns; left = turn[k++]) {
+        const double before = polynomial(c, degree, left);
+        if (!(before * polynomial(c, degree, turn[k]) < 0.0))
+            continue;
+        double low = left, high = turn[k];
+        while (high - low > TIME_RESOLUTION) {
+            const double middle = 0.5 * (low + high);
+            if (polynomial(c, degree, middle) * before > 0.0)
+                low = middle;
+            else
+                high = middle;
+        }
+        root[count++] = high;
+    }
+    return count;
+}
+
+/* First time at which a joint is past a limit, HUGE_VAL where it never is. */
+static double first_crossing(Step *step, int joint)
+{
+    const double *c = step->Q[joint];
+    const double slope[4] = {c[0], 2.0 * c[1], 3.0 * c[2], 4.0 * c[3]};
+    double turn[4], before = 0.0, at_before = limit_margin(step, 0.0, joint);
+    const int turns = sign_changes(slope, 3, turn);
+    for (int k = 0; k <= turns; k++) {
+        const double after = k < turns ? turn[k] * step->size : step->size;
+        const double at_after = limit_margin(step, after, joint);
+        if (at_after < 0.0)
+            return locate(step, limit_margin, joint, before, at_before, after, at_after);
+        before = after;
+        at_before = at_after;
+    }
+    return HUGE_VAL;
+}
+
+/* Whether a force that presses a joint may vanish within the step. */
+static int may_vanish(const Step *step, int joint)
+{
+    double low = HUGE_VAL, high = -HUGE_VAL;
+    for (int stage = 0; stage <= STAGES; stage++) {
+        low = fmin(low, step->pressed[stage][joint]);
+        high = fmax(high, step->pressed[stage][joint]);
+    }
+    return !(low >= high - low);
+}
+
+/* The polynomial through five equidistant values from 0 to 1. */
+static void fit(const double p[LOOKS + 1], double c[LOOKS + 1])
+{
+    const double first = p[1] - p[0], second = p[2] - 2.0 * p[1] + p[0];
+    const double third = p[3] - 3.0 * p[2] + 3.0 * p[1] - p[0];
+    const double fourth = p[4] - 4.0 * p[3] + 6.0 * p[2] - 4.0 * p[1] + p[0];
+    c[0] = p[0]; /* Newton's form, multiplied out */
+    c[1] = 4.0 * (first - second / 2.0 + third / 3.0 - fourth / 4.0);
+    c[2] = 16.0 * (second / 2.0 - third / 2.0 + fourth * 11.0 / 24.0);
+    c[3] = 64.0 * (third / 6.0 - fourth / 4.0);
+    c[4] = 256.0 * (fourth / 24.0);
+}
+
+/* Where the polynomial through the looks at a force has minima that may be below zero; how many. */
+static int doubtful_minima(const double p[LOOKS + 1], double x[LOOKS])
+{
+    double c[LOOKS + 1], slope[LOOKS], low = p[0], high = p[0];
+    int count = 0;
+    fit(p, c);
+    for (int k = 1; k <= LOOKS; k++) {
+        slope[k - 1] = k * c[k];
+        low = fmin(low, p[k]);
+        high = fmax(high, p[k]);
+    }
+    const int turns = sign_changes(slope, LOOKS - 1, x);
+    for (int k = 0; k < turns; k++)
+        if (polynomial(c, LOOKS, x[k]) < DOUBT * (high - low))
+            x[count++] = x[k];
+    return count;
+}
+
+/* First time before another at which a joint is no longer pressed into its limit, else HUGE_VAL. */
+static double first_release(Step *step, double before)
+{
+    double pressed[LOOKS + 1][N_JOINTS], look[LOOKS * N_JOINTS];
+    int looks = 0, doubt = 0;
+    for (int i = 0; i < N_JOINTS; i++)
+        doubt |= step->stops.watched[i] && may_vanish(step, i);
+    if (!doubt)
+        return HUGE_VAL;
+    memcpy(pressed[0], step->pressed[0], sizeof *pressed);
+    memcpy(pressed[LOOKS], step->pressed[STAGES], sizeof *pressed);
+    for (int k = 1; k < LOOKS; k++)
+        press(step, step->size * k / LOOKS, pressed[k]);
+    for (int i = 0; i < N_JOINTS; i++) {
+        double p[LOOKS + 1];
+        for (int k = 0; k <= LOOKS; k++)
+            p[k] = pressed[k][i];
+        if (step->stops.watched[i] && may_vanish(step, i))
+            looks += doubtful_minima(p, look + looks);
+    }
+    for (int k = 1; k <= LOOKS && step->size * (k - 1) / LOOKS < before; k++) {
+        const double a = step->size * (k - 1) / LOOKS, at_a = least_pressed(step, pressed[k - 1]);
+        double b = step->size * k / LOOKS, at_b = least_pressed(step, pressed[k]);
+        for (int j = 0; j < looks; j++) {
+            const double passed = look[j] * step->size;
+            const double at_look = a < passed && passed < b ? release_margin(step, passed, 0) : 0.0;
+            if (at_look < 0.0) {
+                b = passed;
+                at_b = at_look;
+            }
+        }
+        if (at_b < 0.0)
+            return locate(step, release_margin, 0, a, at_a, b, at_b);
+    }
+    return HUGE_VAL;
+}
+
+/* Joints that may be past a limit within the step. Returns a bound on the change of singular values. */
+static double sweep(const Step *step, int near[N_JOINTS])
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    double fastest[N_JOINTS] = {0}, change = 0.0;
+    for (int stage = 0; stage <= STAGES; stage++)
+        for (int i = 0; i < N_JOINTS; i++) { /* quicker than fmax, which minds NaN */
+            const double speed = fabs(step->K[stage][i]);
+            fastest[i] = speed > fastest[i] ? speed : fastest[i];
+        }
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double q = step->y[i], reach = REACH * step->size * fastest[i];
+        near[i] = !step->stops.held[i] && !(q - reach > low[i] && q + reach < high[i]);
+        change += SWING[i] * reach;
+    }
+    return change;
+}
+
+/* What the event at a time within the step is, where the state is y. */
+static void name_event(Step *step, double passed, const double y[N_STATES], int rank_held,
+                       Event *event)
+{
+    double a[N_JOINTS], pressed[N_JOINTS] = {0};
+    if (step->stops.any_watched)
+        evaluate(step, y, a, pressed, NULL);
+    for (int i = 0; i < N_JOINTS; i++) {
+        event->stopped[i] = !step->stops.held[i] && limit_margin(step, passed, i) < 0.0;
+        event->released[i] = step->stops.watched[i] && pressed[i] < 0.0;
+    }
+    event->rank_changed = singular_margin(step, passed, rank_held) < 0.0;
+}
+
+double first_event(Step *step, int rank_held, Event *event)
+{
+    const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
+    int near[N_JOINTS];
+    const double change = sweep(step, near);
+    const int near_rank = !(fmax(step->margin, step->margin_new) > change);
+    int any = near_rank;
+    for (int i = 0; i < N_JOINTS; i++)
+        any |= near[i] || (step->stops.watched[i] && may_vanish(step, i));
+    if (!any)
+        return 0.0;
+    interpolate(step);
+    double first = HUGE_VAL;
+    for (int i = 0; i < N_JOINTS; i++)
+        if (near[i])
+            first = fmin(first, first_crossing(step, i));
+    first = fmin(first, first_release(step, first));
+    if (near_rank)
+        first = fmin(first, search(step, singular_margin, rank_held,
+                                   PACE / REACH * change / step->size, 0.0,
+                                   singular_margin(step, 0.0, rank_held), step->size,
+                                   singular_margin(step, step->size, rank_held), HALVINGS));
+    if (first == HUGE_VAL)
+        return 0.0;
+    double reached[N_STATES];
+    interpolated(step, first, reached);
+    name_event(step, first, reached, rank_held, event);
+    memcpy(step->y_new, reached, sizeof reached);
+    for (int i = 0; i < N_JOINTS; i++)
+        if (event->stopped[i])
+            step->y_new[i] = fmin(fmax(reached[i], low[i]), high[i]);
+    return first;
+}

@@ -1,0 +1,292 @@
+"""Steps across singularities and stops: right or refused, with what SciPy says as the truth.
+
+The oracle integrates the equations of motion, written here with Pinocchio and NumPy, from one event
+to the next: SciPy's ``solve_ivp`` at a tight tolerance, with the joints at limits and the number of
+singular values that J⁺ takes fixed in between.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from native_models import Engine, damped_arm, engine, model, shipped
+from scipy.integrate import solve_ivp
+
+from twodof.plant import integrator
+from twodof.plant.plant import Plant
+
+STEP = 0.01
+EDGE = 1e-13  # beyond an event, so that the next piece begins on its other side
+
+
+class Regime(NamedTuple):
+    held: frozenset[int]
+    rank: int
+
+
+class Oracle:
+    """The motion of a plant under the tutorial's clamp, event by event."""
+
+    def __init__(self, plant: Plant, method: str = "DOP853", max_step: float = 1e-3) -> None:
+        self.plant, self.method, self.max_step = plant, method, max_step
+        self.rcond = plant.rcond if plant.control == "task" else 0.0
+        self.model = plant.robot.model.copy()
+        self.model.gravity.linear = np.array(plant.gravity)
+        self.data = self.model.createData()
+        self.axes = ["xyz".index(axis) for axis in plant.robot.axes]
+        self.n = len(plant.q)
+        self.low, self.high = np.array(plant.q_min), np.array(plant.q_max)
+        self.damping = np.array(plant.robot.damping)
+
+    def jacobian(self, q: np.ndarray) -> np.ndarray:
+        frame = self.plant.robot.frame_id
+        pin.forwardKinematics(self.model, self.data, q)
+        world = pin.LOCAL_WORLD_ALIGNED
+        return pin.computeFrameJacobian(self.model, self.data, q, frame, world)[self.axes]
+
+    def ratios(self, q: np.ndarray) -> np.ndarray:
+        if self.plant.control != "task":
+            return np.zeros(0)
+        sigma = np.linalg.svd(self.jacobian(q), compute_uv=False)
+        return sigma / sigma[0]
+
+    def rank(self, q: np.ndarray) -> int:
+        return int((self.ratios(q) > self.rcond).sum())
+
+    def free_acceleration(self, q: np.ndarray, v: np.ndarray, rank: int) -> np.ndarray:
+        """q̈ without stops."""
+        M = pin.crba(self.model, self.data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        if self.plant.control == "effort":
+            h = pin.nonLinearEffects(self.model, self.data, q, v)
+            return np.linalg.solve(M, np.array(self.plant.tau_cmd) - self.damping * v - h)
+        plant, frame = self.plant, self.plant.robot.frame_id
+        pin.forwardKinematics(self.model, self.data, q, v, np.zeros(self.n))
+        drift = pin.getFrameClassicalAcceleration(
+            self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED
+        ).linear[self.axes]
+        J = self.jacobian(q)
+        x = self.data.oMf[frame].translation[self.axes]
+        wanted = np.array(plant.Kp) * (plant.x_des - x) - np.array(plant.Kd) * (J @ v) - drift
+        U, sigma, Vt = np.linalg.svd(J)
+        command = Vt[:rank].T @ ((U[:, :rank].T @ wanted) / sigma[:rank])
+        return command - np.linalg.solve(M, self.damping * v)
+
+    def after(self, seconds: float) -> np.ndarray:
+        """(q, v) after some time."""
+        y, t = np.array([*self.plant.q, *self.plant.v]), 0.0
+        regime = self.regime(y, self.rank(y[: self.n]))
+        for _ in range(400):
+            events = self.events(regime)
+            solved = solve_ivp(
+                lambda _, y, regime=regime: self.rates(y, regime), (t, seconds), y, self.method,
+                rtol=1e-10, atol=1e-13, max_step=self.max_step, events=list(events.values()),
+            )  # fmt: skip
+            t, y = solved.t[-1], solved.y[:, -1].copy()
+            if t >= seconds:
+                return y
+            happened = [name for name, times in zip(events, solved.t_events) if times.size]
+            rank = regime.rank
+            for kind, i in happened:
+                if kind == "limit":
+                    y[i], y[self.n + i] = np.clip(y[i], self.low[i], self.high[i]), 0.0
+                elif kind == "rank":
+                    rank += i
+            regime = self.regime(y, rank, released={i for kind, i in happened if kind == "free"})
+        raise AssertionError("the oracle meets too many events")
+
+    def regime(self, y: np.ndarray, rank: int, released: frozenset | set = frozenset()) -> Regime:
+        q, v = y[: self.n], y[self.n :]
+        a = self.free_acceleration(q, v, rank)
+        held = set()
+        for i in range(self.n):
+            out = 1.0 if q[i] >= self.high[i] else -1.0
+            if self.low[i] < q[i] < self.high[i] or i in released:
+                continue
+            if out * v[i] > 0.0:
+                v[i] = 0.0  # y changes with it
+            if v[i] == 0.0 and out * a[i] >= 0.0:
+                held.add(i)
+        return Regime(frozenset(held), rank)
+
+    def rates(self, y: np.ndarray, regime: Regime) -> np.ndarray:
+        a = self.free_acceleration(y[: self.n], y[self.n :], regime.rank)
+        a[list(regime.held)] = 0.0
+        return np.concatenate([y[self.n :], a])
+
+    def events(self, regime: Regime) -> dict[tuple[str, int], Any]:
+        n, found = self.n, {}  # type: int, dict[tuple[str, int], Any]
+        for i in range(n):
+            if i in regime.held:
+                found["free", i] = lambda _, y, i=i: self.press(y, i, regime)
+            else:
+                found["limit", i] = lambda _, y, i=i: (
+                    EDGE + min(self.high[i] - y[i], y[i] - self.low[i])
+                )
+        if self.plant.control == "task":
+            rcond, rank = self.rcond, regime.rank
+            if rank:
+                found["rank", -1] = lambda _, y: self.ratios(y[:n])[rank - 1] - rcond + EDGE
+            if rank < len(self.axes):
+                found["rank", 1] = lambda _, y: rcond - self.ratios(y[:n])[rank] + EDGE
+        for event in found.values():
+            event.terminal, event.direction = True, -1
+        return found
+
+    def press(self, y: np.ndarray, i: int, regime: Regime) -> float:
+        a = self.free_acceleration(y[: self.n], y[self.n :], regime.rank)
+        return (a[i] if y[i] >= self.high[i] else -a[i]) + EDGE
+
+
+def both(of: Engine, plant: Plant, steps: int, h: float) -> np.ndarray:
+    """(q, v) of both flavours after some communication steps."""
+    values = of.values(plant)
+    for _ in range(steps):
+        assert of.call("advance", values, h) == 1
+        plant.step(h)
+    return np.array([[*of.group(values, "q"), *of.group(values, "v")], [*plant.q, *plant.v]])
+
+
+CASES: dict[str, Any] = {
+    # damping, changes, communication step, steps, implicit, error
+    "across the fold": (
+        0.0,
+        {"x_des": [-0.49722099942765074, -0.31582739208468036],
+         "Kp": [200.0] * 2, "Kd": [28.0] * 2},
+        0.01, 15, False, 1e-5,
+    ),
+    "damping 10000": (
+        10000.0,
+        {"q_start": [-1.648928452962053, 1.1692017583875287],
+         "v_start": [-0.7871927421571577, 0.5802844167243075],
+         "x_des": [0.10636684709554894, 0.16612958404470635]},
+        0.01, 1, True, 1e-9,
+    ),
+    "damping 300, long steps": (
+        300.0,
+        {"q_start": [0.5478467488258172, -0.8935307702805146],
+         "x_des": [0.16510223091108872, 0.042654310306871945], "max_step": 0.1},
+        0.1, 1, True, 1e-9,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_joint_is_thrown_where_the_pseudo_inverse_jumps(case):
+    damping, changes, h, steps, implicit, error = CASES[case]
+    of = damped_arm(damping)
+    plant = shipped(of, **changes)
+    n = len(plant.q)
+    expected = Oracle(plant, "Radau" if implicit else "DOP853").after(steps * h)[:n]
+    found = both(of, plant, steps, h)[:, :n]
+    np.testing.assert_allclose(found, [expected] * 2, atol=error)
+
+
+GAINS = [(50.0, 40.0), (50.0, 10.0), (200.0, 20.0), (1000.0, 60.0), (1.0, 1.0), (5000.0, 200.0)]
+"""Kd ≥ √Kp."""
+
+
+def at_the_singularity(rng: np.random.Generator) -> dict[str, list[float]]:
+    """A stretched or folded arm, some turns of joint 2 away from the jump of J⁺ or on it."""
+    Kp, Kd = GAINS[rng.integers(len(GAINS))]
+    q = [rng.uniform(-3.0, 3.0), rng.choice([0.0, 0.0, 3.1]) + rng.uniform(-0.1, 0.1)]
+    return {
+        "q_start": np.clip(q, -np.pi, np.pi).tolist(),
+        "v_start": rng.uniform(-8.0, 8.0, 2).tolist(),
+        "x_des": rng.uniform(-0.5, 0.5, 2).tolist(),
+        "Kp": [Kp] * 2,
+        "Kd": [Kd] * 2,
+    }
+
+
+@pytest.mark.long
+def test_short_steps_at_the_singularity_are_those_of_the_oracle(length):
+    """A millisecond each: over more of it the motion forgets where it came from."""
+    rng, of, crossed = np.random.default_rng(5), engine("twodof"), 0
+    for _ in range(length(600, 40)):
+        plant = shipped(of, **at_the_singularity(rng), rtol=1e-9, atol=1e-12)
+        oracle, n = Oracle(plant, max_step=1e-5), len(plant.q)
+        values, before = of.values(plant), oracle.rank(np.array(plant.q))
+        expected = oracle.after(1e-3)
+        assert of.call("advance", values, 1e-3) == 1
+        found = np.array([*of.group(values, "q"), *of.group(values, "v")])
+        crossed += oracle.rank(expected[:n]) != before
+        scale = max(1.0, np.abs(expected[n:]).max())
+        np.testing.assert_allclose(found, expected, atol=1e-6 * scale, err_msg=repr(vars(plant)))
+    assert crossed >= length(60, 4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("gains", GAINS)
+def test_no_step_to_any_target_is_refused(gains, length):
+    rng, of = np.random.default_rng(6), engine("twodof")
+    plant = shipped(of, Kp=[gains[0]] * 2, Kd=[gains[1]] * 2)
+    start, target = of.values(plant), [of.model.reference(f"x_des[{k}]") for k in (1, 2)]
+    for _ in range(length(600, 30)):
+        values = start.copy()
+        values[target] = rng.uniform(-0.5, 0.5, 2)
+        for _ in range(300):
+            assert of.call("advance", values, STEP) == 1
+            assert (np.abs(of.group(values, "q")) <= np.pi).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("max_step", [0.001, 0.01, 0.05])
+def test_falls_between_narrow_stops_miss_none(max_step, length):
+    """The bare arm, whose joints are stopped and released at both ends, also within one step."""
+    rng, of = np.random.default_rng(7), engine("twodof", "effort")
+    stopped = 0
+    for _ in range(length(300, 20)):
+        width = np.exp(rng.uniform(np.log(0.003), np.log(0.6), 2))
+        middle = rng.uniform(-1.0, 1.0, 2)
+        plant = shipped(
+            of, q_min=(middle - width).tolist(), q_max=(middle + width).tolist(),
+            q_start=(middle + width * rng.uniform(-1.0, 1.0, 2)).tolist(),
+            v_start=rng.uniform(-3.0, 3.0, 2).tolist(), rigid_stops=False,
+            rtol=1e-8, atol=1e-11, max_step=max_step,
+        )  # fmt: skip
+        oracle, values = Oracle(plant), of.values(plant)
+        for _ in range(8):
+            assert of.call("advance", values, 0.05) == 1
+        expected = oracle.after(0.4)
+        found = np.array([*of.group(values, "q"), *of.group(values, "v")])
+        stopped += (expected[2:] == 0.0).any()
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert stopped >= length(100, 8)
+
+
+@pytest.mark.parametrize("max_step", [0.001, 0.01, 0.05])
+def test_a_limit_that_is_touched_between_two_ends_of_a_step_stops_the_joint(max_step):
+    """Joint 1 would be past its limit early in the step and back, joint 2 at the end of it."""
+    rng, of = np.random.default_rng(8), engine("twodof", "effort")
+    for _ in range(8):
+        start = {"q_start": rng.uniform(-1.0, 1.0, 2).tolist()}
+        a = Oracle(shipped(of, **start)).free_acceleration(
+            np.array(start["q_start"]), np.zeros(2), 0
+        )
+        start["v_start"] = [-a[0] * max_step * rng.uniform(0.1, 0.4), 0.02 / max_step]
+        q = [Oracle(shipped(of, **start)).after(part * max_step)[:2] for part in np.arange(20) / 20]
+        first, second = np.transpose(q)
+        low, high = [-3.0, -3.0], [3.0, second[19]]
+        turn = (first.max if a[0] < 0.0 else first.min)()
+        (low if a[0] > 0.0 else high)[0] = first[0] + rng.uniform(0.1, 0.9) * (turn - first[0])
+        plant = shipped(of, **start, q_min=low, q_max=high, rigid_stops=False, max_step=max_step)
+        expected = Oracle(plant, max_step=max_step / 50).after(max_step)
+        np.testing.assert_allclose(
+            both(of, plant, 1, max_step), [expected] * 2, atol=1e-4, rtol=1e-4
+        )
+
+
+@pytest.mark.parametrize("name", ["tiago", "tiago_dual"])
+def test_many_joints_at_stops_need_few_evaluations(name, monkeypatch):
+    """Bare robots with hands, which fall onto rigid stops; 60 evaluations are the least a step."""
+    monkeypatch.setattr(integrator, "BUDGET", 3000)
+    plant = model(f"tiago_description/robots/{name}.urdf", "effort").plant()
+    limits = list(zip(plant.q_min, plant.q_max))
+    plant.q_start = [0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in limits]
+    plant.initialise()
+    for _ in range(30):
+        plant.step(STEP)

@@ -1,0 +1,230 @@
+"""Find the first event within an integration step, on its dense output.
+
+An event is where a margin becomes negative: the distance of a joint to a limit, the force that
+presses a joint at rest into its limit, or the margin of the rank of J⁺. Positions are polynomials,
+whose turning points are known; the other margins are looked at as often as their rates of change
+ask for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+
+Margin = Callable[[float], float]
+"""A value at a time within the step that is negative once the regime of the step has ended."""
+
+REACH, PACE = 1.66, 3.72
+"""Bounds on Dormand and Prince's interpolant, which weighs the derivatives of the stages: the
+largest sum of the weights' magnitudes, and that of their rates."""
+LOOKS, DOUBT = 4, 0.25
+"""A force that presses a joint falls below what the stages show of it by less than its range there.
+It is looked at this often in a step where that may be below zero, and again at a minimum of the
+polynomial through these looks that is lower than so much of their range."""
+HALVINGS = 7
+"""Halvings of a step in the search; a shorter excursion is none."""
+TIME_RESOLUTION = 2.0**-52
+THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
+
+
+@dataclass
+class Event:
+    """Event at the end of a step.
+
+    Attributes:
+        stopped: joints that reached a limit.
+        released: joints that are no longer pressed into theirs.
+    """
+
+    stopped: list[int] = field(default_factory=list)
+    released: list[int] = field(default_factory=list)
+
+
+def search(
+    margin: Margin, rate: float, a: float, at_a: float, b: float, at_b: float, step: float,
+    halvings: int = HALVINGS,
+) -> float:  # fmt: skip
+    """First time in (a, b] at which a margin is negative, infinity where it is not.
+
+    Args:
+        margin: the margin.
+        rate: its largest rate of change; with the values at the ends it says where the margin need
+            not be looked at.
+        a, b: times within the step, s.
+        at_a, at_b: the margin there.
+        step: size of the step, s.
+        halvings: how often the interval may be halved.
+    """
+    if at_b >= 0.0 and (halvings == 0 or at_a + at_b >= rate * (b - a)):
+        return inf
+    if halvings == 0:
+        return locate(margin, a, at_a, b, at_b, step)
+    middle = 0.5 * (a + b)
+    at_middle = margin(middle)
+    first = search(margin, rate, a, at_a, middle, at_middle, step, halvings - 1)
+    if first == inf:
+        first = search(margin, rate, middle, at_middle, b, at_b, step, halvings - 1)
+    return first
+
+
+def locate(
+    margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float
+) -> float:  # fmt: skip
+    """First time in (a, b] at which a margin is negative, as it is at b, to the last bits.
+
+    The interpolation is kept near the middle, so that it never needs many more looks than
+    bisection. Source: Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS
+    47(1), 2020.
+
+    Args:
+        margin: the margin.
+        a, b: times within the step, s.
+        at_a, at_b: the margin there.
+        step: size of the step, s.
+    """
+    resolution, k = TIME_RESOLUTION * step, 0.2 / (b - a)
+    slack = b - a  # of the interval, beyond what bisection would have left of it
+    while b - a > resolution:
+        middle, half = 0.5 * (a + b), 0.5 * (b - a)
+        x = (b * at_a - a * at_b) / (at_a - at_b) if at_a > at_b else middle
+        shift = min(k * (b - a) * (b - a), abs(middle - x))
+        x += shift if middle > x else -shift
+        if abs(x - middle) > slack - half:
+            x = middle + (slack - half if x > middle else half - slack)
+        if not a < x < b:
+            x = middle
+        if not a < x < b:  # two neighbouring numbers
+            break
+        at_x = margin(x)
+        if at_x < 0.0:
+            b, at_b = x, at_x
+        else:
+            a, at_a = x, at_x
+        slack = max(0.5 * slack, resolution)
+    return b
+
+
+def first_crossing(
+    state: Callable[[float], Sequence[float]],
+    joint: int,
+    limits: tuple[float, float],
+    slope: Sequence[float],
+    step: float,
+) -> float:
+    """First time at which a joint is past a limit, infinity where it never is.
+
+    Args:
+        state: the state (q, v) at a time within the step.
+        joint: index of the joint.
+        limits: of its position.
+        slope: coefficients of the velocity as a polynomial of time over the step, ascending.
+        step: size of the step, s.
+    """
+    low, high = limits
+
+    def distance(passed: float) -> float:
+        q = state(passed)[joint]
+        return min(high - q, q - low)
+
+    before, at_before = 0.0, distance(0.0)
+    for turn in (*sign_changes(slope), 1.0):
+        after = turn * step
+        at_after = distance(after)
+        if at_after < 0.0:
+            return locate(distance, before, at_before, after, at_after, step)
+        before, at_before = after, at_after
+    return inf
+
+
+def sign_changes(coefficients: Sequence[float]) -> list[float]:
+    """Return the points in (0, 1) at which a polynomial changes its sign, in ascending order.
+
+    Between the turning points, at which its derivative does so, it is monotonic.
+
+    Args:
+        coefficients: in ascending order.
+    """
+    if len(coefficients) == 1:
+        return []
+
+    roots, left = [], 0.0
+    slope = [k * coefficient for k, coefficient in enumerate(coefficients)][1:]
+    for right in (*sign_changes(slope), 1.0):
+        before = _polynomial(coefficients, left)
+        if before * _polynomial(coefficients, right) < 0.0:
+            low, high = left, right
+            while high - low > TIME_RESOLUTION:
+                middle = 0.5 * (low + high)
+                if _polynomial(coefficients, middle) * before > 0.0:
+                    low = middle
+                else:
+                    high = middle
+            roots.append(high)
+        left = right
+    return roots
+
+
+def _polynomial(coefficients: Sequence[float], x: float) -> float:
+    total = 0.0
+    for coefficient in reversed(coefficients):
+        total = total * x + coefficient
+    return total
+
+
+def may_vanish(forces: Sequence[float]) -> bool:
+    """Tell whether a force on a joint may vanish in a step, by its values at the stages."""
+    low, high = min(forces), max(forces)
+    return not low >= high - low
+
+
+def first_release(
+    press: Callable[[float], Sequence[float]],
+    at_ends: tuple[Sequence[float], Sequence[float]],
+    doubtful: Sequence[int],
+    watched: Sequence[int],
+    step: float,
+    before: float,
+) -> float:
+    """First time before another at which a joint is no longer pressed into its limit, else inf.
+
+    Args:
+        press: how all joints are pressed at a time within the step.
+        at_ends: the same at the start and the end of the step.
+        doubtful: joints that may leave their limits.
+        watched: joints that leave their limits when they are no longer pressed.
+        step: size of the step, s.
+        before: a time within the step, s.
+    """
+
+    def least(forces: Sequence[float]) -> float:
+        return min(forces[i] for i in watched)
+
+    def margin(passed: float) -> float:
+        return least(press(passed))
+
+    inner = [press(step * k / LOOKS) for k in range(1, LOOKS)]
+    pressed = [at_ends[0], *inner, at_ends[1]]
+    looks = [x * step for i in doubtful for x in _doubtful_minima([p[i] for p in pressed])]
+    for k in range(1, LOOKS + 1):
+        a, b = step * (k - 1) / LOOKS, step * k / LOOKS
+        if a >= before:
+            break
+        at_a, at_b = least(pressed[k - 1]), least(pressed[k])
+        for look in looks:
+            at_look = margin(look) if a < look < b else 0.0
+            if at_look < 0.0:
+                b, at_b = look, at_look
+        if at_b < 0.0:
+            return locate(margin, a, at_a, b, at_b, step)
+    return inf
+
+
+def _doubtful_minima(forces: Sequence[float]) -> list[float]:
+    """Return the extrema, perhaps below zero, of the polynomial through the looks at a force."""
+    c = THROUGH_LOOKS.dot(forces).tolist()
+    slope = [k * coefficient for k, coefficient in enumerate(c)][1:]
+    bound = DOUBT * (max(forces) - min(forces))
+    return [x for x in sign_changes(slope) if _polynomial(c, x) < bound]
