@@ -3,8 +3,8 @@
     ẏ = A y + B u,    z = C y + D u,    y = (q, v)
 
 A, B, C and D are the FMU's own directional derivatives, exact to rounding; deviations of states y,
-inputs u and outputs z from the operating point. An eigenvalue λ of A has the frequency |λ| and the
-damping ratio −Re λ/|λ|.
+inputs u and outputs z from the operating point. An eigenvalue λ ≠ 0 of A has the frequency |λ| and
+the damping ratio −Re λ/|λ|.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .errors import InputError, SimulationError
 from .fmu import Fmu, Instance, instantiate, load_fmu
 from .simulation.experiments import Setting, Value, resolve
+from .simulation.peaks import limits_of
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ NEAR_JUMP = 1e-6
 
 
 class Mode(NamedTuple):
-    """An eigenvalue, 1/s, with its damping ratio and frequency, rad/s."""
+    """An eigenvalue, 1/s, with its damping ratio, NaN for 0, and frequency, rad/s."""
 
     eigenvalue: complex
     damping: float
@@ -67,9 +68,18 @@ class LinearModel(NamedTuple):
 
     @property
     def modes(self) -> list[Mode]:
-        """Eigenvalues of A, the slowest first."""
-        values = sorted(np.linalg.eigvals(self.A).tolist(), key=lambda z: (abs(z), -z.imag))
-        return [Mode(complex(z), -z.real / abs(z) if z else 1.0, abs(z)) for z in values]
+        """Eigenvalues of A, the slowest first; parts that rounding does not tell from 0 are 0."""
+        values = sorted(_eigenvalues(self.A), key=lambda z: (abs(z), -z.imag))
+        return [Mode(z, -z.real / abs(z) if z else np.nan, abs(z)) for z in values]
+
+
+def _eigenvalues(A: Array) -> list[complex]:
+    """Eigenvalues, their parts 0 within n ε ‖A‖ κ; κ is the condition of each, from its vectors."""
+    values, vectors = np.linalg.eig(A)
+    condition = np.linalg.norm(np.linalg.pinv(vectors), axis=1)
+    error = len(A) * np.finfo(float).eps * np.linalg.norm(A) * condition
+    parts = [np.where(np.abs(part) > error, part, 0.0) for part in (values.real, values.imag)]
+    return [complex(*pair) for pair in np.transpose(parts).tolist()]
 
 
 def linearise(
@@ -98,6 +108,10 @@ def linearise(
         raise InputError(
             f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`"
         )
+    groups = ("der(q[{}])", "der(v[{}])", "q_start[{}]", "v_start[{}]", "q_min[{}]", "q_max[{}]")
+    for name in (g.format(i + 1) for i in range(len(fmu.vector("q"))) for g in groups):
+        if name not in fmu.variables:
+            raise InputError(f"'{fmu.path}' has no variable '{name}', which its linear model needs")
     given = dict(at or {})
     fixed = bool({name.partition("[")[0] for name in given} & {"q", "v"})
     starts = {"v_start": 0.0} if fixed else {}
@@ -186,6 +200,13 @@ class _Point:
         moving = self._read(rates)
         if np.abs(moving).max() > AT_REST * max(1.0, np.abs(whole[:n, :n]).max()):
             remarks.append(f"no equilibrium: the rates are up to {np.abs(moving).max():.3g}")
+        else:
+            growing = [z.real for z in _eigenvalues(whole[:n, :n]) if z.real > 0.0]
+            if growing:
+                remarks.append(
+                    f"an unstable equilibrium: {len(growing)} of {n} eigenvalues grow, the fastest"
+                    f" by {max(growing):.6g} 1/s"
+                )
         variables = self._fmu.variables
         return LinearModel(
             *(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:]),
@@ -197,7 +218,7 @@ class _Point:
         )
 
     def _remarks(self) -> list[str]:
-        """What is said of a singular pose. Raises where there is no linear model."""
+        """Notes on a singular pose and saturated joints. Raises where there is no linear model."""
         limits = [self._read(self._fmu.vector(name)) for name in ("q", "q_min", "q_max")]
         for joint, q, low, high in zip(self._fmu.joints, *limits):
             if q in (low, high):
@@ -205,9 +226,11 @@ class _Point:
                     f"joint '{joint}' is at its limit {q:g}, where the model is not linear: move"
                     " it off, or widen q_min and q_max"
                 )
-        if "rcond" not in self._fmu.variables:
-            return []
-        jacobian = self._instance.derivatives(self._fmu.vector("x"), self._q)
+        remarks = self._saturated()
+        rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # all that J⁺ is of
+        if "rcond" not in self._fmu.variables or not rows:
+            return remarks
+        jacobian = self._instance.derivatives(rows, self._v)
         sigma, (rcond,) = np.linalg.svd(jacobian)[1], self._read(["rcond"])
         ratio = sigma / sigma[0] if sigma[0] else 0.0 * sigma
         if np.abs(ratio[1:] - rcond).min(initial=1.0) < NEAR_JUMP:
@@ -215,8 +238,31 @@ class _Point:
                 f"J⁺ jumps here: σ_min/σ_max = {ratio[-1]:.6g} is rcond; choose another q or rcond"
             )
         if ratio[-1] <= rcond:
-            return [
+            remarks.append(
                 f"a singular pose: σ_min/σ_max = {ratio[-1]:.3g} is below rcond = {rcond:g}, so"
                 " that a direction of the frame is not controlled"
-            ]
-        return []
+            )
+        return remarks
+
+    def _saturated(self) -> list[str]:
+        """Notes on joints whose effort is limited. Raises where one is just at its limit."""
+        if not {**self._fmu.start_values, **self._values}.get("limit_effort"):
+            return []
+        self._instance.reset()
+        self._instance.initialise(0.0, np.inf, {**self._values, "limit_effort": False})
+        efforts = self._read(self._fmu.vector("tau"))
+        self._instance.reset()
+        self._instance.initialise(0.0, np.inf, self._values)
+        remarks = []
+        for joint, tau, limit in zip(self._fmu.joints, efforts, limits_of(self._fmu).effort):
+            if abs(abs(tau) - limit) <= NEAR_JUMP * limit < np.inf:
+                raise SimulationError(
+                    f"joint '{joint}' is at its effort limit {limit:g}, where the model is not"
+                    " linear: choose another point, or limit_effort=false"
+                )
+            if abs(tau) > limit:
+                remarks.append(
+                    f"joint '{joint}' is saturated: its effort stays at {limit:g}, the controller"
+                    f" asks for {tau:.4g}"
+                )
+        return remarks

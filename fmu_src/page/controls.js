@@ -193,9 +193,9 @@ class Readout {
     cell.textContent = text;
   }
 
-  /** Sample k, the joints that are at a limit, and places by their names, m. */
-  /** @type {(k: number, stopped: JointFacts[], places: Record<string, number[]>) => void} */
-  show(k, stopped, places) {
+  /** Sample k, the joints that are at a limit, places by their names, m, and the orientation's error, rad. */
+  /** @type {(k: number, stopped: JointFacts[], places: Record<string, number[]>, turn: number) => void} */
+  show(k, stopped, places, turn) {
     const { session } = this, { joints } = session.facts;
     joints.forEach((joint, i) => {
       ["q", "v", "tau"].forEach((group, c) => (this.cells[i][c].textContent = digits(session.value(group, k, i))));
@@ -203,7 +203,10 @@ class Readout {
     });
     for (const [name, place] of Object.entries(places)) this.tell(name, `(${place.map(digits).join(", ")}) m`);
     const error = session.error(k), unit = session.groups.has("x_des") ? "m" : unitsOf(joints)[0];
-    if (session.follows) this.tell("error", Number.isNaN(error) ? "\u2013" : `${Number((error < SMALLEST ? 0 : error).toPrecision(4))} ${unit}`);
+    const errors = /** @type {[number, string][]} */ ([[error, unit], [turn, "rad"]]);
+    const texts = errors.filter(([value]) => !Number.isNaN(value))
+      .map(([value, of]) => `${Number((value < SMALLEST ? 0 : value).toPrecision(4))} ${of}`);
+    if (session.follows) this.tell("error", texts.join(", ") || "\u2013");
     for (const [name, text] of session.remarks()) this.tell(name, text);
   }
 }

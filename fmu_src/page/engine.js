@@ -1,9 +1,9 @@
 /**
- * The FMU's engine, compiled to WebAssembly: the functions of page.c, by value reference.
+ * The FMU's engine, compiled to WebAssembly: the functions of page.c.
  *
  * @typedef {Object} Variable one of the FMU's
  * @property {string} name
- * @property {number} reference of an element of a vector its own, in a row
+ * @property {number} place among the FMU's variables; elements of a vector are in a row
  * @property {string} causality
  * @property {string} unit
  * @property {number | boolean | null} start
@@ -22,7 +22,7 @@ class Engine {
     this.calls._initialize();
     this.call("engine_instantiate");
     this.room = 0;
-    this.references = this.values = 0;
+    this.places = this.values = 0;
   }
 
   /** @param {Uint8Array} module */
@@ -43,33 +43,33 @@ class Engine {
     if (this.calls[name](...values) >= ERROR) throw new Error(this.said() || name);
   }
 
-  /** @param {number[]} references */
-  prepare(references) {
-    if (references.length > this.room) {
-      this.room = references.length;
-      this.references = this.calls.engine_allocate(4 * this.room);
+  /** @param {number[]} places */
+  prepare(places) {
+    if (places.length > this.room) {
+      this.room = places.length;
+      this.places = this.calls.engine_allocate(4 * this.room);
       this.values = this.calls.engine_allocate(8 * this.room);
     }
-    new Uint32Array(this.memory.buffer, this.references, references.length).set(references);
+    new Uint32Array(this.memory.buffer, this.places, places.length).set(places);
   }
 
-  /** @type {(references: number[], values: number[]) => void} */
-  setReal(references, values) {
-    this.prepare(references);
+  /** @type {(places: number[], values: number[]) => void} */
+  setReal(places, values) {
+    this.prepare(places);
     new Float64Array(this.memory.buffer, this.values, values.length).set(values);
-    this.call("engine_set_reals", this.references, references.length, this.values);
+    this.call("engine_set_reals", this.places, places.length, this.values);
   }
 
-  /** @type {(reference: number, value: boolean) => void} */
-  setBoolean(reference, value) {
-    this.call("engine_set_boolean", reference, Number(value));
+  /** @type {(place: number, value: boolean) => void} */
+  setBoolean(place, value) {
+    this.call("engine_set_boolean", place, Number(value));
   }
 
-  /** @param {number[]} references */
-  getReal(references) {
-    this.prepare(references);
-    this.call("engine_get_reals", this.references, references.length, this.values);
-    return new Float64Array(this.memory.buffer, this.values, references.length);
+  /** @param {number[]} places */
+  getReal(places) {
+    this.prepare(places);
+    this.call("engine_get_reals", this.places, places.length, this.values);
+    return new Float64Array(this.memory.buffer, this.values, places.length);
   }
 
   /** Back to the beginning, before initialisation. */

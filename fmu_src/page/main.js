@@ -80,6 +80,13 @@ class App {
     return place;
   }
 
+  /** Angle between the end effector's orientation and its target in sample k, rad. */
+  /** @param {number} k */
+  turnError(k) {
+    const { session, robot } = this, place = robot.frame(robot.links(session.at("q", k)));
+    return angleBetween(place, rotation(session.target("quat_des", k)));
+  }
+
   /** Set a variable; a refusal is shown. */
   /** @type {(name: string, value: Value | number[]) => void} */
   tell(name, value) {
@@ -129,6 +136,8 @@ class App {
     }));
     const unit = session.groups.has("x_des") ? "m" : units[0], title = `distance from the target, ${unit}`;
     if (session.follows) panels.push({ title, value: (k) => session.error(k), lines: [0], log: true, limits: limits.v });
+    if (session.groups.has("quat_des"))
+      panels.push({ title: "angle from the target orientation, rad", value: (k) => this.turnError(k), lines: [0], log: true, limits: limits.v });
     return panels.filter(({ lines }) => lines.length);
   }
 
@@ -152,10 +161,9 @@ class App {
       byId("loop").addEventListener("change", () => (session.loops = byId("loop").checked));
     }
     addEventListener("keydown", (event) => {
-      const outside = !document.body.matches(".whole") && !document.activeElement?.closest(".arm");
       const fields = `input${event.key === " " ? ":not([type=range])" : ""}, select, button, summary`;
       const typing = event.target instanceof HTMLElement && event.target.matches(fields);
-      if (outside || typing || event.ctrlKey || event.metaKey || event.altKey) return;
+      if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.key === " ") play();
       else if (event.key === "Home") this.camera.reset();
       else return;
@@ -206,7 +214,7 @@ class App {
     const stopped = robot.atLimit(q, session.values);
     if (this.curves.cursor !== null || this.before - this.drawn > 1000 * PANEL) {
       this.curves.draw([colour("--ink"), colour("--hair")]);
-      this.readout.show(k, stopped, this.places(k));
+      this.readout.show(k, stopped, this.places(k), session.groups.has("quat_des") ? this.turnError(k) : NaN);
       this.controls?.show();
       this.label();
       byId("time").textContent = `${session.time(k).toFixed(3)} s`;

@@ -45,6 +45,13 @@ function rotation(quat) {
   return sine === 0 ? placed([0, 0, 0]) : turn([x / sine, y / sine, z / sine], 2 * Math.atan2(sine, w));
 }
 
+/** Angle of the rotation from one frame to another, rad; the cosine of a small one would not tell it. */
+/** @type {(a: Numbers, b: Numbers) => number} */
+function angleBetween(a, b) {
+  const apart = Math.hypot(...[0, 1, 2, 4, 5, 6, 8, 9, 10].map((i) => a[i] - b[i]));
+  return 2 * Math.asin(Math.min(1, apart / Math.sqrt(8)));
+}
+
 /** The product of two quaternions. */
 /** @type {(a: Numbers, b: Numbers) => number[]} */
 function compose(a, b) {

@@ -9,7 +9,7 @@
 
 #define EXPORT __attribute__((visibility("default")))
 
-typedef unsigned int Reference; /* of a scalar; of a vector's elements in a row */
+typedef unsigned int Reference; /* of a scalar or of a vector, as FMI has it */
 
 static void *instance;
 static char said[1024];
@@ -26,13 +26,13 @@ static void note(fmi3InstanceEnvironment environment, fmi3Status status, fmi3Str
 
 static void *instantiate(void)
 {
-    return fmi3InstantiateCoSimulation("page", MODEL_GUID, "", false, false, false, false, NULL, 0,
+    return fmi3InstantiateCoSimulation("page", MODEL_GUID, "", false, true, false, false, NULL, 0,
                                        NULL, note, NULL);
 }
 
 static int get_vector(Reference first, double value[])
 {
-    return fmi3GetFloat64(instance, &first, 1, value, (size_t)EXTENT[first]);
+    return fmi3GetFloat64(instance, &first, 1, value, (size_t)(PLACE[first + 1] - PLACE[first]));
 }
 
 static int set_reals(const Reference vr[], size_t count, const double value[], size_t n_values)
@@ -128,12 +128,13 @@ EXPORT int engine_step(double t, double h)
 static const int WARNING = 1; /* the worst status that is none of a failure */
 static double given[N_VARIABLES]; /* what variables were set to last, else their start */
 
-/* The reference of the vector that an element is of, or of the scalar. */
-static Reference vector_of(Reference element)
+/* The reference of the variable that is at a place, or of the vector that has an element there. */
+static Reference reference_of(int place)
 {
-    while (EXTENT[element] == 0)
-        element--;
-    return element;
+    Reference vr = 1;
+    while (PLACE[vr + 1] <= place)
+        vr++;
+    return vr;
 }
 
 /* Back to the beginning, before initialisation. */
@@ -166,24 +167,24 @@ EXPORT void *engine_allocate(size_t size)
 }
 
 /* Set Real variables, all or, where one is refused, none. */
-EXPORT int engine_set_reals(const Reference element[], size_t count, const double value[])
+EXPORT int engine_set_reals(const int place[], size_t count, const double value[])
 {
     static Reference vr[N_VARIABLES];
     static double draft[N_VARIABLES], values[N_VARIABLES];
     size_t vectors = 0, n_values = 0;
     memcpy(draft, given, sizeof draft);
     for (size_t i = 0; i < count; i++)
-        draft[element[i]] = value[i];
+        draft[place[i]] = value[i];
     for (size_t i = 0; i < count; i++) {
-        const Reference first = vector_of(element[i]);
+        const Reference own = reference_of(place[i]);
         size_t k = 0;
-        while (k < vectors && vr[k] != first)
+        while (k < vectors && vr[k] != own)
             k++;
         if (k < vectors)
             continue;
-        vr[vectors++] = first;
-        memcpy(&values[n_values], &draft[first], (size_t)EXTENT[first] * sizeof *draft);
-        n_values += (size_t)EXTENT[first];
+        vr[vectors++] = own;
+        for (int element = PLACE[own]; element < PLACE[own + 1]; element++)
+            values[n_values++] = draft[element];
     }
     const int status = set_reals(vr, vectors, values, n_values);
     if (status <= WARNING)
@@ -191,24 +192,24 @@ EXPORT int engine_set_reals(const Reference element[], size_t count, const doubl
     return status;
 }
 
-EXPORT int engine_set_boolean(Reference vr, int value)
+EXPORT int engine_set_boolean(int place, int value)
 {
-    return set_boolean(vr, value);
+    return set_boolean(reference_of(place), value);
 }
 
-EXPORT int engine_get_reals(const Reference element[], size_t count, double value[])
+EXPORT int engine_get_reals(const int place[], size_t count, double value[])
 {
     static double vector[N_VARIABLES];
-    Reference latest = N_VARIABLES;
+    Reference latest = 0;
     for (size_t i = 0; i < count; i++) {
-        const Reference first = vector_of(element[i]);
-        if (first != latest) {
-            const int status = get_vector(first, vector);
+        const Reference own = reference_of(place[i]);
+        if (own != latest) {
+            const int status = get_vector(own, vector);
             if (status > WARNING)
                 return status;
-            latest = first;
+            latest = own;
         }
-        value[i] = vector[element[i] - first];
+        value[i] = vector[place[i] - PLACE[own]];
     }
     return 0;
 }

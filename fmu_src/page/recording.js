@@ -159,7 +159,7 @@ function point(stamp, frame, place, quat) {
 function provenance(session) {
   return JSON.stringify({
     format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
-    command_line: "", input_changes: session.changes,
+    command_line: "a page in the browser", input_changes: session.changes,
   });
 }
 

@@ -22,7 +22,7 @@ const RETRY = 1000; // ms between two looks for a server that was lost
 
 /** A connection to this page's server. */
 function connection() {
-  return new WebSocket(`${location.origin.replace("http", "ws")}/socket`);
+  return new WebSocket(`${location.origin.replace("http", "ws")}/socket${location.search}`);
 }
 
 /** Look for the server until it speaks, and show what it has now: its robot may be another. */

@@ -21,7 +21,7 @@ class Session extends Samples {
     super(facts, false);
     this.engine = engine;
     const names = facts.recorded.flatMap((group) => this.groups.get(group) ?? []);
-    this.references = names.map((name) => this.variable(name).reference);
+    this.places = names.map((name) => this.variable(name).place);
     this.startAgain();
   }
 
@@ -42,10 +42,10 @@ class Session extends Samples {
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
     const reals = pairs.filter(([, value]) => typeof value === "number");
-    const references = reals.map(([name]) => this.variable(name).reference);
-    if (reals.length) this.engine.setReal(references, reals.map(([, value]) => Number(value)));
+    const places = reals.map(([name]) => this.variable(name).place);
+    if (reals.length) this.engine.setReal(places, reals.map(([, value]) => Number(value)));
     for (const [name, value] of pairs)
-      if (typeof value === "boolean") this.engine.setBoolean(this.variable(name).reference, value);
+      if (typeof value === "boolean") this.engine.setBoolean(this.variable(name).place, value);
   }
 
   /** Set an input from the next step on; a parameter begins the run anew. */
@@ -114,6 +114,6 @@ class Session extends Samples {
   }
 
   record() {
-    this.append(this.engine.getReal(this.references));
+    this.append(this.engine.getReal(this.places));
   }
 }

@@ -57,6 +57,12 @@ class Body:
         return Body(self.mass, d + p * self.mass, symmetric(inertia))
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Return a × b, also of expressions, which np.cross refuses in NumPy 2.2."""
+    product: Array = a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
+    return product
+
+
 def symmetric(S: Array) -> Array:
     """S, whose upper triangle is taken to be its lower one."""
     return np.where(np.tri(3, dtype=bool), S, S.T)
@@ -145,10 +151,10 @@ def _frames(
         if chosen:
             R, p = placed[chosen[0]]
             other = R @ axes[chosen[0]]
-            normal = np.cross(axis, other)
+            normal = cross(axis, other)
             square = normal.dot(normal)
             if square > SKEW**2:
-                x, origin = normal, axis * (np.cross(p, other).dot(normal) / square)
+                x, origin = normal, axis * (cross(p, other).dot(normal) / square)
             else:
                 x = p - axis * axis.dot(p)
         frames.append((_rotation_to(axis, x), origin))
@@ -163,7 +169,7 @@ def _rotation_to(z: Array, x: Array) -> Array:
         x -= z * z.dot(x)
         length = np.linalg.norm(x)
     x = x / length
-    return np.column_stack([x, np.cross(z, x), z])
+    return np.column_stack([x, cross(z, x), z])
 
 
 def _without_turn(R: Array) -> tuple[Array, float]:

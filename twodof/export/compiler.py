@@ -61,6 +61,14 @@ DIGEST = hashlib.sha256().digest_size
 """Bytes before the library that is kept."""
 
 
+def standard_headers() -> dict[str, bytes]:
+    """The headers of FMI 2.0 and 3.0 by file name, as FMPy brings them."""
+    fmpy = importlib.util.find_spec("fmpy")
+    assert fmpy is not None and fmpy.origin is not None
+    headers = (Path(fmpy.origin).parent / "c-code").glob("fmi[23]*.h")
+    return {header.name: header.read_bytes() for header in headers}
+
+
 def compile_library(
     sources: Mapping[str, bytes],
     platform: str,
@@ -212,6 +220,8 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
 def _kept(file: Path) -> bytes | None:
     """What is kept in a file, or None: there is none, or it is damaged."""
     try:
+        if not _is_ours(file):
+            return None
         content = file.read_bytes()
         os.utime(file)
     except OSError:
@@ -223,8 +233,9 @@ def _kept(file: Path) -> bytes | None:
 def _keep(file: Path, content: bytes) -> None:
     """Keep it where there is room, and nothing beside it that was not used for long."""
     with suppress(OSError):
-        file.parent.mkdir(exist_ok=True)
+        file.parent.mkdir(mode=0o700, exist_ok=True)
         write_file(file, hashlib.sha256(content).digest() + content)
+        file.chmod(0o600)  # whatever the umask: one that others may write is not taken
         for other in file.parent.iterdir():
             if other.is_file() and other.stat().st_mtime < time.time() - KEPT_FOR:
                 other.unlink()
@@ -255,7 +266,8 @@ def zig_cache() -> Path | None:
     try:
         home = named or os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
         cache = Path(home) if named else Path(home, "zig")
-        cache.mkdir(parents=True, exist_ok=True)
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        cache.mkdir(mode=0o700, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
         if named:
@@ -266,4 +278,14 @@ def zig_cache() -> Path | None:
         LOG.warning("zig compiles the C library each time: it has no folder for its cache, which"
                     " ZIG_GLOBAL_CACHE_DIR names (%s)", error)  # fmt: skip
         return None
+    if not _is_ours(cache):
+        LOG.warning("zig compiles the C library each time: its cache '%s' is another user's, or"
+                    " others write to it; ZIG_GLOBAL_CACHE_DIR names another", cache)  # fmt: skip
+        return None
     return cache
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether no other user but root can have changed a file or folder."""
+    state = path.stat()
+    return state.st_uid == os.geteuid() and not state.st_mode & 0o022

@@ -5,26 +5,22 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import BuildError
 from ..files import data_file
-from ..geometry.shapes import link_shapes
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import read_urdf
 from ..plant.variables import CONTROLS, Variable, variable_table
-from .arm_page import Arm, LivePart, live_part
-from .compiler import PLATFORMS, TARGETS, compiles_for_the_web, host_platform
+from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .meshes import collect_meshes
-from .model_description import DEFAULT_STEP, model_description
-from .model_description3 import model_description3
+from .model_description import model_description
 from .native import engine_variables
 from .options import FmuOptions
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
@@ -37,11 +33,6 @@ ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
 """By version of FMI."""
 
 
-def is_live(options: FmuOptions) -> bool:
-    """Whether the arm is in the documentation, alive."""
-    return options.native and options.live_documentation and compiles_for_the_web()
-
-
 def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     """The flavour, what the GUID is of, and what gives all other files: it compiles.
 
@@ -50,8 +41,6 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     """
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
-    if options.control not in CONTROLS:
-        raise BuildError(f"control '{options.control}' is none of {', '.join(CONTROLS)}")
     path = data_file("urdf", "2dof.urdf") if options.urdf is None else Path(options.urdf)
     mesh_dir = None if options.mesh_dir is None else Path(options.mesh_dir)
     if mesh_dir is not None and not mesh_dir.is_dir():
@@ -71,53 +60,20 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     files.update(flavour.files)
     variables = engine_variables(robot, table, options.control, flavour.fmi)
 
-    def describe(guid: str) -> bytes:
-        description = model_description(options, robot, variables, flavour, guid)
-        return model_description3(description, flavour.arrays) if flavour.fmi == 3 else description
-
-    digest = hashlib.sha256(describe(""))
+    digest = hashlib.sha256(model_description(options, robot, variables, flavour, ""))
     for name in sorted(files):
         digest.update(name.encode() + b"\0" + files[name])
     guid = digest.hexdigest()
-    files["modelDescription.xml"] = describe(guid)
+    description = model_description(options, robot, variables, flavour, guid)
+    files["modelDescription.xml"] = description
     files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
 
     def finish() -> Files:
         """What the GUID is not of: binaries and documentation."""
-        with ThreadPoolExecutor(1) as compiling:  # the page is compiled meanwhile
-            binaries = compiling.submit(flavour.binaries, guid)
-            signed, live = flavour.signed(guid), LivePart("", "")
-            if is_live(options):
-                live = _live_part(options, robot, variables, guid, {**files, **signed})
-            described = documentation(options, robot, table, flavour, guid, urdf, live)
-            return {**signed, **binaries.result(), **described}
+        described = documentation(options, robot, table, flavour, guid, urdf)
+        return {**flavour.signed(guid), **described}
 
     return flavour, files, finish
-
-
-def _live_part(
-    options: FmuOptions, robot: Robot, table: Sequence[Variable], guid: str, files: Files
-) -> LivePart:
-    """The arm of the FMU that has these files."""
-    variables = [
-        {
-            "name": variable.name, "reference": reference, "causality": variable.causality,
-            "unit": variable.unit, "start": variable.start, "description": variable.description,
-        }
-        for reference, variable in enumerate(table)
-        if variable.causality not in ("local", "independent")
-    ]  # fmt: skip
-    folder, urdf = "sources/", files["resources/robot.urdf"].decode()
-    shapes, _ = link_shapes(read_urdf(urdf), lambda name: files.get(f"resources/{name}"))
-    return live_part(
-        Arm(
-            name=options.name, guid=guid, file=f"{options.name}.fmu", robot=robot.name,
-            joints=robot.joints, frame=robot.frame, root=robot.root, axes=robot.axes,
-            control=options.control, variables=variables, step=DEFAULT_STEP, urdf=urdf,
-            shapes=shapes,
-            sources={p[len(folder) :]: c for p, c in files.items() if p.startswith(folder)},
-        )
-    )  # fmt: skip
 
 
 def _flavour(
@@ -164,7 +120,11 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
             "%d joints move '%s': not every position and orientation of it can be reached together",
             sum(robot.moves_frame()), robot.frame,
         )  # fmt: skip
-    starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": _rest(robot)}
+    rest = tuple(
+        0.0 if low <= 0.0 <= high else 0.5 * (low + high)
+        for low, high in zip(robot.q_min, robot.q_max, strict=True)
+    )
+    starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": rest}
     for key in ("gravity", "q_start"):
         given = getattr(options, key)
         if given is not None:
@@ -191,11 +151,3 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         if options.control == "pose":
             starts["quat_des"] = tuple(plant.quat)
     return robot, variable_table(robot, starts, options.control), starts
-
-
-def _rest(robot: Robot) -> tuple[float, ...]:
-    """0 where it is inside the limits, else their middle."""
-    return tuple(
-        0.0 if low <= 0.0 <= high else 0.5 * (low + high)
-        for low, high in zip(robot.q_min, robot.q_max, strict=True)
-    )

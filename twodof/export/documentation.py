@@ -12,7 +12,6 @@ from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from ..version import __version__
-from .arm_page import LivePart
 from .flavours import Files, Flavour
 from .options import FmuOptions
 
@@ -38,24 +37,15 @@ NO_DEPENDENCIES = b"None: the binaries need the C library and its mathematics on
 
 def documentation(
     options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour,
-    guid: str, urdf: str, live: LivePart,
+    guid: str, urdf: str,
 ) -> Files:  # fmt: skip
-    """Files of the folder by their path in the FMU.
-
-    Args:
-        options, robot, table, guid: as of the model description.
-        flavour: says what the FMU can do, what it depends on, and whose code it contains.
-        urdf: text of resources/robot.urdf.
-        live: the arm itself, or nothing.
-    """
+    """Files of the folder by their path in the FMU, which has the URDF's text."""
     frame = html.escape(robot.frame)
     rows = []
     for v in table:
         cells = v.name, v.causality, v.unit, "" if v.start is None else v.start, v.description
         rows.append("".join(["<tr>", *(f"<td>{html.escape(str(c))}</td>" for c in cells), "</tr>"]))
     page = Template(_shipped("documentation.html").decode()).substitute(
-        head=live.head,
-        live=live.body,
         name=options.name,
         robot=html.escape(robot.name),
         frame=frame,
@@ -64,6 +54,7 @@ def documentation(
         law=LAWS[options.control].replace("$frame", frame),
         root=html.escape(robot.root),
         variables="\n".join(rows),
+        fmi=flavour.fmi,
         kinds="co-simulation and Model Exchange" if flavour.native else "co-simulation",
         limitations="" if flavour.native else _shipped("limitations.html").decode(),
         version=__version__,

@@ -11,20 +11,21 @@ import sysconfig
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pythonfmu
 
+from ..errors import BuildError
 from ..files import data_file
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
-from .compiler import EXTENSIONS, UNITS, compile_library
+from .compiler import EXTENSIONS, UNITS, compile_library, standard_headers
+from .fmi3_files import build_description, terminals_and_icons
 from .mechanism import mechanism_source
-from .model_description3 import build_description, terminals_and_icons
 from .native import model_header
 from .options import FmuOptions
+from .python_wrapper import repaired_wrapper
 
 LOG = logging.getLogger(__name__)
 
@@ -45,8 +46,7 @@ class Flavour:
         native: whether it is in C: with sources, Model Exchange and derivatives.
         files: resources and sources; the GUID is a digest of them.
         platforms: FMI platforms of the binaries.
-        binaries: given the GUID, the compiled libraries.
-        signed: given the GUID, the sources that contain it.
+        signed: given the GUID, the files that contain it, compiled libraries among them.
         fmi: version of FMI, 2 or 3.
         arrays: whether its vectors are arrays of FMI 3.
     """
@@ -54,8 +54,7 @@ class Flavour:
     native: bool
     files: Files
     platforms: Sequence[str]
-    binaries: Callable[[str], Files]
-    signed: Callable[[str], Files] = lambda guid: {}
+    signed: Callable[[str], Files]
     fmi: int = 2
     arrays: bool = False
 
@@ -64,26 +63,32 @@ def python_flavour(
     options: FmuOptions, robot: Robot, urdf: str, starts: Mapping[str, Any]
 ) -> Flavour:
     """The plant as Python code behind pythonfmu's wrapper, for linux64."""
+    folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
+    folders += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
     config: dict[str, Any] = {
         "frame": robot.frame,
         "axes": robot.axes,
         "control": options.control,
         "starts": starts,
-        "site_packages": _site_packages() if options.link_environment else [],
+        "site_packages": [*dict.fromkeys(folders)] if options.link_environment else [],
     }
     identity = hashlib.sha256(urdf.encode() + json.dumps(config, sort_keys=True).encode())
     config["identity"] = identity.hexdigest()
+    path = PYTHONFMU / "resources/binaries/linux64/libpythonfmu-export.so"
+    if (wrapper := repaired_wrapper(path.read_bytes())) is None:
+        remedy = "run 'pip install --force-reinstall pythonfmu==0.7.0'"
+        raise BuildError(f"'{path}' is not the library of pythonfmu 0.7.0; {remedy}")
+    config["wrapper"] = hashlib.sha256(wrapper).hexdigest()  # the GUID is of it, too
     resources = {
         **_slave_sources(),
         "plant.json": (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
         "requirements.txt": data_file("fmu_src", "requirements.txt").read_bytes(),
     }
-    wrapper = PYTHONFMU / "resources/binaries/linux64/libpythonfmu-export.so"
     return Flavour(
         native=False,
         files={f"resources/{path}": content for path, content in resources.items()},
         platforms=("linux64",),
-        binaries=lambda guid: {f"binaries/linux64/{options.name}.so": wrapper.read_bytes()},
+        signed=lambda guid: {f"binaries/linux64/{options.name}.so": wrapper},
     )
 
 
@@ -106,29 +111,28 @@ def native_flavour(
 ) -> Flavour:
     """The plant as C99 sources, compiled for the platforms."""
     name, control, arrays = options.name, options.control, options.arrays and fmi == 3
-    fmpy = find_spec("fmpy")  # it comes with the headers of the standard
-    assert fmpy is not None and fmpy.origin is not None
-    headers = (Path(fmpy.origin).parent / "c-code").glob(f"fmi{fmi}*.h")
+    headers = standard_headers()
     sources = engine_sources(control, fmi)
     sources["mechanism.c"] = mechanism_source(robot, table).encode()
-    sources.update({header.name: header.read_bytes() for header in headers})
+    if fmi == 2:  # in 3.0 they are the importer's, so that arguments are checked
+        sources |= {file: text for file, text in headers.items() if file.startswith("fmi2")}
 
     def header(guid: str) -> bytes:
         return model_header(robot, table, control, guid, fmi, arrays).encode()
 
-    def binaries(guid: str) -> Files:
-        all_sources = {**sources, "model.h": header(guid)}
+    def signed(guid: str) -> Files:
+        all_sources = {**headers, **sources, "model.h": header(guid)}
 
         def library(platform: str) -> bytes:
             LOG.info("compiling for %s", platform)
             return compile_library(all_sources, platform, name)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            libraries = pool.map(library, platforms)
-            return {
+            libraries = {
                 f"binaries/{platform}/{name}{EXTENSIONS[platform]}": content
-                for platform, content in zip(platforms, libraries)
+                for platform, content in zip(platforms, pool.map(library, platforms))
             }
+        return {"sources/model.h": all_sources["model.h"], **libraries}
 
     files = {f"sources/{path}": content for path, content in sources.items()}
     files["sources/model.h"] = header("")
@@ -139,8 +143,7 @@ def native_flavour(
         native=True,
         files=files,
         platforms=platforms,
-        binaries=binaries,
-        signed=lambda guid: {"sources/model.h": header(guid)},
+        signed=signed,
         fmi=fmi,
         arrays=arrays,
     )
@@ -162,10 +165,3 @@ def _slave_sources() -> Files:
     files[f"slave_{tag}.py"] = slave
     files["slavemodule.txt"] = f"slave_{tag}\n".encode()
     return files
-
-
-def _site_packages() -> list[str]:
-    folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
-    if site.ENABLE_USER_SITE:
-        folders.append(site.getusersitepackages())
-    return list(dict.fromkeys(folders))

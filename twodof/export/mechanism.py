@@ -11,8 +11,11 @@ from ..plant.variables import Variable
 from .bodies import Array, Body, JointTree, joint_tree
 from .recursions import (
     effort_bounds,
+    hybrid_by_factors,
+    hybrid_by_recursion,
     inverse_dynamics,
     mass_matrix,
+    operations_of_factors,
     solve_by_factors,
     solve_by_recursion,
     task_frame,
@@ -29,8 +32,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
             for i, slides in enumerate(constants.prismatic)
         ]
     )
-    a, tau, force = _variables("a", n), _variables("tau", n), _variables("force", 3)
-    v = _variables("v", n)
+    v, a, force = _variables("v", n), _variables("a", n), _variables("force", 3)
     x, R, J, drift = task_frame(constants, joint, v)
     rows = ["xyz".index(axis) for axis in robot.axes]
     frame = _elements("task->x", x[rows])
@@ -43,9 +45,6 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     gravity = _variables("gravity", 3)
     effort = inverse_dynamics(constants, bodies, joint, v, a, gravity)
     bounds = np.abs(effort), effort_bounds(constants, bodies, joint, v, a, gravity)
-    ways = [solve_by_factors(mass_matrix(constants, bodies, joint), tau)]
-    if robot.coupling is None:
-        ways.append(solve_by_recursion(constants, bodies, joint, tau))
     in_all = "const JointPosition joint[N_BODIES]"
     motion = (
         f"{in_all}, const Carrier *carrier, const double v[N_JOINTS], const double a[N_JOINTS],"
@@ -59,12 +58,6 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         "load_carrier(double payload, const double place[3], Carrier *carrier)": load,
         f"inverse_dynamics({motion}, double tau[N_JOINTS])": _elements("tau", effort),
     }
-    solution = min(ways, key=operations)
-    inertial = inverse_dynamics(constants, bodies, joint, np.zeros(n), a, np.zeros(3))
-    solve = (
-        f"acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
-        " double a[N_JOINTS])"
-    )
     alike = {
         f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
         f"effort_bounds({motion}, double bound[N_JOINTS])": _elements(
@@ -76,10 +69,44 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         c_function(f"void {head}", results, varied(results.values(), held=HELD))
         for head, results in functions.items()
     ]
-    texts.append(
-        c_function(f"void {solve}", _elements("a", solution), _solution(solution, inertial))
-    )
+    texts += _forward_dynamics(constants, bodies, joint, in_all)
     return "\n".join([MECHANISM, *texts])
+
+
+def _forward_dynamics(
+    robot: JointTree, bodies: Sequence[Body], joint: Array, in_all: str
+) -> list[str]:
+    """Forward dynamics, and those with held joints, by factors of M or by recursion.
+
+    Whichever takes fewer operations.
+    """
+    n = robot.G.shape[1]
+    a, tau, free, given = (_variables(name, n) for name in ("a", "tau", "free", "given"))
+    split = free * given, free, given - free * given
+    ways, hybrids = [], []
+    if n == len(robot.parent):
+        ways.append(solve_by_recursion(robot, bodies, joint, tau))
+        hybrids.append(hybrid_by_recursion(robot, bodies, joint, *split))
+    if not ways or operations_of_factors(robot.parent) < operations(ways[0]):
+        M = mass_matrix(robot, bodies, joint)
+        ways.insert(0, solve_by_factors(M, tau))
+        hybrids.insert(0, hybrid_by_factors(M, *split))
+    solution = min(ways, key=operations)
+    inertial = inverse_dynamics(robot, bodies, joint, np.zeros(n), a, np.zeros(3))
+    hybrid = min(hybrids, key=lambda both: operations([*both[0], *both[1]]))
+    solve = (
+        f"void acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
+        " double a[N_JOINTS])"
+    )
+    hold = (
+        f"void hybrid_dynamics({in_all}, const Carrier *carrier, const double free[N_JOINTS],"
+        " const double given[N_JOINTS], double a[N_JOINTS], double reaction[N_JOINTS])"
+    )
+    held = c_function(hold, _elements("a", hybrid[0]) | _elements("reaction", hybrid[1]))
+    return [
+        c_function(solve, _elements("a", solution), _solution(solution, inertial)),
+        f"#ifndef IS_COMPLEX\n{held}#endif\n",
+    ]
 
 
 MECHANISM = """\
@@ -95,12 +122,7 @@ LOWER = np.tril_indices(3)
 
 
 def _solution(solution: Array, inertial: Array) -> list[Varied]:
-    """a = M⁻¹τ and how it varies: M δa = δτ − δM a, with the factors that there are.
-
-    Args:
-        solution: a, of the variables τ.
-        inertial: M a, of the variables a.
-    """
+    """a = M⁻¹τ and how it varies, M δa = δτ − δM a; ``inertial`` is M a of the variables a."""
     n = len(solution)
     names = [(f"a[{i}]", f"tau[{i}]") for i in range(n)]
     value = [a for a, _ in varied(solution, held=HELD)]

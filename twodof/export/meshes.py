@@ -10,11 +10,12 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
+from ..bounds import MAX_MESHES
 from ..errors import BuildError
 from ..files import read_file
 
+MAX_LISTED = 50  # names in a message
 LOG = logging.getLogger(__name__)
-MAX_MESHES = 256 * 1024**2  # bytes of all meshes together
 
 
 def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str, dict[str, bytes]]:
@@ -28,9 +29,6 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
         urdf: XML text.
         folder: the URDF's own folder, where relative names and packages are looked for.
         mesh_dir: folder of the packages, of one package, or of the meshes themselves.
-
-    Raises:
-        BuildError: a mesh that cannot be read, or lies elsewhere.
     """
     tree = ET.fromstring(urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     files: dict[str, bytes] = {}
@@ -56,9 +54,10 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
                 raise BuildError(f"mesh '{uri}' cannot be read: {reason}") from error
         mesh.set("filename", f"package://{names[uri]}")
     if missing:
+        missing[MAX_LISTED:] = [f"{len(missing) - MAX_LISTED} more"] * (len(missing) > MAX_LISTED)
         LOG.warning(
             "meshes are left out, as they were not found; give their folder, or that of their"
-            " packages, with `mesh_dir`: %s", ", ".join(dict.fromkeys(missing)),
+            " packages, with `mesh_dir`: %s", ", ".join(missing),
         )  # fmt: skip
     return ET.tostring(tree, encoding="unicode") + "\n", files
 

@@ -1,10 +1,15 @@
-"""modelDescription.xml of either flavour, from the variable table. FMI 2.0.4, section 2.2."""
+"""modelDescription.xml of either flavour, from the variable table.
+
+Source: FMI 2.0.4, section 2.2; FMI 3.0.2, section 2.4, where elements of vectors become arrays, or
+stay scalars for tools that know no arrays.
+"""
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from ..plant.robot import Robot
 from ..plant.urdf import UNBOUNDED
@@ -15,13 +20,15 @@ from ..plant.variables import (
     RANGES,
     Control,
     Range,
+    Value,
     Variable,
     count_event_indicators,
 )
 from ..version import __version__
 from .compiler import UNITS
 from .flavours import Flavour
-from .model_description3 import xml_text
+from .fmi3_files import xml_text
+from .native import INDICATORS
 from .options import FmuOptions
 
 DIMENSIONS: dict[str, dict[str, int]] = {
@@ -63,15 +70,17 @@ LOG_CATEGORIES = {
     "logStatusFatal": "Failures that end the instance",
     "logAll": "All messages",
 }
-DEFAULT_STOP_TIME, DEFAULT_STEP = 5.0, 0.01
 VENDOR = "twodof"
 AUTHOR = "the twodof developers"
 
-CAPABILITIES = {
-    "canGetAndSetFMUstate": "true",
-    "canSerializeFMUstate": "true",
-    "canNotUseMemoryManagementFunctions": "true",
+UNKNOWNS_3 = {
+    "Outputs": "Output",
+    "Derivatives": "ContinuousStateDerivative",
+    "InitialUnknowns": "InitialUnknown",
 }
+"""Elements of 3.0 by the parts of 2.0's ModelStructure."""
+SCALAR = ("name", "valueReference", "description", "causality", "variability", "initial")
+"""Attributes of 2.0's ScalarVariable; others are its type's."""
 STATES = ("q", "v")
 SMALL = ("rtol", "atol", "max_step")
 """Whose start is their size."""
@@ -85,62 +94,71 @@ IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
 def model_description(
     options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour, guid: str
 ) -> bytes:
-    """The XML text.
-
-    Args:
-        options: with the model's name and control law.
-        robot, table: the robot and its variables, by value reference.
-        flavour: says which interfaces there are, and what they can do.
-        guid: as it shall stand in the file; "" while it is being computed.
-    """
-    law = CONTROLS[options.control]
-    root = ET.Element(
-        "fmiModelDescription",
-        fmiVersion="2.0",
-        modelName=options.name,
-        guid=guid,
-        description=f"Robot '{robot.name}' with {len(robot.joints)} joints under"
+    """The XML text, of variables as ``engine_variables`` gives them; the GUID may still be ""."""
+    fmi, law = flavour.fmi, CONTROLS[options.control]
+    names = [replace(v, index=None).name if flavour.arrays else v.name for v in table]
+    reference = {name: str(i) for i, name in enumerate(dict.fromkeys(names), start=1)}
+    references = [reference[name] for name in names]
+    attributes = {
+        "fmiVersion": f"{fmi}.0",
+        "modelName": options.name,
+        "guid" if fmi == 2 else "instantiationToken": guid,
+        "description": f"Robot '{robot.name}' with {len(robot.joints)} joints under"
         f" {law.title.format(frame=robot.frame)}",
-        version=__version__,
-        author=AUTHOR,
-        copyright=f"Copyright (c) {AUTHOR}; of the robot's description, its author's",
-        license="BSD-3-Clause",
-        generationTool=f"{VENDOR} {__version__}",
-        variableNamingConvention="structured",
-    )
-    interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
-    needs = {"needsExecutionTool": "true"}
-    if flavour.native:
-        indicators = count_event_indicators(robot, options.control)
-        root.set("numberOfEventIndicators", str(indicators))
-        interfaces = {"ModelExchange": {"completedIntegratorStepNotNeeded": "true"}, **interfaces}
-        needs = {"needsExecutionTool": "false", "providesDirectionalDerivative": "true"}
-    for interface, own in interfaces.items():
-        attributes = {"modelIdentifier": options.name, **CAPABILITIES, **needs, **own}
-        element = ET.SubElement(root, interface, attributes)
-        if flavour.native:
-            files = ET.SubElement(element, "SourceFiles")
-            for name in UNITS:
-                ET.SubElement(files, "File", name=name)
-    used = {variable.unit for variable in table}
-    _units(root, used)
-    _types(root, used)
+        "version": __version__,
+        "author": AUTHOR,
+        "copyright": f"Copyright (c) {AUTHOR}; of the robot's description, its author's",
+        "license": "BSD-3-Clause",
+        "generationTool": f"{VENDOR} {__version__}",
+        "variableNamingConvention": "structured",
+    }
+    if flavour.native and fmi == 2:
+        attributes["numberOfEventIndicators"] = str(count_event_indicators(robot, options.control))
+    root = ET.Element("fmiModelDescription", attributes)
+    _interfaces(root, options.name, flavour)
+    _units(root, {variable.unit for variable in table}, fmi)
     categories = ET.SubElement(root, "LogCategories")
     for category, description in LOG_CATEGORIES.items():
         ET.SubElement(categories, "Category", name=category, description=description)
-    times = {
-        "startTime": "0.0",
-        "stopTime": repr(DEFAULT_STOP_TIME),
-        "stepSize": repr(DEFAULT_STEP),
-    }
-    ET.SubElement(root, "DefaultExperiment", times)
-    _vendor_annotation(root, robot, options.control)
-    _variables(root, robot, table, flavour.native)
-    _structure(root, robot, table, law)
+    ET.SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="5.0", stepSize="0.01")
+    if fmi == 2:
+        annotations = ET.SubElement(root, "VendorAnnotations")
+        _describe(ET.SubElement(annotations, "Tool", name=VENDOR), robot, options.control)
+    _variables(root, robot, table, names, references, flavour)
+    _structure(root, robot, table, references, law, fmi)
+    if fmi == 3:
+        annotations = ET.SubElement(root, "Annotations")
+        _describe(ET.SubElement(annotations, "Annotation", type=VENDOR), robot, options.control)
     return xml_text(root)
 
 
-def _units(root: ET.Element, used: Collection[str]) -> None:
+def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
+    two, native = flavour.fmi == 2, flavour.native
+    state = "FMUstate" if two else "FMUState"
+    flags = {f"canGetAndSet{state}": True, f"canSerialize{state}": True}
+    if two:
+        flags["canNotUseMemoryManagementFunctions"] = True
+    flags["needsExecutionTool"] = not native
+    if native:
+        flags["providesDirectionalDerivative" if two else "providesDirectionalDerivatives"] = True
+    own = {"CoSimulation": {"canHandleVariableCommunicationStepSize": True}}
+    if native:
+        own = {"ModelExchange": {}, **own}
+    for interface, more in own.items():
+        every = {**flags, **more}
+        if not two:
+            every["providesAdjointDerivatives"] = True
+            if interface == "ModelExchange":
+                every["needsCompletedIntegratorStep"] = True  # so it is in 2.0 by default
+        attributes = {name: str(flag).lower() for name, flag in every.items()}
+        element = ET.SubElement(root, interface, {"modelIdentifier": identifier, **attributes})
+        if two and native:
+            files = ET.SubElement(element, "SourceFiles")
+            for name in UNITS:
+                ET.SubElement(files, "File", name=name)
+
+
+def _units(root: ET.Element, used: Collection[str], fmi: int) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     for name, exponents in DIMENSIONS.items():
         if name in used:
@@ -150,21 +168,21 @@ def _units(root: ET.Element, used: Collection[str]) -> None:
             if name in DISPLAY:
                 display, factor = DISPLAY[name]
                 ET.SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
-
-
-def _types(root: ET.Element, used: Collection[str]) -> None:
     definitions = ET.SubElement(root, "TypeDefinitions")
-    for unit, quantity in QUANTITIES.items():
-        if unit in used:
-            simple = ET.SubElement(definitions, "SimpleType", name=quantity)
-            real = ET.SubElement(simple, "Real", quantity=quantity, unit=unit)
-            if unit in DISPLAY:
-                real.set("displayUnit", DISPLAY[unit][0])
+    for name, quantity in QUANTITIES.items():
+        if name in used:
+            attributes = {"quantity": quantity, "unit": name}
+            if name in DISPLAY:
+                attributes["displayUnit"] = DISPLAY[name][0]
+            if fmi == 2:
+                simple = ET.SubElement(definitions, "SimpleType", name=quantity)
+                ET.SubElement(simple, "Real", attributes)
+            else:
+                ET.SubElement(definitions, "Float64Type", {"name": quantity, **attributes})
 
 
-def _vendor_annotation(root: ET.Element, robot: Robot, control: str) -> None:
+def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
     """What a logger needs to know beyond variable names."""
-    tool = ET.SubElement(ET.SubElement(root, "VendorAnnotations"), "Tool", name=VENDOR)
     task = ET.SubElement(
         tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes,
         control=control,
@@ -192,51 +210,93 @@ def _nominal(robot: Robot, variable: Variable) -> float:
     return 1.0
 
 
-def _variables(root: ET.Element, robot: Robot, table: Sequence[Variable], exchanges: bool) -> None:
+def _variables(
+    root: ET.Element, robot: Robot, table: Sequence[Variable], names: Sequence[str],
+    references: Sequence[str], flavour: Flavour,
+) -> None:  # fmt: skip
     variables = ET.SubElement(root, "ModelVariables")
-    at = {(variable.group, variable.index): i for i, variable in enumerate(table, start=1)}
-    for reference, variable in enumerate(table):
-        state = exchanges and variable.group in STATES
-        attributes = {
-            "name": variable.name,
-            "valueReference": str(reference),
-            "description": variable.description,
-            "causality": variable.causality,
-            "variability": "fixed" if variable.causality == "parameter" else "continuous",
-        }
-        if variable.causality in ("output", "local"):
-            attributes["initial"] = "approx" if state else "calculated"
-        elif variable.causality == "parameter":
-            attributes["initial"] = "exact"
-        scalar = ET.SubElement(variables, "ScalarVariable", attributes)
-        typed = ET.SubElement(scalar, variable.type)
-        if variable.unit:
-            typed.set("unit", variable.unit)
-        if variable.unit in QUANTITIES:
-            typed.set("declaredType", QUANTITIES[variable.unit])
-        within = _range(robot, variable)
-        _size(typed, within, _nominal(robot, variable))
-        start = variable.start
-        if state:  # FMI allows these two of an FMU for co-simulation alone neither
-            start = table[at[f"{variable.group}_start", variable.index] - 1].start or 0.0
-            start = min(max(start, within.low), within.high)
-            typed.set("reinit", "true")
-        if start is not None:
-            boolean = variable.type == "Boolean"
-            typed.set("start", str(start).lower() if boolean else repr(start))
-        if variable.derivative_of:
-            typed.set("derivative", str(at[variable.derivative_of, variable.index]))
+    place = {(variable.group, variable.index): i for i, variable in enumerate(table)}
+    vectors: dict[str, list[int]] = {}  # places of the elements; of a scalar there is one
+    for i, name in enumerate(names):
+        vectors.setdefault(name, []).append(i)
+    for name, places in vectors.items():
+        first, elements = table[places[0]], []
+        for i in places:
+            group, index, start = table[i].group, table[i].index, table[i].start
+            if group in STATES:
+                start = table[place[f"{group}_start", index]].start
+            attributes = _attributes(robot, table[i], start, flavour.native)
+            elements.append({"valueReference": str(i), **attributes})
+        shared = set.intersection(*(set(element.items()) for element in elements))
+        attributes = {"name": name} | {k: v for k, v in elements[0].items() if (k, v) in shared}
+        attributes["valueReference"] = references[places[0]]
+        attributes["description"] = _description(elements)
+        if first.derivative_of:
+            attributes["derivative"] = references[place[first.derivative_of, first.index]]
+        if "start" in elements[0]:
+            attributes["start"] = " ".join(element["start"] for element in elements)
+        if flavour.fmi == 2:
+            own = {key: attributes.pop(key) for key in SCALAR if key in attributes}
+            ET.SubElement(ET.SubElement(variables, "ScalarVariable", own), first.type, attributes)
+            continue
+        element = ET.SubElement(
+            variables, "Float64" if first.type == "Real" else first.type, attributes
+        )
+        if name != first.name:
+            ET.SubElement(element, "Dimension", start=str(len(places)))
 
 
-def _size(typed: ET.Element, within: Range, nominal: float) -> None:
-    for name, value, default in (
-        ("min", within.low, -math.inf), ("max", within.high, math.inf), ("nominal", nominal, 1.0),
+def _attributes(
+    robot: Robot, variable: Variable, start: Value | None, exchanges: bool
+) -> dict[str, str]:
+    """Of a scalar, or an element of a vector."""
+    attributes = {
+        "description": variable.description,
+        "causality": variable.causality,
+        "variability": "fixed" if variable.causality == "parameter" else "continuous",
+    }
+    state = variable.group in STATES
+    if variable.causality in ("output", "local"):
+        attributes["initial"] = "approx" if state else "calculated"
+    elif variable.causality == "parameter":
+        attributes["initial"] = "exact"
+    if variable.unit:
+        attributes["unit"] = variable.unit
+    if variable.unit in QUANTITIES:
+        attributes["declaredType"] = QUANTITIES[variable.unit]
+    within = _range(robot, variable)
+    for key, value, default in (
+        ("min", within.low, -math.inf), ("max", within.high, math.inf),
+        ("nominal", _nominal(robot, variable), 1.0),
     ):  # fmt: skip
         if value != default:
-            typed.set(name, repr(value))
+            attributes[key] = repr(value)
+    if state:
+        start = min(max(start or 0.0, within.low), within.high)
+        attributes |= {"reinit": "true"} if exchanges else {}
+    if start is not None:
+        attributes["start"] = str(start).lower() if isinstance(start, bool) else repr(start)
+    return attributes
 
 
-def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], control: Control) -> None:
+def _description(elements: Sequence[dict[str, str]]) -> str:
+    """What the vector is, and what each of its elements is, with its unit where that differs."""
+    texts = [element["description"] for element in elements]
+    if len({*texts}) == 1:
+        return texts[0]
+    parts = [text.split(", ") for text in texts]
+    same = next(i for i, column in enumerate(zip(*parts)) if len(set(column)) > 1)
+    common = ", ".join(parts[0][:same])
+    owners = [", ".join(part[same:]) for part in parts]
+    if len({element.get("unit") for element in elements}) > 1:
+        owners = [f"{own} [{element['unit']}]" for own, element in zip(owners, elements)]
+    return f"{common}: {'; '.join(owners)}"
+
+
+def _structure(
+    root: ET.Element, robot: Robot, table: Sequence[Variable], references: Sequence[str],
+    control: Control, fmi: int,
+) -> None:  # fmt: skip
     moves = robot.moves_frame()
     inputs = (*control.inputs, *DISTURBANCES)
     law = ("gravity", *control.parameters, "limit_effort")
@@ -257,23 +317,29 @@ def _structure(root: ET.Element, robot: Robot, table: Sequence[Variable], contro
         during["tau"] = (control.inputs, own)
         at_the_start["tau"] = (("limit_effort", *control.inputs), own)
 
-    def known(unknown: Variable, groups: Sequence[str], whose: str) -> str:
-        """1-based indices of variables that an unknown depends on."""
-        return " ".join(
-            str(i)
-            for i, variable in enumerate(table, start=1)
+    def known(unknown: Variable, groups: Sequence[str], whose: str) -> dict[str, None]:
+        """References of variables that an unknown depends on, in their order."""
+        return {
+            reference: None
+            for variable, reference in zip(table, references)
             if variable.group in groups
             and (whose != own or variable.index in (unknown.index, None))
             and (whose != frame or (variable.index is not None and moves[variable.index]))
-        )
+        }
 
-    structure = ET.SubElement(root, "ModelStructure")
-    outputs = ET.SubElement(structure, "Outputs")
-    derivatives = ET.SubElement(structure, "Derivatives")
-    initial = ET.SubElement(structure, "InitialUnknowns")
-    for i, variable in enumerate(table, start=1):
+    unknowns: dict[str, dict[str, dict[str, None]]] = {part: {} for part in UNKNOWNS_3}
+    for variable, reference in zip(table, references):
         if variable.group in during:
-            kind = outputs if variable.causality == "output" else derivatives
-            for parent, rule in ((kind, during), (initial, at_the_start)):
+            kind = "Outputs" if variable.causality == "output" else "Derivatives"
+            for part, rule in ((kind, during), ("InitialUnknowns", at_the_start)):
                 dependencies = known(variable, *rule[variable.group])
-                ET.SubElement(parent, "Unknown", index=str(i), dependencies=dependencies)
+                unknowns[part].setdefault(reference, {}).update(dependencies)
+    structure = ET.SubElement(root, "ModelStructure")
+    for part, name in UNKNOWNS_3.items():
+        parent = ET.SubElement(structure, part) if fmi == 2 else structure
+        tag, key = ("Unknown", "index") if fmi == 2 else (name, "valueReference")
+        for reference, dependencies in unknowns[part].items():
+            ET.SubElement(parent, tag, {key: reference, "dependencies": " ".join(dependencies)})
+    indicators = (r for v, r in zip(table, references) if v.group == INDICATORS)
+    for reference in dict.fromkeys(indicators):
+        ET.SubElement(structure, "EventIndicator", valueReference=reference)

@@ -6,7 +6,6 @@ dynamics are ``mechanism.c``. Pinocchio has read the URDF.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -30,16 +29,8 @@ def model_header(
 ) -> str:
     """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
 
-    Names from the URDF, which may be anybody's, are string literals and nothing else.
-
-    Args:
-        robot: the robot, n joints in Pinocchio's order; at as many as a URDF may have the engine's
-            working memory, which is on the stack, is 0.2 MB.
-        table: its variables; a variable's place is its value reference.
-        control: what drives it, a key of ``CONTROLS``.
-        guid: as the modelDescription has it.
-        fmi: version of FMI.
-        arrays: whether 3 has vectors where 2 has their elements.
+    Names from the URDF, which may be anybody's, are string literals and nothing else. At as many
+    joints as a URDF may have the engine's working memory, which is on the stack, is 0.2 MB.
     """
     m = len(robot.axes)
     table = engine_variables(robot, table, control, fmi)
@@ -54,9 +45,8 @@ def model_header(
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),
-        _value_references(groups),
-        "/* How many values each value reference stands for. */\n"
-        + _table("int EXTENT", _extents(table, fmi == 3 and arrays)),
+        _groups(groups),
+        _references(table, fmi == 3 and arrays),
         _table("char *const VARIABLE_NAME", (variable.name for variable in table)),
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
         _ranges(groups),
@@ -64,6 +54,8 @@ def model_header(
         "/* Effort limits, HUGE_VAL where there is none, and viscous damping of the joints. */\n"
         + _table("double EFFORT", robot.effort),
         _table("double DAMPING", robot.damping),
+        "/* Bounds on the change of singular values, as parts of the largest, with each joint. */\n"
+        + _table("double SWING", robot.swing()),
         "#endif\n",
     ]
     return "\n".join(sections)
@@ -72,7 +64,7 @@ def model_header(
 def engine_variables(
     robot: Robot, table: Sequence[Variable], control: str, fmi: int
 ) -> Sequence[Variable]:
-    """The variables by value reference: in FMI 3.0 event indicators and the time are among them."""
+    """The variables by place: in FMI 3.0 event indicators and the time are among them."""
     if fmi == 2:
         return table
     first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
@@ -82,35 +74,36 @@ def engine_variables(
     return [*table[:first], *indicators, time, *table[first:]]
 
 
-def _value_references(groups: Sequence[str]) -> str:
+def _groups(groups: Sequence[str]) -> str:
     lines = [f"    {group.upper()} = {groups.index(group)}," for group in dict.fromkeys(groups)]
     lines.append(f"    N_VARIABLES = {len(groups)},")
     lines += [f"    {constant} = {group.upper()}," for constant, group in FIRST.items()]
     body = "\n".join(lines)
-    return f"/* Value references: the first of each vector. */\nenum {{\n{body}\n}};\n"
+    return f"/* Places of variables: the first of each vector. */\nenum {{\n{body}\n}};\n"
 
 
 def _ranges(groups: Sequence[str]) -> str:
     rows = "".join(
         f"\n    {{{group.upper()}, {groups.count(group)},"
-        f" {_literal(0.0 if within.positive else within.low)},"
-        f" {_literal(within.high)}, {int(within.positive)}, {_quoted(within.words)}}},"
+        f" {_literal(within.low)}, {_literal(within.high)}, {_quoted(within.words)}}},"
         for group, within in RANGES.items()
         if group in groups
     )
     return (
         "/* Values that variables may have; others may be any number. */\nstatic const struct {\n"
-        "    int first, count;\n    double low, high;\n    int positive;\n    const char *words;\n"
+        "    int first, count;\n    double low, high;\n    const char *words;\n"
         f"}} RANGE[] = {{{rows}\n}};\n"
     )
 
 
-def _extents(table: Sequence[Variable], arrays: bool) -> list[int]:
-    """Of each variable 1, or of each vector's first element its length and of the others 0."""
-    if not arrays:
-        return [1] * len(table)
-    sizes = Counter(variable.group for variable in table)
-    return [0 if variable.index else sizes[variable.group] for variable in table]
+def _references(table: Sequence[Variable], arrays: bool) -> str:
+    """Value references, from 1 on as some importers need them, of variables or whole vectors."""
+    places = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
+    return (
+        "/* The values of a reference, from 1 on: from PLACE[vr] to before PLACE[vr + 1]. */\n"
+        f"enum {{ N_REFERENCES = {len(places)} }};\n"
+        + _table("int PLACE", [0, *places, len(table)])
+    )
 
 
 def _table(declaration: str, values: Iterable[object]) -> str:

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from ..errors import BuildError
+from ..plant.variables import CONTROLS
+
+DEFAULT_NAME = "TwoDof"
 
 
 @dataclass(frozen=True)
@@ -25,12 +32,10 @@ class FmuOptions:
             else 0 where the limits allow and their middle where not.
         control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
             frame's orientation), "joint" or "effort".
-        name: model name and identifier.
+        name: model name and identifier; "": that of the URDF's file, "TwoDof" for the shipped arm.
         link_environment: remember the folders of this Python's packages in the FMU; not for the
             native flavour, which needs none.
         native: the plant as compiled C instead of Python code.
-        live_documentation: put the arm, alive, into the documentation of a native FMU, where
-            there is a compiler for it; its meshes are then in the FMU twice.
         fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
         arrays: whether vectors are arrays in FMI 3; without, each element is a variable of its own,
             as it is in FMI 2, for tools that know no arrays.
@@ -47,10 +52,31 @@ class FmuOptions:
     gravity: tuple[float, float, float] | None = None
     q_start: tuple[float, ...] | None = None
     control: str = "task"
-    name: str = "TwoDof"
+    name: str = ""
     link_environment: bool = False
     native: bool = False
     fmi: int | None = None
     arrays: bool = True
-    live_documentation: bool = True
     platforms: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            name = identifier(self.urdf) if self.urdf is not None else DEFAULT_NAME
+            object.__setattr__(self, "name", name)
+        if self.control not in CONTROLS:
+            near = difflib.get_close_matches(self.control, CONTROLS, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise BuildError(f"`control` '{self.control}' is none of {', '.join(CONTROLS)}{hint}")
+
+    @property
+    def is_default_arm(self) -> bool:
+        """Whether this is the shipped arm with its default settings, in any flavour."""
+        model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "name")
+        return all(getattr(self, key) == getattr(FmuOptions(), key) for key in model)
+
+
+def identifier(robot: str | Path) -> str:
+    """A robot's name for a program, from that of its file."""
+    stem = Path(robot).name.removesuffix(".xacro").removesuffix(".urdf").removesuffix(".fmu")
+    name = re.sub(r"\W", "_", stem, flags=re.ASCII)
+    return name if name.isidentifier() else f"robot_{name}"

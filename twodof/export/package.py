@@ -4,63 +4,81 @@ from __future__ import annotations
 
 import hashlib
 import io
-import logging
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import ZIP_ERRORS, BuildError
-from ..files import check_archive, data_file, read_member, refusing, write_file
+from ..files import check_archive, data_file, descriptor_of, refusing, write_file
 from ..plant.urdf import RobotError
 from ..version import versions
 from .compiler import compiles_for_the_web, host_platform
 from .options import FmuOptions
 
-LOG = logging.getLogger(__name__)
-MADE_OF = ("fmu_src", "urdf", "meshes", "export", "geometry", "plant")
+MADE_OF = ("fmu_src", "urdf", "meshes", "export", "plant")
 """Folders of what is shipped."""
-TOOLS = ("pin", "numpy", "scipy", "coal", "ziglang")
+TOOLS = ("pin", "numpy", "scipy", "ziglang")
 """Packages whose other versions may make another FMU of the same."""
-MAX_PAGE = 512 * 1024**2  # bytes of documentation
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
+DEFAULT_ARM = b"twodof: the default arm"
+"""Beginning of the zip comment of its FMUs, whichever flavour and version."""
 
 
-def build_fmu(output: str | Path | None = None, options: FmuOptions | None = None) -> Path:
+def build_fmu(
+    output: str | Path | None = None, options: FmuOptions | None = None, *, overwrite: bool = False
+) -> Path:
     """Build an FMU.
 
     Args:
         output: the file; None: ``<name>.fmu``, or ``<name>-native.fmu``, in the working
-            directory, which replaces an FMU alone. Written whole or not at all.
+            directory. Written whole or not at all.
         options: what to build; None: the shipped planar arm in the Python flavour.
+        overwrite: replace an existing file. Without it only an FMU of the shipped arm with its
+            default settings is replaced, because ``build_fmu()`` makes it again.
 
     Returns:
         The path of the FMU. A file that already holds exactly this FMU is left alone.
 
     Raises:
         BuildError: naming what is wrong with the URDF, a mesh, an option, the compiler or the
-            output folder.
+            output: another file is there, or it cannot be written.
     """
     options = options or FmuOptions()
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
     path = Path(output if output is not None else default)
-    there = output is None and path.exists()
-    if there and not _fits(path, lambda zipped: "modelDescription.xml" in zipped.namelist()):
-        raise BuildError(f"'{path}' is no FMU, and is not replaced; move it away")
-    made_of = _shipped(options) if options.native and options.urdf is None else b""
-    if made_of and _fits(path, lambda zipped: zipped.comment == made_of):
+    comment = DEFAULT_ARM if options.is_default_arm else b""
+    made_of = options.native and options.urdf is None
+    if made_of:
+        comment += _shipped(options)
+    if made_of and _fits(path, lambda zipped: zipped.comment == comment):
         return path
-    from .composition import compose, is_live  # Pinocchio and SciPy take most of a run's time
+    from .composition import compose  # Pinocchio and SciPy take most of a run's time
 
     try:
         flavour, files, finish = compose(options)
-        built = files["modelDescription.xml"], flavour.platforms, is_live(options)
-        if made_of or not _fits(path, lambda zipped: _holds(zipped, *built)):
-            if there:
-                LOG.warning(f"'{path}' was another FMU, and is replaced")
-            _write_zip(path, {**files, **finish()}, made_of)
+        built = files["modelDescription.xml"], flavour.platforms
+        same = _fits(path, lambda zipped: _holds(zipped, *built))
+        there = path.is_file() and descriptor_of(path) is None  # /dev/stdout is written into
+        if there and not (same or overwrite or is_default_arm(path)):
+            raise BuildError(
+                f"'{path}' is {'another' if is_fmu(path) else 'no'} FMU, and is not replaced: move"
+                " it away, or build with another `output` or with `overwrite=True`"
+            )
+        if made_of or not same:
+            _write_zip(path, {**files, **finish()}, comment)
     except RobotError as error:
         raise BuildError(f"{options.urdf or '2dof.urdf'}: {error}") from error
     return path
+
+
+def is_fmu(path: Path) -> bool:
+    """Whether a file is a zip archive with a model description."""
+    return _fits(path, lambda zipped: "modelDescription.xml" in zipped.namelist())
+
+
+def is_default_arm(path: Path) -> bool:
+    """Whether a file is an FMU of the shipped arm with its default settings."""
+    return _fits(path, lambda zipped: zipped.comment.startswith(DEFAULT_ARM))
 
 
 def _shipped(options: FmuOptions) -> bytes:
@@ -86,17 +104,12 @@ def _fits(path: Path, fits: Callable[[zipfile.ZipFile], bool]) -> bool:
         return False
 
 
-def _holds(
-    archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str], live: bool
-) -> bool:
+def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str]) -> bool:
     """Whether it is already this FMU; its guid is a digest of all that matters."""
-    from .arm_page import CONTAINER
-
     built_for = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
     with archive.open("modelDescription.xml") as file:
         same = file.read(len(description) + 1) == description
-    page = read_member(archive, "documentation/index.html", MAX_PAGE)
-    return same and built_for == set(platforms) and (CONTAINER in page) == live
+    return same and built_for == set(platforms)
 
 
 def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:

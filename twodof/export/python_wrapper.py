@@ -1,32 +1,43 @@
-"""What pythonfmu's wrapper of a Python FMU cannot do, told before it crashes, and made up for."""
+"""Detect and repair the faults of pythonfmu's wrapper, the library of a Python FMU."""
 
 from __future__ import annotations
 
-import ctypes
+import hashlib
+import struct
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
+from ..bounds import MAX_WRAPPER
 from ..errors import FmuError
 
-MAX_WRAPPER = 16 * 1024**2  # it has 0.3 MiB
+DT_FINI_ARRAYSZ = 28  # of an ELF library's dynamic section: size of its array of exit functions
+WRAPPER = "4be156a552c16f30eb4395805c59855d8d4086056d0f165442565f6c5fbac0c9"
+"""SHA-256 of pythonfmu 0.7.0's libpythonfmu-export.so, for linux64."""
+
+
+def repaired_wrapper(library: bytes) -> bytes | None:
+    """The wrapper without its exit function; None: not the library of pythonfmu 0.7.0.
+
+    The function resets a static shared_ptr that C++ has destroyed before, in memory that is free.
+    It is the second of two; the first one has C++ destroy static objects, and stays.
+    """
+    if hashlib.sha256(library).hexdigest() != WRAPPER:
+        return None
+    both, one = (struct.pack("<qq", DT_FINI_ARRAYSZ, size) for size in (16, 8))
+    return library.replace(both, one, 1)
 
 
 def check_python_wrapper(fmu: Path, library: Path, folder: Path) -> None:
-    """Refuse what the wrapper crashes on: it decodes no escape but %20, and needs its module.
+    """Refuse an unzipped FMU whose wrapper crashes, and repair it where another tool packed it.
 
-    Args:
-        fmu: the FMU's file, for messages.
-        library: the binary, of this or any other make.
-        folder: where the FMU is unzipped.
-
-    Raises:
-        FmuError: naming what is wrong.
+    The wrapper decodes no escape but %20, and needs its module.
     """
     with library.open("rb") as file:
-        if b"slavemodule.txt" not in file.read(MAX_WRAPPER):
-            return  # it is no such wrapper
-    _end_before_destructors()
+        content = file.read(MAX_WRAPPER)
+    if b"slavemodule.txt" not in content:
+        return  # it is no such wrapper
+    if (repaired := repaired_wrapper(content)) is not None:
+        library.write_bytes(repaired)
     if "%" in folder.as_uri().replace("%20", ""):
         raise FmuError(
             f"the temporary folder '{folder.parent}' has characters that the FMU's Python wrapper"
@@ -38,15 +49,3 @@ def check_python_wrapper(fmu: Path, library: Path, folder: Path) -> None:
         if "/" not in name and (resources / f"{name}.py").is_file():
             return
     raise FmuError(f"'{fmu}': resources/slavemodule.txt does not name a module beside it")
-
-
-@cache
-def _end_before_destructors() -> None:
-    """Have exit() end the process once Python has: what C++ libraries do after that can abort it.
-
-    A process in which the wrapper has run the plant found its heap corrupted there now and then,
-    in no more than the destructors of static objects, and lost its exit status.
-    """
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "on_exit"):  # glibc's
-        libc.on_exit(libc._exit, None)

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..bounds import MAX_URDF
 from ..errors import BuildError
-from ..files import MAX_URDF, read_urdf_text
+from ..files import read_file, refusing
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .meshes import places_of
 from .xacro_file import expand
@@ -20,24 +21,22 @@ DEFAULT_FRAME = "EndEffector"
 
 
 def read_text(path: Path, mesh_dir: Path | None) -> str:
-    """The text of a URDF, or of what a xacro file makes.
-
-    Raises:
-        BuildError: it cannot be read or expanded, or is not UTF-8.
-    """
+    """The text of a URDF, or of what a xacro file makes; BuildError where there is none."""
     if path.suffix == ".xacro":
         return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
-    return read_urdf_text(path, BuildError)
+    with refusing(BuildError, f"read the URDF '{path}'"):
+        content = read_file(path, MAX_URDF)
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
 
 
 def last_links(urdf: Urdf) -> list[str]:
     """Those without a child that a joint moves."""
     parents = {joint.parent for joint in urdf.joints.values()}
-    return [
-        link
-        for link in urdf.links
-        if link not in parents and any(joint.moves for joint in urdf.chain(link))
-    ]
+    ends = [link for link in urdf.links if link not in parents]
+    return [link for link in ends if any(joint.moves for joint in urdf.chain(link))]
 
 
 def end_effector(urdf: Urdf) -> str:
@@ -67,11 +66,9 @@ def without_meshes(text: str) -> str:
 
 
 def lock_joints(text: str, locks: Mapping[str, float]) -> str:
-    """A URDF with joints fixed at positions; joints that mimic one of them are fixed too.
+    """A URDF with joints, by name or shell pattern, fixed at positions, rad or m.
 
-    Args:
-        text: XML text.
-        locks: positions, rad or m, by joint name or shell pattern.
+    Joints that mimic one of them are fixed too.
 
     Raises:
         RobotError: no joint has such a name, or a position is outside its joint's limits.

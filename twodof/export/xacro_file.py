@@ -12,7 +12,6 @@ import errno
 import io
 import logging
 import os
-import resource
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -23,13 +22,13 @@ from pathlib import Path
 from subprocess import DEVNULL
 from typing import Any
 
-from ..children import Child
+from ..bounds import MAX_XACRO_MEMORY, MAX_XACRO_SECONDS
+from ..children import Child, confine
 from ..errors import BuildError, ChildError
 from ..files import check_file
+from ..version import install
 
 LOG = logging.getLogger(__name__)
-MAX_MEMORY = 1024**3  # bytes
-MAX_SECONDS = 20
 ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
 """Audit events that touch nothing outside the process."""
 
@@ -37,25 +36,19 @@ ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
 def expand(path: Path, folders: Sequence[Path], most: int) -> str:
     """The URDF that a xacro file makes with its arguments at their defaults.
 
-    Args:
-        path: the file.
-        folders: where it and what it includes may be; packages are looked for there.
-        most: bytes of each file, and of the URDF.
-
-    Raises:
-        BuildError: naming what the file asks for in vain.
+    It and what it includes, packages too, are in the folders; each file and the URDF have ``most``
+    bytes at most. A BuildError names what the file asks for in vain.
     """
     missing = [name for name in ("xacro", "simpleeval") if find_spec(name) is None]
     if missing:
         raise BuildError(
-            f"cannot expand '{path}': there is no {' and no '.join(missing)}; install the extra"
-            " 'xacro' (pip install 'twodof[xacro]')"
+            f"cannot expand '{path}': there is no {' and no '.join(missing)}; {install('xacro')}"
         )
     environment = {"LC_ALL": "C.UTF-8"}
     with Child(_expand, path, folders, most, environment=environment, output=DEVNULL) as child:
         try:
-            if not child.poll(MAX_SECONDS):
-                raise EOFError(f"it takes more than {MAX_SECONDS} s")
+            if not child.poll(MAX_XACRO_SECONDS):
+                raise EOFError(f"it takes more than {MAX_XACRO_SECONDS} s")
             text, remarks = child.recv()
         except (EOFError, ChildError) as error:
             raise BuildError(f"cannot expand '{path}': {error}") from error
@@ -70,7 +63,6 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) ->
     from xacro import substitution_args
 
     import_module("yaml")  # as it is when it is used, when nothing can be imported any more
-    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
     os.environ.clear()
     xacro.safe_eval = _evaluate
     substitution_args._eval = _refuse_eval
@@ -78,6 +70,7 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) ->
     for name in ("isinstance", "repr", "type", "vars"):
         del xacro._global_symbols["python"][name]
     xacro.process_doc(xacro.parse("<a b='${math.pi}'/>"))  # which imports the rest
+    confine(MAX_XACRO_MEMORY, MAX_XACRO_SECONDS, folders)
     sys.addaudithook(_guard(folders, most))
     remarks = io.StringIO()
     try:

@@ -6,6 +6,6 @@ with redirect_stdout(None):  # where FMPy says that for aarch64-linux it has no 
     import fmpy  # noqa: F401
 
 from .description import Fmu, load_fmu, opened, read_resource
-from .instance import Instance, instantiate
+from .instance import Instance, Values, instantiate
 
-__all__ = ["Fmu", "Instance", "instantiate", "load_fmu", "opened", "read_resource"]
+__all__ = ["Fmu", "Instance", "Values", "instantiate", "load_fmu", "opened", "read_resource"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import codecs
+import math
 import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import count, product, takewhile
+from math import prod
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -15,12 +18,10 @@ from xml.etree import ElementTree as ET
 import fmpy
 from fmpy.model_description import ModelDescription, ModelVariable
 
+from ..bounds import MAX_DESCRIPTION, MAX_ELEMENTS, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError
 from ..export.compiler import host_platform
-from ..files import UnsafeArchiveError, check_archive, is_plain_xml, read_member
-
-MAX_DESCRIPTION = 8 * 1024**2  # some 50,000 variables
-MAX_RESOURCE = 256 * 1024**2
+from ..files import UnsafeArchiveError, check_archive, read_member
 
 
 @dataclass(frozen=True)
@@ -153,9 +154,10 @@ def load_fmu(path: str | Path) -> Fmu:
     path = Path(path)
     xml, members = _read(path)
     try:
+        root = ET.fromstring(xml)
+        _check_arrays(root)
         with path.open("rb") as file:  # by its name FMPy would take an XML file too
             description = fmpy.read_model_description(file, validate=True)
-        root = ET.fromstring(xml)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
         raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
     if not re.match(r"[23]\.0", description.fmiVersion) or description.coSimulation is None:
@@ -187,7 +189,28 @@ def load_fmu(path: str | Path) -> Fmu:
         raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
     if len(fmu.joints) != n:
         raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
+    _check_starts(fmu)
     return fmu
+
+
+def _check_starts(fmu: Fmu) -> None:
+    """Refuse start values that are no numbers, and task vectors that are not those of the axes."""
+    for name, variable in fmu.variables.items():
+        try:
+            _ = variable.start_value
+        except ValueError:
+            reason = f"the start value of {name}, '{variable.start:.50}', is no number"
+            raise FmuError(f"'{fmu.path}': {reason}") from None
+    if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):
+        raise FmuError(f"'{fmu.path}': its axes '{fmu.axes:.50}' are not different ones of 'xyz'")
+    for group in ("x", "x_des") if fmu.axes else ():
+        names = fmu.vector(group)
+        if len(names) != len(fmu.axes) and (names or group == "x"):
+            raise FmuError(
+                f"'{fmu.path}': {group} has {len(names)} elements for the axes '{fmu.axes}'"
+            )
+        if group == "x_des" and any(fmu.variables[name].start is None for name in names):
+            raise FmuError(f"'{fmu.path}': x_des has no start values")
 
 
 @contextmanager
@@ -229,9 +252,36 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
         raise FmuError(f"'{path}': {error}") from error
     except ZIP_ERRORS as error:
         raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
-    if not is_plain_xml(xml):
+    if not _is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, _checksums(archive)
+
+
+def _is_plain_xml(xml: bytes) -> bool:
+    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
+    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
+    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
+    encoding = declared[1].lower() if declared else b"utf-8"
+    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
+    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
+    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
+
+
+def _check_arrays(root: ET.Element) -> None:
+    """Refuse arrays of FMI 3.0 with too many elements, or sizes that are no numbers: ValueError."""
+    sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
+    room = MAX_ELEMENTS
+    for variable in root.iterfind("ModelVariables/*"):
+        dimensions = variable.findall("Dimension")
+        texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
+        if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
+            raise ValueError(f"variable '{variable.get('name')}' has a dimension of no known size")
+        room -= math.prod(max(1, int(text)) for text in texts) if dimensions else 0
+        if room < 0:
+            raise ValueError(
+                f"with variable '{variable.get('name')}' its arrays have more than {MAX_ELEMENTS}"
+                " elements"
+            )
 
 
 def _checksums(archive: zipfile.ZipFile) -> dict[str, int]:
@@ -270,6 +320,8 @@ def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
         return
     starts: list[str | None] = list((variable.start or "").split())
     starts = starts or [None]
+    if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
+        raise FmuError(f"{variable.name} has {len(starts)} start values, not one or one an element")
     inner = re.fullmatch(r"der\((.*)\)", variable.name)
     for i, place in enumerate(product(*(range(1, size + 1) for size in variable.shape))):
         index = f"[{','.join(map(str, place))}]"

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
+from functools import partial
 from itertools import accumulate, chain
 from math import inf
 from pathlib import Path
@@ -159,9 +160,13 @@ class Instance:
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
         """∂unknown/∂known at the instance's state, a row each of the unknown."""
         references = [[self._fmu.variables[n].reference for n in u] for u in (unknown, known)]
-        columns = [
-            self._slave.getDirectionalDerivative(references[0], [k], [1.0]) for k in references[1]
-        ]
+        try:
+            columns = [
+                self._slave.getDirectionalDerivative(references[0], [k], [1.0])
+                for k in references[1]
+            ]
+        except FMICallException as error:
+            self._refuse(error.status)
         matrix: NDArray[np.float64] = np.array(columns).reshape(len(known), len(unknown)).T
         return matrix
 
@@ -210,7 +215,7 @@ class Instance3(Instance):
     def _instantiate(self, **what: str) -> Any:
         with _loading():
             slave = fmi3.FMU3Slave(**what)
-        slave.instantiate(logMessage=self._log_message, loggingOn=True)
+        slave.instantiate(logMessage=partial(self._log, b""), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
         self._do_step = slave.dll["fmi3DoStep"]
         self._rest = (c_bool(True), *results)
@@ -284,9 +289,6 @@ class Instance3(Instance):
             len(rows), len(columns)
         )
 
-    def _log_message(self, _environment: object, status: int, category: bytes, text: bytes) -> None:
-        self._log(None, b"", status, category, text)
-
 
 @contextmanager
 def instantiate(fmu: Fmu) -> Iterator[Instance]:
@@ -294,9 +296,7 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
 
     It is unzipped into a temporary folder, but for what is there to be read by people.
 
-    Raises:
-        FmuError: it has no binary for this platform, was replaced by another, or it cannot be
-            unzipped or loaded.
+    An FmuError says that it has no binary for this platform, or cannot be unzipped or loaded.
     """
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"

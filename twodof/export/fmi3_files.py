@@ -1,0 +1,55 @@
+"""The XML files that FMI 3.0 has beside modelDescription.xml. FMI 3.0.2, sections 2.5 and 2.6."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+
+from ..plant.variables import DISTURBANCES, Variable
+
+TERMINALS = {
+    "targets": "where the robot is meant to be, or the effort of a controller",
+    "joints": "positions, velocities and efforts of the joints",
+    "forces": "what acts on the robot from outside",
+}
+
+
+def xml_text(root: ET.Element) -> bytes:
+    """As it stands in a file."""
+    ET.indent(root)
+    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"
+
+
+def build_description(identifier: str, units: Sequence[str]) -> bytes:
+    """The text of sources/buildDescription.xml: what a tool compiles."""
+    root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+    build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
+    files = ET.SubElement(build, "SourceFileSet", language="C99")
+    for name in units:
+        ET.SubElement(files, "SourceFile", name=name)
+    ET.SubElement(build, "Library", name="m")
+    return xml_text(root)
+
+
+def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
+    """The text of terminalsAndIcons.xml: how the icon lies, and what belongs together in a plug."""
+    targets = {v.group for v in table if v.group.endswith(("_des", "_cmd"))}
+    terminals = {"targets": targets, "joints": {"q", "v", "tau"}, "forces": set(DISTURBANCES)}
+    root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")
+    graphic = ET.SubElement(root, "GraphicalRepresentation")
+    place = {"x1": "-15", "y1": "-10", "x2": "15", "y2": "10"}  # as wide as high as the icon is
+    ET.SubElement(graphic, "CoordinateSystem", place, suggestedScalingFactorTo_mm="1")
+    ET.SubElement(graphic, "Icon", place)
+    parent = ET.SubElement(root, "Terminals")
+    for name, members in terminals.items():
+        terminal = ET.SubElement(
+            parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name]
+        )
+        names = (v.group if arrays else v.name for v in table if v.group in members)
+        for member in dict.fromkeys(names):
+            ET.SubElement(
+                terminal, "TerminalMemberVariable", variableName=member, memberName=member,
+                variableKind="signal",
+            )  # fmt: skip
+    return xml_text(root)
