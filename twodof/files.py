@@ -4,17 +4,17 @@ folders marked as being written, and folders for a while."""
 from __future__ import annotations
 
 import base64
-import codecs
 import errno
 import fcntl
 import io
 import json
 import os
-import re
+import secrets
 import shutil
 import stat
 import sys
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -23,16 +23,20 @@ from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from .bounds import (
+    MAX_ARCHIVE,
+    MAX_DIRECTORY,
+    MAX_FOLDERS_DEEP,
+    MAX_MEMBERS,
+    MAX_UNZIPPED,
+)
 from .errors import TwoDofError
 
-MAX_URDF = 8 * 1024**2
-MAX_ARCHIVE = 2 * 1024**3
-MAX_DIRECTORY = 4 * 1024**2  # of a zip: some 50,000 members
-MAX_UNZIPPED = 2 * 1024**3
-MAX_DEPTH = 50  # of folders in folders
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
+MAX_LINKS_FOLLOWED = 40  # as the kernel
 TEMPORARY = ".twodof."
 """Prefix of folders whose process has died, or holds their lock."""
+PATIENCE = 5.0  # s that a lock is waited for
 NUMBER = int | float
 VALUES = {str: NUMBER}
 
@@ -68,29 +72,21 @@ def check_file(path: str | Path, most: int) -> None:
         raise OSError(errno.EFBIG, reason, str(path))
 
 
-def read_file(path: str | Path, most: int) -> bytes:
+def read_file(path: str | Path, most: int, *, follow: bool = True) -> bytes:
     """The content of a regular file of at most ``most`` bytes.
 
     Raises:
-        OSError: it cannot be read, or ``check_file`` refuses it.
+        OSError: it cannot be read, ``check_file`` refuses it, or it is a link and not to follow.
     """
+    if not follow and os.path.islink(path):
+        raise OSError(errno.ELOOP, "It is a link, and links in a bag are not followed", str(path))
     check_file(path, most)
-    with Path(path).open("rb") as file:
+    with open(os.open(path, os.O_RDONLY | (0 if follow else os.O_NOFOLLOW)), "rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
-def read_urdf_text(path: str | Path, kind: type[TwoDofError]) -> str:
-    """The text of a URDF; raises ``kind`` where it cannot be read, or is not UTF-8."""
-    with refusing(kind, f"read the URDF '{path}'"):
-        content = read_file(path, MAX_URDF)
-    try:
-        return content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise kind(f"the URDF '{path}' is not UTF-8 text") from error
-
-
 def head_of(path: Path, size: int) -> bytes:
-    """The first bytes of a file; none where it cannot be read."""
+    """Return the first bytes of a file; none where it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return file.read(size)
     return b""
@@ -116,6 +112,9 @@ def check_archive(path: str | Path) -> None:
         members = archive.infolist()
     for member in members:
         _check_member(member)
+    names = [PurePosixPath(member.filename) for member in members]
+    if len({*names, *(folder for name in names for folder in name.parents)}) > MAX_MEMBERS:
+        raise UnsafeArchiveError(f"it has more than {MAX_MEMBERS} files and folders")
     if sum(member.file_size for member in members) > MAX_UNZIPPED:
         raise UnsafeArchiveError(f"it is unsafe: unzipped it exceeds {MAX_UNZIPPED} bytes")
 
@@ -126,8 +125,10 @@ def _check_member(member: zipfile.ZipInfo) -> None:
     outside = name.is_absolute() or ".." in name.parts or "\\" in member.filename
     if link or outside or not member.filename:
         raise UnsafeArchiveError(f"it is unsafe: its member '{name}' leaves its folder")
-    if len(name.parts) > MAX_DEPTH:
-        raise UnsafeArchiveError(f"it is unsafe: its folders are nested deeper than {MAX_DEPTH}")
+    if len(name.parts) > MAX_FOLDERS_DEEP:
+        raise UnsafeArchiveError(
+            f"it is unsafe: its folders are nested deeper than {MAX_FOLDERS_DEEP}"
+        )
     if member.compress_type not in METHODS:
         raise UnsafeArchiveError(
             f"its member '{name}' is compressed by method {member.compress_type};"
@@ -160,24 +161,48 @@ class _Archive(io.FileIO):
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all.
+    """Write a file whole or not at all, where a link leads; or into a device, pipe or /dev/stdout.
+
+    A new file has the mode that the umask leaves; one that is replaced keeps its mode.
 
     Raises:
-        OSError: it cannot be written, or is there and no regular file: root would replace a device.
+        OSError: it cannot be written.
     """
-    os.stat(f"{path.parent}/")  # else it is the temporary file's name that is told
-    if path.exists():
-        check_file(path, sys.maxsize)
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".twodof-", delete=False) as file:
-        partial = Path(file.name)
-        try:
+    descriptor, mode = descriptor_of(path), 0
+    with suppress(FileNotFoundError):
+        mode = os.stat(path).st_mode
+    if descriptor is not None or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):
+        with open(path if descriptor is None else os.dup(descriptor), "wb") as file:
             file.write(content)
-            file.flush()
-            os.chmod(partial, 0o644)
-            os.replace(partial, path)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
+        return
+    if mode:
+        check_file(path, sys.maxsize)
+    target = Path(os.path.realpath(path))
+    os.stat(f"{target.parent}/")  # else it is the temporary file's name that is told
+    partial = target.with_name(f".twodof-{secrets.token_hex(8)}")
+    new = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        with open(new, "wb") as file:
+            if mode:
+                os.fchmod(new, stat.S_IMODE(mode) & 0o777)
+            file.write(content)
+        os.replace(partial, target)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def descriptor_of(path: str | Path) -> int | None:
+    """The open file that a name such as /dev/stdout or /dev/fd/3 means; None for other names."""
+    for _ in range(MAX_LINKS_FOLLOWED):
+        folder, name = os.path.split(os.path.abspath(path))
+        if name.isdecimal() and os.path.realpath(folder) == f"/proc/{os.getpid()}/fd":
+            return int(name)
+        try:
+            path = Path(folder, os.readlink(path))
+        except OSError:  # no link
+            break
+    return None
 
 
 @contextmanager
@@ -224,7 +249,7 @@ def lock(path: Path, *, wait: bool = False) -> int:
 
     Args:
         path: the folder.
-        wait: for those that look whether it is being written.
+        wait: up to PATIENCE s, for those that look whether it is being written.
 
     Raises:
         BlockingIOError: another process writes it.
@@ -232,9 +257,12 @@ def lock(path: Path, *, wait: bool = False) -> int:
     """
     folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place would be waited for
     try:
-        if not _locked(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB)) or (
-            not os.path.samestat(os.fstat(folder), os.stat(path))
+        end = time.monotonic() + (PATIENCE if wait else 0.0)
+        while (
+            not (own := _locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) and time.monotonic() < end
         ):
+            time.sleep(0.01)
+        if not own or not os.path.samestat(os.fstat(folder), os.stat(path)):
             raise BlockingIOError(errno.EWOULDBLOCK, "another process writes it", str(path))
     except BaseException:
         os.close(folder)
@@ -289,16 +317,6 @@ def data_file(*parts: str) -> Path:
     package = Path(__file__).parent
     installed = package.joinpath(*parts)
     return installed if installed.exists() else package.parent.joinpath(*parts)
-
-
-def is_plain_xml(xml: bytes) -> bool:
-    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
-    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
-    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
-    encoding = declared[1].lower() if declared else b"utf-8"
-    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
-    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
-    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
 
 
 def parsed(text: bytes) -> Any:

@@ -53,12 +53,15 @@ class Kinematics:
         urdf: the robot.
         joints: names of the joints whose positions are the columns of q. Those that mimic one of
             them, and have no column, follow it; all others rest at 0.
+
+    Attributes:
+        origins: rotation matrix of each joint's frame in its parent's at 0, by name.
     """
 
     def __init__(self, urdf: Urdf, joints: Sequence[str]) -> None:
         self.urdf = urdf
         self._columns = {name: i for i, name in enumerate(joints)}
-        self._origins = {
+        self.origins = {
             joint.name: Rotation.from_euler("xyz", joint.rpy).as_matrix()
             for joint in urdf.joints.values()
         }
@@ -75,7 +78,7 @@ class Kinematics:
 
     def _in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
         """Where a joint's child is in its parent; one where it rests."""
-        origin, along = self._origins[joint.name], self._moved(joint, q) * joint.axis
+        origin, along = self.origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
             return Placement(joint.xyz + turned(origin, along), origin[None])
         turn = Rotation.from_rotvec(along).as_matrix()
@@ -86,7 +89,7 @@ class Kinematics:
 
         N × 7, or 1 × 7 where it rests: m, and a unit quaternion x, y, z, w.
         """
-        moved, still = self._moved(joint, q), Rotation.from_matrix(self._origins[joint.name])
+        moved, still = self._moved(joint, q), Rotation.from_matrix(self.origins[joint.name])
         if joint.prismatic:
             place = joint.xyz + moved * still.apply(joint.axis)
             return np.hstack([place, np.broadcast_to(still.as_quat(), (len(moved), 4))])
@@ -127,13 +130,19 @@ class Kinematics:
         By Rodrigues' formula, p = a (a·p) + cos q (p − a (a·p)) + sin q a × p.
         """
         moved, axis = self._moved(joint, q), np.array(joint.axis)
-        origin = self._origins[joint.name].T
+        origin = self.origins[joint.name].T
         if joint.prismatic:
             return np.asarray(joint.xyz + (point + moved * axis) @ origin)
         along, across = np.outer(axis, axis), np.cross(np.eye(3), axis)
         beside = np.cos(moved) * (point @ ((np.eye(3) - along) @ origin))
         beside += np.sin(moved) * (point @ (-across @ origin))
         return np.asarray(joint.xyz + point @ (along @ origin) + beside)
+
+    def angle(self, link: str, q: ArrayLike, quat: ArrayLike) -> float:
+        """Angle between a link's orientation at one sample and a quaternion x, y, z, w, rad."""
+        rotation = self.along(self.urdf.chain(link), np.asarray(q)[None])[-1].rotation
+        apart = Rotation.from_matrix(rotation[0]).inv() * Rotation.from_quat(quat)
+        return float(apart.magnitude())
 
     def jacobian(self, link: str, q: ArrayLike) -> Array:
         """Of the link in the root's axes, N × 6 × joints: linear, then angular velocity is J v."""

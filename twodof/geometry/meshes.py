@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import io
 import logging
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from subprocess import DEVNULL
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files import temporary_folder
+from ..bounds import MAX_FATAL_MESHES, MAX_MESH_WAIT, MAX_SURFACES, MAX_TRIANGLES
+from ..children import Child
+from ..files import NUMBER, fits, parsed, temporary_folder
 from .kinematics import Array
+from .mesh_readers import serve
 
 LOG = logging.getLogger(__name__)
 ReadMesh = Callable[[str], bytes | None]
@@ -24,6 +28,8 @@ COLOURED = (".dae", ".obj")
 """Formats that have colours."""
 MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
 """Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
+SHAPE, COLOURS, LIBRARY = "shape", "colours", "colours.mtl"
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each takes address space
 
 
 class Surface(NamedTuple):
@@ -34,68 +40,165 @@ class Surface(NamedTuple):
     colour: Colour | None
 
 
-def surfaces(name: str, read: ReadMesh, scale: Array) -> list[Surface]:
-    """The surfaces of a mesh, none where it is not at hand or cannot be read.
+class _KilledError(ValueError):
+    """A mesh ended its reader."""
 
-    Textures are not shown. An OBJ's colours are those of the file beside it that a build gives
-    its name and ``.mtl``.
+
+class _AnswerError(Exception):
+    """A reader has answered as none does that is sound."""
+
+
+class Meshes:
+    """The mesh files of one robot, read in confined child processes that start when needed.
+
+    A context manager. The meshes share a process: they are of one robot, so one that spoils the
+    memory of its reader can only spoil the picture of its own robot.
+
+    Args:
+        read: gives the content of a mesh file.
     """
-    content = read(name)
-    if content is None:
-        return []
-    suffix = Path(name).suffix.lower()
-    if suffix in COLOURED:
+
+    def __init__(self, read: ReadMesh) -> None:
+        self._read = read
+        self._results: dict[tuple[str, bool], list[Surface] | ValueError] = {}
+        self._readers: dict[str, Child] = {}
+        self._stack = ExitStack()
+        self._warned: set[str] = set()
+        self._fatal = self._triangles = self._surfaces = 0
+
+    def __enter__(self) -> Meshes:
+        self._folder = self._stack.enter_context(temporary_folder())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for reader in self._readers.values():
+            reader.close()
+        self._stack.close()
+
+    def scaled(self, name: str, scale: Array) -> list[Surface]:
+        """The surfaces of a mesh, m; none, with a warning, where it cannot be read."""
         try:
-            return _coloured(suffix, content, read(f"{name}.mtl"), scale)
-        except Exception as error:  # of a foreign reader, each in its own way
-            LOG.info("mesh '%s' is drawn without its colours: %s", name, error)
-    try:
-        mesh = load_mesh(name, content, scale)
-    except ValueError:
-        return []
-    triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
-    return [Surface(np.array(mesh.vertices()), np.array(triangles, dtype=np.uint32), None)]
+            surfaces = [s._replace(vertices=s.vertices * scale) for s in self.surfaces(name)]
+            if not all(np.isfinite(surface.vertices).all() for surface in surfaces):
+                raise ValueError("it has a vertex that is not finite")
+            return surfaces
+        except ValueError as error:
+            if name not in self._warned:
+                LOG.warning("mesh '%s' is left out: %s", name, error)
+            self._warned.add(name)
+            return []
+
+    def surfaces(self, name: str, coloured: bool = True) -> list[Surface]:
+        """The surfaces of a mesh file, in the file's own unit; none where it is not at hand.
+
+        Textures are not shown. An OBJ's colours are those of the file beside it that a build gives
+        its name and ``.mtl``.
+
+        Raises:
+            ValueError: it cannot be read, or is of a format that has other files read beside it.
+        """
+        key = name, coloured
+        if key not in self._results:
+            try:
+                self._results[key] = self._surfaces_of(name, coloured)
+            except ValueError as error:
+                self._results[key] = error
+        result = self._results[key]
+        if isinstance(result, ValueError):
+            raise result
+        self._triangles += sum(len(surface.triangles) for surface in result)
+        self._surfaces += len(result)
+        if self._triangles > MAX_TRIANGLES or self._surfaces > MAX_SURFACES:
+            raise ValueError(
+                f"the robot's meshes have more than {MAX_TRIANGLES} triangles or {MAX_SURFACES}"
+                " surfaces together"
+            )
+        return result
+
+    def _surfaces_of(self, name: str, coloured: bool) -> list[Surface]:
+        suffix, content = Path(name).suffix.lower(), self._read(name)
+        if content is None:
+            return []
+        if suffix not in MESH_FORMATS:
+            raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
+        if coloured and suffix in COLOURED and all(map(find_spec, ("trimesh", "collada"))):
+            try:
+                return self._parsed(COLOURS, suffix, content, self._read(f"{name}.mtl"))
+            except _KilledError:
+                raise
+            except ValueError:  # it reads less than assimp
+                pass
+        if suffix == ".obj":
+            content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
+        return self._parsed(SHAPE, suffix, content, None)
+
+    def _parsed(
+        self, kind: str, suffix: str, content: bytes, library: bytes | None
+    ) -> list[Surface]:
+        """What a reader makes of a file.
+
+        A reader that has read other meshes may die of one of these: a fresh one tries again.
+        """
+        file = self._folder / f"mesh{suffix}"
+        file.write_bytes(content)
+        if library is not None:
+            (self._folder / LIBRARY).write_bytes(library)
+        fresh = kind not in self._readers
+        while True:
+            if self._fatal >= MAX_FATAL_MESHES:
+                raise _KilledError(f"{MAX_FATAL_MESHES} others end their reader")
+            if kind not in self._readers:
+                self._readers[kind] = Child(
+                    serve, kind, self._folder, environment=ONE_THREAD, output=DEVNULL
+                )
+            reader = self._readers[kind]
+            try:
+                reader.send((file.name, None if library is None else LIBRARY))
+                return _received(reader)
+            except (EOFError, _AnswerError) as error:
+                self._readers.pop(kind).close()
+                if fresh:
+                    self._fatal += 1
+                    raise _KilledError(f"it ends its reader: {error}") from None
+                fresh = True
 
 
-def _coloured(suffix: str, content: bytes, library: bytes | None, scale: Array) -> list[Surface]:
-    """By trimesh, which places them in the file's scene."""
-    import trimesh
-
-    files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # whatever it is called
-    scene = trimesh.load_scene(
-        io.BytesIO(content), file_type=suffix[1:], resolver=files, process=False
-    )
-    coloured = []
-    for mesh in scene.dump():
-        material = getattr(mesh.visual, "material", None)
-        colour = None
-        if material is not None and not (suffix == ".obj" and library is None):
-            r, g, b = (float(value) / 255.0 for value in material.main_color[:3])
-            colour = r, g, b
-        vertices = np.array(mesh.vertices) * scale
-        coloured.append(Surface(vertices, np.array(mesh.faces, dtype=np.uint32), colour))
-    if not coloured:
-        raise ValueError("the file has no triangles")
-    return coloured
-
-
-def load_mesh(name: str, content: bytes, scale: Array | Sequence[float]) -> Any:
-    """A mesh file as coal's model, its vertices in m.
+def _received(reader: Child) -> list[Surface]:
+    """The answer of a reader, checked, as a reader may be in the power of the file.
 
     Raises:
-        ValueError: it cannot be read, or is of a format that has other files read beside it.
+        ValueError: the file is refused.
+        _AnswerError: no sound reader answers so.
+        EOFError: it has ended.
     """
     try:
-        import coal
-    except ImportError as missing:
-        raise ValueError(f"{missing}; install the package 'coal'") from missing
-    suffix = Path(name).suffix.lower()
-    if suffix not in MESH_FORMATS:
-        raise ValueError(f"its format '{suffix}' is none of {', '.join(MESH_FORMATS)}")
-    if suffix == ".obj":
-        content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
-    with temporary_folder() as folder:
-        file = folder / Path(name).name
-        file.write_bytes(content)
-        # boxes along the axes: others take longer, and complain on stderr of odd triangles
-        return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
+        answer = parsed(reader.receive(200 * MAX_SURFACES, MAX_MESH_WAIT))
+    except (ValueError, RecursionError) as error:
+        raise _AnswerError(f"its answer is none: {error}") from None
+    if isinstance(answer, str):
+        raise ValueError(answer[:500])
+    if not fits(answer, [(int, int, NUMBER, NUMBER, NUMBER)]) or any(
+        min(row[:2]) < 0 for row in answer
+    ):
+        raise _AnswerError("its answer is none")
+    sizes = [sum(row[i] for row in answer) for i in (0, 1)]
+    if sizes[0] > 3 * MAX_TRIANGLES or sizes[1] > MAX_TRIANGLES:
+        raise _AnswerError("its answer is too long")
+    content = [reader.receive(size * n, MAX_MESH_WAIT) for size, n in zip(sizes, (24, 12))]
+    if [len(part) for part in content] != [24 * sizes[0], 12 * sizes[1]]:
+        raise _AnswerError("its answer is none")
+    vertices = np.frombuffer(content[0], "<f8").reshape(-1, 3)
+    triangles = np.frombuffer(content[1], "<u4").reshape(-1, 3)
+    if not np.isfinite(vertices).all():
+        raise ValueError("it has a vertex that is not finite")
+    surfaces, i, j = [], 0, 0
+    for v, t, *colour in answer:
+        own = vertices[i : i + v], triangles[j : j + t]
+        if own[1].max(initial=0) >= max(v, 1):
+            raise ValueError("it has a triangle of vertices that do not exist")
+        if t:
+            surfaces.append(Surface(*own, (*colour,) if min(colour) >= 0 else None))
+        i, j = i + v, j + t
+    if not surfaces:
+        raise ValueError("it has no triangles")
+    return surfaces

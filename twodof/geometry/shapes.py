@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ..plant.urdf import RobotError, Urdf
 from .kinematics import Array, Placement
-from .meshes import Colour, ReadMesh, Surface, surfaces
+from .meshes import Colour, Meshes, ReadMesh, Surface
 
 Indices = NDArray[np.uint32]
 
@@ -45,25 +46,33 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
         RobotError: a shape is not described by numbers.
     """
     shapes, missing = [], []
-    for link in robot.tree.findall("link"):
-        name = str(link.get("name"))
-        for visual in link.findall("visual"):
-            geometry = visual.find("geometry")
-            if geometry is None or not len(geometry):
-                continue
-            element = geometry[0]
-            try:
-                place, colour = origin(visual.find("origin")), _colour(robot.tree, visual)
-                drawn = _surfaces(element, read)
-            except ValueError as error:
-                raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
-            shapes += [Shape(name, place, s.colour or colour, *s[:2]) for s in drawn]
-            if element.tag == "mesh" and not drawn:
-                missing.append(element.get("filename", "").removeprefix("package://"))
+    named = {
+        material.get("name"): material for material in reversed(robot.tree.findall("material"))
+    }
+    with Meshes(read) as meshes:
+        for link in robot.tree.findall("link"):
+            name = str(link.get("name"))
+            for visual in link.findall("visual"):
+                geometry = visual.find("geometry")
+                if geometry is None or not len(geometry):
+                    continue
+                element = geometry[0]
+                try:
+                    place, colour = origin(visual.find("origin")), _colour(visual, named)
+                    drawn = _surfaces(element, meshes)
+                except ValueError as error:
+                    raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
+                shapes += [Shape(name, place, s.colour or colour, *s[:2]) for s in drawn]
+                if element.tag == "mesh" and not drawn and read(_file(element)) is None:
+                    missing.append(_file(element))
     return shapes or _sticks(robot), missing
 
 
-def _surfaces(element: ET.Element, read: ReadMesh) -> list[Surface]:
+def _file(element: ET.Element) -> str:
+    return element.get("filename", "").removeprefix("package://")
+
+
+def _surfaces(element: ET.Element, meshes: Meshes) -> list[Surface]:
     """Of a URDF's geometry; none where it is of an unknown kind or its mesh is of no use."""
 
     def number(key: str) -> float:
@@ -71,9 +80,7 @@ def _surfaces(element: ET.Element, read: ReadMesh) -> list[Surface]:
         return float(value)
 
     if element.tag == "mesh":
-        name = element.get("filename", "").removeprefix("package://")
-        scale = floats(element, "scale", "1 1 1")
-        return [s for s in surfaces(name, read, scale) if np.isfinite(s.vertices).all()]
+        return meshes.scaled(_file(element), floats(element, "scale", "1 1 1"))
     if element.tag == "box":
         corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
         return [Surface(corners * floats(element, "size", "1 1 1"), BOX, None)]
@@ -133,12 +140,12 @@ def _sticks(robot: Urdf) -> list[Shape]:
     return shapes
 
 
-def _colour(tree: ET.Element, visual: ET.Element) -> Colour:
+def _colour(visual: ET.Element, named: Mapping[str | None, ET.Element]) -> Colour:
+    """Its material's own, or that of the robot's material of this name."""
     material = visual.find("material")
     if material is not None:
-        named = [m for m in tree.findall("material") if m.get("name") == material.get("name")]
-        for candidate in (material, *named):
-            if (colour := candidate.find("color")) is not None:
+        for candidate in (material, named.get(material.get("name"))):
+            if candidate is not None and (colour := candidate.find("color")) is not None:
                 r, g, b = floats(colour, "rgba", "1 1 1 1")[:3].tolist()
                 return r, g, b
     return NO_MATERIAL

@@ -1,0 +1,108 @@
+"""Mesh files read by assimp (coal) and by trimesh, in a confined child process of `meshes.py`.
+
+Both have unsafe or unbounded code: assimp overruns its heap on damaged files. Nothing but their
+arrays leaves the process, as bytes and never as a pickle.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections import defaultdict
+from collections.abc import Callable
+from importlib import import_module
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bounds import MAX_MESH_MEMORY, MAX_MESH_SECONDS, MAX_MESHES_SECONDS, MAX_TRIANGLES
+from ..children import confine, limit_time
+
+Part = tuple[NDArray[np.float64], NDArray[np.uint32], "list[float] | None"]
+Reader = Callable[[bytes, Path, "bytes | None"], list[Part]]
+NO_COLOUR = (-1, -1, -1)
+
+
+def serve(pipe: Connection, kind: str, folder: Path) -> None:
+    """In the child: read the files of the folder that the pipe names, one after another."""
+    try:
+        read = {"shape": _coal, "colours": _trimesh}[kind]()
+    except ImportError as missing:
+        read = _refusing(f"{missing}; install the package '{missing.name}'")
+    confine(MAX_MESH_MEMORY, MAX_MESHES_SECONDS, [folder])
+    while True:
+        name, library = pipe.recv()
+        limit_time(MAX_MESH_SECONDS)
+        try:
+            path = folder / name
+            colours = (folder / library).read_bytes() if library else None
+            parts = read(path.read_bytes(), path, colours)
+            if sum(len(triangles) for _, triangles, _ in parts) > MAX_TRIANGLES:
+                raise ValueError(f"it has more than {MAX_TRIANGLES} triangles")
+        except MemoryError:
+            answer: object = f"it takes more than {MAX_MESH_MEMORY // 2**20} MiB"
+        except Exception as error:  # of a foreign reader, each in its own way
+            answer = _reason(error, path)
+        else:
+            answer = [(len(v), len(t), *(colour or NO_COLOUR)) for v, t, colour in parts]
+            pipe.send_bytes(json.dumps(answer).encode())
+            pipe.send_bytes(b"".join(v.astype("<f8").tobytes() for v, _, _ in parts))
+            pipe.send_bytes(b"".join(t.astype("<u4").tobytes() for _, t, _ in parts))
+            continue
+        pipe.send_bytes(json.dumps(answer).encode())
+
+
+def _refusing(reason: str) -> Reader:
+    def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
+        raise ValueError(reason)
+
+    return read
+
+
+def _reason(error: Exception, path: Path) -> str:
+    """In one line; coal's has its own file, the mesh's and a hint around assimp's."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    text = text.rpartition(" message: ")[2].partition(" Hint: ")[0]
+    text = text.removeprefix(f"Could not load resource {path} ")
+    return text.replace("std::bad_alloc", f"it takes more than {MAX_MESH_MEMORY // 2**20} MiB")
+
+
+def _coal() -> Reader:
+    import coal
+
+    def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
+        # boxes along the axes: others take longer, and complain on stderr of odd triangles
+        mesh = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
+        if mesh.num_tris > MAX_TRIANGLES:
+            raise ValueError(f"it has {mesh.num_tris} triangles, at most {MAX_TRIANGLES}")
+        triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
+        faces = np.array(triangles, dtype=np.uint32).reshape(-1, 3)
+        return [(np.array(mesh.vertices(), dtype=np.float64), faces, None)]
+
+    return read
+
+
+def _trimesh() -> Reader:
+    import trimesh
+
+    import_module("collada")  # as trimesh does when it is used, which a confined process cannot
+
+    def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
+        files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # whatever its name
+        scene = trimesh.load_scene(
+            io.BytesIO(content), file_type=path.suffix[1:], resolver=files, process=False
+        )
+        parts: list[Part] = []
+        for mesh in scene.dump():
+            material = getattr(mesh.visual, "material", None)
+            colour = None
+            if material is not None and not (path.suffix == ".obj" and library is None):
+                colour = [float(value) / 255.0 for value in material.main_color[:3]]
+            parts.append((np.array(mesh.vertices), np.array(mesh.faces, dtype=np.uint32), colour))
+        if not parts:
+            raise ValueError("the file has no triangles")
+        return parts
+
+    return read
