@@ -10,7 +10,9 @@ import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
+from urllib.parse import urlsplit
 
 import browser
 import numpy as np
@@ -236,6 +238,43 @@ def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> 
     until(page, lambda found: found["time"] == "0.010 s")
 
 
+def test_a_flood_of_orders_stops_no_news(command: Served, page: Page) -> None:
+    """Nor another page's orders, and its own last one is followed."""
+    with open_socket(socket_of(command)) as flood, open_socket(socket_of(command)) as other:
+        other.send('["play", true]')
+        stopped = Event()
+
+        def send() -> None:
+            while not stopped.is_set():
+                for order in ('["play", true]', '["step", null]', '["change", {"Kp": 55.0}]'):
+                    for _ in range(1000):
+                        flood.send(order)
+            flood.send('["change", {"Kp": 56.0}]')
+
+        sending = Thread(target=send)
+        sending.start()
+        try:
+            for k in range(30):
+                target = 0.1 + k / 1000
+                other.send(json.dumps(["change", {"x_des[1]": target}]))
+                while json.loads(other.recv(timeout=5.0))["values"]["x_des[1]"] != target:
+                    pass
+        finally:
+            stopped.set()
+            while True:  # what has come of news, which nobody else reads
+                try:
+                    flood.recv(timeout=0.1)
+                except TimeoutError:
+                    if not sending.is_alive():
+                        break
+            sending.join()
+        while json.loads(other.recv(timeout=browser.PATIENCE))["values"]["Kp[1]"] != 56.0:
+            pass
+        other.send('["play", false]')
+        while json.loads(other.recv(timeout=browser.PATIENCE))["playing"]:
+            pass
+
+
 def test_a_setting_that_is_none_is_told_as_text(command: Served, page: Page) -> None:
     def ask(name: str, value: object, number: int) -> None:
         latest(command, lambda news: news["noted"] == number, ["change", {name: value}])
@@ -254,10 +293,11 @@ def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(
 ) -> None:
     """In the Python flavour; what is beyond the page's own pace is not waited for."""
     with served("live", fmu_path, cwd=tmp_path) as command:
-        host, port = command.url.removeprefix("http://").split(":")
-        deaf = socket.create_connection((host, int(port)))
+        place = urlsplit(socket_of(command))
+        deaf = socket.create_connection((str(place.hostname), place.port or 0))
         head = "".join(f"{name}: {value}\r\n" for name, value in browser.UPGRADE)
-        deaf.sendall(f"GET /socket HTTP/1.1\r\nHost: localhost\r\n{head}\r\n".encode())
+        path = f"/socket?{place.query}"
+        deaf.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n{head}\r\n".encode())
         with opened(shown, command.url) as page:
             press(page, "Record")
             page.get_by_role("button", name=re.compile("^Stop recording")).wait_for()
@@ -305,7 +345,17 @@ def end(command: Served, folder: Path, number: signal.Signals) -> float:
 
 
 def socket_of(command: Served) -> str:
-    return command.url.replace("http:", "ws:") + "/socket"
+    return browser.socket_of(command.url)
+
+
+def test_who_has_no_token_is_refused(command: Served) -> None:
+    """Another user of this machine, to whom the port is open."""
+    token = urlsplit(command.url).query.removeprefix("token=")
+    assert len(token) == 43
+    for query in ("", "?token=", f"?token={token[:-1]}", f"?token={token}x", f"?{token}"):
+        for path, headers in (("/", ()), ("/socket", browser.UPGRADE)):
+            own = ("Host", "localhost"), *headers
+            assert browser.answer(command.url, *own, path=path + query) == 403
 
 
 def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
@@ -314,8 +364,11 @@ def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
         ((("Host", "localhost"), ("Origin", "http://evil.example")), 403),
         ((("Host", "evil.example"), ("Origin", "http://evil.example")), 403),
     ):
-        assert browser.answer(command.url, *headers, *browser.UPGRADE, path="/socket") == status
-        assert browser.answer(command.url, *headers) == (200 if status == 101 else 403)
+        query = urlsplit(command.url).query
+        path = f"/socket?{query}"
+        assert browser.answer(command.url, *headers, *browser.UPGRADE, path=path) == status
+        page = 200 if status == 101 else 403
+        assert browser.answer(command.url, *headers, path=f"/?{query}") == page
 
 
 def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> None:
@@ -457,19 +510,20 @@ def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_p
 
 
 def test_a_page_whose_server_ends_goes_on_with_the_next(
-    shown: Browser, native_path: Path, tmp_path: Path
+    shown: Browser, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Which steps another robot, whose joints have units of their own.
 
     At rest J⁻ᵀ τ_ext is balanced by Kp: M (J⁻¹ Kp e) = τ_ext, with the textbook's M.
     """
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # the server that is killed leaves a folder
     (tmp_path / "slider.urdf").write_text(SLIDER)
     options = twodof.FmuOptions(
         urdf=tmp_path / "slider.urdf", frame="tip", axes="xy", q_start=(0.1, 0.6)
     )
     slider = twodof.build_fmu(tmp_path / "Slider.fmu", options)
     with served("live", native_path, cwd=tmp_path) as command:
-        port = int(command.url.rpartition(":")[2])
+        port = urlsplit(command.url).port or 0
         with opened(shown, command.url) as page:
             until(page, lambda found: time_of(found) > 0.1)
             command.interrupt(signal.SIGKILL)

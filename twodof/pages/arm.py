@@ -1,23 +1,83 @@
-"""A native FMU in one HTML file that needs neither a network nor a server."""
+"""An arm in a page: its robot, and what moves it: its engine, samples of a run, or a server.
+
+All is in the page itself: it asks no network for anything, and its Content-Security-Policy allows
+its own script alone. Text from the URDF is in it as JSON, and shown as text.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from ..bounds import MAX_HEAD, MAX_SOURCE
 from ..errors import PageError
-from ..export.arm_page import CONTAINER, Arm, arm_page, live_part
-from ..files import head_of, read_member, refusing, write_file
+from ..export.compiler import compile_web_module, standard_headers
+from ..files import data_file, head_of, packed, read_member, refusing, write_file
 from ..fmu import Fmu, opened, read_resource
-from ..geometry.shapes import link_shapes
-from ..plant.urdf import RobotError, read_urdf
+from ..geometry.kinematics import Kinematics, Placement
+from ..geometry.shapes import Shape, link_shapes, sphere
+from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
 from ..simulation.experiments import Experiment, Setting, experiment
+from ..version import versions
 
-MAX_SOURCE = 16 * 1024**2  # bytes of a file
-NO_SOURCES: Mapping[str, bytes] = {}
-MAX_HEAD = 64 * 1024  # bytes in which a page says that it is one
+SCRIPTS = (
+    "engine.js", "samples.js", "session.js", "replay.js", "remote.js", "matrices.js", "robot.js",
+    "camera.js", "scene.js", "handle.js", "curves.js", "recording.js", "controls.js", "main.js",
+)  # fmt: skip
+"""In the order in which they are read."""
+FUNCTIONS = (
+    "engine_instantiate", "engine_message", "engine_forget", "engine_allocate", "engine_reset",
+    "engine_initialise", "engine_set_reals", "engine_set_boolean", "engine_get_reals",
+    "engine_step",
+)  # fmt: skip
+"""Of page.c, which the page calls."""
+RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
+"""Groups of variables that a sample holds, in its order."""
+GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
+POLICY = (
+    "default-src 'none'; script-src 'sha256-{script}'{more};"
+    " style-src 'unsafe-inline'; img-src data:"
+)
+CONTAINER = b'<div class="arm" id="arm"'
+"""By which a page with an arm is known."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What a page of a robot is made of.
+
+    Attributes:
+        name: of the FMU.
+        robot: name of the robot; frame, axes, control, joints as in ``Fmu``.
+        variables: one for each of the FMU's, elements of vectors by themselves: name, value
+            reference, causality, unit, start and description.
+        step: communication step, s.
+        urdf: text of resources/robot.urdf.
+        shapes: of its links.
+        remarks: what is not as it should be.
+    """
+
+    name: str
+    robot: str
+    joints: Sequence[str]
+    frame: str
+    axes: str
+    control: str
+    variables: Sequence[Mapping[str, Any]]
+    step: float
+    urdf: str
+    shapes: Sequence[Shape]
+    remarks: Sequence[str] = ()
 
 
 def page(
@@ -43,14 +103,25 @@ def page(
         BuildError: there is no compiler.
     """
     run = experiment(fmu, stop_time=inf, step=step, settings=settings)
-    path, sources = Path(output), _sources(run.fmu)
-    if not run.fmu.control or not sources:
+    fmu, path, sources = run.fmu, Path(output), _sources(run.fmu)
+    if not fmu.control or not sources:
         raise PageError(
-            f"'{run.fmu.path}' has no plant in C, as native FMUs of this package have;"
+            f"'{fmu.path}' has no plant in C, as native FMUs of this package have;"
             " build one with 'twodof build --native'"
         )
-    arm = arm_of(run, sources)
-    content = arm_page(arm.robot or arm.name, live_part(arm))
+    arm = arm_of(run)
+    files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
+    units = ("fmu.c", "page.c")  # a page asks for no derivatives
+    module = compile_web_module(files, units, FUNCTIONS)
+    provenance = {
+        "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
+        **{key: getattr(fmu, key) for key in ("robot", "frame", "root", "axes", "joints")},
+        "step": run.step,
+        "versions": versions(),
+        "urdf": arm.urdf,
+    }
+    engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
+    content = arm_page(arm.robot or arm.name, arm, engine, allowed, provenance=provenance)
     with refusing(PageError, f"write '{path}'"):
         write_file(path, content)
     return path
@@ -61,7 +132,7 @@ def is_page(path: Path) -> bool:
     return CONTAINER in head_of(path, MAX_HEAD)
 
 
-def arm_of(run: Experiment, sources: Mapping[str, bytes] = NO_SOURCES) -> Arm:
+def arm_of(run: Experiment) -> Arm:
     """What a page of a run's FMU is made of.
 
     Raises:
@@ -70,23 +141,24 @@ def arm_of(run: Experiment, sources: Mapping[str, bytes] = NO_SOURCES) -> Arm:
     fmu = run.fmu
     urdf = fmu.urdf or ""
     try:
-        shapes, _ = link_shapes(read_urdf(urdf), partial(read_resource, fmu))
+        robot = read_urdf(urdf)
+        shapes, _ = link_shapes(robot, partial(read_resource, fmu))
+        if fmu.frame and fmu.frame not in robot.links:
+            raise RobotError(f"it has no link '{fmu.frame}'")
     except RobotError as error:
         raise PageError(f"'{fmu.path}': its robot cannot be shown: {error}") from error
     variables = [
         {
-            "name": name, "reference": variable.reference + variable.element,
-            "causality": variable.causality,
+            "name": name, "place": place, "causality": variable.causality,
             "unit": variable.unit or "", "start": run.start_values.get(name),
             "description": variable.description,
         }
-        for name, variable in fmu.variables.items()
+        for place, (name, variable) in enumerate(fmu.variables.items())
         if variable.causality != "local"
     ]  # fmt: skip
     return Arm(
-        name=fmu.name, guid=fmu.guid, file=fmu.path.name, robot=fmu.robot, joints=fmu.joints,
-        frame=fmu.frame, root=fmu.root, axes=fmu.axes, control=fmu.control, variables=variables,
-        step=run.step, urdf=urdf, shapes=shapes, sources=sources,
+        name=fmu.name, robot=fmu.robot, joints=fmu.joints, frame=fmu.frame, axes=fmu.axes,
+        control=fmu.control, variables=variables, step=run.step, urdf=urdf, shapes=shapes,
     )  # fmt: skip
 
 
@@ -98,3 +170,120 @@ def _sources(fmu: Fmu) -> dict[str, bytes]:
             for name in fmu.members
             if name.count("/") == 1 and name[:8] == "sources/" and name[-2:] in (".c", ".h")
         }
+
+
+def arm_page(
+    title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: Any
+) -> bytes:
+    """The HTML of an arm.
+
+    Args:
+        title: of the page.
+        arm: the robot.
+        source: what moves it, packed: its "engine", or "samples", N × (time in s, groups in
+            ``RECORDED``); nothing: the server of the page, at /socket.
+        allowed: what the page may do beside running its script, in the words of its policy.
+        facts: further ones for the script.
+    """
+    known, meshes = _facts(arm)
+    data = json.dumps({**known, **facts}, sort_keys=True).replace("<", "\\u003c")
+    script = "".join(_asset(name) for name in SCRIPTS)
+    script = f'(() => {{ "use strict";\n{script}}})();\n'
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = POLICY.format(script=digest, more=allowed)
+    parts = {"facts": data, "meshes": packed(meshes), **source}.items()
+    blocks = "\n".join(
+        f'<script type="application/json" id="arm-{name}">{text}</script>' for name, text in parts
+    )
+    page = (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)} - twodof</title>\n"
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f'<link rel="icon" href="data:,">\n<style>\n{_asset("arm.css")}</style>\n</head>\n'
+        f"<body>\n{_asset('arm.html')}{blocks}\n<script>{script}</script>\n</body>\n</html>\n"
+    )
+    return page.encode("utf-8", "replace")  # names of files need not be text
+
+
+def _asset(name: str) -> str:
+    return data_file("fmu_src", "page", name).read_text("utf-8")
+
+
+def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
+    """What the page knows of its FMU, and the content of its meshes."""
+    urdf = read_urdf(arm.urdf)
+    ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
+    packed = [_mesh(shape) for shape in [ball, *arm.shapes]]
+    links, number = _links(urdf, arm.joints)
+    facts = {
+        **{key: getattr(arm, key) for key in ("name", "robot", "frame", "axes", "control", "step")},
+        "joints": [_joint(name, urdf.joints.get(name)) for name in arm.joints],
+        "recorded": RECORDED,
+        "remarks": list(arm.remarks),
+        "variables": list(arm.variables),
+        "links": links,
+        "frameLink": number[arm.frame],
+        "shapes": [
+            {"link": number[s.link], "place": _matrix(s.place), "colour": s.colour}
+            for s in arm.shapes
+        ],
+        "meshes": [facts for facts, _ in packed],
+    }
+    return facts, b"".join(content for _, content in packed)
+
+
+def _joint(name: str, joint: Joint | None) -> dict[str, Any]:
+    """Of a joint that moves on its own; null where it has no limit, or none is known."""
+    if joint is None:
+        return {"name": name, "prismatic": False, "low": None, "high": None, "effort": None}
+    limits = {"low": joint.low, "high": joint.high, "effort": joint.effort}
+    finite = {key: value if abs(value) < UNBOUNDED else None for key, value in limits.items()}
+    return {"name": name, "prismatic": joint.prismatic, **finite}
+
+
+def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dict[str, int]]:
+    """The tree of links, parents first, with the joint above each; the number of each link."""
+    kinematics = Kinematics(urdf, joints)
+    number = {urdf.root: 0}
+    links: list[dict[str, Any]] = [{"parent": -1}]
+    for joint in sorted(urdf.joints.values(), key=lambda joint: len(urdf.chain(joint.child))):
+        number[joint.child] = len(links)
+        column, ratio, offset = kinematics.column(joint)
+        links.append(
+            {
+                "parent": number[joint.parent],
+                "place": _matrix(Placement(np.array(joint.xyz), kinematics.origins[joint.name])),
+                "axis": joint.axis,
+                "prismatic": joint.prismatic,
+                "column": -1 if column is None else column,
+                "ratio": ratio,
+                "offset": offset,
+            }
+        )
+    return links, number
+
+
+def _matrix(place: Placement) -> list[float]:
+    """4 × 4, by columns, as WebGL has it."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = place.rotation
+    matrix[:3, 3] = place.translation
+    values: list[float] = matrix.T.reshape(-1).tolist()
+    return values
+
+
+def _mesh(shape: Shape) -> tuple[dict[str, Any], bytes]:
+    """Its vertices as whole parts of its size, each once, and its triangles: 16 and 32 bits."""
+    low = shape.vertices.min(axis=0)
+    size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-9)
+    grains = np.round((shape.vertices - low) / size * GRAIN).astype("<u2")
+    vertices, place = np.unique(grains, axis=0, return_inverse=True)
+    triangles = place.reshape(-1)[shape.triangles]
+    whole = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    content = vertices.astype("<u2").tobytes()
+    content += bytes(-len(content) % 4) + whole.astype("<u4").tobytes()
+    facts = {
+        "low": low.tolist(), "size": size, "vertices": len(vertices), "triangles": len(whole),
+    }  # fmt: skip
+    return facts, content

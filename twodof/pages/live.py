@@ -10,12 +10,11 @@ from math import inf
 from pathlib import Path
 
 from ..errors import InputError
-from ..export.arm_page import arm_page, served_part
 from ..fmu import Fmu
 from ..simulation.experiments import Experiment, Setting, experiment
-from .arm import arm_of
+from .arm import arm_of, arm_page
 from .loop import Loop
-from .serving import HOST, PORT, Connection, Server
+from .serving import HOST, PORT, Connection, Server, user_token
 
 RATE = 30.0  # Hz, of what is told to pages
 
@@ -59,8 +58,8 @@ def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Server:
         PageError: it cannot be shown.
     """
     arm = arm_of(run)
-    page = arm_page(arm.robot or arm.name, served_part(arm))
-    return Server(page, host, port, partial(_talk, loop))
+    page = arm_page(arm.robot or arm.name, arm, {}, "; connect-src 'self'")
+    return Server(page, host, port, partial(_talk, loop), token=user_token())
 
 
 async def _talk(loop: Loop, connection: Connection) -> None:
@@ -78,6 +77,7 @@ async def _talk(loop: Loop, connection: Connection) -> None:
             except (ValueError, TypeError, AttributeError):
                 return  # none of our pages
             heard += 1
+            await asyncio.sleep(1 / RATE if loop.behind else 0.0)  # the news have their turn
 
     loop.viewers += 1
     listening = asyncio.ensure_future(listen())

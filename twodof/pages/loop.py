@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import RLock
+from threading import Condition
 from typing import Any
 
 from ..bag.writer import Bag
@@ -27,6 +26,8 @@ from ..simulation.sample import Sample
 MOST_ROWS = 1000  # that are kept for pages that have not asked yet,
 MOST_AT_ONCE = 200  # and are told at a time
 MOST_NOTES = 4
+MOST_ORDERS = 16  # that wait, after which a page is not listened to for a while
+MOST_STEPS = 10  # in one order
 IDLE = 0.05  # s between two looks at whether to go on
 TOLD = ("x_des", "quat_des", "q_des")
 """Inputs that are told with a sample."""
@@ -90,9 +91,9 @@ class Loop:
         self._recording: Excerpt | None = None
         self._changes: dict[str, Value] = {}
         self._playing = True
-        self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
+        self._orders: deque[tuple[str, Any]] = deque()
         self._groups = [name for group in TOLD for name in fmu.vector(group)]
-        self._lock = RLock()  # of what news are made of
+        self._lock = Condition()  # of orders, and of what news are made of
         self._rows: deque[list[float]] = deque(maxlen=MOST_ROWS)
         self._notes: deque[str] = deque(maxlen=MOST_NOTES)
         self._number = self._count = self._noted = 0
@@ -120,14 +121,17 @@ class Loop:
                 else:
                     self.pace.restart()
                     self._obey(IDLE)
-                while not (self._orders.empty() or stop()):
-                    self._obey()
+                for _ in range(len(self._orders)):  # whoever adds more meanwhile
+                    if not stop():
+                        self._obey()
         finally:
             self._end_recording()
             self._source.close()
 
     def tell(self, order: str, value: Any = None) -> None:
         """Ask for something to be done between two steps; from any thread.
+
+        Orders of one kind that follow each other become one, in which the newest values win.
 
         Args:
             order: "change" of inputs and parameters, the latter begin the run anew; "play";
@@ -148,7 +152,16 @@ class Loop:
                 self._values |= value
             elif order in ("play", "step"):
                 self._playing = order == "play" and bool(value)
-        self._orders.put((order, value))
+            value = 1 if order == "step" else value
+            if self._orders and self._orders[-1][0] == order:
+                value = _joined(order, self._orders.pop()[1], value)
+            self._orders.append((order, value))
+            self._lock.notify()
+
+    @property
+    def behind(self) -> bool:
+        """Whether too many orders wait; from any thread."""
+        return len(self._orders) >= MOST_ORDERS
 
     def note(self, text: str) -> None:
         """Tell a text on all pages; from any thread."""
@@ -188,15 +201,16 @@ class Loop:
             }  # fmt: skip
 
     def _obey(self, patience: float = 0.0) -> None:
-        try:
-            order, value = self._orders.get(timeout=patience)
-        except Empty:
-            return
+        with self._lock:
+            if not self._lock.wait_for(lambda: self._orders, patience):
+                return
+            order, value = self._orders.popleft()
         if order == "change":
             self._change(value)
         elif order == "step" and not self._broken:
             self.pace.restart()
-            self._step()
+            for _ in range(value):
+                self._step()
         elif order == "reset":
             self._restart({}, self._first if value else None)
         elif order == "record" and not value:
@@ -284,3 +298,12 @@ class Loop:
         except BagError as error:
             self.note(f"The recording has ended: {error}")
         self.pace.restart()
+
+
+def _joined(order: str, before: Any, value: Any) -> Any:
+    """The value of an order that does the same as two of its kind."""
+    if order == "change":
+        return {**before, **value}
+    if order == "step":
+        return min(before + value, MOST_STEPS)
+    return before or value if order == "reset" else value

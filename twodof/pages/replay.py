@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from ..bag.recording import Recording
-from ..errors import BuildError, FmuError, PageError
-from ..export.arm_page import RECORDED, Arm, arm_page, replayed_part
+from ..errors import BuildError, FmuError, PageError, check_keywords
 from ..export.meshes import collect_meshes
 from ..export.urdf_source import read_text
-from ..files import data_file, refusing, write_file
+from ..files import data_file, packed, refusing, write_file
 from ..fmu import load_fmu, read_resource
 from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
 from ..geometry.shapes import Shape, link_shapes
 from ..plant.urdf import RobotError, read_urdf
 from ..plots.track import Track, read_tracks
+from .arm import RECORDED, Arm, arm_page
 from .serving import HOST, PORT, Server
 
 MOST_SAMPLES = 100_000  # of which a quarter is shown at most where there are more
@@ -73,16 +73,16 @@ def replay(
     count = track.recording.count
     thinned = [f"{shown} of {count} samples, extremes among them"] if shown < count else []
     arm = Arm(
-        name=track.name, guid="", file="", robot=motion.robot if motion else "",
+        name=track.name, robot=motion.robot if motion else "",
         joints=[joint.name for joint in track.joints],
-        frame=motion.frame if motion else "base", root=motion.root if motion else "base",
+        frame=motion.frame if motion else "base",
         axes=track.task.axes if track.task else track.recording.axes, control="",
         variables=[*_variables(track, groups)], step=float(track.t[-1]) / max(1, len(track.t) - 1),
         urdf=text, shapes=shapes, remarks=[*remarks, *thinned],
     )  # fmt: skip
     samples = np.column_stack([track.t, *(groups[name] for name in RECORDED if name in groups)])
     title = " - ".join(filter(None, (arm.robot, arm.name)))
-    return arm_page(title, replayed_part(arm, samples)), remarks
+    return arm_page(title, arm, {"samples": packed(samples.astype("<f8").tobytes())}), remarks
 
 
 def _groups(track: Track) -> dict[str, Array]:
@@ -166,6 +166,7 @@ def view(
         host, port: where to listen.
         robot: options of ``replay``.
     """
+    check_keywords(robot, view, replay)
     page, remarks = replay(bag, **robot)
     with Server(page, host, port) as server:
         opened(server.url, remarks)

@@ -1,6 +1,7 @@
-"""One page for browsers, and a websocket for it: a server on a thread of its own.
+"""A server on a thread of its own: one page for browsers with its websocket, or a websocket alone.
 
-It answers requests of its own page alone: whatever else a browser has open cannot read it.
+It answers requests of its own page, and of origins that are named: whatever else a browser has
+open cannot read it.
 """
 
 from __future__ import annotations
@@ -8,21 +9,30 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import os
 import re
+import secrets
 import socket
-from collections.abc import Awaitable, Callable
+import stat
+from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
 from ipaddress import ip_address
+from itertools import permutations
+from pathlib import Path
 from threading import Event, Thread
+from typing import Any
 
 from ..errors import PageError
 
 try:
+    from websockets.asyncio.client import connect
     from websockets.asyncio.server import ServerConnection, serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
+    from websockets.typing import Subprotocol
 except ImportError as missing:
     raise PageError(
         f"cannot show a page: {missing}; install the package 'websockets' (the extra 'view')"
@@ -38,6 +48,7 @@ HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
     "Connection": "close",
 }
@@ -55,9 +66,12 @@ class Server:
     """A page that is served as long as the context lasts.
 
     Args:
-        page: its HTML.
+        page: its HTML; None: there is none, and a websocket on any path.
         host, port: where to listen; port 0: any that is free.
         talk: to each websocket that the page opens; None: it opens none.
+        origins: other pages that are answered too.
+        token: that requests must have in their query; "": none.
+        protocol: of the websocket.
 
     Attributes:
         url: where the page is.
@@ -67,13 +81,17 @@ class Server:
     """
 
     def __init__(
-        self, page: bytes, host: str = HOST, port: int = PORT, talk: Talk | None = None
-    ) -> None:
+        self, page: bytes | None, host: str = HOST, port: int = PORT, talk: Talk | None = None, *,
+        origins: Collection[str] = (), protocol: str | None = None, token: str = "",
+    ) -> None:  # fmt: skip
+        self._query = f"token={token}" if token else ""
         self._page, self._host, self._talk = page, host, talk
+        self._origins, self._protocols = origins, protocol and [Subprotocol(protocol)]
         self._started = Event()
         self._socket, self._address = _listen(host, port)
         shown = ANYWHERE.get(self._address) or (f"[{host}]" if ":" in host else host)
         self.url = f"http://{shown}:{self._socket.getsockname()[1]}"
+        self.url += f"/?{self._query}" if token else ""
 
     def __enter__(self) -> Server:
         self._thread = Thread(target=asyncio.run, args=(self._serve(),), daemon=True)
@@ -90,7 +108,7 @@ class Server:
         server = await serve(
             self._talked, sock=self._socket, process_request=self._answer, logger=_silent,
             compression=None, max_size=LARGEST, open_timeout=SLOW, close_timeout=SLOW,
-            create_connection=_Answering,
+            create_connection=_Answering, subprotocols=self._protocols or None,
         )  # fmt: skip
         self._started.set()
         await self._ended.wait()
@@ -103,11 +121,17 @@ class Server:
                 await self._talk(connection)
 
     def _answer(self, connection: Connection, request: Request) -> Response | None:
-        if not _is_own(request, self._host, self._address):
+        if not _is_own(request, self._host, self._address, self._origins):
             return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
-        if request.path == "/socket" and self._talk is not None:
+        if self._page is None:
             return None
-        if request.path != "/":
+        path, _, query = request.path.partition("?")
+        if self._query and not secrets.compare_digest(query.encode(), self._query.encode()):
+            return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
+        path = path if self._query else request.path
+        if path == "/socket" and self._talk is not None:
+            return None
+        if path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "there is one page, /\n")
         headers = Headers(HEADERS)
         headers["Content-Length"] = str(len(self._page))
@@ -129,7 +153,41 @@ class _Answering(ServerConnection):
             self.transport.close()
 
 
-def _is_own(request: Request, host: str, address: str) -> bool:
+def user_token() -> str:
+    """A secret of this user, kept for the pages of later servers; a new one where it cannot be."""
+    with suppress(OSError, RuntimeError):
+        home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
+        path, private = Path(home, "twodof", "token"), partial(os.open, mode=0o600)
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with suppress(FileExistsError), open(path, "x", opener=private) as file:
+            file.write(secrets.token_urlsafe(32))
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)) as file:
+            state, kept = os.fstat(file.fileno()), file.read(100)
+        own = stat.S_ISREG(state.st_mode) and state.st_uid == os.getuid()
+        if own and not state.st_mode & 0o077 and re.fullmatch(r"[\w-]{43}", kept, re.ASCII):
+            return kept
+    return secrets.token_urlsafe(32)
+
+
+async def relay(url: str, connection: Connection) -> None:
+    """Pass messages between a websocket and that of another server, until one of them ends."""
+    protocols = [connection.subprotocol] if connection.subprotocol else None
+    async with connect(
+        url, subprotocols=protocols, compression=None, max_size=None, proxy=None, logger=_silent
+    ) as other:
+
+        async def pump(source: Any, sink: Any) -> None:
+            with suppress(ConnectionClosed):
+                async for message in source:
+                    await sink.send(message)
+
+        pumps = [asyncio.ensure_future(pump(*ends)) for ends in permutations((connection, other))]
+        await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+        for one in pumps:
+            one.cancel()
+
+
+def _is_own(request: Request, host: str, address: str, others: Collection[str] = ()) -> bool:
     """Whether a request is for this page, by what was asked to listen on, and not another's.
 
     Any website may have its own name resolve to this machine, and then its Origin is the Host that
@@ -138,9 +196,10 @@ def _is_own(request: Request, host: str, address: str) -> bool:
     Args:
         request: what is asked for.
         host, address: what was asked to listen on, and what that is resolved to.
+        others: origins that may ask too.
     """
     hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-    foreign = any(origin.partition("://")[2] not in hosts for origin in origins)
+    foreign = any(it not in others and it.partition("://")[2] not in hosts for it in origins)
     if len(hosts) != 1 or foreign:
         return False
     name = re.sub(r":\d+$", "", hosts[0].lower()).strip("[]")

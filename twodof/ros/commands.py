@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
+from ..bounds import MAX_COMMAND
 from ..errors import InputError
 from ..fmu import Fmu
 from ..simulation.experiments import NANOSECONDS
@@ -18,7 +19,6 @@ from .messages import JOINT_STATE, POINT, POSE, store_of
 
 LOG = logging.getLogger(__name__)
 LONGEST_NAME = 80  # of a frame or joint, that is told
-MAX_COMMAND = 64 * 1024  # bytes; some thousand joints, read within milliseconds
 TIMEOUT = 0.5  # s without a command until the robot is held
 RAMP = 0.5  # s in which efforts come down to 0
 Inputs = dict[str, float]

@@ -1,13 +1,14 @@
-"""What is heard on a ROS 2 network: commands, and whether the run is paused."""
+"""Readers of a ROS 2 network: commands, the nodes that send them, and orders to pause."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
-from ..simulation.experiments import NANOSECONDS
+from ..simulation.experiments import NANOSECONDS, Experiment
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample
 from .commands import LONGEST_NAME, Command, CommandError, Commands, deserialise, warner
@@ -15,7 +16,7 @@ from .dds import dds_qos, dds_topic
 from .messages import JOINT_STATE, POINT, POSE, STREAM
 
 # isort: split
-from cyclonedds import core, sub  # where missing, dds says so
+from cyclonedds import builtin, core, sub  # where missing, dds says so
 
 LOG = logging.getLogger(__name__)
 ORDERS = {"/pause": "std_msgs/msg/Bool", "/step": "std_msgs/msg/UInt32"}
@@ -23,6 +24,55 @@ LOOK = 100_000_000  # ns after which it is asked whether to go on
 UNREAD = core.SampleState.NotRead | core.ViewState.Any | core.InstanceState.Any
 WHAT = {JOINT_STATE: "a command", POINT: "a point", POSE: "a pose"}
 Read = TypeVar("Read")
+MOST_COMMANDERS = 20  # that are recorded
+AT_ONCE = 1.0  # s within which commands of two nodes are conflicting ones
+PROPERTIES = {
+    "host": ("__Hostname", "fastdds.physical_data.host"),
+    "process": ("__ProcessName", "fastdds.physical_data.process"),
+}
+"""Facts of a participant, and what Cyclone DDS and Fast DDS call them."""
+
+
+class Commanders:
+    """The nodes whose commands are followed, recorded in the experiment; conflicts are warned of.
+
+    Args:
+        participant: of the DDS domain.
+        run: that is commanded.
+    """
+
+    def __init__(self, participant: Any, run: Experiment) -> None:
+        topic = builtin.BuiltinTopicDcpsParticipant
+        self._participants, self._run = builtin.BuiltinDataReader(participant, topic), run
+        self._names: dict[int, str] = {}
+        self._latest, self._since = "", 0.0
+        self._warn = warner(LOG)
+
+    def note(self, reader: Any, writer: int, t: float) -> None:
+        """Take the writer of a command, by its handle, and the time of the run, s."""
+        if writer not in self._names:
+            self._names[writer] = self._record(reader, writer, t)
+        name, now = self._names[writer], time.monotonic()
+        if self._latest not in ("", name) and now - self._since < AT_ONCE:
+            both = f"{self._latest} and {name}"
+            self._warn("two", f"two nodes command the robot at once, {both}: the newest wins")
+        self._latest, self._since = name, now
+
+    def _record(self, reader: Any, writer: int, t: float) -> str:
+        """The GUID of a writer's participant, which is recorded with its host and process."""
+        endpoint = reader.get_matched_publication_data(writer)
+        if endpoint is None:  # it has left
+            return f"writer {writer:x}"
+        facts = {"guid": str(endpoint.participant_key)}
+        for one in self._participants.read(1000):
+            if one.key == endpoint.participant_key and one.qos is not None:
+                said = {p.key: p.value for p in one.qos if isinstance(p, core.Policy.Property)}
+                names = ((fact, key) for fact, keys in PROPERTIES.items() for key in keys)
+                facts |= {fact: said[key][:LONGEST_NAME] for fact, key in names if key in said}
+        known = [fact for _, fact in self._run.commanders]
+        if facts not in known and len(known) < MOST_COMMANDERS:
+            self._run.commanders.append((t, facts))
+        return facts["guid"]
 
 
 class Listener:
@@ -34,12 +84,14 @@ class Listener:
         heard: topics and types of commands.
         orders: hear /pause and /step.
         oldest: s before a sample that joint commands for it may be stamped; None: any time.
+        run: in which the nodes that command are recorded.
     """
 
     def __init__(
         self, participant: Any, follows: Commands, heard: Mapping[str, str], *,
-        orders: bool, oldest: float | None,
+        orders: bool, oldest: float | None, run: Experiment,
     ) -> None:  # fmt: skip
+        self._commanders = Commanders(participant, run)
         self._follows, self._heard, self._oldest = follows, heard, oldest
         self._readers = {
             name: sub.DataReader(
@@ -73,7 +125,8 @@ class Listener:
                     raise CommandError("stamp", text)
                 return command
 
-            for command in self._come(name, read, WHAT[kind]):
+            for command, writer in self._come(name, read, WHAT[kind]):
+                self._commanders.note(self._readers[name], writer, sample.t)
                 if command.strangers:
                     reason = f"a command on {name} is of joints that this robot has not"
                     names = ", ".join(command.strangers)[:LONGEST_NAME]
@@ -99,17 +152,19 @@ class Listener:
 
     def _take_orders(self) -> None:
         for name, kind in ORDERS.items():
-            for order in self._come(name, partial(deserialise, kind), "an order"):
+            for order, _ in self._come(name, partial(deserialise, kind), "an order"):
                 if name == "/pause":
                     self._paused, self._steps = bool(order.data), 0
                 else:
                     self._steps += order.data
 
-    def _come(self, name: str, read: Callable[[bytes], Read], what: str) -> Iterator[Read]:
-        """What has come on a topic, the last few at most, as it is read."""
+    def _come(
+        self, name: str, read: Callable[[bytes], Read], what: str
+    ) -> Iterator[tuple[Read, int]]:
+        """Messages of a topic, the last few at most, as they are read, and their writers."""
         for message in self._readers[name].take(STREAM.depth):
             if message.sample_info.valid_data:
                 try:
-                    yield read(message.cdr)
+                    yield read(message.cdr), message.sample_info.publication_handle
                 except CommandError as error:
                     self._warn(error.kind, f"{what} on {name} {error}: ignored")

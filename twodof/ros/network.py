@@ -5,12 +5,17 @@ Variables are those of rcl and rmw_cyclonedds of Jazzy.
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import re
 import socket
+import stat
+import struct
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from ipaddress import ip_address
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
@@ -30,6 +35,9 @@ NO_NETWORK = (
     "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
 )
 ANNOUNCED = 1  # s between two announcements to participants of this host
+SO_ATTACH_FILTER = 26  # of Linux, on the architectures that there are packages for
+INTERFACE, SOURCE = 0xFFFFF008, 0xFFF0000C  # a packet's interface and IPv4 source, for its filter
+LOAD, EQUAL, ACCEPT = 0x20, 0x15, 0x06  # instructions of a packet filter
 
 
 class Network(NamedTuple):
@@ -54,8 +62,43 @@ class Network(NamedTuple):
         """Who can hear, in words."""
         if self.loopback:
             return "loopback alone (ROS_LOCALHOST_ONLY)"
-        words = {"LOCALHOST": "this host alone; `subnet=True` opens it", "OFF": "nobody"}
+        hosts = f"this host and {', '.join(self.peers)}" if self.peers else "this host alone"
+        words = {"LOCALHOST": f"{hosts}; `subnet=True` opens it", "OFF": "nobody"}
         return f"range {self.range} ({words.get(self.range, 'other hosts too')})"
+
+    @contextmanager
+    def guarded(self) -> Iterator[None]:
+        """Limit the sockets that Cyclone DDS opens meanwhile to the hosts of ``reach``.
+
+        Cyclone DDS listens on all addresses, whatever its interfaces, and answers whoever finds
+        its ports. So the kernel drops packets that come neither by the loopback interface, as all
+        of this host do, nor from a peer: Cyclone DDS sends to nobody whom it has not heard of.
+
+        Raises:
+            PublishError: the kernel refuses.
+        """
+        before = _sockets()
+        yield
+        if self.range not in ("LOCALHOST", "OFF") and not self.loopback:
+            return
+        heard = [] if self.range == "OFF" else [(INTERFACE, socket.if_nametoindex("lo"))]
+        for peer in self.peers if self.range == "LOCALHOST" else ():
+            found = socket.getaddrinfo(peer, None, socket.AF_INET, socket.SOCK_DGRAM)
+            heard += [(SOURCE, int(ip_address(address[0]))) for *_, address in found]
+        rules = [
+            (code, skipped, k)
+            for field, value in heard
+            for code, skipped, k in ((LOAD, 0, field), (EQUAL, 1, value), (ACCEPT, 0, 0xFFFFFFFF))
+        ]
+        program = b"".join(struct.pack("HBBI", c, 0, n, k) for c, n, k in (*rules, (ACCEPT, 0, 0)))
+        text = ctypes.create_string_buffer(program)
+        attached = struct.pack("HL", len(program) // 8, ctypes.addressof(text))
+        try:
+            for number in _sockets() - before:
+                with socket.socket(fileno=os.dup(number)) as one:
+                    one.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, attached)
+        except OSError as error:
+            raise PublishError(f"cannot keep to {self.reach}: {error.strerror}") from error
 
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
         """What Cyclone DDS is told, as rmw_cyclonedds of Jazzy does.
@@ -128,6 +171,18 @@ def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) 
     return Network(int(number), reach, _peers(variables), custom=custom)
 
 
+def _sockets() -> set[int]:
+    """File descriptors of this process that are sockets of the internet's protocols."""
+    found = set()
+    for name in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # it is closed by now
+            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                with socket.socket(fileno=os.dup(int(name))) as one:
+                    if one.family in (socket.AF_INET, socket.AF_INET6):
+                        found.add(int(name))
+    return found
+
+
 def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
     peers = tuple(filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")))
     for peer in peers:
@@ -194,7 +249,8 @@ def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, di
         try:
             with errors.open("wb") as file:
                 os.dup2(file.fileno(), 2)
-            opened = domain.Domain(place.domain, place.configuration(str(trace), own))
+            with place.guarded():
+                opened = domain.Domain(place.domain, place.configuration(str(trace), own))
         except (core.DDSException, UnicodeEncodeError):
             opened = None
         finally:

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import InputError, PublishError, SimulationError
+from ..errors import InputError, PublishError, SimulationError, check_keywords
 from ..fmu import Fmu
 from ..simulation.experiments import NANOSECONDS, Experiment, Setting
 from ..simulation.master import Member, Summary, as_experiment, at_rest, simulate_together
@@ -103,6 +103,7 @@ class Publisher(Sink):
             InputError: it has nothing to command, or no effort to ramp.
         """
         self._run, self._follows = run, Commands(run.fmu)
+        run.commanders.clear()  # those of a run before
         self._messages = Messages(run, scene=self._scene, effort=self._effort, clock=self._clock)
         self.topics = tuple(map(self._named, self._messages.topics))
         of_joints = self._follows.type == JOINT_STATE
@@ -148,7 +149,8 @@ class Publisher(Sink):
         self._domain = self._shared or open_domain(self.place)
         self.interface = self._domain.interface
         try:
-            participant = self._participant = domain.DomainParticipant(self.place.domain)
+            with self.place.guarded():  # one may have sockets of its own, by CYCLONEDDS_URI
+                participant = self._participant = domain.DomainParticipant(self.place.domain)
             self._writers = {
                 name: pub.DataWriter(
                     participant,
@@ -159,7 +161,7 @@ class Publisher(Sink):
             }
             self._listener = Listener(
                 participant, self._follows, self._heard, orders=self._clock,
-                oldest=None if self._watchdog is None else self._watchdog.timeout,
+                oldest=None if self._watchdog is None else self._watchdog.timeout, run=self._run,
             )  # fmt: skip
         except core.DDSException as error:
             raise PublishError(f"DDS domain {self.place.domain} fails: {error}") from error
@@ -276,7 +278,7 @@ def publish(
         PublishError: in lockstep no command came in time.
         SimulationError: the FMU refused or failed a call.
     """
-    run = as_experiment(run, options, stop_time=inf)
+    run = as_experiment(publish, run, options, stop_time=inf)
     wire = wire or Publisher()
     if pace is None and not wire.lockstep:
         pace = RealTime()
@@ -306,6 +308,7 @@ def publish_together(
     Raises:
         FmuError, InputError, PublishError, SimulationError: as ``publish``.
     """
+    check_keywords(options, publish_together, Publisher)
     if pace is None and not options.get("lockstep"):
         pace = RealTime()
     if not robots:

@@ -8,12 +8,12 @@ from __future__ import annotations
 import logging
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from ..geometry.kinematics import Array, Kinematics, Placement
-from ..geometry.meshes import load_mesh
+from ..geometry.meshes import Meshes, ReadMesh
 from ..geometry.shapes import floats, origin
 from ..plant.urdf import Joint, RobotError, read_urdf
 
@@ -39,9 +39,7 @@ class Scene:
         RobotError: the URDF is not sound.
     """
 
-    def __init__(
-        self, urdf: str, joints: Sequence[str], frame: str, read: Callable[[str], bytes | None]
-    ) -> None:
+    def __init__(self, urdf: str, joints: Sequence[str], frame: str, read: ReadMesh) -> None:
         robot = read_urdf(urdf)
         if frame not in robot.links:
             raise RobotError(f"it has no link '{frame}'")
@@ -50,7 +48,8 @@ class Scene:
         self.moving = [joint for joint in every if self._kinematics.moves(joint)]
         self.fixed = [joint for joint in every if not self._kinematics.moves(joint)]
         try:
-            _replace_meshes(robot.tree, read)
+            with Meshes(read) as meshes:
+                _replace_meshes(robot.tree, meshes)
         except ValueError as error:
             raise RobotError(f"its meshes cannot be placed: {error}") from error
         self.description = ET.tostring(robot.tree, encoding="unicode")
@@ -67,7 +66,7 @@ class Scene:
         return self._kinematics.path(self._frame, q)
 
 
-def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> None:
+def _replace_meshes(tree: ET.Element, meshes: Meshes) -> None:
     fitted: dict[tuple[str, str], tuple[ET.Element, Placement] | None] = {}
     for link in tree.findall("link"):
         for part in [*link.findall("visual"), *link.findall("collision")]:
@@ -77,7 +76,7 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
                 continue
             key = (mesh.get("filename", ""), mesh.get("scale", "1 1 1"))
             if key not in fitted:
-                fitted[key] = _fit(key[0], floats(mesh, "scale", "1 1 1"), read)
+                fitted[key] = _fit(key[0], floats(mesh, "scale", "1 1 1"), meshes)
             fit = fitted[key]
             if fit is None:
                 link.remove(part)
@@ -88,11 +87,9 @@ def _replace_meshes(tree: ET.Element, read: Callable[[str], bytes | None]) -> No
             _place(part, origin(part.find("origin")) * placement)
 
 
-def _fit(
-    uri: str, scale: Array, read: Callable[[str], bytes | None]
-) -> tuple[ET.Element, Placement] | None:
+def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement] | None:
     """Smallest box or cylinder along the mesh's principal axes or its own, and its pose."""
-    vertices = _vertices(uri, scale, read)
+    vertices = _vertices(uri, scale, meshes)
     if vertices is None:
         return None
     candidates = []
@@ -123,21 +120,18 @@ def _principal_axes(vertices: Array) -> Array:
     return np.asarray(axes, dtype=np.float64)
 
 
-def _vertices(uri: str, scale: Array, read: Callable[[str], bytes | None]) -> Array | None:
-    content = read(uri.removeprefix("package://"))
-    if content is None:
-        reason = "the FMU does not carry it"
-    else:
-        try:
-            mesh = load_mesh(uri, content, scale)
-            vertices = np.array(mesh.vertices(), dtype=np.float64)
-            if np.abs(vertices).max(initial=0.0) < LARGEST:  # false where one is not a number
-                return vertices
-            reason = "it has no sound size"
-        except ValueError as error:
-            reason = " ".join(str(error).split())  # coal's has many lines
-    logger.warning("mesh '%s' is left out of the scene: %s", uri, reason)
-    return None
+def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
+    try:
+        surfaces = meshes.surfaces(uri.removeprefix("package://"), coloured=False)
+        if not surfaces:
+            raise ValueError("the FMU does not carry it")
+        vertices = np.concatenate([surface.vertices for surface in surfaces]) * scale
+        if np.abs(vertices).max(initial=0.0) < LARGEST:  # false where one is not a number
+            return vertices
+        raise ValueError("it has no sound size")
+    except ValueError as error:
+        logger.warning("mesh '%s' is left out of the scene: %s", uri, error)
+        return None
 
 
 def _place(part: ET.Element, place: Placement) -> None:

@@ -24,12 +24,12 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.polynomial.polynomial import polyder, polyval
 
+from ..bounds import MAX_TRAJECTORY
 from ..simulation.experiments import NANOSECONDS
 from .cdr import Array
 from .commands import CommandError, deserialise, known_joints, sized
 from .messages import JOINT_TRAJECTORY
 
-MAX_TRAJECTORY = 4 * 1024**2  # bytes; some ten thousand points, read within a second
 PARTS = ("positions", "velocities", "accelerations")
 DEGREE = 5
 ORDERS = np.arange(DEGREE + 1)

@@ -1,18 +1,26 @@
-"""A run for Foxglove, without ROS: the bag's messages over a WebSocket, and gains from there."""
+"""A run for Foxglove, without ROS: the bag's messages over a WebSocket, and gains from there.
+
+Foxglove's SDK answers any website. So it listens where no website finds it, on an address of the
+loopback network that is drawn at random, and browsers are answered by the door of the pages.
+"""
 
 from __future__ import annotations
 
 import logging
+import secrets
 from collections.abc import Callable, Mapping
+from functools import partial
 from threading import Lock
 from typing import Any
 
-from ..errors import InputError, PublishError
+from ..errors import InputError, PageError, PublishError
 from ..plant.variables import GAINS
+from ..ros.cdr import Rows
+from ..ros.commands import warner
+from ..ros.messages import Messages, store_of
 from ..simulation.experiments import Experiment, Value, check_going_on, resolve
 from ..simulation.sample import Sample, Sink
-from .cdr import Rows
-from .messages import Messages, store_of
+from .serving import HOST, Server, relay
 
 try:
     from foxglove import Channel, Context, Parameter, Schema, start_server
@@ -24,18 +32,23 @@ except ImportError as missing:
     ) from missing
 
 LOG = logging.getLogger(__name__)
-HOST, PORT = "127.0.0.1", 8765
+PORT = 8765
+PROTOCOL = "foxglove.sdk.v1"
+APPS = ("https://app.foxglove.dev", "https://embed.foxglove.dev", "file://")
+"""Origins of Foxglove's web app, its embedded viewer and its desktop app."""
+logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL + 1)  # a line a bad message
 
 
 class Foxglove(Sink):
     """A sink that serves each sample to Foxglove, on the loopback interface alone.
 
-    The gains are its parameters, which a panel there shows and sets.
+    The gains are its parameters, which a panel there shows and, with ``set_gains``, sets.
 
     Args:
         port: where it listens; 0: any that is free.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
+        set_gains: let whoever connects set the gains.
         opened: told when it listens.
 
     Attributes:
@@ -51,10 +64,11 @@ class Foxglove(Sink):
         *,
         scene: bool = False,
         effort: bool = False,
+        set_gains: bool = False,
         opened: Callable[[Foxglove], None] = lambda server: None,
     ) -> None:
         self._port, self._opened, self.url = port, opened, ""
-        self._scene, self._effort = scene, effort
+        self._scene, self._effort, self._set_gains = scene, effort, set_gains
 
     def begin(self, run: Experiment) -> Foxglove:
         """Take the experiment whose samples come.
@@ -63,7 +77,7 @@ class Foxglove(Sink):
             BagError: the FMU has not what is asked for.
         """
         self._messages = Messages(run, scene=self._scene, effort=self._effort)
-        self._gains = _Gains(run)
+        self._gains = _Gains(run, self._set_gains)
         return self
 
     def __enter__(self) -> Foxglove:
@@ -75,15 +89,18 @@ class Foxglove(Sink):
             self._channels[name] = Channel(
                 name, schema=schema, message_encoding="cdr", context=context
             )
+        hidden = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
         try:
             self._server = start_server(
-                name="twodof", host=HOST, port=self._port, context=context,
+                name="twodof", host=hidden, port=0, context=context,
                 capabilities=[Capability.Parameters], server_listener=self._gains,
             )  # fmt: skip
-        except (RuntimeError, OSError, OverflowError) as error:
-            reason = f"port {self._port} of {HOST} cannot be listened on: {error}"
-            raise PublishError(f"cannot serve Foxglove: {reason}; choose another") from error
-        self.url = f"ws://{HOST}:{self._server.port}"
+            talk = partial(relay, f"ws://{hidden}:{self._server.port}")
+            self._door = Server(None, HOST, self._port, talk, origins=APPS, protocol=PROTOCOL)
+        except (RuntimeError, OSError, PageError) as error:
+            raise PublishError(f"cannot serve Foxglove: {error}") from error
+        self._door.__enter__()
+        self.url = self._door.url.replace("http:", "ws:")
         self._opened(self)
         return self
 
@@ -105,14 +122,15 @@ class Foxglove(Sink):
         return self._gains.take()
 
     def __exit__(self, *exception: object) -> None:
+        self._door.__exit__(*exception)
         self._server.stop()
 
 
 class _Gains(ServerListener):
     """The gains as parameters; its methods are called by threads of the server."""
 
-    def __init__(self, run: Experiment) -> None:
-        self._fmu = run.fmu
+    def __init__(self, run: Experiment, control: bool) -> None:
+        self._fmu, self._control, self._warn = run.fmu, control, warner(LOG)
         self.held: Mapping[str, Value] = run.start_values
         groups = {group: run.fmu.vector(group) or [group] for group in GAINS}
         self._groups = {g: names for g, names in groups.items() if names[0] in run.fmu.variables}
@@ -151,12 +169,14 @@ class _Gains(ServerListener):
         """Take gains, one number for all elements or one each; and tell what then holds."""
         for parameter in parameters:
             try:
+                if not self._control:
+                    raise InputError("gains are shown alone; `set_gains=True` lets it")
                 if parameter.name not in self._groups:
                     raise InputError(f"'{parameter.name:.80}' is no gain of this FMU")
                 asked = resolve(self._fmu, {parameter.name: _numbers(parameter.get_value())})
                 check_going_on(self._fmu, asked, self.held)
             except InputError as error:
-                LOG.warning("a parameter that Foxglove set is ignored: %s", error)
+                self._warn("parameter", f"a parameter that Foxglove set is ignored: {error}")
                 continue
             with self._lock:
                 self._asked |= asked

@@ -1,0 +1,149 @@
+"""The hosts and nodes that a published run obeys: two network namespaces, and two controllers."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from harness import wait_until
+from nodes import CABLE, Node, ended, isolated, published
+
+FOREIGN = """
+import sys, time
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from rosbags.typesys import Stores, get_typestore
+from twodof.ros.dds import dds_qos, dds_type
+from twodof.ros.messages import POINT, STREAM
+
+number, peer = int(sys.argv[1]), sys.argv[2]
+domain = Domain(number, f'''<CycloneDDS><Domain>
+<General><AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><SPDPInterval>1 s</SPDPInterval>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer Address="{peer}"/></Peers>
+</Discovery></Domain></CycloneDDS>''')
+participant = DomainParticipant(number)
+states = "sensor_msgs/msg/JointState"
+topic = Topic(participant, "rt/joint_states", dds_type(states))
+reader = DataReader(participant, topic, dds_qos(STREAM, states))
+topic = Topic(participant, "rt/target_command", dds_type(POINT))
+writer = DataWriter(participant, topic, dds_qos(STREAM, POINT))
+store = get_typestore(Stores.ROS2_HUMBLE)
+kinds = store.types
+header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](0, 0), "world")
+message = kinds[POINT](header, kinds["geometry_msgs/msg/Point"](0.12, 0.17, 0.0))
+point = writer.data_type(bytes(store.serialize_cdr(message, POINT)))
+end, heard = time.monotonic() + float(sys.argv[3]), 0
+while heard < 50 and time.monotonic() < end:
+    heard += len(reader.take(10))
+    writer.write(point)
+    time.sleep(0.01)
+print(heard)
+"""
+ENTER = ("nsenter", "--net", "--target")
+
+
+@contextmanager
+def other_host(process: subprocess.Popen[str]) -> Iterator[int]:
+    """A network namespace at the other end of a run's cable, as the process that holds it."""
+    inside = ("unshare", "--net", "sh", "-c", "ip link set lo up; echo; exec sleep infinity")
+    with subprocess.Popen(inside, stdout=subprocess.PIPE) as host:
+        try:
+            assert host.stdout is not None and host.stdout.readline()
+            for pid, command in (
+                (process.pid, f"link set cable1 netns {host.pid}"),
+                (host.pid, "address add 10.200.0.2/24 dev cable1"),
+                (host.pid, "link set cable1 up"),
+            ):
+                subprocess.run([*ENTER, str(pid), "ip", *command.split()], check=True)
+            yield host.pid
+        finally:
+            host.kill()
+
+
+@pytest.mark.parametrize(
+    ("options", "variables", "said", "open_to"),
+    [
+        ([], {}, "(this host alone; --subnet opens it)", False),
+        ([], {"ROS_LOCALHOST_ONLY": "1"}, "loopback alone (ROS_LOCALHOST_ONLY)", False),
+        ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "(nobody)", False),
+        (
+            [], {"ROS_STATIC_PEERS": "10.200.0.3"},
+            "(this host and 10.200.0.3; --subnet opens it)", False,
+        ),
+        (
+            [], {"ROS_STATIC_PEERS": "10.200.0.3;10.200.0.2"},
+            "(this host and 10.200.0.3, 10.200.0.2; --subnet opens it)", True,
+        ),
+        (["--subnet"], {}, "range SUBNET (other hosts too)", True),
+    ],
+)  # fmt: skip
+def test_other_hosts_are_obeyed_where_it_says_so_alone(
+    native_path: Path, tmp_path: Path, number: int,
+    options: list[str], variables: dict[str, str], said: str, open_to: bool,
+) -> None:  # fmt: skip
+    """One that announces itself to each of the run's ports, listens and commands."""
+    bag, inside = tmp_path / "bag", isolated(CABLE)
+    variables = {"ROS_LOCALHOST_ONLY": "", **variables}
+    options = [*options, "-o", str(bag)]
+    with (
+        published(number, native_path, *options, inside=inside, **variables) as process,
+        other_host(process) as host,
+    ):
+        assert said in process.told[1]
+        command = [*ENTER, str(host), sys.executable, "-c", FOREIGN, str(number), "10.200.0.1"]
+        seconds = "60" if open_to else "6"
+        heard = subprocess.run([*command, seconds], stdout=subprocess.PIPE, check=True).stdout
+        process.send_signal(signal.SIGINT)
+        ended(process, 130)
+    provenance = json.loads((bag / "run.json").read_text())
+    assert (int(heard) >= 50) == open_to and (int(heard) > 0) == open_to
+    assert bool(provenance["input_changes"]) == ("commanders" in provenance) == open_to
+
+
+def test_nodes_that_command_are_recorded_and_two_at_once_reported(
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node]
+) -> None:
+    """Each once, by what DDS tells of its participant."""
+    bag = tmp_path / "bag"
+    one, two = listen("/target_command"), listen("/target_command")
+    with published(number, native_path, "-o", str(bag)) as process:
+        wait_until((bag / "run.json").exists)
+
+        def commanders() -> list[tuple[float, dict[str, str]]]:
+            return list(json.loads((bag / "run.json").read_text()).get("commanders", []))
+
+        def command(node: Node, x: float) -> None:
+            """Until it is followed: a point before the run has discovered its sender is lost."""
+
+            def followed() -> bool:
+                node.point("/target_command", "world", x, 0.17, 0.0)
+                return f'"x_des[1]":{x}' in (bag / "run.json").read_text()
+
+            wait_until(followed)
+
+        command(one, 0.11)
+        command(two, 0.12)
+        for x in (0.13, 0.14):
+            one.point("/target_command", "world", x, 0.17, 0.0)
+            two.point("/target_command", "world", x + 0.1, 0.17, 0.0)
+        command(two, 0.15)
+        process.send_signal(signal.SIGINT)
+        _, err = ended(process, 130)
+    (first, facts), (second, others) = commanders()
+    assert 0.0 < first < second
+    for node, its in ((one, facts), (two, others)):
+        assert its["process"] == str(node.process.pid) and its["host"]
+        assert re.fullmatch(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", its["guid"])
+    (line,) = err.splitlines()
+    both = re.search("two nodes command the robot at once, (.*) and (.*): the newest wins", line)
+    assert both and {both[1], both[2]} == {facts["guid"], others["guid"]}
