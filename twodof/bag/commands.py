@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
+from ..bounds import MAX_COMMANDS
 from ..errors import BagError, InputError
 from ..files import shown
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import CONTROLS
-from ..ros.cdr import Rows
 from ..ros.commands import LONGEST_NAME, Command, CommandError, Commands
 from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY
 from ..ros.trajectories import Trajectory, follow, read_trajectory
@@ -26,7 +26,6 @@ from .reader import whole_bag
 from .records import Allowance, DamageError
 
 LOG = logging.getLogger(__name__)
-MAX_COMMANDS = 1_000_000
 SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of what a robot did
 FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs with which trajectories are followed
 Read = TypeVar("Read", Command, Trajectory)
@@ -96,7 +95,7 @@ def _messages(
                 begins[channel.topic] = min(first, begins.get(channel.topic, first))
             wanted = channel.topic not in SAMPLES if topic is None else channel.topic == topic
             if channel.type in types and wanted:
-                rows = zip(stamps.tolist(), repeat(channel.type), map(Rows.tobytes, data))
+                rows = zip(stamps.tolist(), repeat(channel.type), map(np.ndarray.tobytes, data))
                 topics.setdefault(channel.topic, []).extend(rows)
     except (OSError, DamageError) as error:
         raise BagError(f"cannot read the bag '{path}': {error}") from error

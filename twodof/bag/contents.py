@@ -6,22 +6,28 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from ..bounds import MAX_METADATA
+from ..errors import BagError
 from ..files import read_file
 from .mcap import mcap_messages
 from .records import Allowance, Batch, refusing_damage
 from .sqlite import sqlite3_messages
-
-MAX_METADATA = 64 * 1024**2  # bytes
 
 
 def storage_files(folder: Path) -> list[Path]:
     """The files that hold a bag's messages, in the order in which they were written.
 
     An MCAP file alone, as pages and other tools write them, is a bag too.
+
+    Raises:
+        BagError: one is a link: a bag from elsewhere would name any file of this machine.
     """
     if folder.suffix == ".mcap" and folder.is_file():
         return [folder]
-    files = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
+    named = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")]
+    if link := next((p for p in named if p.is_symlink()), None):
+        raise BagError(f"'{link}' is a link, and links in a bag are not followed; copy the file")
+    files = [p for p in named if p.is_file()]
     return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
 
@@ -31,7 +37,9 @@ def stated_count(folder: Path) -> int | None:
     Raises:
         OSError: it cannot be read.
     """
-    text = read_file(folder / "metadata.yaml", MAX_METADATA).decode("utf-8", "replace")
+    text = read_file(folder / "metadata.yaml", MAX_METADATA, follow=False).decode(
+        "utf-8", "replace"
+    )
     stated = re.search(r"^  message_count: (\d{1,18})$", text, re.MULTILINE)
     return int(stated[1]) if stated else None
 

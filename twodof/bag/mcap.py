@@ -13,19 +13,9 @@ from zlib import crc32
 import lz4.frame
 import numpy as np
 
+from ..bounds import MAX_CHUNK, MAX_RATIO, MAX_TOPICS
 from ..ros.cdr import Rows
-from .records import (
-    MAX_CHUNK,
-    MAX_RATIO,
-    MAX_TOPICS,
-    RECORD,
-    TEXT,
-    Allowance,
-    Batch,
-    Channel,
-    DamageError,
-    refusing_damage,
-)
+from .records import RECORD, TEXT, Allowance, Batch, Channel, DamageError, refusing_damage
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -68,11 +58,7 @@ def _chunks(path: Path, allowance: Allowance) -> Iterator[bytes]:
 
 
 def read_metadata(path: Path, name: str, key: str) -> str:
-    """An entry of a file's own metadata; "" where it has none of that name.
-
-    Raises:
-        DamageError, OSError: as ``read_messages``.
-    """
+    """An entry of a file's own metadata, "" where it has none; errors as of ``read_messages``."""
     with refusing_damage(path):
         for _, content in _records(path, Allowance(), (METADATA,)):
             title, _, position = fields("sI", content, HEAD.size)

@@ -22,9 +22,8 @@ Indices = NDArray[np.intp]
 class Outline:
     """Chooses samples, from time to time, of those chosen before and those that came since.
 
-    Args:
-        most: samples that may wait to be chosen from, of which a quarter is left at most.
-        lines: gives those of a recording beside its positions and velocities, N values each.
+    At most ``most`` samples wait to be chosen from, of which a quarter is left at most; ``lines``
+    gives those of a recording beside its positions and velocities, N values each.
     """
 
     def __init__(self, most: int, lines: Callable[[Recording], Sequence[Array]]) -> None:
@@ -47,9 +46,8 @@ class Outline:
 def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
     """The first and last sample of each part, and where a line is lowest and highest in it.
 
-    Args:
-        parts: their numbers, N, ascending from 0 or more.
-        lines: N values each; what is not finite is no extreme.
+    Parts are numbered, N numbers that ascend from 0 or more; values that are not finite are no
+    extremes.
     """
     starts = np.flatnonzero(np.diff(parts, prepend=-1))
     sizes = np.diff(starts, append=len(parts))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
+from ..bounds import MAX_PROVENANCE
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..simulation.experiments import Changes, Experiment
@@ -23,10 +24,9 @@ FORMAT = 1
 KEY = "twodof"
 """Of the provenance in a bag's own metadata."""
 MAX_YAML = 256 * 1024  # bytes of changes: a writer of YAML takes 2 s for a MiB
-TAIL = b"]}\n"
 KNOWN_UNTIL = "inputs_known_until"
 """Key of the time, s, from which on more inputs changed than the file has room for."""
-MAX_SIZE = 64 * 1024**2
+MAX_TAIL = 64 * 1024  # bytes of who commanded: more than 20 of them have
 PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
 
 SHAPE = {
@@ -46,7 +46,8 @@ SHAPE = {
 class ProvenanceFile:
     """run.json of a bag that is being written: whole at any moment, with the changes so far.
 
-    The changes of inputs stand at its end, so that adding some writes no other byte anew.
+    The changes of inputs stand at its end, before who commanded the robot alone, so that adding
+    some writes no other byte anew.
 
     Args:
         folder: of the bag.
@@ -61,33 +62,42 @@ class ProvenanceFile:
     def __init__(self, folder: Path, namespace: str, run: Experiment, command_line: str) -> None:
         self.path, self.key = folder / file_of(namespace), key_of(namespace)
         self._head = _as_json(_provenance(run, command_line))[:-1] + b',"input_changes":['
-        self.path.write_bytes(self._head + TAIL)
+        self._run, self._commanders = run, len(run.commanders)
+        self.path.write_bytes(self._head + self._tail())
         self._start, self._end = run.start_time, len(self._head)
         self._separator, self._full = b"", False
 
     def add(self, changes: Changes) -> None:
         """Add times and the inputs that changed there, as many as a reader is ready for."""
-        if self._full or not changes:
+        commanders = len(self._run.commanders)
+        if self._full or (not changes and commanders == self._commanders):
             return
-        text, tail = self._separator + b",".join(_as_json([t, v]) for t, v in changes), TAIL
-        if self._end + len(text) > MAX_SIZE - 100:
-            text, tail = b"", self._until(changes[0][0])
+        text, tail = b",".join(_as_json([t, v]) for t, v in changes), self._tail()
+        text = self._separator + text if text else text
+        if self._end + len(text) > MAX_PROVENANCE - MAX_TAIL:
+            text, tail = b"", self._tail(changes[0][0])
             self._full = True
         with self.path.open("r+b") as file:
             file.seek(self._end)
             file.write(text + tail)
         self._end += len(text)
-        self._separator = b","
+        self._separator, self._commanders = b"," if changes else self._separator, commanders
 
     def text(self) -> str:
         """What the bag's own metadata holds: the whole, or where that is long no changes."""
         content = self.path.read_bytes()
         if len(content) > len(self._head) + MAX_YAML:
-            content = self._head + self._until(self._start)
+            content = self._head + self._tail(self._start)
         return content.decode().strip()
 
-    def _until(self, time: float) -> bytes:
-        return b'],"%s":%r}\n' % (KNOWN_UNTIL.encode(), time)
+    def _tail(self, until: float | None = None) -> bytes:
+        """List the commanders, and the time until which the changes of inputs are complete."""
+        rest: dict[str, Any] = {}
+        if self._run.commanders:
+            rest["commanders"] = [*self._run.commanders]
+        if until is not None:
+            rest[KNOWN_UNTIL] = until
+        return (b"]," if rest else b"]") + _as_json(rest)[1:] + b"\n"
 
 
 def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
@@ -168,7 +178,11 @@ def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
     single = path.suffix == ".mcap" and path.is_file()
     file = path if single else path / file_of(namespace)
     try:
-        text = read_metadata(path, KEY, FILE).encode() if single else read_file(file, MAX_SIZE)
+        text = (
+            read_metadata(path, KEY, FILE).encode()
+            if single
+            else read_file(file, MAX_PROVENANCE, follow=False)
+        )
         if single and not text:
             return {}
         content = parsed(text)

@@ -47,13 +47,8 @@ def read_outline(
 ) -> Recording:
     """A bag as ``read_bag`` gives it, but of more than ``most`` samples fewer, for drawing.
 
-    Args:
-        path: the bag's folder.
-        most: samples that are in memory, besides those of a chunk of the bag.
-        lines: that are drawn over time beside positions and velocities, of a part of the bag.
-
-    Raises:
-        BagError: as ``read_bag``; and what ``lines`` raises.
+    Besides those of a chunk of the bag no more are in memory. ``lines`` gives what is drawn over
+    time beside positions and velocities, of a part of the bag; what it raises is raised here too.
     """
     return _read(Path(path), _JointStates, _Targets(), Outline(most, lines))
 
@@ -197,12 +192,7 @@ def _recording(
 
 
 def whole_bag(path: Path) -> list[Path]:
-    """The files of a bag that was closed.
-
-    Raises:
-        BagError: it is no bag, or is unfinished.
-        OSError: its folder cannot be read.
-    """
+    """The files of a bag that was closed; a BagError where it is none, or unfinished."""
     files = storage_files(path)
     if not files:
         packed = [*path.glob("*.zstd")]

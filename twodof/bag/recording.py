@@ -105,7 +105,23 @@ class Recording:
     def schedule(self) -> Schedule:
         """The inputs and parameters that held, each from its communication point on."""
         try:
-            return self._schedule()
+            starts = self.provenance.get("start_values", {})
+            changes: Sequence[Any] = self.provenance.get("input_changes", [])
+            if not all(
+                map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))
+            ):
+                raise ValueError("values are not finite")
+            schedule: Schedule = [(0, ChainMap({}, starts))]
+            changed: dict[str, Any] = {}
+            for time, values in changes:
+                steps = (time - self.provenance["start_time"]) / self.provenance["step"]
+                k = max(0, ceil(steps - TIME_TOLERANCE))
+                changed = {**changed, **values}
+                if k == schedule[-1][0] and len(schedule) > 1:  # the first sample is before any
+                    schedule.pop()
+                schedule.append((k, ChainMap(changed, starts)))
+            last = self.steps[-1] if self.provenance else 0
+            return [(k, values) for k, values in schedule if k < last or k == 0]
         except (KeyError, ValueError, ArithmeticError) as error:
             raise BagError(f"the run.json in '{self.path}' does not fit its samples") from error
 
@@ -184,20 +200,3 @@ class Recording:
             for i in range(part.shape[1])
         }
         return pd.DataFrame(columns, index=pd.Index(self.t, name="t"))
-
-    def _schedule(self) -> Schedule:
-        starts = self.provenance.get("start_values", {})
-        changes: Sequence[Any] = self.provenance.get("input_changes", [])
-        if not all(map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))):
-            raise ValueError("values are not finite")
-        schedule: Schedule = [(0, ChainMap({}, starts))]
-        changed: dict[str, Any] = {}
-        for time, values in changes:
-            steps = (time - self.provenance["start_time"]) / self.provenance["step"]
-            k = max(0, ceil(steps - TIME_TOLERANCE))
-            changed = {**changed, **values}
-            if k == schedule[-1][0] and len(schedule) > 1:  # the first sample is before any
-                schedule.pop()
-            schedule.append((k, ChainMap(changed, starts)))
-        last = self.steps[-1] if self.provenance else 0
-        return [(k, values) for k, values in schedule if k < last or k == 0]

@@ -17,11 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bounds import MAX_CHUNK, MAX_RATIO
 from ..ros.cdr import Rows
 
-MAX_TOPICS = 1000
-MAX_CHUNK = 256 * 1024**2  # bytes, of a message too; writers cut chunks at 1 to 4 MiB
-MAX_RATIO = 1000  # of unpacked to packed; an arm at rest reaches 24, one of 50 joints 220
 RECORD = 2000  # bytes that a record counts for; a message takes 3 of the file at least, packed
 TEXT = 100  # bytes that one of a topic's texts counts for, which are kept
 
@@ -64,11 +62,7 @@ class Allowance:
     left: int = MAX_CHUNK
 
     def spend(self, size: int) -> None:
-        """Take so many bytes off.
-
-        Raises:
-            DamageError: they are not left.
-        """
+        """Take so many bytes off; a DamageError where they are not left."""
         self.left -= size
         if self.left < 0:
             raise DamageError(f"it unpacks to more than {MAX_RATIO} times its size")

@@ -17,16 +17,15 @@ from rosbags.rosbag2 import Reader, ReaderError, WriterError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from ..bounds import MAX_DEFINITION, MAX_PROFILES, MAX_PROVENANCE
 from ..errors import BagError
-from ..files import lock, sync
+from ..files import lock, read_file, sync
 from . import provenance
 from .contents import read_messages, stated_count, storage_files
 from .records import Allowance, Channel, DamageError
 from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, check_path
 from .summary import read_summary
 
-MAX_YAML = 64 * 1024  # bytes of all topics' different profiles; it is slow to read
-MAX_DEFINITION = 64 * 1024  # bytes
 NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
 
 
@@ -139,10 +138,14 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
     robots = provenance.robots_of(folder)
     others = set()
     writer = BagWriter(new, KINDS[files[0].suffix])
+    kept: dict[str, bytes] = {}
     for robot in robots:
+        name = provenance.file_of(robot)
+        with suppress(OSError):
+            kept[name] = read_file(folder / name, MAX_PROVENANCE, follow=False)
         with suppress(BagError):  # damaged: the messages are worth saving without it
             if provenance.read_provenance(folder, robot):
-                text = (folder / provenance.file_of(robot)).read_text("utf-8").strip()
+                text = kept[name].decode("utf-8").strip()
                 writer.set_custom_data(provenance.key_of(robot), text)
     with writer:
         topics, pending = _Topics(writer), 0
@@ -165,9 +168,8 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
                 damage.append(str(error))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
-    for name in map(provenance.file_of, robots):
-        if (folder / name).is_file():
-            shutil.copyfile(folder / name, new / name)
+    for name, content in kept.items():
+        (new / name).write_bytes(content)
     with Reader(new) as reader:  # whole is what another reader opens
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     sync(*new.iterdir(), new)
@@ -200,7 +202,7 @@ class _Topics:
         if text not in self._profiles:
             self._profiles[text] = []
             self._yaml += len(text)
-            if self._yaml < MAX_YAML:
+            if self._yaml < MAX_PROFILES:
                 with suppress(
                     ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError
                 ):

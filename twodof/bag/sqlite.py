@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -13,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ..bounds import MAX_TOPICS
 from ..files import temporary_folder
-from .records import MAX_TOPICS, Batch, Channel, DamageError
+from .records import Batch, Channel, DamageError
 
 PLAIN = ("CREATE TABLE ", "CREATE INDEX ")  # as SQLite begins its records of them
 TABLES = {  # of ROS 2, and their columns; those of older versions end earlier
@@ -58,7 +60,9 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
     which SQLite would look for, anywhere, and delete; a copy that is longer names none.
     """
     unfinished = _unfinished(path)
-    with temporary_folder(path.absolute().parent.parent if unfinished else None) as folder:
+    beside = path.absolute().parent.parent  # where there is room for a second one, as a rule
+    use = beside if unfinished and os.access(beside, os.W_OK) else None
+    with temporary_folder(use) as folder:
         uri = path.absolute().as_uri() + "?immutable=1"
         if unfinished:
             for file in (path, *unfinished):
@@ -83,7 +87,7 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
 def _unfinished(path: Path) -> list[Path]:
     """The files that a writer which died leaves beside its database."""
     files = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
-    return [file for file in files if file.is_file() and file.stat().st_size]
+    return [f for f in files if f.is_file() and not f.is_symlink() and f.stat().st_size]
 
 
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:

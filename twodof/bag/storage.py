@@ -26,6 +26,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from ..errors import BagError
+from ..files import sync
 from ..ros.cdr import Rows
 from .mcap import CHUNK, HEAD, MAGIC, MESSAGE
 from .records import Stamps as Stamps
@@ -51,6 +52,8 @@ FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # place of the summary, of its o
 
 class McapStorage(McapWriter):
     """MCAP whose chunks are cut at each flush."""
+
+    durable = False  # wait for the disk at the end
 
     _end = 0  # of the last chunk that got through
 
@@ -112,6 +115,9 @@ class McapStorage(McapWriter):
             checksum = crc32(file.read()[: -CHECKSUM.size])
             file.seek(-CHECKSUM.size, os.SEEK_END)
             file.write(CHECKSUM.pack(checksum, MAGIC))
+            if self.durable:  # before metadata.yaml says that it is whole
+                file.flush()
+                os.fsync(file.fileno())
 
     def salvage(self) -> None:
         """After a failed flush: bring the file into a state from which the next can go on."""
@@ -123,6 +129,8 @@ class McapStorage(McapWriter):
 
 class Sqlite3Storage(Sqlite3Writer):
     """SQLite whose messages are inserted and committed at each flush, all or none."""
+
+    durable = False  # wait for the disk at the end
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         super().__init__(path, compression)
@@ -156,16 +164,12 @@ class Sqlite3Storage(Sqlite3Writer):
         """Bring everything to the file, and close it."""
         self.flush(sync=False)
         super().close(version, metadata)
+        if self.durable:
+            sync(self.path)
 
 
 class BagWriter(Writer):
-    """rosbags' writer on these storages.
-
-    Args:
-        path: folder of the bag, must not exist.
-        storage: "mcap" or "sqlite3".
-        fsync: wait for the disk at each flush.
-    """
+    """rosbags' writer on these storages; with ``fsync`` it waits for the disk at each flush."""
 
     STORAGE_PLUGINS = MappingProxyType(
         {StoragePlugin.MCAP: McapStorage, StoragePlugin.SQLITE3: Sqlite3Storage}
@@ -175,6 +179,12 @@ class BagWriter(Writer):
     def __init__(self, path: Path, storage: str, *, fsync: bool = False) -> None:
         super().__init__(path, version=METADATA_VERSION, storage_plugin=STORAGES[storage])
         self._fsync = fsync
+
+    def open(self) -> None:
+        """Make the folder and its files."""
+        super().open()
+        assert self.storage is not None
+        self.storage.durable = self._fsync
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
         """Write messages, of each connection one by each of N stamps; they wait for a flush."""
@@ -198,12 +208,9 @@ class BagWriter(Writer):
 
 
 def check_path(path: Path, storage: str) -> None:
-    """Refuse a place where a bag of this storage would not be found again.
+    """Refuse a place where a bag of this storage would not be found again, by a BagError.
 
     Its name is written into metadata.yaml; rosbags makes a URI of a database's whole path.
-
-    Raises:
-        BagError: another name is needed.
     """
     part, text = ("path", str(path)) if storage == "sqlite3" else ("name", path.name)
     if storage == "sqlite3" and any(c in text for c in "?#%"):

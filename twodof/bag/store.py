@@ -16,13 +16,12 @@ from typing import Protocol
 
 from rosbags.rosbag2 import WriterError
 
+from ..bounds import MAX_METADATA
 from ..errors import BagError
 from ..files import lock, read_file, sync
-from ..ros.cdr import Rows
 from ..ros.messages import Topic, store_of
-from .contents import MAX_METADATA
 from .provenance import read_provenance, robots_of
-from .storage import REMOVED, STORAGES, BagWriter, Stamps, check_path
+from .storage import REMOVED, STORAGES, BagWriter, check_path
 
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
@@ -45,22 +44,14 @@ class Part(Protocol):
         """How many samples are in the bag."""
 
     def metadata(self) -> tuple[str, str]:
-        """Key and text of the robot's provenance, for the bag's own metadata.
-
-        Raises:
-            OSError: it was removed.
-        """
+        """Key and text of the robot's provenance; an OSError where that was removed."""
 
 
 class Store:
     """A folder with the messages of one robot, or of several: opened by the first of them, closed
     by the last.
 
-    Args:
-        path, storage, overwrite, fsync: as of ``Bag``.
-
-    Raises:
-        BagError: the folder exists or cannot be written.
+    Arguments and errors are those of ``Bag``. ``writer`` takes messages while it is open.
     """
 
     def __init__(self, path: Path, storage: str, *, overwrite: bool, fsync: bool) -> None:
@@ -98,7 +89,7 @@ class Store:
                 self._create()
             try:
                 part.open()
-                self._writer.flush()
+                self.writer.flush()
                 if self.fsync:
                     sync(self.path, self.path.absolute().parent)
             except BaseException:
@@ -114,26 +105,14 @@ class Store:
 
     def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
         """Numbers of new connections, in the order of the topics."""
-        add = self._writer.add_connection
+        add = self.writer.add_connection
         return [
             add(name, kind, typestore=store_of(kind), offered_qos_profiles=[qos]).id
             for name, (kind, qos) in topics.items()
         ]
 
-    def count(self, connection: int) -> int:
-        """How many messages of a connection are written."""
-        return self._writer.counts[connection]
-
-    def give(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Write messages, of each connection one by each stamp."""
-        self._writer.write_all(stamps, messages)
-
     def check(self) -> None:
-        """Raise what has ended the thread, if anything has.
-
-        Raises:
-            BagError: so does a bag that is not open.
-        """
+        """Raise what has ended the thread, if anything has; BagError where the bag is not open."""
         if self._failure is not None:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
@@ -154,9 +133,7 @@ class Store:
     def leave(self, exception: object) -> None:
         """End one robot's part; the last closes the bag.
 
-        Raises:
-            BagError: the disk is full or the folder is gone, unless such an exception is on its
-                way already.
+        A full disk or a lost folder is a BagError, unless such an exception is on its way already.
         """
         with self._turn:
             self._entered -= 1
@@ -173,14 +150,14 @@ class Store:
 
     def _create(self) -> None:
         """Create the bag's folder, or leave nothing of it."""
-        self._writer = BagWriter(self.path, self._storage, fsync=self.fsync)
+        self.writer = BagWriter(self.path, self._storage, fsync=self.fsync)
         self._lock = -1  # no descriptor yet
         self._due: SimpleQueue[None] = SimpleQueue()
         self._stores = 0
         self._begun = self._closing = self._closed = self._ended = False
         self._failure = None
         try:
-            self._writer.open()
+            self.writer.open()
             self._lock = lock(self.path, wait=True)  # before it is a bag that others may overwrite
             with (self.path / RESERVE).open("wb") as reserve:
                 reserve.write(b"\0" * RESERVE_SIZE)
@@ -194,7 +171,7 @@ class Store:
 
     def _remove(self) -> None:
         with suppress(OSError, sqlite3.Error):
-            self._writer.abort()
+            self.writer.abort()
         shutil.rmtree(self.path, ignore_errors=True)
         with suppress(OSError):
             os.close(self._lock)
@@ -238,23 +215,23 @@ class Store:
     def _store(self) -> None:
         for part in self._parts:
             part.hand_over()
-        self._writer.flush()
+        self.writer.flush()
 
     def _close(self) -> None:
         """Close the bag; after a failure give up the reserve and store what is still there."""
-        storage = self._writer.storage
+        storage = self.writer.storage
         assert storage is not None
         if self._failure is not None:
             if not storage.path.exists():
-                self._writer.abort()
+                self.writer.abort()
                 return
             (self.path / RESERVE).unlink(missing_ok=True)
             storage.salvage()
             self._store()
         for part in self._parts:
             with suppress(OSError):  # it was removed: the messages are worth closing without it
-                self._writer.set_custom_data(*part.metadata())
-        self._writer.close()
+                self.writer.set_custom_data(*part.metadata())
+        self.writer.close()
         if self.fsync:
             sync(storage.path, self.path / "metadata.yaml", self.path)
         self._closed = True

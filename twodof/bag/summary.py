@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
+from ..bounds import MAX_SUMMARY
 from .mcap import CHANNEL, CHUNK, FOOTER, HEAD, MAGIC, SCHEMA, Tables, messages_in, unpack_chunk
 from .records import Allowance, Batch, Channel, DamageError, refusing_damage
 
@@ -24,7 +25,6 @@ FOOTER_FIELDS = struct.Struct("<QQI")
 END = HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
 CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, place, length, bytes of what follows
-MAX_SUMMARY = 64 * 1024**2
 
 
 @dataclass(frozen=True)

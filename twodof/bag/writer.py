@@ -147,14 +147,10 @@ class Bag(Sink):
 
     def stored(self) -> int:
         """How many samples are in the bag."""
-        return self._store.count(self._connections[JOINT_STATES])
+        return self._store.writer.counts[self._connections[JOINT_STATES]]
 
     def metadata(self) -> tuple[str, str]:
-        """Key and text of the provenance, for the bag's own metadata.
-
-        Raises:
-            OSError: it was removed.
-        """
+        """Key and text of the provenance; an OSError where that was removed."""
         return self._provenance.key, self._provenance.text()
 
     def _named(self, topic: str) -> str:
@@ -162,7 +158,7 @@ class Bag(Sink):
 
     def _give(self, stamps: Stamps, messages: Mapping[str, Rows]) -> None:
         rows = {self._connections[topic]: rows for topic, rows in messages.items()}
-        self._store.give(stamps, rows)
+        self._store.writer.write_all(stamps, rows)
 
     def _note(self, sample: Sample) -> None:
         """Queue what changed of the inputs since the sample before."""

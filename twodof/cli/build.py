@@ -41,13 +41,13 @@ def add(build: argparse.ArgumentParser) -> None:
         " (%(default)s)",
     )  # fmt: skip
     flag("--orientation", help="of the frame too: a target orientation beside the position")
-    option("--name", default="TwoDof", help="name of the model (%(default)s)")
+    option(
+        "--name", type=not_empty,
+        help="name of the model (the URDF's file name, TwoDof for the shipped arm)",
+    )  # fmt: skip
+    flag("--overwrite", help="replace an existing file that is not the default arm's FMU")
     flag("--link-environment", help="remember in the FMU where this Python's packages are")
     flag("--native", help="compiled C, which needs no Python where it runs")
-    flag(
-        "--no-live-documentation",
-        help="leave the arm that runs in a browser out of a native FMU's documentation",
-    )
     option(
         "--platform", dest="platforms", action="append", default=[], metavar="P",
         help="of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
@@ -69,7 +69,7 @@ def call(options: argparse.Namespace) -> int:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
     check_company(
         options,
-        needs={"--no-live-documentation": "--native", "--mesh-dir": "a URDF"},
+        needs={"--mesh-dir": "a URDF"},
         excludes={"--no-meshes": "--mesh-dir"},
     )
     if options.orientation and options.control != "task":
@@ -83,18 +83,20 @@ def call(options: argparse.Namespace) -> int:
     platforms = PLATFORMS[options.fmi or 2] if "all" in options.platforms else options.platforms
     chosen = FmuOptions(
         urdf=options.urdf or options.robot,
+        name=options.name or "",
         lock=_locks(options.locks),
         meshes=not options.no_meshes,
         gravity=options.gravity and tuple(options.gravity),
         q_start=options.q_start and tuple(options.q_start),
         control="pose" if options.orientation else options.control,
         arrays=not options.scalars,
-        live_documentation=not options.no_live_documentation,
         platforms=tuple(dict.fromkeys(platforms)),
-        **said(options, "mesh_dir", "frame", "axes", "name", "link_environment", "native", "fmi"),
+        **said(options, "mesh_dir", "frame", "axes", "link_environment", "native", "fmi"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
-    path = build_fmu(options.output, chosen)
+    path = build_fmu(options.output, chosen, overwrite=options.overwrite)
+    if not path.is_file():  # a pipe, from which nothing is read back
+        return 0
     from ..fmu import load_fmu
 
     fmu = load_fmu(path)

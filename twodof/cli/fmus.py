@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
-import sys
 from pathlib import Path
 from typing import Any
 
 from ..errors import BuildError
 from .options import CommandLineError
+from .printing import quote, say
 
 
 def is_robot(path: str | None) -> bool:
@@ -33,11 +32,11 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
 
     native = options.native or host_platform() != "linux64"
     if native and not options.native:
-        print("the Python flavour is for Linux x86-64: building the native one", file=sys.stderr)
+        say("the Python flavour is for Linux x86-64: building the native one", error=True)
     if not of_urdf:
-        return _built(native=native)
-    robot = Path(options.fmu)
-    return _built(urdf=robot, name=identifier(robot), frame=options.frame, native=native)
+        return _default_arm(options.verb, native=native)
+    overwrite = getattr(options, "overwrite", False)
+    return _built(overwrite, urdf=Path(options.fmu), frame=options.frame, native=native)
 
 
 def fast_fmu(options: argparse.Namespace) -> Path:
@@ -45,21 +44,32 @@ def fast_fmu(options: argparse.Namespace) -> Path:
     if options.fmu:
         return Path(options.fmu)
     try:
-        return _built(native=True)
+        return _default_arm(options.verb, native=True)
     except BuildError as error:
-        print(f"{error}; running the Python flavour, which is slower", file=sys.stderr)
-        return _built()
+        say(f"{error}; running the Python flavour, which is slower", error=True)
+        return _default_arm(options.verb)
 
 
-def _built(**what: Any) -> Path:
+def _default_arm(verb: str, *, native: bool = False) -> Path:
+    """Return the default arm's FMU, built if need be; no other FMU is in its place or alone."""
+    from ..export.package import is_default_arm, is_fmu
+
+    there = [path for path in sorted(Path().glob("*.fmu")) if is_fmu(path)]
+    own = f"TwoDof{'-native' * native}.fmu"
+    taken = there if len(there) == 1 else [path for path in there if path.name == own]
+    if taken and not is_default_arm(taken[0]):
+        raise CommandLineError(
+            f"no FMU is named, and '{taken[0]}' is here, which is not the default arm's:"
+            f" type 'twodof {verb} {quote(taken[0])}' to use it, or build the default arm's with"
+            f" 'twodof build{' --native' * native} -o arm.fmu'"
+        )
+    path = _built(native=native)
+    say(f"no FMU is named: this is {path}, the default planar arm", error=True)
+    return path
+
+
+def _built(overwrite: bool = False, **what: Any) -> Path:
     from ..export.options import FmuOptions
     from ..export.package import build_fmu
 
-    return build_fmu(None, FmuOptions(**what))
-
-
-def identifier(robot: Path) -> str:
-    """A robot's name for a program, from that of its file."""
-    stem = robot.name.removesuffix(".xacro").removesuffix(".urdf").removesuffix(".fmu")
-    name = re.sub(r"\W", "_", stem, flags=re.ASCII)
-    return name if name.isidentifier() else f"robot_{name}"
+    return build_fmu(None, FmuOptions(**what), overwrite=overwrite)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from .options import add_options
-from .printing import print_json, print_table
-from .sweep import best_runs, print_best
+from .printing import print_json, print_table, say
+from .sweep import best_facts, print_best
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -59,7 +59,8 @@ def _show_bags(path: Path, as_json: bool) -> None:
         print_json(**facts[0] if len(facts) == 1 else several)
         return
     for i, bag in enumerate(bags):
-        print("\n" * (i > 0), end="")
+        if i > 0:
+            say()
         _print_bag(bag)
 
 
@@ -106,7 +107,7 @@ def _print_sweep_json(path: Path, table: DataFrame, provenance: dict[str, Any]) 
         path=str(path),
         runs=len(table),
         outcomes=table["outcome"].value_counts().to_dict(),
-        best=best_runs(table).to_dict("records"),
+        **best_facts(table),
         **{key: provenance[key] for key in ("fmu", "design", "options")},
         command_line=provenance.get("command_line"),
     )
@@ -159,7 +160,7 @@ def _print_fmu(fmu: Fmu) -> None:
             starts = ", ".join(_start(v.start) for v in variables if v.start is not None)
             units = ", ".join(dict.fromkeys(variable.unit or "" for variable in variables))
             rows.append((f"{group}{size}", units, starts, causality))
-    print()
+    say()
     print_table(*rows)
 
 
@@ -196,7 +197,7 @@ def _print_bag(run: Recording) -> None:
         rows.append(("FMU", f"{fmu['file']} ({fmu['name']}, {fmu['guid']})"))
         rows.append(("made by", run.provenance["command_line"] or "the Python API"))
     print_table(*rows)
-    print()
+    say()
     print_table(*((topic.name, f"{topic.count:8d}", topic.type) for topic in run.topics))
 
 

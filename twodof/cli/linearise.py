@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from .options import add_options, parse_settings
-from .printing import print_json, print_table
+from .printing import print_json, print_table, say
 
 if TYPE_CHECKING:
     from ..linear import LinearModel
@@ -48,13 +48,14 @@ def _print(model: LinearModel) -> None:
         *((name, f"{value:.6g} {model.units[name]}".strip()) for name, value in model.point.items())
     )
     for remark in model.remarks:
-        print(f"note: {remark}")
-    print("\neigenvalue, 1/s          damping  frequency, rad/s")
+        say(f"note: {remark}")
+    say("\neigenvalue, 1/s          damping  frequency, rad/s")
     for z, damping, frequency in model.modes:
         number = f"{z.real:.6g}{z.imag:+.6g}j" if z.imag else f"{z.real:.6g}"
-        print(f"{number:<24} {damping:7.4f}  {frequency:.6g}")
+        ratio = f"{damping:7.4f}" if z else f"{'–':>7}"
+        say(f"{number:<24} {ratio}  {frequency:.6g}")
     for name in "ABCD":
-        print(f"\n{name}")
+        say(f"\n{name}")
         rows = model.states if name in "AB" else model.outputs
         columns = model.states if name in "AC" else model.inputs
         values = ((f"{x:.6g}" for x in row) for row in getattr(model, name).tolist())

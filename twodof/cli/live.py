@@ -6,7 +6,7 @@ import argparse
 
 from .fmus import fast_fmu
 from .options import OF_A_PAGE, add_fmu, add_options, add_output, parse_settings
-from .printing import print_next, quote
+from .printing import print_next, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 from .view import open_page, place
 
@@ -32,7 +32,7 @@ def call(options: argparse.Namespace) -> int:
             command_line=options.command_line,
         )  # fmt: skip
     for bag in bags:
-        print(f"bag   {bag}")
+        say(f"bag   {bag}")
     if bags:
         print_next(f"twodof plot {quote(bags[-1])}", f"twodof view {quote(bags[-1])}")
     return INTERRUPTED

@@ -9,16 +9,20 @@ import argparse
 import io
 import logging
 import os
+import re
 import shlex
 import sys
+import warnings
 from collections.abc import Sequence
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext, redirect_stdout
+from itertools import takewhile
+from typing import Any, NoReturn
 
 from ..errors import TwoDofError
 from ..version import __version__
 from . import build, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
 from .options import CommandLineError
-from .printing import in_options, plain
+from .printing import in_options, plain, say
 from .signals import INTERRUPTED, is_interrupt
 
 VERBS = {
@@ -43,6 +47,10 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **named: Any) -> None:
         super().__init__(allow_abbrev=False, **named)
+
+    def error(self, message: str) -> NoReturn:
+        """End with a wrong command line."""
+        super().error(plain(message))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -80,9 +88,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost a tenth of a short run
+    os.environ.pop("MPLBACKEND", None)  # that of a notebook, which may not be installed here
     try:
         options = _options(arguments)
-        status: int = options.call(options)
+        with _facts_beside(getattr(options, "output", None) or getattr(options, "export", None)):
+            status: int = options.call(options)
         if sys.stdout is not None:
             sys.stdout.flush()
         return status
@@ -114,6 +124,9 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
         import argcomplete
 
         argcomplete.autocomplete(program)
+    for argument in takewhile("--".__ne__, arguments):  # argparse would take it for an empty list
+        if re.fullmatch(r"(-\w|--[\w-]+=)--", argument):
+            program.error(f"argument {argument[:-2].rstrip('=')}: '--' is no value")
     options = program.parse_args(arguments)
     options.command_line = shlex.join(["twodof", *arguments])
     if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
@@ -121,16 +134,28 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     log = logging.StreamHandler()
     log.setFormatter(_Words("%(levelname)s: %(message)s"))
     logging.basicConfig(handlers=[log], level=logging.WARNING)
+    # those of matplotlib have names of an untrusted file
+    warnings.showwarning = lambda warning, *_, **__: logging.getLogger("twodof").warning(
+        "%s", warning
+    )
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     return options
+
+
+def _facts_beside(output: str | None) -> AbstractContextManager[object]:
+    """Facts go to stderr where the standard output is the file that is written."""
+    from ..files import descriptor_of
+
+    beside = output is not None and descriptor_of(output) == 1
+    return redirect_stdout(sys.stderr) if beside else nullcontext()
 
 
 def _fail(message: str, status: int = 1) -> int:
     line = " ".join(message.split())
     if len(line) > LONGEST_LINE:  # a name of a file from elsewhere can have any length
         line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
-    print("twodof: error:", plain(line), file=sys.stderr)
+    say(f"twodof: error: {line}", error=True)
     return status
 
 

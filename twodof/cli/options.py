@@ -25,6 +25,14 @@ def not_empty(text: str) -> str:
     return text
 
 
+STANDARD_OUTPUT = "/dev/stdout"
+
+
+def output_file(text: str) -> str:
+    """A file to be written; "-" is the standard output."""
+    return STANDARD_OUTPUT if text == "-" else not_empty(text)
+
+
 OPTIONS: dict[str, dict[str, Any]] = {
     # what is run, for how long
     "--frame": dict(
@@ -48,7 +56,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "--effort": dict(action="store_true", help="add the control effort"),
     "--stamp-start": dict(type=float, metavar="S", help="first stamp, s since the epoch (now)"),
-    "--overwrite": dict(action="store_true", help="replace an existing bag"),
+    "--overwrite": dict(
+        action="store_true", help="replace an existing bag, or the FMU of a URDF"
+    ),
     "--json": dict(action="store_true", help="print the facts as JSON, SI units"),
     "--fsync": dict(
         action="store_true", help="wait for the disk twice a second, for a power loss"
@@ -112,11 +122,7 @@ def check_company(
     needs: dict[str, str] | None = None,
     excludes: dict[str, str] | None = None,
 ) -> None:
-    """Refuse options that would do nothing: without another, or beside another.
-
-    Raises:
-        CommandLineError: naming both.
-    """
+    """Refuse options that would do nothing, without another or beside another, and name both."""
     for option, other in (needs or {}).items():
         if _given(options, option) and not _given(options, other):
             raise CommandLineError(f"{option} does nothing without {other}")

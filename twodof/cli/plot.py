@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .options import CommandLineError, add_output, add_robot_options
+from .options import CommandLineError, add_robot_options, output_file
 from .printing import print_table
 from .sweep import print_best
 
@@ -22,7 +22,10 @@ def add(plot: argparse.ArgumentParser) -> None:
         " sweep, each metric over the variables."
     )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
-    add_output(plot, "FILE", ".png, .svg, .pdf or .html (a window)")
+    plot.add_argument(
+        "-o", dest="output", type=output_file, metavar="FILE",
+        help=".png, .svg, .pdf or .html; - is the standard output, as PNG (a window)",
+    )  # fmt: skip
     plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     add_robot_options(plot)
 
@@ -41,7 +44,14 @@ def call(options: argparse.Namespace) -> int:
             raise CommandLineError(f"'{sweeps[0]}' is a sweep; --{option} is for bags")
     if len(options.bags) > 1:
         raise CommandLineError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
-    return _plot_sweep(options, Path(sweeps[0]))
+    from ..plots.sweeps import drawing
+    from ..sweeps.results import read_sweep
+
+    folder = Path(sweeps[0])
+    table, provenance = read_sweep(folder)
+    _show_or_save(drawing(table, provenance, folder.resolve().name), options.output)
+    print_best(table)
+    return 0
 
 
 def _plot_bags(options: argparse.Namespace) -> int:
@@ -59,16 +69,6 @@ def _plot_bags(options: argparse.Namespace) -> int:
         if text := "; ".join(filter(None, (outcome(track), apart))):
             results.append((label, text))
     _show_or_save(drawing(tracks), options.output, *results)
-    return 0
-
-
-def _plot_sweep(options: argparse.Namespace, folder: Path) -> int:
-    from ..plots.sweeps import drawing
-    from ..sweeps.results import read_sweep
-
-    table, provenance = read_sweep(folder)
-    _show_or_save(drawing(table, provenance, folder.resolve().name), options.output)
-    print_best(table)
     return 0
 
 

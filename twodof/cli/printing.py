@@ -1,19 +1,24 @@
-"""What goes to the terminal: tables, facts as JSON, and the library's messages in options."""
+"""All output to the terminal: lines, tables, facts as JSON, the library's messages in options."""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
+import shutil
+import sys
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from pathlib import Path
 
 ARGUMENT = re.compile(r"`(\w+)(?:=True)?`")
 OPTIONS = {
     "path": "-o", "output": "-o", "platforms": "--platform", "changes": "--input",
-    "robots": "NAME=FMU",
+    "robots": "NAME=FMU", "set_gains": "--foxglove-control",
 }  # fmt: skip
 """Options that are not called as the argument of the library which they give."""
+NEEDS = {"plot": "matplotlib", "view": "websockets"}
+"""Modules that verbs need, of the extra 'view'."""
 POSE = "control 'pose'"
 """Which is two options."""
 
@@ -25,7 +30,10 @@ def in_options(text: str) -> str:
 
 
 def plain(text: str) -> str:
-    """A text with its control characters as escapes: files from elsewhere write on no terminal."""
+    """Return a text with control and bidirectional characters as escapes.
+
+    Names in untrusted files are no commands to the terminal, and turn no line around.
+    """
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
@@ -34,21 +42,47 @@ def quote(path: Path) -> str:
     return shlex.quote(str(path))
 
 
+def say(text: str = "", *, error: bool = False) -> None:
+    """Print a line, on the standard error where it is one; every verb prints by this function."""
+    print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
+
+
 def print_table(
     *rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = ""
 ) -> None:
     """Texts in columns, a row a line; each line begins with what is to stand before."""
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:
-        print(plain(before + "  ".join(map(align, row, widths)).rstrip()))
+        say(before + "  ".join(map(align, row, widths)).rstrip())
 
 
 def print_next(*commands: str) -> None:
-    """What to type next."""
-    print("\nnext", *commands, sep="\n  ")
+    """Print what to type next, as this shell finds it; without what is not installed."""
+    from ..version import install
+
+    missing = {verb for verb, module in NEEDS.items() if find_spec(module) is None}
+    shown = [command for command in commands if not {*command.split()[1:2]} & missing]
+    program = _program()
+    lines = [re.sub("^twodof ", lambda _: f"{program} ", command) for command in shown]
+    if lines:
+        say("\n  ".join(["\nnext", *lines]))
+    if len(shown) < len(commands):
+        say(f"\nto plot and view: {install('view')}")
+
+
+def _program() -> str:
+    """This program for the shell: its name where that finds it, else its path."""
+    own = Path(sys.executable).with_name("twodof")
+    found = shutil.which("twodof")
+    if found is not None and own.exists() and own.samefile(found):
+        return "twodof"
+    own = own if own.exists() else Path(sys.executable)
+    inside = own.is_relative_to(Path.cwd())
+    path = quote(own.relative_to(Path.cwd()) if inside else own)
+    return path if own.name == "twodof" else f"{path} -m twodof"
 
 
 def print_json(**facts: object) -> None:
     """Facts for another program, in SI units; null where there is no finite number."""
     finite = json.loads(json.dumps(facts), parse_constant=lambda _: None)
-    print(json.dumps(finite, indent=2))
+    say(json.dumps(finite, indent=2))

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .fmus import identifier
 from .options import OF_A_RUN, CommandLineError, add_options, add_output, check_company, said
-from .printing import in_options, print_json, print_next, print_table, quote
+from .printing import in_options, print_json, print_next, print_table, quote, say
 from .run import bag_of, experiment_of, facts_of, print_summary
 from .signals import INTERRUPTED, asked_to_stop
 
 if TYPE_CHECKING:
-    from ..ros.foxglove import Foxglove
+    from ..pages.foxglove import Foxglove
     from ..ros.publisher import Publisher
     from ..simulation.experiments import Experiment
 
@@ -42,6 +40,7 @@ def add(publish: argparse.ArgumentParser) -> None:
     flag("--subnet", help="for other hosts too, not for this one alone")
     flag("--foxglove", help="serve Foxglove too, on this machine alone")
     option("--foxglove-port", type=int, metavar="PORT", help="(8765)")
+    flag("--foxglove-control", help="let Foxglove set the gains")
     add_options(publish, "--namespace")
     option("--state-topic", default="joint_states", metavar="TOPIC", help="(%(default)s)")
     option(
@@ -72,7 +71,8 @@ def call(options: argparse.Namespace) -> int:
     if not 0.0 < options.rate < math.inf:
         raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")
     of_a_bag = ("--overwrite", "--fsync", "--storage")
-    check_company(options, needs={**dict.fromkeys(of_a_bag, "-o"), "--foxglove-port": "--foxglove"})
+    of_foxglove = dict.fromkeys(("--foxglove-port", "--foxglove-control"), "--foxglove")
+    check_company(options, needs={**dict.fromkeys(of_a_bag, "-o"), **of_foxglove})
     options.storage = options.storage or "mcap"
     robots = _robots(options)
     bag = bag_of(options, options.output) if options.output else None
@@ -117,6 +117,7 @@ def call(options: argparse.Namespace) -> int:
 
 def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
     """What is to be run, by namespace; what is alone needs none."""
+    from ..export.options import identifier
     from ..ros.messages import check_name
 
     robots: dict[str, Experiment] = {}
@@ -144,13 +145,16 @@ def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
 
 
 def _foxglove(options: argparse.Namespace) -> Foxglove:
-    from ..ros.foxglove import Foxglove
+    from ..pages.foxglove import Foxglove
 
     def tell(server: Foxglove) -> None:
-        print(f"open  Foxglove, Open connection, Foxglove WebSocket: {server.url}", flush=True)
+        say(f"open  Foxglove, Open connection, Foxglove WebSocket: {server.url}")
 
     port = {} if options.foxglove_port is None else {"port": options.foxglove_port}
-    return Foxglove(**port, scene=options.scene, effort=options.effort, opened=tell)
+    return Foxglove(
+        **port, scene=options.scene, effort=options.effort, set_gains=options.foxglove_control,
+        opened=tell,
+    )  # fmt: skip
 
 
 def _print_network(stop_time: float | None, wire: Publisher) -> None:
@@ -162,4 +166,3 @@ def _print_network(stop_time: float | None, wire: Publisher) -> None:
         ("end", "Ctrl-C" if stop_time is None else f"after {stop_time:g} s, or Ctrl-C"),
     )
     print_next(f"ros2 topic echo {wire.topics[0]}")
-    sys.stdout.flush()

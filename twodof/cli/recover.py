@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .printing import print_next, print_table, quote
+from .printing import print_next, print_table, quote, say
 
 
 def add(recover: argparse.ArgumentParser) -> None:
@@ -20,7 +20,7 @@ def call(options: argparse.Namespace) -> int:
 
     done = recover(options.bag)
     if done.original is None:
-        print(f"'{done.path}' is complete; there is nothing to recover")
+        say(f"'{done.path}' is complete; there is nothing to recover")
         return 0
     print_table(
         ("bag", f"{done.path} ({sum(done.counts.values())} messages)"),

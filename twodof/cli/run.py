@@ -108,6 +108,8 @@ def facts_of(
         end_time=last.t,
         stopped=summary.stopped,
         q=last.q, v=last.v, x=last.x, x_des=last.target, error=summary.error,
+        turn_error=summary.turn_error, joint_error=summary.joint_error,
+        beyond_limits=[excess._asdict() for excess in summary.beyond_limits],
         wall_time=summary.wall_time,
         missed=None if pace is None else pace.missed,
         worst=None if pace is None else pace.worst,
@@ -130,7 +132,18 @@ def print_summary(
         rows.append(("bag", f"{bag.address} ({messages})"))
     if summary.error is not None:
         target = ", ".join(f"{value:g}" for value in last.target or ())
-        rows.append(("end effector", f"{summary.error:.3g} m from its target ({target}) m"))
+        turn = summary.turn_error
+        words = "" if turn is None else f", {turn:.3g} rad from its target orientation"
+        rows.append(("end effector", f"{summary.error:.3g} m from its target ({target}) m{words}"))
+    if last.joint_target is not None:
+        off = [abs(wanted - q) for wanted, q in zip(last.joint_target, last.q)]
+        worst = off.index(max(off))
+        distance = f"{off[worst]:.3g} {run.fmu.variables[run.fmu.vector('q')[worst]].unit}"
+        rows.append(("joints", f"at most {distance} from q_des, joint '{run.fmu.joints[worst]}'"))
+    for joint, quantity, peak, limit, fmi_unit in summary.beyond_limits:
+        unit = fmi_unit.replace(".", "·")
+        beyond = f"{peak:.4g} {unit}, beyond the URDF's limit of {limit:.4g} {unit}"
+        rows.append((f"peak {quantity}", f"joint '{joint}': {beyond}"))
     simulated = last.k * run.step
     speed = simulated / summary.wall_time if summary.wall_time else 0.0
     taken = f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time"

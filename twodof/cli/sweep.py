@@ -21,7 +21,7 @@ from .options import (
     parse_settings,
     said,
 )
-from .printing import print_json, print_next, print_table, quote
+from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print_json(
             fmu=str(fmu), sweep=str(output), runs=total, done=len(table),
-            outcomes=counts.to_dict(), best=best_runs(table).to_dict("records"),
+            outcomes=counts.to_dict(), **best_facts(table),
         )  # fmt: skip
         return INTERRUPTED if stopped else 0
     print_table(
@@ -112,25 +112,37 @@ def call(options: argparse.Namespace) -> int:
 
 
 def best_runs(table: DataFrame) -> DataFrame:
-    """The first few runs by settling time, effort and final error: variables, metrics known."""
-    from ..sweeps.results import ranked
+    """The first few of the ranked runs: variables, metrics known."""
+    from ..sweeps.ranking import ranked
 
     best = ranked(table).head(5)
     columns = [*best.columns]
     return best[columns[: columns.index("end_time")]].dropna(axis="columns", how="all")
 
 
+def best_facts(table: DataFrame) -> dict[str, object]:
+    """The best runs, and how many exceed the URDF's limits, for another program."""
+    from ..sweeps.ranking import beyond_limits
+
+    best = best_runs(table).to_dict("records")
+    return dict(best=best, beyond_limits=int(beyond_limits(table).sum()))
+
+
 def print_best(table: DataFrame) -> None:
-    """The best runs, with units."""
+    """The best runs, with units; nothing is called best that is equal to others."""
     from ..sweeps.metrics import METRICS
-    from ..sweeps.results import RANKED
+    from ..sweeps.ranking import RANKED, equals, ranked, remark
 
     best = best_runs(table)
     units = [METRICS[name].unit if name in METRICS else "" for name in best.columns]
     rows = [[f"{value:.4g}" for value in row] for row in best.to_numpy()]
     ranks = [RANKED[name] for name in RANKED if name in best.columns][:2]
-    title = f"best: {', '.join(ranks) or 'no metric ranks them'}"
-    print(f"\n{title}" if rows else "\nno run was finished")
+    title = f"best: {', '.join(ranks)}" if ranks else "finished; no metric ranks them"
+    if ranks and (count := equals(ranked(table))) > 1:
+        title = f"no single best run: {count} are equal up to rounding"
+    say(f"\n{title}" if rows else "\nno run was finished")
+    if text := remark(table):
+        say(f"note: {text}")
     if rows:
         print_table(best.columns, units, *rows, align=str.rjust, before="  ")
 
@@ -139,7 +151,7 @@ def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
     """Of --grid: evenly spaced values, both ends included."""
     import numpy as np
 
-    from ..sweeps.design import MAX_RUNS
+    from ..bounds import MAX_RUNS
 
     grids: dict[str, tuple[float, ...]] = {}
     for text in texts:

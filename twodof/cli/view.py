@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .options import OF_A_PAGE, add_options, add_robot_options, check_company, not_empty, said
-from .printing import in_options
+from .options import OF_A_PAGE, add_options, add_robot_options, check_company, output_file, said
+from .printing import in_options, say
 from .signals import asked_to_stop
 
 
@@ -19,8 +18,8 @@ def add(view: argparse.ArgumentParser) -> None:
     view.description = "Replay a bag in the browser, or write a page that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path)
     view.add_argument(
-        "--export", type=not_empty, metavar="FILE.html",
-        help="write one self-contained file instead",
+        "--export", type=output_file, metavar="FILE.html",
+        help="write one self-contained file instead; - is the standard output",
     )  # fmt: skip
     add_robot_options(view)
     view.add_argument(
@@ -38,7 +37,7 @@ def call(options: argparse.Namespace) -> int:
     robot = said(options, "urdf", "mesh_dir", "frame", "fmu")
     if options.export:
         _print_remarks(export(options.bag, options.export, **robot))
-        print(f"page  {options.export}; it needs no network")
+        say(f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:
         view(
@@ -59,7 +58,7 @@ def open_page(
     """Tell where the page is, and open it where there is a display."""
     _print_remarks(remarks)
     what = f"{fmu}; " if fmu is not None else ""
-    print(f"open  {url} ({what}Ctrl-C ends)", flush=True)
+    say(f"open  {url} ({what}Ctrl-C ends)")
     if not options.no_browser and {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
         import webbrowser
 
@@ -68,4 +67,4 @@ def open_page(
 
 def _print_remarks(remarks: Sequence[str]) -> None:
     for remark in remarks:
-        print(f"WARNING: {in_options(remark)}", file=sys.stderr)
+        say(f"WARNING: {in_options(remark)}", error=True)

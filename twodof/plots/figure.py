@@ -1,7 +1,4 @@
-"""Figures that go into files, windows and notebooks: their style, and how they are written.
-
-All that is common to the figures of bags and of sweeps.
-"""
+"""Style, head and files of all figures, of bags and of sweeps."""
 
 from __future__ import annotations
 
@@ -9,19 +6,23 @@ import html
 import io
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain
+from math import ceil
 from pathlib import Path
+from string import Template
 from typing import Any, NamedTuple
 
 from ..errors import PlotError
-from ..files import free_name, head_of, refusing, write_file
+from ..files import data_file, descriptor_of, free_name, head_of, refusing, write_file
 from ..version import __version__
 from .strokes import GREY, HAIR, INK
 
 try:
     import matplotlib.style
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.lines import Line2D
 except ImportError as missing:
     raise PlotError(
         f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
@@ -35,35 +36,12 @@ STYLE = {
     "legend.borderpad": 0.0, "legend.borderaxespad": 0.0, "savefig.dpi": 200,
     "svg.hashsalt": "twodof", "pdf.fonttype": 42,
 }  # fmt: skip
+LETTER = 0.058  # inches, mean width
 TICK_STYLE: dict[str, Any] = {
     "direction": "in", "width": 0.7, "color": GREY, "labelsize": 7.0, "labelcolor": INK,
     "grid_color": HAIR, "grid_linewidth": 0.6,
 }  # fmt: skip
 """Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
-
-STYLES = """html { overflow-y: scroll; }
-h1 { font-size: 1.1em; margin: 0 0 .5em; overflow-wrap: anywhere; }
-#plots { display: grid; grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); gap: 1em; }
-#plots .plot { min-width: 0; }
-#side { overflow-x: auto; }
-#legend { width: 100%; margin: 0 0 1em; font-size: 12px; font-variant-numeric: tabular-nums; }
-#legend td, #legend th { padding: 1px 6px; text-align: right; white-space: nowrap; }
-#legend td:first-child, #legend th:first-child { text-align: left; min-width: 5em; }
-#legend label { display: flex; gap: .4em; align-items: center; cursor: pointer; }
-#legend .joint label { padding-left: 1em; }
-table.runs { display: block; overflow-x: auto; overflow-wrap: anywhere; }
-.runs td { min-width: 5em; }
-@media (max-width: 1150px) { #plots { grid-template-columns: minmax(0, 1fr); } }
-@media (max-width: 500px) {
-  #legend td, #legend th { padding: 1px 3px; } #legend .joint label { padding-left: 0; }
-}
-@media (prefers-color-scheme: dark) {
-  html, html body { background: #141414; }
-  body > :not(svg) { filter: invert(.92) hue-rotate(180deg); }
-}
-"""
-"""Of pages. In the dark all but maps, whose colours are numbers, is turned inside out, with the
-hues of curves."""
 
 
 class Plot(Figure):
@@ -77,7 +55,6 @@ class Drawing(NamedTuple):
     """What can be drawn into a figure, or stand on a page.
 
     Attributes:
-        title: for people.
         name: of the file where the user gives none.
         draw: draws it into an empty figure, and sets the figure's size.
         columns: of the table that stands below it on a page.
@@ -100,7 +77,6 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     """Draw into a file, written whole or not at all; its path.
 
     Args:
-        drawing: what to draw.
         output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the
             drawing's name and .png in the working directory, with a number where another file has
             that name.
@@ -123,6 +99,7 @@ def file_kind(path: str | Path) -> str:
         PlotError: any other.
     """
     kind = Path(path).suffix.lower().removeprefix(".")
+    kind = kind or ("" if descriptor_of(path) is None else "png")
     if kind not in ("png", "svg", "pdf", "html"):
         raise PlotError(f"'{path}': the name of a plot ends in .png, .svg, .pdf or .html")
     return kind
@@ -146,9 +123,45 @@ def show(drawing: Drawing) -> bool:
     return True
 
 
+def draw_head(
+    figure: Figure,
+    title: str,
+    texts: Iterable[str],
+    size: tuple[float, float],
+    handles: Sequence[Line2D] = (),
+) -> SubFigure:
+    """Draw a title, texts and a key; return the part for the panels, of a size in inches."""
+    letters = int((size[0] - 0.3) / LETTER)
+    lines = [line for text in texts for line in textwrap.wrap(text, letters)]
+    for handle in handles:
+        handle.set_label(_end(str(handle.get_label()), int(0.8 * letters) - 10))
+    longest = max((len(str(handle.get_label())) for handle in handles), default=0)
+    columns = max(1, letters // (12 + longest))
+    rows = len(lines) + ceil(len(handles) / columns)
+    figure.set_size_inches(size[0], size[1] + 0.45 + 0.17 * rows)
+    figure.set_layout_engine("constrained", w_pad=0.05, h_pad=0.05, wspace=0.0, hspace=0.0)
+    look: dict[str, Any] = {"x": 0.1 / size[0], "ha": "left", "fontsize": 11, "fontweight": "bold"}
+    figure.suptitle(_end(title, letters // 2), **look)
+    room = figure.add_subfigure(figure.add_gridspec()[0])
+    legend = room.legend(
+        handles=handles, title="\n".join(lines), alignment="left", loc="outside upper left",
+        ncols=columns, handlelength=3.5, fontsize=8.0, title_fontsize=8.0, borderaxespad=0.8,
+    )  # fmt: skip
+    legend.get_title().set_color(GREY)
+    return room
+
+
+def _end(text: str, letters: int) -> str:
+    """As much of a text's end as there is room for."""
+    return text if len(text) <= letters else f"…{text[1 - letters :]}"
+
+
 def _draw(drawing: Drawing, figure: Figure) -> Figure:
     with matplotlib.style.context(["default", STYLE]):
         drawing.draw(figure)
+    for axes in figure.axes:
+        if axes.get_label() != "<colorbar>":
+            axes.tick_params(which="both", **TICK_STYLE)
     return figure
 
 
@@ -173,38 +186,15 @@ def _html(drawing: Drawing) -> bytes:
         svg = _rendered(drawn(drawing), "svg").decode()
         body = svg[svg.index("<svg") :]
     title = html.escape(drawing.title)
-    columns = drawing.columns
     rows = "\n".join(
         f"<tr><th>{html.escape(key)}</th>"
-        + "".join(f"<td>{html.escape(column.get(key, ''))}</td>" for column in columns)
+        + "".join(f"<td>{html.escape(column.get(key, ''))}</td>" for column in drawing.columns)
         + "</tr>"
-        for key in dict.fromkeys(chain(*columns))
+        for key in dict.fromkeys(chain(*drawing.columns))
     )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8"/>
-<meta name="viewport" content="width=device-width, initial-scale=1"/>
-<title>{title}</title>
-<style>
-{STYLES}body {{ font: 14px/1.5 sans-serif; color: {INK}; background: white; max-width: 1500px;
-  margin: 0 auto; padding: 1em; }}
-body > svg {{ width: 100%; max-width: 1100px; height: auto; }}
-table {{ border-collapse: collapse; margin-top: 1em; }}
-th, td {{ text-align: left; vertical-align: top; padding: 0.2em 1.5em 0.2em 0; }}
-th {{ color: {GREY}; font-weight: normal; white-space: nowrap; }}
-tr {{ border-top: 1px solid {HAIR}; }}
-</style>
-</head>
-<body>
-<h1>{title}</h1>
-{body}
-<table class="runs">
-{rows}
-</table>
-</body>
-</html>
-""".encode()
+    page = Template(data_file("plots", "page.html").read_text("utf-8"))
+    colours = {"ink": INK, "grey": GREY, "hair": HAIR}
+    return page.substitute(colours, title=title, body=body, rows=rows).encode()
 
 
 def _is_ours(path: Path) -> bool:

@@ -3,6 +3,7 @@
 "use strict";
 
 /** @typedef {{bag: number, joint: string, label: string, colour: string, dashes: string}} Row */
+/** @typedef {{data: {meta: [number, string, string]}, fullData: {x: ArrayLike<number>}, pointNumber: number, x: number, y: number}} Hovered */
 /** @typedef {{data: {meta: [number | null, string, string]}[], layout: object}} Chart */
 
 const ROUNDING = 1e-12; // what is less is not told
@@ -66,14 +67,16 @@ class Legend {
     return bag === null || (on(`${bag} `) && on(`${bag} ${joint}`));
   }
 
-  /** @param {{data: {meta: [number, string, string]}, x: number, y: number}[]} points under the cursor */
+  /** @param {Hovered[]} points under the cursor: of each curve the nearest */
   tell(points) {
     for (const cell of this.cells.values()) cell.textContent = "";
-    for (const { data, y } of points) {
+    const latest = Math.max(...points.map(({ x }) => x));
+    for (const { data, fullData, pointNumber, x, y } of points) {
+      if (x < latest && pointNumber === fullData.x.length - 1) continue; // it has ended before
       const cell = this.cells.get(data.meta.join(" "));
       if (cell) cell.textContent = (Math.abs(y) < ROUNDING ? 0 : Number(y)).toPrecision(5).replaceAll("-", "\u2212");
     }
-    this.time.textContent = points.length ? `${Number(points[0].x.toPrecision(7))} s` : "";
+    this.time.textContent = points.length ? `${Number(latest.toPrecision(7))} s` : "";
   }
 }
 

@@ -17,17 +17,7 @@ import numpy as np
 from ..errors import PlotError
 from ..files import data_file, packed
 from .closed_form import Array
-from .panels import (
-    CURVE,
-    KINDS,
-    TARGET,
-    Looks,
-    Panel,
-    duration,
-    error_panel,
-    joint_names,
-    joint_panels,
-)
+from .panels import CURVE, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
 from .strokes import GREY, HAIR, INK, Stroke, looks
 from .track import Track
 from .words import labels
@@ -73,11 +63,6 @@ def body(tracks: Sequence[Track]) -> str:
     )
 
 
-def _text(name: str) -> str:
-    """As plotly has it, which reads tags in what it shows."""
-    return html.escape(name, quote=False)
-
-
 def _numbers(values: Array) -> dict[str, str]:
     """As plotly has arrays: bytes, which are exact."""
     content = np.ascontiguousarray(values, dtype="<f8").tobytes()
@@ -109,17 +94,17 @@ def _trace(stroke: Stroke) -> dict[str, Any]:
 
 def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
     """Which samples are drawn, where they are not all: a line for each track."""
-    lines = []
+    text = ""
     for i, track in enumerate(tracks):
         own = (trace["x"]["bdata"] for trace in figure["data"] if trace["meta"][0] == i)
         drawn = max((len(x) * 3 // 32 for x in own), default=0)  # doubles as base64
         if drawn < track.recording.count:
-            lines.append(
-                f"<p>A curve of '{_text(track.name)}' is drawn through at most {drawn} of"
+            text += (
+                f"<p>A curve of '{html.escape(track.name)}' is drawn through at most {drawn} of"
                 f" {track.recording.count} samples: of each part of it the ends, extremes, and both"
                 " sides of the greatest steps. Fewer joints are drawn through more.</p>\n"
             )
-    return "".join(lines)
+    return text
 
 
 def _looks(tracks: Sequence[Track]) -> Looks:
@@ -152,13 +137,12 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, Any]]:
 def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
     """A row for each quantity, on one axis of time."""
     own = _looks(tracks)
-    panels = sorted(joint_panels(tracks, own), key=lambda panel: [*KINDS].index(panel.kind))
     rows: dict[str, list[Panel]] = {}
-    for panel in panels:
-        rows.setdefault(f"{KINDS[panel.kind]} in {panel.unit}", []).append(panel)
-    if error := error_panel(tracks, own):
-        heading = f"Distance from the target in {error.unit}"
-        rows[": ".join(filter(None, (heading, error.note)))] = [error]
+    for panel in sorted(panels_of(tracks, own), key=lambda panel: [*KINDS].index(panel.kind)):
+        heading = f"{KINDS[panel.kind]} in {panel.unit}"
+        if panel.kind == "error" and panel.note:
+            heading += f": {panel.note}"
+        rows.setdefault(heading, []).append(panel)
     height = len(rows) * (ROW + GAP) - GAP
     time = {
         **AXIS, "range": [0.0, duration(tracks)], "title": {"text": "time in s"},
@@ -175,7 +159,7 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         top = 1.0 - (row - 1) * (ROW + GAP) / height
         layout[f"yaxis{row}"] = _value_axis(panels, top, top - ROW / height)
         strokes = [stroke for panel in panels for stroke in panel.strokes]
-        if any(stroke.is_target for stroke in strokes):
+        if any(stroke.label == "target" and not stroke.kind for stroke in strokes):
             heading += f"; {TARGET}"
         layout["annotations"].append(_heading(heading, top))
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):
@@ -197,8 +181,9 @@ def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str,
 
 
 def _heading(text: str, top: float) -> dict[str, Any]:
+    text = html.escape(text, quote=False)  # plotly reads tags
     return {
-        "text": _text(text), "x": 0.0, "y": top, "xref": "paper", "yref": "paper",
+        "text": text, "x": 0.0, "y": top, "xref": "paper", "yref": "paper",
         "xanchor": "left", "yanchor": "bottom", "showarrow": False, "font": {"size": 13},
     }  # fmt: skip
 
@@ -213,10 +198,9 @@ def in_workspace(tracks: Sequence[Track]) -> list[dict[str, Any]]:
 
 def _view(view: View, title: str) -> dict[str, Any]:
     axes = [
-        {**AXIS, "title": {"text": f"{letter} in m"}, "range": [low, high], "nticks": 6,
-         "constrain": "domain"}
-        for letter, low, high in zip(view.axes, *view.box(1.0))
-    ]  # fmt: skip
+        {**AXIS, "title": {"text": f"{letter} in m"}, "range": limits, "nticks": 6}
+        for letter, limits in zip(view.axes, (view.across, view.up))
+    ]
     strokes = sorted(view.strokes, key=lambda stroke: stroke.depth)
     layout = {
         **LAYOUT, "height": 394 + TOP, "annotations": [_heading(title, 1.0)],

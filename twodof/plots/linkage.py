@@ -18,10 +18,7 @@ LOOKS = 2000  # for singularities, along the way
 
 @dataclass(frozen=True)
 class Reach:
-    """The circle that a planar arm cannot leave: centre (3 values) and radius, m, and its normal.
-
-    ``normal`` is 0, 1 or 2 for the root's x, y or z.
-    """
+    """The circle that a planar arm cannot leave, m; its normal is the root's x, y or z: 0, 1, 2."""
 
     centre: Array
     radius: float
@@ -33,7 +30,6 @@ class Motion:
     """What the robot's geometry makes of the joints' motion; points in the root frame, m.
 
     Attributes:
-        robot: the robot's name.
         frame, root: the end effector's link, and the link that points are expressed in.
         path: the end effector's, N × 3.
         start, end: the arm at the first and the last sample: root, joints and end effector, × 3.
@@ -50,11 +46,9 @@ class Motion:
 
 
 class Linkage(NamedTuple):
-    """What a picture needs of a robot: geometry, limits and damping.
+    """Geometry, limits and damping of a robot for pictures; its masses need not make sense.
 
     Attributes:
-        urdf: the robot; its masses need not make sense.
-        kinematics: of the joints in ``moving``.
         moving: joints that move on their own; those that mimic one too where a bag has them.
         frame: the end effector's link.
         axes: the task's, of "xyz".
@@ -71,23 +65,11 @@ class Linkage(NamedTuple):
         """The joints that move the frame, from the root on."""
         return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
 
-    @property
-    def freedoms(self) -> int:
-        """How many joints move the frame, without those that mimic another."""
-        return len({joint.leader for joint in self.chain})
-
     def motion(self, q: Array) -> Motion:
         """What q, N × ``moving``, rad or m, moves."""
         start, end = self._skeletons(q[[0, -1]])
-        return Motion(
-            robot=self.urdf.name,
-            frame=self.frame,
-            root=self.urdf.root,
-            path=self.kinematics.path(self.frame, q),
-            start=start,
-            end=end,
-            reach=self._reach(),
-        )
+        path, reach = self.kinematics.path(self.frame, q), self._reach()
+        return Motion(self.urdf.name, self.frame, self.urdf.root, path, start, end, reach)
 
     def _skeletons(self, q: Array) -> Array:
         """Origins of the root, of joints that move the frame, and of the frame; N × points × 3."""
@@ -130,13 +112,9 @@ class Linkage(NamedTuple):
 
 
 def load_linkage(text: str, frame: str, axes: str, names: Sequence[str]) -> Linkage:
-    """A URDF's; without a frame, to its "EndEffector", or the link behind most joints.
+    """Linkage of a URDF's text; without a frame, to "EndEffector" or the link behind most joints.
 
-    Args:
-        text: XML text.
-        frame: the end effector's link.
-        axes: the task's, of "xyz".
-        names: joints whose positions are known.
+    ``names`` are the joints whose positions are known.
 
     Raises:
         RobotError: it is not sound, or no joint moves the frame.

@@ -14,20 +14,14 @@ import numpy as np
 from ..errors import PlotError
 from .closed_form import Array
 from .settings import number
-from .strokes import (
-    PALE,
-    SMALLEST_EFFORT,
-    SMALLEST_ERROR,
-    SMALLEST_PART,
-    SMALLEST_RANGE,
-    Look,
-    Stroke,
-)
+from .strokes import PALE, SMALLEST_ERROR, SMALLEST_RANGE, Look, Stroke
 from .track import JointTrack, Track
 
-KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort"}
+KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort", "error": "Distance from the target"}
 UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "tau": ("N·m", "N")}
 """Of joints that turn and of those that slide."""
+SMALLEST_EFFORT = 1e-6  # N·m, N: what changes less is shown at rest
+SMALLEST_PART = 1e-4  # of a value: ticks, of six digits, differ
 CURVE, THIN, THICK = 1.4, 0.9, 4.0
 """Widths: of curves, of limits and targets, of closed forms behind curves."""
 TARGET = "thin dashes: target"
@@ -39,7 +33,7 @@ class Panel(NamedTuple):
     """One quantity over time.
 
     Attributes:
-        kind: of KINDS, or "error", the distance from the target.
+        kind: of KINDS.
         joint: its name; "" of the error.
         unit: "rad or m" where no robot tells which.
         strokes: curves of each track that has it, which have a kind; behind them targets, limits,
@@ -87,13 +81,14 @@ def duration(tracks: Sequence[Track]) -> float:
     return max(float(track.t[-1]) for track in tracks) or 1.0
 
 
-def joint_panels(tracks: Sequence[Track], looks: Looks) -> list[Panel]:
-    """Of each joint in turn: those of KINDS that any joint has."""
+def panels_of(tracks: Sequence[Track], looks: Looks) -> list[Panel]:
+    """Panels of each joint in turn, of the KINDS that any has; last the error if it is known."""
     joints = [joint for track in tracks for joint in track.joints]
-    kinds = [kind for kind in KINDS if any(getattr(joint, kind).size for joint in joints)]
-    return [
-        _joint_panel(kind, name, tracks, looks) for name in joint_names(tracks) for kind in kinds
-    ]
+    kinds = [kind for kind in UNITS if any(getattr(joint, kind).size for joint in joints)]
+    names = joint_names(tracks)
+    panels = [_joint_panel(kind, name, tracks, looks) for name in names for kind in kinds]
+    error = _error_panel(tracks, looks)
+    return [*panels, error] if error else panels
 
 
 def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) -> Panel:
@@ -108,16 +103,19 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
         if kind == "q" and joint.target.size:
             thin = Look("target", look.colour, (3, 2))
             targets.append(_curve("target", i, track.t, joint.target, thin, THIN, 1.95, joint=name))
-        pair = _limits(kind, joint)
-        for limit in pair:
-            if limit is not None:
-                limits.append(limit)
-                ends, level = np.array([0.0, duration(tracks)]), np.array([limit, limit])
-                dashed = Look("limit", look.colour, (7, 2, 1.5, 2))
-                lines.append(_curve("limit", i, ends, level, dashed, THIN, 1.9, joint=name))
-        words.append(_note(*pair))
+        own_limits = _limits(kind, joint)
+        for limit in own_limits:
+            ends, level = np.array([0.0, duration(tracks)]), np.array([limit, limit])
+            dashed = Look("limit", look.colour, (7, 2, 1.5, 2))
+            lines.append(_curve("limit", i, ends, level, dashed, THIN, 1.9, joint=name))
+        limits += own_limits
+        words.append(_note(own_limits))
     smallest = SMALLEST_EFFORT if kind == "tau" else SMALLEST_RANGE
-    low, high = _range([stroke.y for stroke in (*curves, *targets)], smallest)
+    finite = [stroke.y[np.isfinite(stroke.y)] for stroke in (*curves, *targets)]
+    values = np.concatenate([y for y in finite if y.size] or [np.zeros(1)])
+    low, high = float(values.min()), float(values.max())
+    short = max(smallest, SMALLEST_PART * max(abs(low), abs(high))) - (high - low)
+    low, high = low - 0.5 * max(0.0, short), high + 0.5 * max(0.0, short)
     near = [x for x in limits if abs(2 * x - low - high) < 1.8 * (high - low)]
     low, high = min([low, *near]), max([high, *near])
     pad = 0.06 * (high - low)
@@ -137,34 +135,22 @@ def _curve(
     )
 
 
-def _limits(kind: str, joint: JointTrack) -> tuple[float | None, float | None]:
-    if kind == "q":
-        return joint.low, joint.high
+def _limits(kind: str, joint: JointTrack) -> list[float]:
+    pair = (joint.low, joint.high) if kind == "q" else ()
     if kind == "tau" and joint.effort is not None:
-        return -joint.effort, joint.effort
-    return None, None
+        pair = (-joint.effort, joint.effort)
+    return [limit for limit in pair if limit is not None]
 
 
-def _note(low: float | None, high: float | None) -> str:
-    limits = [number(float(f"{limit:.3g}")) for limit in (low, high) if limit is not None]
-    if low is not None and high == -low:
-        return f"limits ±{limits[1]}"
-    return f"limit{'s' * (len(limits) - 1)} {', '.join(limits)}" if limits else ""
+def _note(limits: Sequence[float]) -> str:
+    texts = [number(float(f"{limit:.3g}")) for limit in limits]
+    if len(limits) == 2 and limits[1] == -limits[0]:
+        return f"limits ±{texts[1]}"
+    return f"limit{'s' * (len(texts) - 1)} {', '.join(texts)}" if texts else ""
 
 
-def _range(values: Sequence[Array], smallest: float) -> tuple[float, float]:
-    """Smallest and largest value, at least so far apart."""
-    finite = np.concatenate([y[np.isfinite(y)] for y in values] or [np.empty(0)])
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
-    smallest = max(smallest, SMALLEST_PART * max(abs(low), abs(high)))
-    short = max(0.0, smallest - (high - low))
-    return low - 0.5 * short, high + 0.5 * short
-
-
-def error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
-    """Distance from the target, and what it is in closed form; whole decades for an axis that is
-    logarithmic. None where no target is known.
-    """
+def _error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
+    """Distance from the target over whole decades, and in closed form; None without a target."""
     tasks = [(i, track.t, track.task) for i, track in enumerate(tracks) if track.task]
     if not tasks:
         return None

@@ -19,8 +19,6 @@ DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))
 curves look different."""
 
 SMALLEST_RANGE = 1e-3  # rad, m, rad/s, m/s: what moves less is shown at rest
-SMALLEST_EFFORT = 1e-6  # N·m, N
-SMALLEST_PART = 1e-4  # of a value: ticks, of six digits, differ
 SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
@@ -36,12 +34,9 @@ class Stroke(NamedTuple):
     """A line in a picture, or marks.
 
     Attributes:
-        label: what it is.
         track: whose, or None.
         x, y: across and up; empty where the other alone is meant, along a whole line each.
-        colour: as in HTML.
         width: of the line in points; 0: none.
-        dashes: as in DASHES.
         mark: "o" at all points but the last, "+" or "." at all, or "".
         depth: what is higher is drawn over what is lower.
         joint: whose of the track; "": the track's own.
@@ -66,11 +61,6 @@ class Stroke(NamedTuple):
     def is_limit(self) -> bool:
         """Whether it is a limit, and not a curve that is called so."""
         return self.label == "limit" and not self.kind
-
-    @property
-    def is_target(self) -> bool:
-        """Whether it is a target over time, and not a curve that is called so."""
-        return self.label == "target" and not self.kind
 
     @property
     def is_whole(self) -> bool:

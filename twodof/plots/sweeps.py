@@ -17,10 +17,9 @@ import numpy as np
 
 from ..errors import PlotError
 from ..sweeps.metrics import METRICS
-from ..sweeps.results import RANKED, ranked
-from .artists import add_axes
+from ..sweeps.ranking import ROUNDING, USE, beyond_limits, candidates, places, ranked, remark
 from .closed_form import Array
-from .figure import Drawing
+from .figure import Drawing, draw_head
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
 # isort: split
@@ -36,25 +35,14 @@ if TYPE_CHECKING:
 PAIRED = ("settling_time", "overshoot", "peak_effort")
 """Metrics of which maps of pairs are drawn: speed, its price in precision and in effort."""
 MOST_PAIRS = 10
-WIDTH, HEIGHT, LEFT, RIGHT, GAP, TOP, BELOW = 2.05, 1.7, 0.7, 0.85, 1.15, 1.2, 0.85
-"""Inches: a panel, beside the outer ones, between them, above them, and below each."""
+WIDTH, HEIGHT = 3.2, 2.5  # of a panel with its axes and bar, inches
 WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "rad/s2": "rad/s²"}
 """FMI's units, as other figures have them."""
 WIDE = 10.0  # ratio of largest to smallest from which on colours are logarithmic
-BEST: dict[str, Any] = {
-    "marker": "*",
-    "s": 90,
-    "color": COLOURS[1],
-    "edgecolors": "white",
-    "linewidths": 0.7,
-}
-CRITICAL: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
-MISSING: dict[str, Any] = {
-    "facecolor": HAIR,
-    "hatch": "////",
-    "edgecolor": "#c3cad1",
-    "linewidth": 0.0,
-}
+BEST: dict[str, Any] = dict(marker="*", s=90, color=COLOURS[1], edgecolors="white", linewidths=0.7)
+BEYOND: dict[str, Any] = dict(marker="X", s=10, color=INK, edgecolors="white", linewidths=0.4)
+CRITICAL: dict[str, Any] = dict(linestyle=(0, (4, 2)), linewidth=1.2)
+MISSING: dict[str, Any] = dict(facecolor=HAIR, hatch="////", edgecolor="#c3cad1", linewidth=0.0)
 
 
 class _Panel(NamedTuple):
@@ -77,24 +65,22 @@ def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -
     if best.empty:
         raise PlotError(f"'{name}' has no run that was finished")
     shown = {"run": "run", **{name: f"{name}{_in(table.attrs['units'][name])}" for name in varied}}
-    shown |= {key: f"{metric.title}{_in(metric.unit)}" for key, metric in METRICS.items()}
+    known = [key for key in METRICS if table[key].notna().any()]
+    shown |= {key: f"{METRICS[key].title}{_in(METRICS[key].unit)}" for key in known}
     columns = [
         {title: f"{row[key]:.4g}" for key, title in shown.items()}
         for row in best.head(5).to_dict("records")
     ]
     title = f"{provenance['fmu']['name']}: {len(table)} runs over {', '.join(varied)}"
-    draw = partial(_draw, table, varied, {*design["grids"]}, title, _settings(provenance))
+    options = provenance["options"]
+    settings = [f"{options['stop_time']:g} s each in steps of {options['step']:g} s"]
+    settings += [f"{name} = {value:g}" for name, value in options["settings"].items()]
+    draw = partial(_draw, table, varied, {*design["grids"]}, title, ", ".join(settings))
     return Drawing(title, Path(name).name, draw, columns)
 
 
 def _in(unit: str) -> str:
     return f", {WRITTEN.get(unit, unit)}" if unit else ""
-
-
-def _settings(provenance: Mapping[str, Any]) -> str:
-    options = provenance["options"]
-    given = [f"{name} = {value:g}" for name, value in options["settings"].items()]
-    return ", ".join([f"{options['stop_time']:g} s each in steps of {options['step']:g} s", *given])
 
 
 def _draw(
@@ -107,40 +93,47 @@ def _draw(
 ) -> None:
     panels, across = _panels(table, varied)
     rows = ceil(len(panels) / across)
-    width = LEFT + across * (WIDTH + GAP) - GAP + RIGHT
-    height = TOP + rows * (HEIGHT + BELOW) - 0.2
-    figure.set_size_inches(width, height)
-    figure.text(0.15 / width, 1 - 0.3 / height, title, fontsize=11, fontweight="bold")
-    figure.text(0.15 / width, 1 - 0.5 / height, settings, color=GREY)
     key = "★ least"
+    beyond = table[beyond_limits(table)] if len(varied) < 3 else table[:0]
+    if len(beyond):
+        key += "    ×: beyond the URDF's effort or velocity limits"
     if len(varied) > 1:
         key += "    hatched, hollow: not defined, as the settling time of a run that did not settle"
     if {"Kp", "Kd"} <= {*varied}:
         key += "    dashed: critical damping, Kd = 2 √Kp"
-    figure.text(0.15 / width, 1 - 0.68 / height, key, color=GREY)
+    texts = (settings, key, remark(table))
+    inside = draw_head(figure, title, texts, (WIDTH * across, HEIGHT * rows))
+    grid = inside.add_gridspec(rows, across)
     for i, panel in enumerate(panels):
-        row, column = divmod(i, across)
-        left, top = LEFT + column * (WIDTH + GAP), TOP + row * (HEIGHT + BELOW)
-        axes = add_axes(figure, left, top, WIDTH, HEIGHT)
+        axes = inside.add_subplot(grid[i])
         axes.set_label(f"{panel.metric} over {panel.x}" + (f" and {panel.y}" if panel.y else ""))
         if panel.y is None:
             _draw_curve(axes, table, panel)
         else:
             rows = table
-            if len(varied) > 2:  # of all runs at one place, the best
-                rows = table.groupby([panel.x, panel.y], as_index=False)[panel.metric].min()
+            if len(varied) > 2:  # of all candidates at one place, the best
+                counts = table.index.isin(candidates(table).index)
+                rows = table.assign(**{panel.metric: table[panel.metric].where(counts)})
+                rows = rows.groupby([panel.x, panel.y], as_index=False)[panel.metric].min()
             draw = _draw_cells if {panel.x, panel.y} <= grids else _draw_dots
             shown = draw(axes, rows, panel)
             _draw_critical(axes, panel, "white" if draw is _draw_cells else GREY)
-            _mark_best(axes, table, panel)
-            _draw_bar(figure, axes, shown)
+            bar = inside.colorbar(shown, ax=axes)
+            bar.ax.tick_params(labelsize=7.0, color=GREY, labelcolor=INK, width=0.7)
+            bar.outline.set_visible(False)
+            if isinstance(shown.norm, LogNorm):
+                _label_decades(bar.ax.yaxis)
+            else:
+                bar.locator = MaxNLocator(5)
+        axes.scatter(beyond[panel.x], beyond[panel.y or panel.metric], zorder=2.5, **BEYOND)
+        _mark_best(axes, table, panel)
 
 
 def _panels(table: pandas.DataFrame, varied: Sequence[str]) -> tuple[list[_Panel], int]:
     """The panels, and how many are side by side."""
-    telling = [metric for metric in METRICS if table[metric].nunique() > 1]
-    if not telling:
-        telling = [metric for metric in METRICS if table[metric].notna().any()]
+    metrics = [metric for metric in METRICS if metric not in USE]
+    telling = [metric for metric in metrics if table[metric].nunique() > 1]
+    telling = telling or [metric for metric in metrics if table[metric].notna().any()]
     if len(varied) <= 2:
         return [_Panel(metric, *varied) for metric in telling], 3
     chosen = [metric for metric in PAIRED if metric in telling] or telling[:1]
@@ -156,7 +149,6 @@ def _draw_curve(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
     if isinstance(_norm(values), LogNorm):
         axes.set_yscale("log")
         _label_decades(axes.yaxis)
-    _mark_best(axes, table, panel)
 
 
 def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
@@ -191,29 +183,25 @@ def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
 
 
 def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
-    """Where the metric is least; of equal ones, the one that ranks first."""
-    order = list(dict.fromkeys((panel.metric, *RANKED)))
-    best = table.dropna(subset=[panel.metric]).sort_values(order, kind="stable").iloc[0]
-    axes.scatter([best[panel.x]], [best[panel.y or panel.metric]], zorder=3, **BEST)
+    """Mark the run with the least value among the candidates; none where several are equal."""
+    runs = candidates(table).dropna(subset=[panel.metric])
+    least = runs[places(runs[panel.metric].to_numpy(dtype=float)) == 0]
     metric = METRICS[panel.metric]
     axes.set_title(f"{metric.title}{_in(metric.unit)}", pad=14.0)
-    at = ", ".join(f"{name} {best[name]:.4g}" for name in (panel.x, panel.y) if name)
+    value = least[panel.metric].min()  # of none it is not a number
+    shown = f"{value:.3g}" if value > ROUNDING else "0"
+    text = f"least in {len(least)} runs: {shown}" if len(least) else "not defined"
+    if len(least) == 1:
+        best = least.iloc[0]
+        axes.scatter([best[panel.x]], [best[panel.y or panel.metric]], zorder=3, **BEST)
+        at = ", ".join(f"{name} {best[name]:.4g}" for name in (panel.x, panel.y) if name)
+        text = f"★ {shown} at {at}"
     axes.annotate(
-        f"★ {best[panel.metric]:.3g} at {at}", (0, 1), (0, 4), xycoords="axes fraction",
+        text, (0, 1), (0, 4), xycoords="axes fraction",
         textcoords="offset points", fontsize=7.0, color=GREY,
     )  # fmt: skip
     named = {name: f"{name}{_in(unit)}" for name, unit in table.attrs["units"].items()}
     axes.set(xlabel=named[panel.x], ylabel=named[panel.y] if panel.y else "")
-
-
-def _draw_bar(figure: Figure, axes: Axes, shown: Any) -> None:
-    bar = figure.colorbar(shown, ax=axes, cax=axes.inset_axes((1.04, 0.0, 0.06, 1.0)))
-    bar.ax.tick_params(labelsize=7.0, color=GREY, labelcolor=INK, width=0.7)
-    bar.outline.set_visible(False)
-    if isinstance(shown.norm, LogNorm):
-        _label_decades(bar.ax.yaxis)
-    else:
-        bar.locator = MaxNLocator(5)
 
 
 def _label_decades(axis: Axis) -> None:
@@ -236,7 +224,6 @@ def _norm(values: Array) -> Normalize:
     known = values[np.isfinite(values)]
     if not known.size:
         return Normalize(0.0, 1.0)
-    low, high = max(known.min(), SMALLEST_ERROR), known.max()
-    if known.min() > 0.0 and high > WIDE * low:
-        return LogNorm(low, high)
-    return Normalize(known.min(), high)
+    low, high = known.min(), known.max()
+    least = max(low, SMALLEST_ERROR)
+    return LogNorm(least, high) if low > 0.0 and high > WIDE * least else Normalize(low, high)

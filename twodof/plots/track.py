@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +31,11 @@ class JointTrack:
     """One joint's coordinate over time.
 
     Attributes:
-        name: the joint's name.
         unit: "rad" or "m"; "" where no robot tells which.
-        low, high: limits of the run, or else of the URDF; None where there is none or it is not
-            known.
-        effort: limit of the URDF, N·m or N; None likewise.
-        q, v, tau: positions, velocities and efforts, N values each; v and tau are empty where they
-            are not known.
-        target: position that it is to have, in effect up to each sample, N values; empty likewise.
+        low, high: limits of the run, or else of the URDF; None where none is known.
+        effort, speed: limits of the URDF, N·m or N, and per s; None likewise.
+        q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample,
+            N values each; all but q are empty where they are not known.
     """
 
     name: str
@@ -45,6 +43,7 @@ class JointTrack:
     low: float | None
     high: float | None
     effort: float | None
+    speed: float | None
     q: Array
     v: Array
     tau: Array
@@ -65,13 +64,13 @@ class Task:
     """What the controller was told and how well it did; m task axes.
 
     Attributes:
-        axes: the task axes, of "xyz".
         target: position in effect up to each sample, N × m; not a number where none was known yet.
         error: distance from the target, m, N values; likewise.
         closed_form: the same for the closed form; None where the gains are not known, or the robot
             has fewer joints than the task has coordinates.
         off: distance between the two positions, m, N values; None likewise.
         disturbances: what was at work that the closed form does not have.
+        turned: angle from the target orientation at the end, rad; None where there is none.
     """
 
     axes: str
@@ -80,11 +79,7 @@ class Task:
     closed_form: Array | None
     off: Array | None
     disturbances: tuple[str, ...]
-
-    @property
-    def departure(self) -> float | None:
-        """The most that it is off the closed form, m."""
-        return None if self.off is None else float(self.off.max())
+    turned: float | None
 
 
 @dataclass(frozen=True)
@@ -92,12 +87,10 @@ class Track:
     """All that is drawn of one bag.
 
     Attributes:
-        recording: the bag.
         settings: how it was made, as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
         t: time since the first sample, s, N values.
         joints: in the bag's order.
-        motion: None where the robot is not known.
-        task: None where the target or the robot is not known.
+        motion, task: None where the robot is not known, or for the task the target.
     """
 
     recording: Recording
@@ -121,27 +114,25 @@ def read_tracks(
     frame: str | None = None,
     most: int = MOST,
 ) -> list[Track]:
-    """Read bags and compute what there is to draw.
+    """Read bags, or the bags in folders, and compute what there is to draw.
 
-    Of a bag alone, given by its folder, that has more than ``most`` samples, those are read with
-    which all lines over time look as with all samples; several are compared sample by sample.
+    A single folder with more than ``most`` samples is downsampled without a visible change of lines
+    over time; several bags are compared sample by sample.
 
     Args:
-        bags: bags, or their folders.
         urdf: the robot of all of them; None: the one that each bag carries, if any.
         frame: the end effector's link; None: as in the run that made the bag, and for bags from
             elsewhere the URDF's "EndEffector", or the link behind most joints.
-        most: samples.
 
     Raises:
         BagError: a bag cannot be read.
         PlotError: the URDF is at fault, does not fit the bag, or there are no positions.
     """
-    text = None if urdf is None else _read_urdf(Path(urdf))
-
-    def track(bag: Recording) -> Track:
-        return _track(bag, text, str(urdf), frame)
-
+    try:
+        text = None if urdf is None else read_text(Path(urdf), None)
+    except BuildError as error:
+        raise PlotError(str(error)) from error
+    track = partial(_track, urdf=text, source=str(urdf), frame=frame)
     if len(bags) == 1 and not isinstance(bags[0], Recording):
         return [track(read_outline(bags[0], most, lambda part: _lines(track(part))))]
     return [track(bag if isinstance(bag, Recording) else read_bag(bag)) for bag in bags]
@@ -156,13 +147,6 @@ def _lines(track: Track) -> list[Array]:
         errors = (track.task.error, track.task.closed_form, track.task.off)
         lines += [line for line in errors if line is not None]
     return lines
-
-
-def _read_urdf(path: Path) -> str:
-    try:
-        return read_text(path, None)
-    except BuildError as error:
-        raise PlotError(str(error)) from error
 
 
 def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> Track:
@@ -192,7 +176,9 @@ def _with_robot(
         raise PlotError(f"{source}: {error}") from error
     joints, q = _joints(bag, names, linkage), _of_linkage(bag, linkage, names, bag.q)
     motion, task = linkage.motion(q), None
-    if run.get("frame", linkage.frame) == linkage.frame and _has_target(bag, linkage):
+    rooted = run or (bag.heard is not None and bag.heard.frame == linkage.urdf.root)
+    known = bag.target.size and not np.isnan(bag.target[-1]).any()
+    if rooted and known and run.get("frame", linkage.frame) == linkage.frame:
         v = _of_linkage(bag, linkage, names, bag.v)
         task = _task(bag, linkage, joints, q, v[0], motion.path)
     return Track(bag, settings, bag.t, joints, motion, task)
@@ -208,23 +194,22 @@ def _joints(
         efforts = bag.held("tau_cmd", n)
     joints = []
     for i, name in enumerate(names):
-        unit, effort = "", None
-        low, high = starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]")
+        unit = ""
+        limits = [starts.get(f"q_min[{i + 1}]"), starts.get(f"q_max[{i + 1}]"), None, None]
         if linkage is not None and name in linkage.urdf.joints:
             joint = linkage.urdf.joints[name]
             unit = "m" if joint.prismatic else "rad"
-            low = joint.low if low is None else low
-            high = joint.high if high is None else high
-            effort = joint.effort if joint.effort < UNBOUNDED else None
-        low = None if low is None or low <= -UNBOUNDED else low
-        high = None if high is None or high >= UNBOUNDED else high
+            own = (joint.low, joint.high, joint.effort, joint.velocity)
+            limits = [b if a is None else a for a, b in zip(limits, own)]
+        limits = [None if x is None or abs(x) >= UNBOUNDED else x for x in limits]
+        low, high, effort, speed = limits
         q, v, tau, target = (
             values[:, i] if values.shape == bag.q.shape else np.empty(0)
             for values in (bag.q, bag.v, efforts, targets)
         )
         if effort is not None and first.get("limit_effort"):  # of commands; a bag's are within it
             tau = np.clip(tau, -effort, effort)
-        joints.append(JointTrack(name, unit, low, high, effort, q, v, tau, target))
+        joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target))
     return tuple(joints)
 
 
@@ -251,13 +236,6 @@ def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: 
 # --- the task ---
 
 
-def _has_target(bag: Recording, linkage: Linkage) -> bool:
-    """Whether the target is known, at the end at least, in the robot's root frame."""
-    if not bag.target.size or np.isnan(bag.target[-1]).any():
-        return False
-    return bool(bag.provenance) or (bag.heard is not None and bag.heard.frame == linkage.urdf.root)
-
-
 def _task(
     bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array
 ) -> Task:
@@ -273,10 +251,14 @@ def _task(
             raise ValueError("positions or targets are beyond all bounds")
         first = bag.schedule[0][1]
         turns = "quat_des[1]" in first
+        quat, turned = bag.target_quat[-1], None
+        if quat.size:
+            turned = linkage.kinematics.angle(linkage.frame, q[-1], quat)
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
-        followed = len(axes) + 3 * turns <= linkage.freedoms  # in all that is asked for at a time
+        freedoms = {joint.leader for joint in linkage.chain}
+        followed = len(axes) + 3 * turns <= len(freedoms)  # in all that is asked for at a time
         if not (inputs_known and followed and all(f"{g}[1]" in first for g in Held._fields)):
-            return Task(linkage.axes, target, error, None, None, ())
+            return Task(linkage.axes, target, error, None, None, (), turned)
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
         xd0 = (linkage.kinematics.jacobian(linkage.frame, q[:1])[0] @ v0)[axes]
         e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
@@ -292,4 +274,4 @@ def _task(
         "external torque": any(values[name] for _, values in bag.schedule for name in external),
     }
     disturbances = tuple(name for name, present in at_work.items() if present)
-    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances)
+    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances, turned)

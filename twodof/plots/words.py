@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..files import shown
+from ..simulation.peaks import EXACT
 from .settings import number
-from .track import Track
+from .track import JointTrack, Track
 
 TOLD = {
     "x_des": "", "q_des": "", "tau_cmd": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²",
@@ -32,9 +33,8 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     if clear and max(map(len, words)) <= 80:
         return words
     names = [track.name for track in tracks]
-    if len(set(names)) < len(names):
-        return [shown(track.recording.path) for track in tracks]
-    return names
+    paths = [shown(track.recording.path) for track in tracks]
+    return names if len({*names}) == len(names) else paths
 
 
 def common_settings(tracks: Sequence[Track]) -> str:
@@ -56,13 +56,33 @@ def _setting(key: str, text: str) -> str:
 
 
 def outcome(track: Track) -> str:
-    """How near the end effector came to its target and to the closed form; "" if not known."""
-    if track.task is None:
-        return ""
-    text = f"{track.task.error[-1]:.3g} m from its target at the end"
-    if track.task.departure is not None:
-        text += f"; at most {track.task.departure:.1g} m off the closed form"
-    return text
+    """Errors at the end, and what exceeds the URDF's limits; "" if nothing of it is known."""
+    texts = []
+    if track.task is not None:
+        texts.append(f"{track.task.error[-1]:.3g} m from its target at the end")
+        if track.task.turned is not None:
+            texts[0] += f", {track.task.turned:.3g} rad from its target orientation"
+        if track.task.off is not None:
+            texts.append(f"at most {track.task.off.max():.1g} m off the closed form")
+    if driven := [joint for joint in track.joints if joint.target.size]:
+        off = [abs(float(joint.target[-1] - joint.q[-1])) for joint in driven]
+        worst = driven[off.index(max(off))]
+        far = f"{max(off):.3g} {worst.unit}".strip()
+        texts.append(f"joints at most {far} from their targets at the end, {worst.name}")
+    texts += filter(None, map(_beyond_limits, track.joints))
+    return "; ".join(texts)
+
+
+def _beyond_limits(joint: JointTrack) -> str:
+    """Which of the URDF's limits a joint exceeds, and by how much; "" if none."""
+    unit = "N" if joint.unit == "m" else "N·m"
+    peaks = [("effort", joint.tau, joint.effort, unit)]
+    peaks.append(("velocity", joint.v, joint.speed, f"{joint.unit}/s"))
+    return ", ".join(
+        f"{joint.name} has {quantity} {np.abs(values).max():.4g} {unit}, beyond its limit {limit:g}"
+        for quantity, values, limit, unit in peaks
+        if limit is not None and values.size and np.abs(values).max() > limit * (1.0 + EXACT)
+    )
 
 
 def difference(first: Track, other: Track) -> str:
@@ -71,45 +91,38 @@ def difference(first: Track, other: Track) -> str:
     Positions of the other are interpolated linearly to the times of the first.
     """
     both = first.t <= other.t[-1]
-    places = {joint.name: joint.q for joint in other.joints}
-    worst = ""
-    most = -1.0
+    t, places = first.t[both], {joint.name: joint.q for joint in other.joints}
+    found = []
     for joint in first.joints:
-        if joint.name in places and both.any():
+        if joint.name in places and len(t):
             with np.errstate(invalid="ignore"):  # of two infinities
-                off = np.abs(joint.q[both] - np.interp(first.t[both], other.t, places[joint.name]))
-            lost = ~np.isfinite(off)
-            if lost.any():
-                at = float(first.t[both][lost.argmax()])
-                lost_at = f"{joint.name} is not finite at {number(at)} s"
+                off = np.abs(joint.q[both] - np.interp(t, other.t, places[joint.name]))
+            if (lost := ~np.isfinite(off)).any():
+                lost_at = f"{joint.name} is not finite at {number(t[lost.argmax()])} s"
                 return f"cannot be told from '{first.name}': {lost_at}"
-            if off.max() > most:
-                most, at = float(off.max()), float(first.t[both][off.argmax()])
-                spread = float(np.sqrt(np.mean(off**2)))
-                where = f"at most, {joint.name} at {number(at)} s; RMS {spread:.3g}"
-                size = f"{most:.3g} {joint.unit}".strip()
-                worst = f"{size} off '{first.name}' {where}"
-    return worst
+            found.append((joint, off))
+    if not found:
+        return ""
+    joint, off = max(found, key=lambda each: float(each[1].max()))
+    size = f"{off.max():.3g} {joint.unit}".strip()
+    where = f"at most, {joint.name} at {number(t[off.argmax()])} s"
+    return f"{size} off '{first.name}' {where}; RMS {np.sqrt(np.mean(off**2)):.3g}"
 
 
 def summary(track: Track, first: Track | None = None) -> dict[str, str]:
     """The main numbers of a run in words, by what they are; and how far it is off the first."""
-    settings = {
-        key: track.settings[key]
-        for key in ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
-        if key in track.settings
-    }
+    told = ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
     stopped = [joint.name for joint in track.joints if joint.at_limit]
     rows = {
         "bag": track.name,
         "robot": track.motion.robot if track.motion else "",
         "end effector": track.motion.frame if track.motion else "",
         "duration": f"{number(float(track.t[-1]))} s, {track.recording.count} samples",
-        **settings,
+        **{key: track.settings[key] for key in told if key in track.settings},
         "at a limit": ", ".join(stopped) or "no joint",
     }
-    if track.task:
-        rows["result"] = outcome(track)
+    if text := outcome(track):
+        rows["result"] = text
     if first is not None:
         rows["difference"] = difference(first, track)
     return rows

@@ -1,7 +1,4 @@
-"""The arm in its workspace: how it stands, the end effector's path, targets, what it can reach.
-
-What is drawn, whoever draws it.
-"""
+"""Strokes of the arm in its workspace: start, end, the end effector's path, targets, reach."""
 
 from __future__ import annotations
 
@@ -29,21 +26,13 @@ class View(NamedTuple):
 
     Attributes:
         axes: letters of the axes across and up.
-        strokes: in the order of their making.
-        low, high: corners of what must be shown, m.
+        across, up: limits that show what must be seen, with room at the edges, m.
     """
 
     axes: str
     strokes: tuple[Stroke, ...]
-    low: Array
-    high: Array
-
-    def box(self, aspect: float) -> tuple[Array, Array]:
-        """Low and high corners of a frame, height : width as given, with room at its edges."""
-        size = self.high - self.low
-        half = max(1.15 * float(np.max(size / (1.0, aspect))) / 2, SMALLEST_RANGE)
-        middle, reach = (self.low + self.high) / 2, np.array([half, half * aspect])
-        return middle - reach, middle + reach
+    across: tuple[float, float]
+    up: tuple[float, float]
 
 
 def workspace_title(tracks: Sequence[Track]) -> str:
@@ -76,11 +65,13 @@ def _view(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> View
         *_paths(plane, tracks, looks),
         *_circles(plane, tracks),
     ]
-    framed = [stroke for stroke in strokes if stroke.framed]
-    across = np.concatenate([stroke.x for stroke in framed])
-    up = np.concatenate([stroke.y for stroke in framed])
-    low, high = np.array([[extreme(across), extreme(up)] for extreme in (np.nanmin, np.nanmax)])
-    return View("".join("xyz"[axis] for axis in plane), tuple(strokes), low, high)
+    limits = []
+    for values in ("x", "y"):
+        seen = np.concatenate([getattr(stroke, values) for stroke in strokes if stroke.framed])
+        low, high = np.nanmin(seen), np.nanmax(seen)
+        half, middle = max(0.575 * (high - low), SMALLEST_RANGE), 0.5 * (low + high)
+        limits.append((float(middle - half), float(middle + half)))
+    return View("".join("xyz"[axis] for axis in plane), tuple(strokes), *limits)
 
 
 def _stroke(label: str, track: int | None, points: Array, *look: Any, **more: Any) -> Stroke:

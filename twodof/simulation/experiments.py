@@ -9,13 +9,14 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import chain, pairwise
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
+from ..bounds import MAX_CELLS, MAX_TABLE, MIN_STEP
 from ..errors import InputError
 from ..files import check_file
 from ..fmu import Fmu, load_fmu
@@ -27,13 +28,9 @@ Setting = Any
 Changes = list[tuple[float, dict[str, Value]]]
 """Times in s, ascending, and the inputs that take new values there."""
 
-MAX_TABLE = 64 * 1024**2
-MAX_CELLS = 1_000_000  # all of them go into the bag's run.json
-
 TIME_TOLERANCE = 1e-9  # of a communication step
 NANOSECONDS = 1_000_000_000
 LOG = logging.getLogger(__name__)
-
 LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
 
 
@@ -49,6 +46,7 @@ class Experiment:
         given: those of them that differ from the model description on purpose.
         changes: inputs over time, after the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
+        commanders: times in s, and facts of each third party whose commands are followed from then.
     """
 
     fmu: Fmu
@@ -59,6 +57,7 @@ class Experiment:
     given: Mapping[str, Value]
     changes: Changes
     stamp_start: float | None
+    commanders: list[tuple[float, dict[str, str]]] = field(default_factory=list)
 
     def __repr__(self) -> str:
         end = "without end" if self.steps == inf else f"to {self.time(self.steps):g} s"
@@ -178,6 +177,8 @@ def _inputs_at(fmu: Fmu, t: float, asked: Mapping[str, Setting]) -> dict[str, Va
 def _steps(start: float, stop: float, h: float) -> float:
     if not (h > 0.0 and isfinite(h)):
         raise InputError(f"step {h:g} s must be > 0")
+    if h < MIN_STEP:
+        raise InputError(f"step {h!r} s must be at least {MIN_STEP:g} s")
     if stop == inf and isfinite(start):
         return inf
     if not (isfinite(start) and isfinite(stop) and stop > start):

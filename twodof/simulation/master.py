@@ -19,8 +19,8 @@ from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple
 
-from ..errors import InputError, SimulationError, diverged, step_failure
-from ..fmu import Fmu, Instance, instantiate
+from ..errors import InputError, SimulationError, check_keywords, diverged, step_failure
+from ..fmu import Fmu, Instance, Values, instantiate
 from .experiments import (
     NANOSECONDS,
     TIME_TOLERANCE,
@@ -32,6 +32,7 @@ from .experiments import (
     resolve,
 )
 from .pace import RealTime
+from .peaks import Excess, Peaks, limits_of
 from .sample import Sample, Sink
 
 OUTPUTS = ("q", "v", "x", "tau", "quat")
@@ -73,13 +74,21 @@ def samples(
         FmuError, InputError: before the first sample.
         SimulationError: the FMU refused or failed a call, or gave a value that is not finite.
     """
-    run = as_experiment(run, options)
+    run = as_experiment(samples, run, options)
+    yield from _stepped(run, lambda row: None, pace, stop, ready, resume, instance)
+
+
+def _stepped(
+    run: Experiment, watch: Callable[[Values], object], pace: RealTime | None, stop: Stop,
+    ready: Callable[[], object], resume: Resume, instance: Instance | None,
+) -> Samples:  # fmt: skip
+    """The samples of a run; ``watch`` takes the outputs of each as a buffer."""
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
         instance.initialise(run.start_time, run.time(run.steps), run.given)
         ready()
-        take, since = _sampler(instance, run), run.start_time
+        take, since = _sampler(instance, run, watch), run.start_time
         for k in count():
             sample = take(k, inputs, since)
             if pace is not None:
@@ -106,13 +115,16 @@ def samples(
 
 
 def as_experiment(
-    run: Experiment | Fmu | str | Path, options: Mapping[str, Any], **usual: Any
-) -> Experiment:
+    called: Callable[..., object], run: Experiment | Fmu | str | Path, options: Mapping[str, Any],
+    **usual: Any,
+) -> Experiment:  # fmt: skip
     """The experiment, or that of an FMU, with the options of ``experiment`` or else the usual ones.
 
     Raises:
         FmuError, InputError: as ``experiment``; or an experiment has options beside it.
+        TypeError: ``called``, which was given the options, has none of such a name.
     """
+    check_keywords(options, called, experiment)
     if not isinstance(run, Experiment):
         return experiment(run, **{**usual, **options})
     if options:
@@ -122,7 +134,7 @@ def as_experiment(
 
 
 def _sampler(
-    instance: Instance, run: Experiment
+    instance: Instance, run: Experiment, watch: Callable[[Values], object]
 ) -> Callable[[int, Mapping[str, Value], float], Sample]:
     """A function that reads the outputs after k steps, with the inputs and since when they hold."""
     groups = [run.fmu.vector(group) for group in OUTPUTS]
@@ -132,9 +144,11 @@ def _sampler(
     start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
-        t, values = start + k * step, unpack(read())
+        t, row = start + k * step, read()
+        values = unpack(row)
         if not isfinite(sum(values)) and not all(map(isfinite, values)):
             raise diverged(k, t)
+        watch(row)
         stamp = first_stamp + round(k * step * NANOSECONDS)
         parts = values[of_q], values[of_v], values[of_x], values[of_tau]
         return Sample(k, t, *parts, inputs, since, stamp, values[of_quat])
@@ -177,16 +191,29 @@ class Summary:
         last: the last sample.
         wall_time: s, without loading and initialisation.
         stopped: whether it was asked to end before its stop time.
+        beyond_limits: joints whose effort or velocity at a sample exceeds the URDF's limit, the
+            worst first.
     """
 
     last: Sample
     wall_time: float
     stopped: bool
+    beyond_limits: tuple[Excess, ...]
 
     @property
     def error(self) -> float | None:
         """Distance of the end effector from its target at the end, m; None without a target."""
         return self.last.error
+
+    @property
+    def turn_error(self) -> float | None:
+        """Angle of the end effector from its target orientation at the end, rad; None without."""
+        return self.last.turn_error
+
+    @property
+    def joint_error(self) -> float | None:
+        """Largest distance of a joint from its target at the end, rad or m; None without one."""
+        return self.last.joint_error
 
 
 def simulate(
@@ -206,7 +233,7 @@ def simulate(
     Args:
         steer: asked after each sample for new inputs, which hold from that sample's time on.
     """
-    run = as_experiment(run, options)
+    run = as_experiment(simulate, run, options)
     member = Member(run, sinks, steer, resume, instance)
     return simulate_together([member], pace=pace, stop=stop)[0]
 
@@ -245,11 +272,14 @@ def simulate_together(
             for sink in [sink.begin(run) for run, sinks, *_ in members for sink in sinks]:
                 stack.enter_context(sink)
 
-        sources = []
+        sources, peaks = [], []
+        limits = [limits_of(run.fmu) for run, *_ in members]
         for member in members:
             run, _, _, resume, own = member
             ready = begin if member is members[-1] else lambda: None
-            source = samples(run, stop=lambda: ended, ready=ready, resume=resume, instance=own)
+            peaks.append(Peaks([*chain(*map(run.fmu.vector, OUTPUTS))]))
+            watch = peaks[-1].add
+            source = _stepped(run, watch, None, lambda: ended, ready, resume, own)
             sources.append(stack.enter_context(closing(source)))
         latest = [next(source) for source in sources]
         sends, steers = [s.send for s in sources], [m.steer for m in members]
@@ -267,4 +297,7 @@ def simulate_together(
             except StopIteration:
                 break
         taken = time.perf_counter() - started
-    return [Summary(s, taken, s.k < run.steps) for s, (run, *_) in zip(latest, members)]
+    return [
+        Summary(s, taken, s.k < run.steps, peak.beyond(limit, run.fmu))
+        for s, (run, *_), peak, limit in zip(latest, members, peaks, limits)
+    ]

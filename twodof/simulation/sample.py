@@ -56,9 +56,21 @@ class Sample(NamedTuple):
         return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
 
     @property
+    def joint_target(self) -> tuple[float, ...] | None:
+        """q_des, rad or m, one value a joint; None where the FMU has no such inputs."""
+        return self._given("q_des", len(self.q))
+
+    @property
     def error(self) -> float | None:
         """Distance of the end effector from its target, m; None where there is no target."""
         return None if self.target is None else dist(self.x, self.target)
+
+    @property
+    def joint_error(self) -> float | None:
+        """Largest distance of a joint from its target, rad or m; None where there is no target."""
+        if self.joint_target is None:
+            return None
+        return max(abs(wanted - q) for wanted, q in zip(self.joint_target, self.q))
 
     @property
     def turn_error(self) -> float | None:

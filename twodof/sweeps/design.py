@@ -10,11 +10,10 @@ from math import isfinite, prod
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bounds import MAX_RUNS
 from ..errors import InputError
 from ..fmu import Fmu
 from ..simulation.experiments import Setting, resolve
-
-MAX_RUNS = 1_000_000
 
 
 @dataclass(frozen=True)

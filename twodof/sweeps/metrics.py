@@ -1,18 +1,21 @@
 """What one run is judged by, from its samples at the communication points t_0 … t_N.
 
-With e_k = x_des − x_k, the end effector's error at t_k, and d = e_0 / |e_0|, its first direction;
-|·| is the Euclidean norm over the task axes, h the communication step. Nothing is interpolated:
-times are those of samples, and extremes those of samples.
+With e_k = x_des − x_k, the end effector's error at t_k, or under joint control e_k = q_des − q_k,
+and d = e_0 / |e_0|, its first direction; |·| is the Euclidean norm over the task axes or joints, h
+the communication step, θ_k the angle between the end effector's orientation and its target. Nothing
+is interpolated: times are those of samples, and extremes those of samples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..simulation.peaks import Limits
 
 Array = NDArray[np.float64]
 
@@ -39,14 +42,21 @@ class Metric(NamedTuple):
 METRICS: Mapping[str, Metric] = {
     "settling_time": Metric(
         "settling time (2 %)", "s",
-        "first t_k - t_0 from which on |e| stays within 2 % of |e_0| until the end of the run",
+        "first t_k - t_0 from which on |e| stays within 2 % of |e_0|, and θ within 2 % of θ_0,"
+        " until the end of the run",
     ),
     "overshoot": Metric(
         "overshoot", "",
         "largest -e_k·d / |e_0|, the part of the way by which the target is passed; 0: not passed",
     ),
-    "final_error": Metric("final error", "m", "|e_N|"),
-    "rms_error": Metric("RMS error", "m", "root of the mean of |e_k|² over all samples"),
+    "final_error": Metric("final error", "m", "|e_N| of the end effector"),
+    "final_turn_error": Metric("final orientation error", "rad", "θ_N"),
+    "final_joint_error": Metric(
+        "final joint error", "rad", "largest |q_des - q_N| of any joint; m for prismatic joints"
+    ),
+    "rms_error": Metric(
+        "RMS error", "m", "root of the mean of |e_k|² of the end effector over all samples"
+    ),
     "peak_effort": Metric(
         "peak |τ|", "N.m", "largest |τ_i| of any joint at any sample; N for prismatic joints"
     ),
@@ -57,42 +67,74 @@ METRICS: Mapping[str, Metric] = {
         "time at joint limits", "s", "h times the number of samples after the first at which any"
         " joint is at one of its limits",
     ),
+    "effort_use": Metric(
+        "peak |τ| / limit", "", "largest |τ_i| as a share of the URDF's effort limit; above 1 the"
+        " robot cannot do it",
+    ),
+    "velocity_use": Metric(
+        "peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; likewise",
+    ),
 }  # fmt: skip
 """By name of the column. A metric is NaN where it is not defined: what a run that was not finished
 would have done, the settling of one that did not settle, the settling and overshoot of one that
-starts within 1e-9 m of its target, and what needs an output, target or limit that the FMU has not.
+starts within 1e-9 m or rad of its target, and what needs an output, target or limit that the FMU
+has not.
 For all of them less is better."""
 
 
-def measure(
-    t: Array, q: Array, v: Array, x: Array, tau: Array, target: Array, q_min: Array, q_max: Array
-) -> dict[str, float]:
-    """All metrics of one run of N + 1 samples.
+def measure(t: Array, run: Mapping[str, Array], limits: Limits) -> dict[str, float]:
+    """All metrics of one run of N + 1 samples of n joints and m task axes.
 
     Args:
         t: N + 1 times, s.
-        q, v: joint positions and velocities, (N + 1) × n, rad or m, and per s.
-        x: position of the end effector along the task axes, (N + 1) × m, m.
-        tau: control effort, (N + 1) × n, N·m or N.
-        target: m values, m; NaN where there is none.
-        q_min, q_max: n values; NaN where there is none.
+        run: outputs q, v, x, tau and quat, N + 1 rows each, and the vectors x_des, quat_des, q_des,
+            q_min and q_max; no columns or NaN where the FMU has none.
+        limits: of the URDF.
     """
-    metrics = dict.fromkeys(METRICS, nan)
-    metrics["peak_velocity"] = float(np.abs(v).max())
+    metrics, tau = dict.fromkeys(METRICS, nan), run["tau"]
+    metrics["peak_velocity"] = float(np.abs(run["v"]).max())
+    metrics["velocity_use"] = _use(run["v"], limits.velocity)
     if tau.size:
         metrics["peak_effort"] = float(np.abs(tau).max())
-    if not np.isnan(q_min).any() and not np.isnan(q_max).any():
-        at_limit = np.any((q <= q_min + AT_LIMIT) | (q >= q_max - AT_LIMIT), axis=1)
+        metrics["effort_use"] = _use(tau, limits.effort)
+    q, low, high = run["q"], run["q_min"] + AT_LIMIT, run["q_max"] - AT_LIMIT
+    if not np.isnan(low).any() and not np.isnan(high).any():
+        at_limit = np.any((q <= low) | (q >= high), axis=1)
         metrics["time_at_limits"] = float(at_limit[1:].sum() * (t[-1] - t[0]) / (len(t) - 1))
-    if not x.size or np.isnan(target).any():
-        return metrics
-    e = target - x
-    error = np.linalg.norm(e, axis=1)
-    metrics["final_error"] = float(error[-1])
-    metrics["rms_error"] = float(np.sqrt(np.mean(error**2)))
-    if error[0] >= SMALLEST_MOVE:
-        metrics["overshoot"] = max(0.0, float((-e @ e[0]).max()) / float(error[0]) ** 2)
-        outside = np.flatnonzero(error > BAND * error[0])  # the first sample is
-        if outside[-1] < len(t) - 1:
-            metrics["settling_time"] = float(t[outside[-1] + 1] - t[0])
+    distances = []
+    for now in ("x", "q"):
+        if run[now].size and not np.isnan(run[f"{now}_des"]).any():
+            e = run[f"{now}_des"] - run[now]
+            error = np.linalg.norm(e, axis=1)
+            distances.append(error)
+            if now == "x":
+                metrics["final_error"] = float(error[-1])
+                metrics["rms_error"] = float(np.sqrt(np.mean(error**2)))
+            else:
+                metrics["final_joint_error"] = float(np.abs(e[-1]).max())
+            if error[0] >= SMALLEST_MOVE:
+                metrics["overshoot"] = max(0.0, float((-e @ e[0]).max()) / float(error[0]) ** 2)
+    if run["quat"].size and not np.isnan(run["quat_des"]).any():
+        distances.append(angles(run["quat"], run["quat_des"]))
+        metrics["final_turn_error"] = float(distances[-1][-1])
+    ends = [_settled(error) for error in distances if error[0] >= SMALLEST_MOVE]
+    if ends and max(ends) < len(t):
+        metrics["settling_time"] = float(t[max(ends)] - t[0])
     return metrics
+
+
+def angles(quat: Array, target: Array) -> Array:
+    """Angle of each unit quaternion from a target of any length but 0, rad."""
+    target = target / np.linalg.norm(target)
+    apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
+    return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))
+
+
+def _use(values: Array, limits: tuple[float, ...]) -> float:
+    """Largest magnitude as a share of its limit; NaN where there is no limit."""
+    return float((np.abs(values) / limits).max()) if min(limits) < inf else nan
+
+
+def _settled(error: Array) -> int:
+    """The sample from which on an error stays within the band; the number of samples if none."""
+    return int(np.flatnonzero(error > BAND * error[0])[-1]) + 1  # the first sample is outside

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bounds import MAX_RUNS, MAX_SWEEP
 from ..errors import SweepError
 from ..files import (
     NUMBER,
@@ -31,7 +32,7 @@ from ..files import (
     refusing,
     write_file,
 )
-from .design import MAX_RUNS
+from ..version import install
 from .metrics import METRICS
 from .runner import Row
 
@@ -41,9 +42,7 @@ try:
     import pyarrow.compute as pc
     import pyarrow.parquet as pq
 except ImportError as missing:
-    raise SweepError(
-        f"cannot store a table: {missing}; install the extra 'sweep' (pip install 'twodof[sweep]')"
-    ) from missing
+    raise SweepError(f"cannot store a table: {missing}; {install('sweep')}") from missing
 
 WHOLE = "runs.parquet"
 PART = re.compile(r"part-(\d{6})\.parquet")
@@ -60,16 +59,7 @@ SHAPE = {
     "command_line": str,
 }
 """Of the provenance that is read back."""
-MAX_SIZE = 512 * 1024**2
-"""Bytes of a table in memory: a million runs with a message each."""
 TEXTS = ["outcome", "message"]
-
-RANKED = {
-    "settling_time": "settled first",
-    "peak_effort": "with least effort",
-    "final_error": "with least error at the end",
-}
-"""By what the best run is chosen, each where those before are equal or not known; in words."""
 
 
 class Results:
@@ -93,7 +83,7 @@ class Results:
         self, path: str | Path, names: Sequence[str], units: Sequence[str], runs: int,
         provenance: dict[str, Any], *, resume: bool = False,
     ) -> None:  # fmt: skip
-        self.path = Path(path)
+        self.path = _named(Path(path))
         self._schema = _schema(names, units, provenance)
         self._rows: list[Row] = []
         self._part = 0
@@ -199,12 +189,6 @@ def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
     return rows, _provenance(files[0], table.schema)
 
 
-def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
-    """The runs that were finished, the best first: by settling time, effort and final error."""
-    finished = table[table["outcome"] == "finished"]
-    return finished.sort_values(list(RANKED), kind="stable")
-
-
 def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, Any]) -> pa.Schema:
     def number(name: str, unit: str, text: str) -> pa.Field:
         return pa.field(name, pa.float64(), metadata={"unit": unit, "description": text})
@@ -229,16 +213,25 @@ def _files(path: Path) -> list[Path]:
     return sorted(filter(_is_part, path.iterdir()))
 
 
+def _named(path: Path) -> Path:
+    """The path, where pyarrow takes its name."""
+    try:
+        path.as_posix().encode()
+    except UnicodeEncodeError as error:
+        raise SweepError(f"'{path}' is no name in UTF-8, which a sweep's has to be") from error
+    return path
+
+
 def _is_part(file: Path) -> bool:
     return PART.fullmatch(file.name) is not None
 
 
 def _read(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
     """Each file with its table."""
-    room = MAX_SIZE
+    room = MAX_SWEEP
     for file in files:
         try:
-            check_file(file, MAX_SIZE)
+            check_file(_named(file), MAX_SWEEP)
             schema = pq.read_schema(file)
             runs = _check_schema(file, schema)
             with pq.ParquetFile(file, read_dictionary=TEXTS) as stored:

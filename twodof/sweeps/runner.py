@@ -18,6 +18,7 @@ from ..files import temporary_folder
 from ..fmu import Instance, instantiate
 from ..simulation.experiments import Experiment, Value, experiment, resolve
 from ..simulation.master import OUTPUTS, simulate
+from ..simulation.peaks import limits_of
 from ..simulation.sample import Sample, Sink
 from .metrics import METRICS, Array, measure
 
@@ -62,6 +63,7 @@ class Runner:
             path = folder / job.file
             path.write_bytes(job.content)
             self._base = experiment(path, **job.options)
+            self._limits = limits_of(self._base.fmu)
             self._folder = stack.pop_all()
 
     def __enter__(self) -> Runner:
@@ -87,7 +89,7 @@ class Runner:
         except SimulationError as error:
             self._drop()  # whatever state it is in
             return lost(point, run.time(error.k), error.outcome, str(error))
-        metrics = _metrics(run, outputs).values()  # in the order of METRICS
+        metrics = self._metrics(run, outputs).values()  # in the order of METRICS
         return (number, *values, *metrics, run.time(run.steps), "finished", None)
 
     def _outputs(self, run: Experiment, number: int) -> Mapping[str, Array]:
@@ -100,6 +102,14 @@ class Runner:
         bag = Bag(self._job.bags / f"{number:06d}", overwrite=True)
         simulate(run, kept, bag, instance=self._fresh())
         return {name: np.array([getattr(s, name) for s in kept.samples]) for name in OUTPUTS}
+
+    def _metrics(self, run: Experiment, outputs: Mapping[str, Array]) -> dict[str, float]:
+        """What a run is judged by."""
+        n, m = outputs["q"].shape[1], outputs["x"].shape[1]
+        t = run.start_time + np.arange(len(outputs["q"]), dtype=np.float64) * run.step
+        sizes = {"x_des": m, "quat_des": 4, "q_des": n, "q_min": n, "q_max": n}
+        given = {name: _given(run, name, size) for name, size in sizes.items()}
+        return measure(t, {**outputs, **given}, self._limits)
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
         """Rows of some points, and the time they took, s; errors as of ``run``."""
@@ -163,15 +173,6 @@ class _Kept(Sink):
 
     def write(self, sample: Sample) -> None:
         self.samples.append(sample)
-
-
-def _metrics(run: Experiment, outputs: Mapping[str, Array]) -> dict[str, float]:
-    """What a run is judged by."""
-    q, v, x, tau = (outputs[group] for group in ("q", "v", "x", "tau"))
-    t = run.start_time + np.arange(len(q), dtype=np.float64) * run.step
-    target = _given(run, "x_des", x.shape[1])
-    limits = [_given(run, name, q.shape[1]) for name in ("q_min", "q_max")]
-    return measure(t, q, v, x, tau, target, *limits)
 
 
 def _given(run: Experiment, group: str, size: int) -> Array:

@@ -1,0 +1,203 @@
+"""Errors and exceeded limits of a run, and the runs of a sweep that may be called best."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from math import inf, nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from native_models import robots_folder
+from scipy.spatial.transform import Rotation
+
+import twodof
+from twodof.cli.main import main
+from twodof.sweeps.ranking import places
+
+UR5 = "ur_description/urdf/ur5_robot.urdf"
+GOAL = (0.9, 0.1, 0.3, 0.2)
+
+
+@pytest.fixture(scope="module")
+def ur5(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """By its control."""
+    folder = tmp_path_factory.mktemp("ur5")
+    return {
+        control: twodof.build_fmu(
+            folder / f"{control}.fmu",
+            twodof.FmuOptions(
+                urdf=robots_folder() / UR5, frame="ee_link", control=control, native=True,
+                meshes=False, q_start=(0.1, -1.2, 1.4, 0.2, -1.0, 0.3),
+            ),
+        )
+        for control in ("pose", "joint")
+    }  # fmt: skip
+
+
+def limits(quantity: str) -> np.ndarray:
+    """Limits of the URDF's joints, in its order."""
+    joints = ET.parse(robots_folder() / UR5).getroot().findall("joint[@type='revolute']")
+    found = [joint.find("limit") for joint in joints]
+    return np.array([float(limit.attrib[quantity]) for limit in found if limit is not None])
+
+
+class Kept(twodof.Sink):
+    def __init__(self) -> None:
+        self.samples: list[twodof.Sample] = []
+
+    def write(self, sample: twodof.Sample) -> None:
+        self.samples.append(sample)
+
+
+@pytest.mark.parametrize("count", [3, 5000])
+def test_a_summary_has_the_errors_of_all_that_is_controlled(
+    ur5: dict[str, Path], count: int
+) -> None:
+    kept = Kept()
+    settings = {"quat_des": GOAL, "Kp": 400.0, "Kp_rot": 400.0}
+    run = twodof.simulate(ur5["pose"], kept, settings=settings, step=0.002, stop_time=0.002 * count)
+    last = kept.samples[-1]
+    apart = Rotation.from_quat(last.quat).inv() * Rotation.from_quat(GOAL)
+    assert run.turn_error == pytest.approx(apart.magnitude(), abs=1e-12)
+    assert run.joint_error is None
+    peaks = {
+        "effort": np.abs([sample.tau for sample in kept.samples]).max(axis=0),
+        "velocity": np.abs([sample.v for sample in kept.samples]).max(axis=0),
+    }
+    joints = twodof.load_fmu(ur5["pose"]).joints
+    expected = [
+        (joint, quantity, peak, limit, {"effort": "N.m", "velocity": "rad/s"}[quantity])
+        for quantity, values in peaks.items()
+        for joint, peak, limit in zip(joints, values, limits(quantity))
+        if peak > limit
+    ]
+    worst = sorted(expected, key=lambda excess: -excess[2] / excess[3])
+    assert [tuple(excess) for excess in run.beyond_limits] == worst and worst
+
+
+def test_a_run_of_joints_has_the_largest_error_and_saturation_is_within_limits(
+    ur5: dict[str, Path],
+) -> None:
+    goal = (0.3, -1.0, 1.2, 0.9, -0.8, 0.3)
+    settings = {"q_des": goal, "Kp": 60.0, "Kd": 10.0, "limit_effort": True}
+    run = twodof.simulate(ur5["joint"], settings=settings, stop_time=0.1)
+    assert run.joint_error == np.abs(np.array(goal) - run.last.q).max() > 0.01
+    assert run.error is None and run.turn_error is None
+    assert not [excess for excess in run.beyond_limits if excess.quantity == "effort"]
+
+
+def test_a_run_prints_all_of_its_errors_and_limits(
+    ur5: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sets = ["--set", "quat_des=0.9,0.1,0.3,0.2", "--set", "Kp_rot=400", "--stop-time", "0.3"]
+    bag = str(tmp_path / "bag")
+    assert main(["run", str(ur5["pose"]), "-o", bag, "--effort", *sets]) == 0
+    out = capsys.readouterr().out
+    assert " rad from its target orientation\n" in out
+    assert " N·m, beyond the URDF's limit of 28 N·m\n" in out
+    assert main(["plot", bag, "-o", str(tmp_path / "plot.png")]) == 0
+    out = capsys.readouterr().out
+    assert " rad from its target orientation; " in out and "beyond its limit 28" in out
+    summary = twodof.simulate(
+        ur5["pose"], settings={"quat_des": GOAL, "Kp_rot": 400.0}, stop_time=0.3
+    )
+    assert f" {summary.turn_error:.3g} rad from its target orientation" in out
+    assert main(["run", str(ur5["joint"]), "-o", bag, "--overwrite", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["error"], facts["turn_error"], facts["joint_error"]) == (None, None, 0.0)
+    assert main(["plot", bag, "-o", str(tmp_path / "plot.png")]) == 0
+    assert "joints at most 0 rad from their targets at the end" in capsys.readouterr().out
+
+
+def test_metrics_of_a_pose_are_those_of_its_samples(ur5: dict[str, Path], tmp_path: Path) -> None:
+    settings = {"quat_des": tuple(2.0 * np.array(GOAL)), "x_des": (0.4, 0.2, 0.5), "Kp": 100.0,
+                "Kd": 20.0, "Kd_rot": 20.0}  # fmt: skip
+    grid = {"Kp_rot": [1.0, 30.0, 100.0]}
+    table = twodof.sweep(ur5["pose"], grid=grid, settings=settings, stop_time=4.0)
+    for row in table.to_dict("records"):
+        chosen = {**settings, "Kp_rot": row["Kp_rot"]}
+        samples = [*twodof.samples(ur5["pose"], settings=chosen, stop_time=4.0)]
+        assert row["final_turn_error"] == pytest.approx(samples[-1].turn_error, abs=1e-12)
+        assert np.isnan(row["final_joint_error"])
+        use = np.abs([sample.tau for sample in samples]) / limits("effort")
+        assert row["effort_use"] == pytest.approx(use.max(), rel=1e-12)
+        use = np.abs([sample.v for sample in samples]) / limits("velocity")
+        assert row["velocity_use"] == pytest.approx(use.max(), rel=1e-12)
+        errors = np.array([(sample.error, sample.turn_error) for sample in samples])
+        late = np.flatnonzero((errors > 0.02 * errors[0]).any(axis=1))[-1] + 1
+        if late == len(samples):
+            assert np.isnan(row["settling_time"])
+        else:
+            assert row["settling_time"] == pytest.approx(0.01 * late)
+    assert table["settling_time"].isna().tolist() == [True, False, False]
+
+
+def test_joint_control_settles_too(ur5: dict[str, Path]) -> None:
+    """Each joint as e'' + Kd e' + Kp e = 0, critically damped: e = e0 (1 + 5 t) exp(-5 t)."""
+    settings = {"q_des": (0.3, -1.0, 1.2, 0.4, -0.8, 0.5), "Kd": 10.0}
+    (row,) = twodof.sweep(ur5["joint"], grid={"Kp": [25.0]}, settings=settings).to_dict("records")
+    t = np.arange(501) * 0.01
+    shape = (1.0 + 5.0 * t) * np.exp(-5.0 * t)
+    assert row["settling_time"] == pytest.approx(t[np.flatnonzero(shape > 0.02)[-1] + 1])
+    assert row["final_joint_error"] == pytest.approx(0.2 * shape[-1], rel=1e-3)
+    assert row["overshoot"] == 0.0 and np.isnan(row["final_error"])
+
+
+def test_no_run_beyond_the_limits_is_best(
+    ur5: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--set", "q_des=0.3,-1.0,1.2,0.4,-0.8,0.5", "--set", "Kd=20", "--json"]
+    folder = str(tmp_path / "some")
+    assert (
+        main(["sweep", str(ur5["joint"]), "--grid", "Kp=20:4000:5", "-o", folder, *arguments]) == 0
+    )
+    facts = json.loads(capsys.readouterr().out)
+    assert 0 < facts["beyond_limits"] < 5
+    assert len(facts["best"]) == 5 - facts["beyond_limits"]
+    assert all(max(run["effort_use"], run["velocity_use"]) <= 1.0 for run in facts["best"])
+    assert main(["info", folder]) == 0
+    out = capsys.readouterr().out
+    said = f"note: {facts['beyond_limits']} of 5 finished runs exceed the URDF's effort or velocity"
+    assert f"{said} limits and are not ranked\n" in out
+    folder = str(tmp_path / "all")
+    assert (
+        main(["sweep", str(ur5["joint"]), "--grid", "Kp=4000:5000:2", "-o", folder, *arguments])
+        == 0
+    )
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["beyond_limits"] == len(facts["best"]) == 2
+    assert main(["plot", folder, "-o", str(tmp_path / "map.png")]) == 0
+    said = "all 2 finished runs exceed the URDF's effort or velocity limits, the best too\n"
+    assert said in capsys.readouterr().out
+
+
+def test_what_rounding_tells_apart_is_equal(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The tolerance's last bits change nothing: no run of these is better than another."""
+    grid = ["--grid", "rcond=0.001:0.002:3", "--stop-time", "0.3", "-o", str(tmp_path / "s")]
+    assert main(["sweep", str(native_path), *grid]) == 0
+    assert "\nno single best run: 3 are equal up to rounding\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ((), ()),
+        ((2.0, 1.0, 1.0), (1, 0, 0)),
+        ((1e-15, 3e-16, 1e-3), (0, 0, 1)),
+        ((1000.0 + 1e-10, 1000.0, 1000.0 + 1e-8), (0, 0, 1)),
+        ((nan, 0.5, nan, 0.25), (2, 1, 2, 0)),
+        ((nan, nan), (0, 0)),
+        ((inf, 1.0, inf), (1, 0, 1)),
+        ((0.0, 0.9e-12, 1.8e-12, 2.7e-12), (0, 0, 1, 1)),
+    ],
+)
+def test_places_are_those_of_the_values(
+    values: tuple[float, ...], expected: tuple[int, ...]
+) -> None:
+    assert tuple(places(np.array(values))) == expected
+    shuffled = np.random.default_rng(1).permutation(len(values))
+    assert tuple(places(np.array(values)[shuffled])) == tuple(np.array(expected, int)[shuffled])

@@ -1,0 +1,78 @@
+"""The best runs of a sweep: within the URDF's limits, and better by more than rounding."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..simulation.peaks import EXACT
+from .metrics import Array
+
+if TYPE_CHECKING:
+    import pandas
+
+RANKED = {
+    "settling_time": "settled first",
+    "peak_effort": "with least effort",
+    "final_error": "with least error at the end",
+    "final_turn_error": "with least orientation error at the end",
+    "final_joint_error": "with least joint error at the end",
+}
+"""By what the best run is chosen, each where those before are equal or not known; in words."""
+USE = ["effort_use", "velocity_use"]
+ROUNDING = 1e-12  # relative, and absolute below 1: values that are nearer count as equal
+
+
+def places(values: Array) -> NDArray[np.int64]:
+    """Place of each value, 0 for the least; those equal to the least of a place share it.
+
+    NaN have the last place.
+    """
+    order = np.argsort(values, kind="stable")
+    begins, most = [], -inf
+    for value in values[order].tolist():
+        begins.append(value > most)  # NaN begins none
+        if begins[-1]:
+            most = value + ROUNDING * max(1.0, abs(value))
+    ranks = np.empty(len(values), np.int64)
+    ranks[order] = np.cumsum(begins, dtype=np.int64) - 1 + np.isnan(values[order])
+    return ranks
+
+
+def beyond_limits(table: pandas.DataFrame) -> pandas.Series:
+    """Which runs exceed an effort or velocity limit of the URDF."""
+    return (table[USE] > 1.0 + EXACT).any(axis=1)
+
+
+def candidates(table: pandas.DataFrame) -> pandas.DataFrame:
+    """Finished runs within the URDF's limits; all finished runs where none is within them."""
+    finished = table[table["outcome"] == "finished"]
+    possible = finished[~beyond_limits(finished)]
+    return finished if possible.empty else possible
+
+
+def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
+    """The candidates, the best first: by settling time, effort and errors at the end."""
+    runs = candidates(table)
+    keys = [places(runs[name].to_numpy(dtype=float)) for name in RANKED]
+    return runs.iloc[np.lexsort(keys[::-1])] if len(runs) else runs
+
+
+def equals(runs: pandas.DataFrame) -> int:
+    """How many of ranked runs are as good as the first, up to rounding."""
+    keys = np.array([places(runs[name].to_numpy(dtype=float)) for name in RANKED])
+    return int((keys == keys[:, :1]).all(axis=0).sum()) if len(runs) else 0
+
+
+def remark(table: pandas.DataFrame) -> str:
+    """How many finished runs exceed the URDF's limits; "" where none does."""
+    finished = table[table["outcome"] == "finished"]
+    count = int(beyond_limits(finished).sum())
+    beyond = "the URDF's effort or velocity limits"
+    if 0 < count == len(finished):
+        return f"all {count} finished runs exceed {beyond}, the best too"
+    some = f"{count} of {len(finished)} finished runs exceed {beyond} and are not ranked"
+    return some if count else ""
