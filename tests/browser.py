@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import signal
 import subprocess
@@ -15,15 +16,15 @@ from contextlib import closing, contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import urlsplit, urlunsplit
 
 import numpy as np
 import websockets.sync.client
-from harness import needs
 from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 from scipy import ndimage
 from scipy.spatial import ConvexHull
+from tools import needs
 
 LINKS = (
     lambda r, g, b: (r < 110) & (g < 120) & (b < 130) & (b >= r),
@@ -88,7 +89,7 @@ LATENCY = """([label, text, row]) => new Promise(resolve => {
 @contextmanager
 def chromium() -> Iterator[Browser]:
     """A headless browser that renders in software."""
-    program = needs("chromium", "chromium-browser", "google-chrome")
+    program = needs("chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=program, args=ARGUMENTS, timeout=1e3 * PATIENCE
@@ -130,10 +131,11 @@ class Served:
         self.process = subprocess.Popen(
             [*COMMAND, *map(str, arguments), "--port", str(port), "--no-browser"],
             cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "XDG_STATE_HOME": str(cwd / "state")},
         )  # fmt: skip
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        found = re.match(r"open +(http://127\.0\.0\.1:\d+)", line)
+        found = re.match(r"open +(http://127\.0\.0\.1:\d+\S*)", line)
         if not found:
             self.process.kill()
             raise AssertionError(line + self.process.communicate()[1])
@@ -167,9 +169,15 @@ def served(*arguments: str | Path, cwd: Path, port: int = 0) -> Iterator[Served]
         command.process.communicate()
 
 
+def socket_of(url: str) -> str:
+    """The websocket of a page, with the page's token."""
+    parts = urlsplit(url)
+    return urlunsplit(parts._replace(scheme="ws", path="/socket"))
+
+
 def connect(url: str) -> None:
     """Connect as a browser does that has the page open, and leave at once."""
-    with websockets.sync.client.connect(url.replace("http:", "ws:") + "/socket") as connection:
+    with websockets.sync.client.connect(socket_of(url)) as connection:
         connection.recv()
         time.sleep(0.1)
 

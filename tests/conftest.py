@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import importlib.metadata
-import shutil
+import os
 import signal
 import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from harness import cannot_run
 from nodes import listen as listen
 from nodes import number as number
 from nodes import program as program
@@ -19,13 +19,25 @@ from recordings import changing as changing
 from recordings import default as default
 from recordings import foreign as foreign
 from recordings import gains as gains
+from scratch import Scratch
+from tools import missing, needs
+from tools import pytest_terminal_summary as pytest_terminal_summary
 
 import twodof
 
 
-def pytest_configure() -> None:
-    """A shell's background job ignores Ctrl-C, and so would all that tests start."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Start as from a shell in the foreground, with the environment activated.
+
+    A shell's background job ignores Ctrl-C, and so would all that tests start.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    here = str(Path(sys.executable).parent)
+    if here not in os.environ["PATH"].split(os.pathsep):
+        os.environ["PATH"] = os.pathsep.join([here, os.environ["PATH"]])
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Scratch(config))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -49,9 +61,10 @@ LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Start with the files that take longest, so that the processes end at about one time.
 
-    What needs a file's page comes last in it: one that is shown draws beside all that runs.
+    Eight files at a time are in the shuffled order. The tests of a file that need its page are
+    the last ones: a page that is shown draws beside all that runs.
     """
-    place = {f"test_{name}.py": i for i, name in enumerate(LONGEST)}
+    place = {f"test_{name}.py": i // 8 for i, name in enumerate(LONGEST)}
 
     def order(item: pytest.Item) -> tuple[int, bool]:
         fixtures = item.fixturenames if isinstance(item, pytest.Function) else ()
@@ -91,12 +104,11 @@ def disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
     def mount(size: int, options: str = "rw") -> Path:
         folder = tmp_path / f"disk{len(mounted)}"
         folder.mkdir()
-        if shutil.which("mount") is None:
-            cannot_run("small disks need the command 'mount'")
+        needs("disks")
         command = ["mount", "-t", "tmpfs", "-o", f"{options},size={size}k", "tmpfs", str(folder)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            cannot_run(f"small disks cannot be mounted here: {done.stderr.strip()}")
+            missing("disks")
         mounted.append(folder)
         return folder
 

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
@@ -32,8 +33,9 @@ def heights(axes: Axes, label: str) -> list[float]:
 
 
 def legend_of(axes: Axes) -> list[str]:
-    found = axes.get_legend()
-    assert found is not None
+    """Its own, or that of its part of the figure."""
+    own = axes.get_legend()
+    (found,) = [own] if own else axes.figure.legends
     return [text.get_text() for text in found.get_texts()]
 
 
@@ -56,12 +58,18 @@ def panels(figure: Figure) -> Panels:
 
 
 def texts(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.findobj(Text) if text.get_text()]
+    """Line by line."""
+    return [line for text in figure.findobj(Text) for line in text.get_text().splitlines()]
 
 
-def key(figure: Figure) -> list[str]:
+def key(figure: Figure) -> Legend:
     """The labels that tell tracks apart."""
-    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    (legend,) = figure.subfigs[0].legends
+    return legend
+
+
+def key_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in key(figure).get_texts()]
 
 
 def notes(axes: Axes) -> list[str]:

@@ -6,12 +6,12 @@ import contextlib
 import fcntl
 import functools
 import importlib
-import importlib.util
 import itertools
 import multiprocessing
 import os
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -23,10 +23,11 @@ from textwrap import dedent, indent
 from typing import TYPE_CHECKING, Any
 
 import fmpy
-import pytest
 from fmpy import fmi2
 from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
+from scratch import run_folder
+from tools import needs
 
 
 def shared(factory, name, make):
@@ -196,6 +197,26 @@ class Recorded:
         return blob
 
 
+def unzipped(fmu):
+    """Unzip an FMU into a folder of its own, which the end of the run removes."""
+    return fmpy.extract(str(fmu), tempfile.mkdtemp(prefix="fmu ", dir=run_folder()))
+
+
+@contextlib.contextmanager
+def wine(folder):
+    """Yield the command and the environment that run programs of Windows; its server ends too."""
+    command, server = needs("wine"), needs("wineserver")
+    environment = {
+        **os.environ, "TMPDIR": str(folder), "WINEPREFIX": str(folder / "wine"),
+        "WINEDEBUG": "-all", "WINEDLLOVERRIDES": "mscoree,mshtml=",
+    }  # fmt: skip
+    try:
+        yield command, environment
+    finally:
+        for option in ("--kill", "--wait"):
+            subprocess.run([server, option], env=environment, check=False)
+
+
 class Driver:
     """One instance; ``log`` collects (status, message), ``status`` is that of the last call.
 
@@ -203,7 +224,7 @@ class Driver:
     """
 
     def __init__(self, fmu, folder=None, guid=None):
-        self.folder = folder or fmpy.extract(fmu, tempfile.mkdtemp(prefix="fmu "))
+        self.folder = folder or unzipped(fmu)
         self.description = _description(self.folder)
         self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
         self.log = []
@@ -274,21 +295,6 @@ class Driver:
     def free(self):
         self.slave.freeInstance()
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def needs(*names):
-    """A program's path, or a module's name, under the first of its names that is installed."""
-    for name in names:
-        if program := shutil.which(name):
-            return program
-        if "/" not in name and importlib.util.find_spec(name):
-            return name
-    return cannot_run(f"{names[0]} is not installed")
-
-
-def cannot_run(reason):
-    """Skip a test that this machine cannot run; in CI, which can run all, it fails."""
-    return pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)
 
 
 def changed_step(fmu_path, folder, lines):

@@ -22,9 +22,10 @@ from typing import Any
 
 import pytest
 from bags import SECOND
-from harness import cannot_run, needs, shared
+from harness import shared
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from tools import missing, needs
 
 HERE = Path(__file__).resolve().parent
 TWODOF = [sys.executable, "-m", "twodof"]
@@ -37,14 +38,14 @@ PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
 @pytest.fixture(scope="session")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The Fast DDS node, compiled once for all processes of the tests."""
-    generator, compiler = needs("fastddsgen"), needs("g++", "c++")
-    if not Path("/usr/include/fastdds/dds").is_dir():
-        cannot_run("the headers of Fast DDS are not installed (Debian: libfastrtps-dev)")
+    generator, compiler = needs("fastddsgen"), needs("g++")
+    needs("fastdds")
 
     def make(folder: Path) -> None:
         for source in (HERE / "fastdds").iterdir():
             shutil.copy(source, folder)
-        subprocess.run([generator, "-cs", "ros.idl"], cwd=folder, check=True, capture_output=True)
+        command = [generator, "-cs", "-t", str(folder), "ros.idl"]  # -t: for temporary files
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
         sources = [f'#include "{path.name}"\n' for path in folder.glob("*.c[px][px]")]
         (folder / "all.cc").write_text("".join(sources))  # headers are read once
         command = [compiler, "-std=c++14", "-w", "-I.", "all.cc", "-lfastrtps", "-lfastcdr"]
@@ -58,6 +59,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def number() -> Iterator[int]:
     """A DDS domain that nothing else on this machine uses, claimed by a TCP port of its number."""
+    needs("cyclonedds")
     first = os.getpid()
     for it in range(100):
         domain = 1 + (first + it) % 100
@@ -207,3 +209,26 @@ def listed(message: Any) -> Any:
 def stamp_of(header: Any) -> int:
     (seconds, nanoseconds), _frame = header
     return int(seconds) * SECOND + int(nanoseconds)
+
+
+ISOLATED = ("unshare", "--net", "sh", "-c")
+
+
+def isolated(script: str) -> tuple[str, ...]:
+    """A command's beginning that runs it in a network of its own, after a script."""
+    needs("networks")
+    needs("ip")
+    if subprocess.run([*ISOLATED, "ip link"], capture_output=True, check=False).returncode != 0:
+        missing("networks")
+    return (*ISOLATED, f'{script}\nexec "$@"', "sh")
+
+
+# a network of two interfaces that are each other's cable
+CABLE = """
+ip link set lo up
+for which in all default; do echo 1 > /proc/sys/net/ipv6/conf/$which/disable_ipv6; done 2> /dev/null
+ip link add cable0 type veth peer name cable1
+ip address add 10.200.0.1/24 dev cable0
+ip link set cable0 up
+ip link set cable1 up
+"""

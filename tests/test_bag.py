@@ -34,7 +34,7 @@ from bags import (
     write_elsewhere,
 )
 from mcap.reader import make_reader
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter
 from ruamel.yaml import YAML
@@ -113,6 +113,35 @@ def test_bag_has_every_sample_bit_for_bit(
     expected = [joint_state(k, s, effort=effort) for k, s in enumerate(recording.samples)]
     assert (len(expected), len(expected[0].effort)) == (501, 16 * effort)
     assert read(recording.bag(storage, kind)) == expected
+
+
+class Pause(twodof.Sink):
+    def write(self, sample: twodof.Sample) -> None:
+        if sample.k == 100:
+            time.sleep(0.2)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_the_bytes_that_are_reproducible_are_those_of_the_docs(
+    storage: str, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that is flushed more often has another storage file, and all else alike."""
+    bags = []
+    for name, period in (("seldom", 60.0), ("often", 0.01)):
+        monkeypatch.setattr("twodof.bag.store.FLUSH_PERIOD", period)
+        bags.append(tmp_path / name / "bag")
+        bags[-1].parent.mkdir()
+        bag = twodof.Bag(bags[-1], storage=storage, scene=True)
+        twodof.simulate(native_path, Pause(), bag, stop_time=2.0, stamp_start=START)
+    read = []
+    for path in bags:
+        with Reader(path) as reader:
+            read.append([(c.topic, t, bytes(data)) for c, t, data in reader.messages()])
+    assert read[0] == read[1] and len(read[0]) > 800
+    files = {path.name: path.read_bytes() for path in bags[0].iterdir()}
+    differing = {name for name in files if files[name] != (bags[1] / name).read_bytes()}
+    assert {path.name for path in bags[1].iterdir()} == files.keys()
+    assert differing == {"bag.mcap" if storage == "mcap" else "bag.db3"}
 
 
 def test_first_stamp_is_the_wall_clock_by_default(native_path: Path, tmp_path: Path) -> None:

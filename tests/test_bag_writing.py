@@ -26,10 +26,11 @@ from bags import (
     read_with_sqlite3,
     sample,
 )
-from harness import needs, wait_until
+from harness import wait_until
 from mcap.exceptions import EndOfFile
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
+from tools import needs
 
 import twodof
 from twodof.bag.storage import BagWriter

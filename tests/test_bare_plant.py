@@ -39,7 +39,7 @@ def test_bare_plant_is_pinocchios(name, length):
         effort = np.add(plant.tau_cmd, plant.tau_ext) + J.T @ plant.f_ext
         effort -= np.array(plant.robot.damping) * v
         expected = reference.forward_dynamics(q, v, effort)
-        ours, _ = plant.equations_of_motion()(q, v)
+        ours, *_ = plant.equations_of_motion().acceleration(q, v, None)
         theirs = np.empty(native.n)
         native.call("acceleration", native.values(plant), theirs)
         M = reference.mass_matrix(q)
@@ -79,7 +79,7 @@ def test_bare_plant_is_mujocos(name, length, tmp_path, monkeypatch):
         plant.tau_cmd = rng.normal(0, 20, len(ours)).tolist()
         plant.prepare()
         q, v = np.array(plant.q), np.array(plant.v)
-        acceleration, _ = plant.equations_of_motion()(q, v)
+        acceleration, *_ = plant.equations_of_motion().acceleration(q, v, None)
         data.qpos, data.qvel = G @ q[order] + c, G @ v[order]
         data.qacc = G @ np.array(acceleration)[order]
         mujoco.mj_inverse(theirs, data)
@@ -183,7 +183,9 @@ def test_stops_are_the_same_in_both_flavours(name, rigid):
         stops.impact(y, kept.tolist())
         if any(0.0 < abs(speed) < 1e-12 for speed in y[n:]):
             continue  # rounding says whether it rests
-        rates = list(plant.equations_of_motion()(np.array(y[:n]), np.array(y[n:]))[0])
+        rates = list(
+            plant.equations_of_motion().acceleration(np.array(y[:n]), np.array(y[n:]), None)[0]
+        )
         pressed = list(rates)
         stops.hold(y, rates, kept.tolist())
         assert deviation(y[n:], native.group(values, "v")) <= 1e-9

@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from harness import needs
 from scipy.integrate import solve_ivp
+from tools import needs
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 Mujoco = Callable[[str, int], tuple[float, list[float]]]
@@ -66,7 +66,7 @@ def test_robots_are_measured_as_they_come(benchmarks: SimpleNamespace, robots: P
 
 @pytest.fixture(scope="module")
 def mujoco(benchmarks: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Mujoco:
-    needs("cc")
+    needs("gcc")
     return benchmarks.engine.mujoco_runner(tmp_path_factory.mktemp("mujoco"))
 
 
@@ -103,7 +103,7 @@ def test_the_rival_has_the_same_right_hand_side(benchmarks: SimpleNamespace) -> 
     )
     plant.initialise()
     q, v = plant.q, [0.3, -0.2, 0.1, 0.4]
-    expected = plant.equations_of_motion()(np.array(q), np.array(v))[0]
+    expected = plant.equations_of_motion().acceleration(np.array(q), np.array(v), None)[0]
     inputs = [getattr(plant, name) for name in benchmarks.generated.INPUTS]
     for way in benchmarks.generated.WAYS:
         rival = benchmarks.generated.right_hand_side(arm.robot, way)(q, v, *inputs)

@@ -9,6 +9,8 @@ from native_models import model
 
 from twodof.export.bodies import joint_tree
 from twodof.export.recursions import (
+    hybrid_by_factors,
+    hybrid_by_recursion,
     inverse_dynamics,
     mass_matrix,
     solve_by_factors,
@@ -74,6 +76,16 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
     assert_close(M, expected)
     for a in (solve_by_factors(M, v), solve_by_recursion(constants, constants.body, joint, v)):
         np.testing.assert_allclose(expected @ a.astype(float), v, rtol=0, atol=1e-11)
+    free = rng.integers(0, 2, n)
+    split = free * v, free, (1 - free) * v  # effort of free joints, acceleration of the others
+    for a, reaction in (
+        hybrid_by_factors(M, *split),
+        hybrid_by_recursion(constants, constants.body, joint, *split),
+    ):
+        np.testing.assert_array_equal(a[free == 0], v[free == 0])
+        assert_close(reaction * free, np.zeros(n))
+        balance = expected @ a.astype(float) - reaction.astype(float)
+        np.testing.assert_allclose(balance, free * v, rtol=0, atol=1e-11)
     x, R, J, drift = task_frame(constants, joint, v)
     pin.forwardKinematics(reference, data, q, v, np.zeros(n))
     frame, axes = robot.frame_id, pin.LOCAL_WORLD_ALIGNED

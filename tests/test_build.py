@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from fmpy import read_model_description
 from fmpy.validation import validate_fmu
-from harness import Driver, in_child_process, needs
+from harness import Driver, in_child_process
 from lxml import etree
+from tools import needs
 
 from twodof import FmuOptions, TwoDofError, build_fmu
 from twodof.export.compiler import host_platform
@@ -35,7 +36,7 @@ def test_fmpy_finds_no_problem(fmu_path):
 
 def test_every_name_unit_and_start_is_as_designed(fmu_path):
     variables = {v.name: v for v in read_model_description(str(fmu_path)).modelVariables}
-    assert [v.valueReference for v in variables.values()] == list(range(len(variables)))
+    assert [v.valueReference for v in variables.values()] == list(range(1, len(variables) + 1))
     pi = repr(np.pi)
     expected = {
         ("input", "m"): {"x_des[1]": "0.2", "x_des[2]": "0.05"},
@@ -45,8 +46,8 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
         ("input", "1/s"): {"Kd[1]": "40.0", "Kd[2]": "40.0", "Kn": "0.0"},
         ("input", "N.m"): {"tau_ext[1]": "0.0", "tau_ext[2]": "0.0"},
         ("input", "N"): {"f_ext[1]": "0.0", "f_ext[2]": "0.0", "f_ext[3]": "0.0"},
-        ("output", "rad"): {"q[1]": None, "q[2]": None},
-        ("output", "rad/s"): {"v[1]": None, "v[2]": None},
+        ("output", "rad"): {"q[1]": "0.5", "q[2]": "0.35"},
+        ("output", "rad/s"): {"v[1]": "0.0", "v[2]": "0.0"},
         ("output", "m"): {"x[1]": None, "x[2]": None},
         ("output", "m/s"): {"xd[1]": None, "xd[2]": None},
         ("output", "N.m"): {"tau[1]": None, "tau[2]": None},
@@ -160,6 +161,31 @@ def test_an_fmu_that_is_up_to_date_is_left_alone(fmu_path, tmp_path):
     assert path.stat().st_mtime > 1e9
 
 
+def test_an_fmu_of_other_settings_is_replaced_on_request_alone(fmu_path, tmp_path):
+    """Whichever name it has, and whoever built it; the default arm's can be built again."""
+    path = tmp_path / "A.fmu"
+    path.write_bytes(fmu_path.read_bytes())
+    other = build_fmu(path, FmuOptions(control="effort")).read_bytes()
+    for options in (None, FmuOptions(native=True), FmuOptions(control="joint")):
+        with pytest.raises(TwoDofError, match=r"A\.fmu' is another FMU, and is not replaced"):
+            build_fmu(path, options)
+    assert path.read_bytes() == other
+    assert build_fmu(path, overwrite=True).read_bytes() == fmu_path.read_bytes()
+    (tmp_path / "B.fmu").write_text("notes")
+    with pytest.raises(TwoDofError, match=r"B\.fmu' is no FMU, and is not replaced"):
+        build_fmu(tmp_path / "B.fmu")
+    assert build_fmu(tmp_path / "B.fmu", overwrite=True).read_bytes() == fmu_path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("ur5.urdf", "ur5"), ("ur-5.urdf.xacro", "ur_5"), ("5.urdf", "robot_5"), (None, "TwoDof")],
+)
+def test_a_model_is_named_after_its_robot(file, name):
+    assert FmuOptions(urdf=file).name == name
+    assert FmuOptions(urdf=file, name="Own").name == "Own"
+
+
 def test_a_link_into_the_environment_changes_the_digest(fmu_path, tmp_path):
     linked = build_fmu(tmp_path / "L.fmu", FmuOptions(link_environment=True))
     guids = {read_model_description(str(path)).guid for path in (fmu_path, linked)}
@@ -231,7 +257,7 @@ def test_what_is_compiled_is_said(tmp_path, caplog):
     needs("ziglang")
     caplog.set_level("INFO", "twodof.export")
     build_fmu(tmp_path / "TwoDof.fmu", FmuOptions(native=True))
-    assert set(caplog.messages) == {f"compiling for {host_platform()}", "compiling for the browser"}
+    assert set(caplog.messages) == {f"compiling for {host_platform()}"}
 
 
 def test_what_is_ignored_in_a_urdf_is_said(tmp_path, caplog):
@@ -287,7 +313,7 @@ def test_names_of_a_urdf_are_text_in_all_that_the_fmu_holds(native, tmp_path):
             assert "evil" not in code  # nor in a comment
     assert [joint.get("name") for joint in described.iter("Joint")] == list(NAMES)
     assert (described.get("name"), described.get("frame")) == NAMES
-    assert page.tags.count("script") == 4 * native  # of the page itself
+    assert "script" not in page.tags
     for name in NAMES:
         assert f"position, joint {name}" in page.text
     log = Driver(fmu).initialise(q_start=(4.0, 4.0)).log
@@ -298,26 +324,6 @@ def test_names_of_a_urdf_are_text_in_all_that_the_fmu_holds(native, tmp_path):
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(TwoDofError, match=r"cannot write '.*nowhere/A\.fmu'"):
         build_fmu(tmp_path / "nowhere" / "A.fmu")
-
-
-def test_what_is_no_file_is_not_replaced(tmp_path):
-    """Which root could do to a device."""
-    pipe, link = tmp_path / "A.fmu", tmp_path / "B.fmu"
-    os.mkfifo(pipe)
-    link.symlink_to(pipe)
-    for path in (pipe, link):
-        with pytest.raises(TwoDofError, match=rf"cannot write '{path}': Not a regular file"):
-            build_fmu(path)
-    assert pipe.is_fifo() and link.is_symlink()
-
-
-def test_what_a_native_one_cannot_draw_is_named(tmp_path):
-    urdf = tmp_path / "arm.urdf"
-    text = data_file("urdf", "2dof.urdf").read_text()
-    urdf.write_text(re.sub(r'rgba="[^"]*"', 'rgba="1 nan 1 1"', text))
-    options = FmuOptions(urdf=urdf, mesh_dir=data_file("meshes"), axes="xy", native=True)
-    with pytest.raises(TwoDofError, match=r"arm\.urdf: link 'link1' cannot be drawn: rgba='1 nan"):
-        build_fmu(tmp_path / "A.fmu", options)
 
 
 # --- dependencies, by moving one variable at a time ---
@@ -353,7 +359,7 @@ def start_values(driver):
     return {
         v.name: v.start == "true" if v.type == "Boolean" else float(v.start)
         for v in driver.description.modelVariables
-        if v.start is not None
+        if v.start is not None and v.causality != "output"
     }
 
 
@@ -470,7 +476,7 @@ def test_sizes_are_those_of_the_robot(fmu_path):
     assert size("v[1]") == size("x[1]") == size("q_start[1]") == (None, None, None)
     assert size("tau[1]") == size("tau_ext[2]") == (None, None, 10.0)
     assert size("Kp[2]") == size("Kn") == size("payload") == (0.0, None, None)
-    assert size("rtol") == (np.nextafter(0.0, 1.0), None, 1e-3)
+    assert size("rtol") == (np.finfo(float).tiny, None, 1e-3)
     assert size("rcond") == (0.0, np.nextafter(1.0, 0.0), None)
 
 

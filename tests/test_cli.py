@@ -97,6 +97,32 @@ def test_run_says_how_fast_it_was_and_what_to_do_next(session: dict[str, str]) -
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("activated", [True, False])
+@pytest.mark.parametrize("missing", [[], ["matplotlib", "websockets"]])
+def test_what_is_suggested_can_be_typed(
+    activated: bool, missing: list[str], native_path: Path, tmp_path: Path
+) -> None:
+    """In a shell that finds the program or does not, with and without figures and pages."""
+    here = str(Path(sys.executable).parent)
+    path = [p for p in os.environ["PATH"].split(os.pathsep) if Path(p) != Path(here)]
+    spec = f"import importlib.util as u; f = u.find_spec; absent = {missing!r}; "
+    spec += "u.find_spec = lambda n, *a: None if n in absent else f(n, *a); "
+    code = f"{spec}import sys; from twodof.__main__ import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", str(native_path), "--stop-time", "0.1", "-o", "bag"],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+        env={**os.environ, "PATH": os.pathsep.join([here] * activated + path)},
+    )  # fmt: skip
+    following = done.stdout.partition("\nnext\n")[2]
+    program = "twodof" if activated else f"{here}/twodof"
+    commands = [line.strip() for line in following.partition("\n\n")[0].splitlines()]
+    shown = [] if missing else [f"{program} plot bag", f"{program} view bag"]
+    assert commands == [*shown, "ros2 bag play bag"]
+    remedy = f"to plot and view: install the extra 'view': {sys.executable} -m pip install "
+    assert (remedy in following) == bool(missing)
+    assert not re.search(r"(?<!/)twodof\[", following)  # a folder, no name for an index
+
+
 def test_info_of_a_bag_shows_what_is_in_it(session: dict[str, str]) -> None:
     found = rows(session["info bag"])
     bag = twodof.read_bag(Path(session["cwd"]) / "bag")
@@ -140,11 +166,15 @@ def test_default_run_builds_the_fmu_again_only_if_it_differs(
 
     first, content = run("one"), fmu_file.read_bytes()
     assert run("two") == first
+    said = "no FMU is named: this is TwoDof.fmu, the default planar arm\n"
+    assert capfd.readouterr().err == 2 * said
     assert main(["build", "--q-start", "0.1", "0.2"]) == 0
-    assert fmu_file.read_bytes() != content
-    assert run("three") > first
+    other = fmu_file.read_bytes()
+    assert other != content
+    assert main(["run", "--stop-time", "0.01", "-o", "three"]) != 0
+    assert fmu_file.read_bytes() == other  # somebody wanted it so
+    assert main(["build", "--overwrite"]) == 0
     assert fmu_file.read_bytes() == content
-    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

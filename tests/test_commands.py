@@ -11,8 +11,9 @@ import pytest
 from bags import STORE
 
 import twodof
+from twodof.bounds import MAX_COMMAND
 from twodof.errors import InputError
-from twodof.ros.commands import MAX_COMMAND, RAMP, CommandError, Commands, Watchdog
+from twodof.ros.commands import RAMP, CommandError, Commands, Watchdog
 from twodof.ros.messages import JOINT_STATE, POINT
 
 Build = Callable[..., twodof.Fmu]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from native_models import model
+from tools import missing
 
 from twodof.errors import BuildError
 from twodof.export import compiler
@@ -74,6 +75,40 @@ def test_libraries_that_are_not_used_are_not_kept(kept):
     answer(1)
     answer(3)
     assert used.exists() and not unused.exists()
+
+
+def given_away(path):
+    if os.geteuid():
+        missing("root")
+    os.chown(path, 65534, 65534)
+
+
+@pytest.mark.parametrize("change", [given_away, lambda path: path.chmod(0o777)])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_library_that_others_may_have_written_is_not_taken(kept, caplog, change, whole):
+    """Their code would run in the next FMU, whether it is in the library or in zig's C library."""
+    first = answer(1)
+    (file,) = kept.iterdir()
+    file.write_bytes(hashlib.sha256(b"evil").digest() + b"evil")
+    assert answer(1) == b"evil"
+    change(kept.parent if whole else file)
+    assert answer(1) == first
+    assert [str(kept.parent) in r.getMessage() for r in caplog.records] == [True] * whole
+    assert (compiler.zig_cache() is None) == whole
+
+
+def test_a_new_cache_is_for_its_user_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "a" / "b"))
+    before = os.umask(0o002)
+    try:
+        cache = compiler.zig_cache()
+        assert cache is not None
+        compiler._keep(cache / "twodof" / "key", b"content")
+    finally:
+        os.umask(before)
+    modes = [path.stat().st_mode & 0o777 for path in (cache, *cache.rglob("*"))]
+    assert modes == [0o700, 0o700, 0o600]
+    assert compiler._kept(cache / "twodof" / "key") == b"content"
 
 
 def test_no_home_for_the_cache_is_told(monkeypatch, caplog):

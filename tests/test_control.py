@@ -39,7 +39,7 @@ def test_both_flavours_have_the_same_accelerations_and_efforts(name, control):
             values, a = native.values(plant), np.empty(native.n)
             native.call("acceleration", values, a)
             q, v = np.array(plant.q), np.array(plant.v)
-            assert deviation(a, plant.equations_of_motion()(q, v)[0]) <= 1e-9
+            assert deviation(a, plant.equations_of_motion().acceleration(q, v, None)[0]) <= 1e-9
             native.call("outputs", values)
             assert deviation(native.group(values, "tau"), plant.tau) <= 1e-10
             assert deviation(native.group(values, "xd"), plant.xd) <= 1e-12
@@ -51,7 +51,7 @@ def fmus(tmp_path_factory) -> dict[tuple[str, bool], Path]:
     return {
         (control, native): build_fmu(
             folder / f"{control}{native}.fmu",
-            FmuOptions(control=control, native=native, live_documentation=False),
+            FmuOptions(control=control, native=native),
         )
         for control in CONTROLS
         for native in (False, True)
@@ -354,7 +354,7 @@ def test_a_target_on_a_limit_does_not_chatter(fmus, side):
 
 
 def test_a_control_that_is_none_is_refused():
-    with pytest.raises(twodof.TwoDofError, match="control 'velocity' is none of task, pose, joint"):
+    with pytest.raises(twodof.TwoDofError, match="`control` 'velocity' is none of task, pose, j"):
         build_fmu(None, FmuOptions(control="velocity"))
 
 
@@ -368,8 +368,9 @@ def test_a_payload_that_is_none_is_refused(fmus, payload):
 @pytest.mark.parametrize("control", ["pose", "effort"])
 def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, capsys):
     """Bag, figure, replay, sweep and what a page offers, with an FMU of each control."""
+
     from twodof.cli.main import main
-    from twodof.export.arm_page import RECORDED
+    from twodof.pages.arm import RECORDED
     from twodof.pages.loop import Loop
 
     monkeypatch.chdir(tmp_path)

@@ -26,26 +26,41 @@ def test_equals_pinv_for_any_conditioning(m, n):
         jacobian = with_singular_values(rng, m, n, rng.uniform(0.1, 2.0) * ratios)
         b = rng.normal(size=m)
         expected = np.linalg.pinv(jacobian, rcond=RCOND) @ b
-        result, rank = apply_pseudo_inverse(jacobian.tolist(), b.tolist(), RCOND)
+        result, rank, margin = apply_pseudo_inverse(jacobian.tolist(), b.tolist(), RCOND)
         sigma = np.linalg.svd(jacobian, compute_uv=False)
         assert rank == (sigma > RCOND * sigma[0]).sum()
+        assert 0.0 < margin <= np.abs(sigma[1:] / sigma[0] - RCOND).min(initial=1.0) + 1e-12
         scale = max(1.0, np.abs(expected).max())
         assert np.abs(result - expected).max() <= 1e-11 * scale
 
 
+@pytest.mark.parametrize("m, n", [(2, 2), (2, 6), (3, 3), (3, 7), (6, 7)])
+def test_a_given_rank_keeps_the_largest_singular_values(m, n):
+    rng = np.random.default_rng(m * n)
+    for rank in range(m + 1):
+        ratios = np.sort(10 ** rng.uniform(-2.5, 0, size=m))[::-1]
+        ratios[0] = 1.0
+        jacobian, b = with_singular_values(rng, m, n, ratios), rng.normal(size=m)
+        u, sigma, vt = np.linalg.svd(jacobian, full_matrices=False)
+        expected = vt[:rank].T @ ((u.T @ b)[:rank] / sigma[:rank])
+        result, same, margin = apply_pseudo_inverse(jacobian.tolist(), b.tolist(), RCOND, rank)
+        assert same == rank and np.abs(result - expected).max() <= 1e-10
+        assert (margin >= 0.0) == (rank == (ratios > RCOND).sum())
+
+
 @pytest.mark.parametrize("m", [1, 2, 3])
 def test_zero_jacobian_gives_zero(m):
-    assert apply_pseudo_inverse([[0.0, 0.0]] * m, [1.0] * m, RCOND) == ([0.0, 0.0], 0)
+    assert apply_pseudo_inverse([[0.0, 0.0]] * m, [1.0] * m, RCOND)[:2] == ([0.0, 0.0], 0)
 
 
 def test_rcond_zero_keeps_every_singular_value():
-    result, _ = apply_pseudo_inverse([[1.0, 0.0], [0.0, 1e-6]], [1.0, 1.0], 0.0)
+    result, *_ = apply_pseudo_inverse([[1.0, 0.0], [0.0, 1e-6]], [1.0, 1.0], 0.0)
     assert result == pytest.approx([1.0, 1e6], rel=1e-12)
 
 
 def test_a_singular_value_at_the_cut_is_dropped():
     # numpy keeps σ > rcond·σ_max only
-    assert apply_pseudo_inverse([[1.0, 0.0], [0.0, 0.25]], [1.0, 1.0], 0.25) == ([1.0, 0.0], 1)
+    assert apply_pseudo_inverse([[1.0, 0.0], [0.0, 0.25]], [1.0, 1.0], 0.25)[:2] == ([1.0, 0.0], 1)
 
 
 def test_arguments_are_left_alone():

@@ -156,6 +156,28 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_that_programs_printed_name_their_commit(page: Path) -> None:
+    text = page.read_text("utf-8")
+    cells = ([cell.strip() for cell in line.split("|")[1:]] for line in text.splitlines())
+    number = re.compile(r"\d[\d.e-]*(?: [a-zµ]+)?")
+    printed = [row for row in cells if sum(map(bool, map(number.fullmatch, row))) >= 2]
+    assert not printed or re.search(r"printed at commit\n?\s?`[0-9a-f]{7,}`", text), printed[0]
+
+
+def test_paths_of_the_map_are_there() -> None:
+    readme = (ROOT / "README.md").read_text("utf-8").partition("## Map\n")[2]
+    rows = re.findall(r"^[|] (`.+?) [|] (.+) [|]$", readme, re.MULTILINE)
+    assert len(rows) > 10
+    for paths, what in rows:
+        first, *others = re.findall(r"`([\w./]+)`", paths)
+        base = ROOT / first
+        for place in (first, *others):
+            assert (ROOT / place).exists() or (base.parent / place).exists(), place
+        inside = re.findall(r"`([\w.]+(?:/|\.py))`", what) if base.is_dir() else []
+        assert all((base / name).exists() for name in inside), what
+
+
 def test_readme_is_short_and_has_the_command_of_the_tests() -> None:
     readme = (ROOT / "README.md").read_bytes()
     assert len(readme) <= MAX_README

@@ -7,6 +7,7 @@ import pkgutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,33 @@ def test_a_users_program_is_checked_by_its_types(tmp_path: Path) -> None:
     ]
     assert any("ndarray" in line for line in lines)
     assert any("tuple[float, ...] | None" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda fmu: twodof.simulate(fmu, stop_tim=2), "simulate.. has no argument 'stop_tim'; did"
+         r" you mean 'stop_time'\?"),
+        (lambda fmu: next(twodof.samples(fmu, stepp=2)), "samples.. has no argument 'stepp'; did"
+         r" you mean 'step'\?"),
+        (lambda fmu: twodof.publish(fmu, setting={}), "publish.. has no argument 'setting'; did you"
+         r" mean 'settings'\?"),
+        (lambda fmu: twodof.publish_together({}, lock_step=True),
+         r"publish_together.. .*'lockstep'\?"),
+        (lambda fmu: twodof.view("bag", export="a.html"), "view.. has no argument 'export'; .*It"
+         " takes bag, fmu, frame, host, mesh_dir, opened, port, stop, urdf$"),
+    ],
+)  # fmt: skip
+def test_a_keyword_that_is_none_is_told_of_the_function_that_was_called(
+    call: Callable[[Path], object], told: str, native_path: Path
+) -> None:
+    with pytest.raises(TypeError, match=f"^{told}"):
+        call(native_path)
+
+
+def test_a_control_that_is_none_is_told_where_it_was_typed() -> None:
+    with pytest.raises(twodof.TwoDofError, match=r"^`control` 'jont' is .*; did you mean 'joint'"):
+        twodof.FmuOptions(control="jont")
 
 
 def test_reprs_are_one_line(native_path: Path, tmp_path: Path) -> None:

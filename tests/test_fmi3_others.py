@@ -11,8 +11,8 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from harness import needs
 from native_models import HERE
+from tools import needs
 
 import twodof
 from twodof.cli.main import main
@@ -57,7 +57,7 @@ def oscillators(tmp_path_factory):
     rest = folder / "rest.c"
     rest.write_text("".join(f"int {name}(void) {{ return 0; }}\n" for name in others))
     library = folder / "oscillators.so"
-    command = [needs("cc"), "-shared", "-fPIC", "-I", headers, "-o", library]
+    command = [needs("gcc"), "-shared", "-fPIC", "-I", headers, "-o", library]
     subprocess.run([*command, HERE / "oscillators.c", rest, "-lm"], check=True)
     fmu = folder / "Oscillators.fmu"
     with zipfile.ZipFile(fmu, "w") as archive:

@@ -12,13 +12,17 @@ from typing import Any
 
 import pytest
 from bags import SECOND
-from harness import cannot_run, needs, wait_until
+from browser import UPGRADE, answer
+from harness import wait_until
 from nodes import LATCHED, PATIENCE, STREAMS, ended, published, recorded, stamp_of
+from tools import needs
 from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+from websockets.typing import Subprotocol
 
 import twodof
 from twodof.errors import PublishError
-from twodof.ros.foxglove import Foxglove
+from twodof.pages.foxglove import Foxglove
 
 
 def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(
@@ -26,9 +30,8 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(
 ) -> None:
     """The one of its viewer, in JavaScript; a gain is in the FMU within two steps."""
     client = Path(__file__).with_name("foxglove_client.js")
-    node, packages = needs("node"), client.with_name("node_modules") / "@foxglove"
-    if not packages.is_dir():
-        cannot_run("Foxglove's packages are not in tests/node_modules")
+    node = needs("node")
+    needs("foxglove")
     told, clients, step = tmp_path / "told", [], 0.2  # long: what the machine does is not tested
 
     def opened(server: Foxglove) -> None:
@@ -36,7 +39,8 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(
             clients.append(subprocess.Popen([node, str(client), server.url], stdout=out))
         wait_until(lambda: "advertised" in told.read_text())
 
-    viewer, bag = Foxglove(0, scene=True, effort=True, opened=opened), tmp_path / "bag"
+    bag = tmp_path / "bag"
+    viewer = Foxglove(0, scene=True, effort=True, set_gains=True, opened=opened)
     twodof.simulate(
         native_path, viewer, twodof.Bag(bag, scene=True, effort=True), stop_time=4, step=step,
         pace=twodof.RealTime(), steer=viewer.command,
@@ -73,7 +77,7 @@ def test_the_command_line_tells_where_it_listens(native_path: Path, number: int)
     with published(number, native_path, *options) as process:
         assert process.stdout is not None
         url = process.stdout.readline().split()[-1]
-        with connect(url, subprotocols=["foxglove.sdk.v1"]) as connection:  # type: ignore[list-item]
+        with joined(url) as connection:
             assert json.loads(connection.recv())["capabilities"][0] == "parameters"
         process.send_signal(signal.SIGINT)
         assert ended(process, 130)[1] == ""
@@ -92,17 +96,82 @@ def test_the_command_line_tells_where_it_listens(native_path: Path, number: int)
 def test_what_is_no_gain_is_ignored(
     native_path: Path, caplog: pytest.LogCaptureFixture, name: str, value: Any, reason: str
 ) -> None:
-    viewer = Foxglove(0).begin(twodof.experiment(native_path))
+    """With one warning, however often it comes."""
+    viewer = Foxglove(0, set_gains=True).begin(twodof.experiment(native_path))
     asked = {"name": name} if value is None else {"name": name, "value": value}
-    with (
-        viewer,
-        connect(viewer.url, subprotocols=["foxglove.sdk.v1"]) as connection,  # type: ignore[list-item]
-    ):
-        connection.send(json.dumps({"op": "setParameters", "parameters": [asked], "id": "a"}))
-        wait_until(lambda: caplog.records)
+    with viewer, joined(viewer.url) as connection:
+        for _ in range(100):
+            ask(connection, asked)
     assert viewer.command() == {}
     (record,) = caplog.records
     assert reason in record.message
+
+
+def joined(url: str, **options: Any) -> Connection:
+    """A connection of Foxglove's protocol."""
+    return connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], **options)
+
+
+def ask(connection: Connection, asked: dict[str, Any]) -> list[Any]:
+    """Set a parameter; what then holds, as it is answered."""
+    connection.send(json.dumps({"op": "setParameters", "parameters": [asked], "id": "a"}))
+    while True:
+        text = connection.recv(timeout=PATIENCE)
+        if isinstance(text, str) and (answer := json.loads(text))["op"] == "parameterValues":
+            return [it["value"] for it in answer["parameters"]]
+
+
+def test_gains_are_set_where_asked_for_alone(
+    native_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for set_gains, held, taken in (
+        (False, [50.0, 50.0], {}), (True, [1.0, 1.0], {"Kp[1]": 1.0, "Kp[2]": 1.0}),
+    ):  # fmt: skip
+        viewer = Foxglove(0, set_gains=set_gains).begin(twodof.experiment(native_path))
+        with viewer, joined(viewer.url) as connection:
+            assert ask(connection, {"name": "Kp", "value": 1.0}) == [held]
+        assert viewer.command() == taken
+    (record,) = caplog.records
+    assert "gains are shown alone; `set_gains=True` lets it" in record.message
+
+
+def test_websites_but_foxgloves_own_are_refused(native_path: Path) -> None:
+    """By Origin, and by Host where a website's name leads to this machine."""
+    with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
+        url, own = viewer.url.replace("ws:", "http:"), ("Host", viewer.url.removeprefix("ws://"))
+        protocol = ("Sec-WebSocket-Protocol", "foxglove.sdk.v1")
+
+        def status(*headers: tuple[str, str]) -> int:
+            return answer(url, *headers, protocol, *UPGRADE)
+
+        assert status(own) == 101
+        for origin in ("https://app.foxglove.dev", "https://embed.foxglove.dev", "file://"):
+            assert status(own, ("Origin", origin)) == 101
+        for origin in (
+            "https://evil.example", "null", "http://localhost:3000", "http://app.foxglove.dev",
+            "https://app.foxglove.dev.evil.example", "https://evil.example/app.foxglove.dev",
+        ):  # fmt: skip
+            assert status(own, ("Origin", origin)) == 403
+        for host in ("evil.example", "app.foxglove.dev"):
+            assert status(("Host", host), ("Origin", f"https://{host}")) == 403
+            assert status(("Host", host)) == 403
+
+
+def test_a_client_of_junk_prints_nothing(
+    native_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
+        address = viewer.url.removeprefix("ws://").split(":")
+        for _ in range(20):
+            with socket.create_connection((address[0], int(address[1]))) as one:
+                one.sendall(b"GARBAGE\r\n\r\n")
+        with joined(viewer.url) as connection:
+            for _ in range(500):
+                connection.send("no JSON")
+                connection.send(b"\xff\x00")
+                connection.send('{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 9}]}')
+            ask(connection, {"name": "Kp", "value": 1.0})  # by then it has read all of them
+    assert [record.name for record in caplog.records] == ["twodof.pages.foxglove"]
 
 
 def test_a_port_that_is_taken_is_named(native_path: Path) -> None:
@@ -111,7 +180,7 @@ def test_a_port_that_is_taken_is_named(native_path: Path) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         viewer = Foxglove(port).begin(twodof.experiment(native_path))
-        with pytest.raises(PublishError, match=f"port {port} of 127.0.0.1 cannot be listened on"):
+        with pytest.raises(PublishError, match=f"port {port} of 127.0.0.1 is in use"):
             viewer.__enter__()
 
 

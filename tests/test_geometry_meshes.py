@@ -13,11 +13,18 @@ from playwright.sync_api import ViewportSize
 
 import twodof
 from twodof.cli.main import main
-from twodof.geometry.meshes import load_mesh, surfaces
+from twodof.geometry.meshes import Meshes, ReadMesh, Surface
 from twodof.geometry.shapes import link_shapes
 from twodof.plant.urdf import read_urdf
 
 ONE = np.ones(3)
+
+
+def surfaces(name: str, read: ReadMesh, scale: np.ndarray) -> list[Surface]:
+    with Meshes(read) as meshes:
+        return meshes.scaled(name, scale)
+
+
 DAE = "{http://www.collada.org/2005/11/COLLADASchema}"
 
 
@@ -46,7 +53,9 @@ def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) 
         for listed in tree.iter(f"{DAE}{kind}"):
             colour = diffuse[effects[symbols[listed.attrib["material"]]]]
             expected[colour] += int(listed.attrib["count"])
-    parts = surfaces(f"{name}.dae", {f"{name}.dae": content}.get, 2.0 * ONE)
+    with Meshes({f"{name}.dae": content}.get) as meshes:
+        parts = meshes.scaled(f"{name}.dae", 2.0 * ONE)
+        (shape,) = meshes.surfaces(f"{name}.dae", coloured=False)
     triangles: Counter[tuple[float, ...]] = Counter()
     for part in parts:
         own = np.array(part.colour, float)
@@ -55,9 +64,9 @@ def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) 
         triangles[nearest] += len(part.triangles)
     assert triangles == expected and len(triangles) > 1 - (name == "hand")
     points = np.concatenate([part.vertices for part in parts])
-    shape = np.array(load_mesh(f"{name}.dae", content, 2.0 * ONE).vertices())
-    np.testing.assert_allclose(points.min(axis=0), shape.min(axis=0), atol=1e-6)
-    np.testing.assert_allclose(points.max(axis=0), shape.max(axis=0), atol=1e-6)
+    corners = 2.0 * shape.vertices
+    np.testing.assert_allclose(points.min(axis=0), corners.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(points.max(axis=0), corners.max(axis=0), atol=1e-6)
 
 
 CUBE = """mtllib colours.mtl
@@ -115,15 +124,17 @@ URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/>
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_mesh_that_is_not_finite_is_not_drawn(number: float) -> None:
+def test_a_mesh_that_is_not_finite_is_not_drawn(
+    number: float, caplog: pytest.LogCaptureFixture
+) -> None:
     """A page whose numbers are not JSON shows nothing at all."""
     facet = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
     robot = read_urdf(URDF.replace("cube.obj", "cube.stl"))
-    for value, missing in ((2.0, []), (number, ["cube.stl"])):
+    for value, text in ((2.0, ""), (number, "mesh 'cube.stl' is left out: it has a vertex that")):
         facet[6] = value
         content = bytes(80) + b"\1\0\0\0" + facet.tobytes() + bytes(2)
         shapes, absent = link_shapes(robot, {"cube.stl": content}.get)
-        assert absent == missing
+        assert absent == [] and text in caplog.text and bool(text) == bool(caplog.text)
         assert all(np.isfinite(shape.vertices).all() for shape in shapes)
 
 

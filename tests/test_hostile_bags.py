@@ -208,6 +208,9 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
         ) + "rosbag2_bagfile_information: {compression_format: *l8}"
     ).encode())),
     "60 MB of metadata": instead("metadata.yaml", written(lambda: b"[" * (60 * MIB))),
+    "30 MB of provenance": instead("run.json", written(
+        lambda: b'{"format":1,"fmu":{},"x":[' + b'{"a":10},' * (3 * MIB) + b"0]}"
+    )),
     "60 MB of provenance": instead("run.json", written(
         lambda: b'{"format":1,"fmu":[' + b"{}," * (20 * MIB) + b"0]}"
     )),
@@ -226,5 +229,5 @@ SLOW = {
     "5000 files", "pages in a circle", "10 GB in a chunk of 1 kB", "2.5 GB in a chunk of lz4",
     "250 MB of zeros in a chunk", "250 MB of messages in a chunk", "a message of 700 MB",
     "a message of 300 MB in a database", "60 MB of small records", "60 MB of metadata",
-    "60 MB of provenance", "a thousand topics with profiles of their own",
+    "30 MB of provenance", "60 MB of provenance", "a thousand topics with profiles of their own",
 }  # fmt: skip

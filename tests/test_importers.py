@@ -12,8 +12,9 @@ from pathlib import Path
 import fmpy
 import numpy as np
 import pytest
-from harness import Driver, in_child_process, needs
+from harness import Driver, in_child_process
 from native_models import model
+from tools import needs
 
 import twodof
 from twodof import FmuOptions
@@ -39,9 +40,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
     @functools.cache
     def build(control: str, fmi: int) -> tuple[str, list[float]]:
-        options = FmuOptions(
-            control=control, native=True, fmi=fmi, arrays=fmi == 2, live_documentation=False
-        )
+        options = FmuOptions(control=control, native=True, fmi=fmi, arrays=fmi == 2)
         fmu = twodof.build_fmu(tmp_path_factory.mktemp("built") / "Arm.fmu", options)
         result = fmpy.simulate_fmu(
             str(fmu), stop_time=END, step_size=0.01, output_interval=0.01, output=Q,
@@ -63,6 +62,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
 @pytest.mark.parametrize("control", COMMANDS)
 def test_libcosim(control: str, built: Build) -> None:
+    needs("libcosimpy")
     in_libcosim(control, *built(control, 2))
 
 
@@ -184,8 +184,9 @@ class Controller(Fmi2Slave):
 
 def test_a_second_fmu_holds_the_arm_in_libcosim(built: Build, tmp_path: Path) -> None:
     """It comes as near the target as the loop inside, by a way that a step of 1 ms leaves near."""
+    needs("libcosimpy")
     plant, _ = built("effort", 2)
-    options = FmuOptions(control="joint", native=True, live_documentation=False)
+    options = FmuOptions(control="joint", native=True)
     inside = twodof.build_fmu(tmp_path / "in.fmu", options)
     script = tmp_path / "controller.py"
     script.write_text(CONTROLLER.format(urdf=twodof.load_fmu(plant).urdf, kp=KP, kd=KD, goal=GOAL))

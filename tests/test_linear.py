@@ -6,14 +6,17 @@ import zipfile
 
 import fmpy
 import numpy as np
+import oracles
+import pinocchio as pin
 import pytest
-from harness import needs
 from native_models import model as model_of
+from native_models import robots_folder
 from scipy.linalg import expm
 
 import twodof
 from twodof import FmuOptions, build_fmu
 from twodof.cli.main import main
+from twodof.plant.robot import load_robot
 
 UPRIGHT = [np.pi / 2, 0.0]
 
@@ -85,6 +88,81 @@ def test_a_singular_pose_and_a_motion_are_remarked(native_path):
     assert [remark[:15] for remark in model.remarks] == ["a singular pose", "no equilibrium:"]
 
 
+def test_a_free_joint_has_no_damping_and_what_falls_is_unstable(bare, capsys):
+    """Without gravity nothing holds joints; upright, two of four eigenvalues grow."""
+    free = twodof.linearise(bare, {"q": [0.3, 0.3], "gravity": 0.0})
+    assert [mode.eigenvalue for mode in free.modes] == [0.0] * 4
+    assert all(np.isnan(mode.damping) for mode in free.modes) and free.remarks == ()
+    assert main(["linearise", str(bare), "--at", "q=0.3,0.3", "--at", "gravity=0"]) == 0
+    assert re.findall("^0 +– +0$", capsys.readouterr().out, re.M) == ["0" + 30 * " " + "–  0"] * 4
+    upright = twodof.linearise(bare, {"q": UPRIGHT})
+    fastest = np.linalg.eigvals(upright.A).real.max()
+    (remark,) = upright.remarks
+    assert remark.startswith("an unstable equilibrium: 2 of 4 eigenvalues grow")
+    assert float(remark.split()[-2]) == pytest.approx(fastest, rel=1e-5)
+    assert twodof.linearise(bare, {"q": [-np.pi / 2, 0.0]}).remarks == ()  # hanging
+
+
+def test_a_pole_of_rounding_is_zero(native_path):
+    """Kp = 0 on one axis: its target is followed in velocity alone, and rounding left a pole."""
+    q = [0.4, 0.9]
+    at = {"q": q, "x_des": oracles.position(np.array(q)), "Kp": [0.0, 50.0], "Kd": [10.0, 20.0]}
+    model = twodof.linearise(native_path, at)
+    still, *others = model.modes
+    assert (still.eigenvalue, still.frequency) == (0.0, 0.0) and np.isnan(still.damping)
+    expected = [-10.0, *np.roots([1.0, 20.0, 50.0])]
+    found = [mode.eigenvalue for mode in others]
+    assert np.sort_complex(np.array(found)) == pytest.approx(
+        np.sort_complex(np.array(expected)), abs=1e-9
+    )
+
+
+@pytest.fixture(scope="module")
+def ur10(tmp_path_factory):
+    options = FmuOptions(
+        urdf=robots_folder() / "ur_description/urdf/ur10_joint_limited_robot.urdf", frame="tool0",
+        control="pose", native=True, meshes=False,
+    )  # fmt: skip
+    return build_fmu(tmp_path_factory.mktemp("ur10") / "UR10.fmu", options)
+
+
+def singular_ratio(fmu, q):
+    """σ_min/σ_max of all six rows, by Pinocchio."""
+    robot = load_robot(str(twodof.load_fmu(fmu).urdf), "tool0", "xyz")
+    data, frame = robot.model.createData(), robot.model.getFrameId("tool0")
+    aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    sigma = np.linalg.svd(pin.computeFrameJacobian(robot.model, data, np.array(q), frame, aligned))
+    return sigma[1][-1] / sigma[1][0]
+
+
+def test_singularities_of_the_orientation_count(ur10):
+    """The wrist's: positions alone are controlled as well as before."""
+    wrist = [0.3, -1.2, 1.4, 0.2, 0.0, 0.3]
+    (remark, _) = twodof.linearise(ur10, {"q": wrist}).remarks
+    assert remark.startswith("a singular pose: σ_min/σ_max = ")
+    near = [*wrist[:4], 0.15, 0.3]
+    ratio = singular_ratio(ur10, near)
+    assert 0.01 < ratio < 0.1
+    with pytest.raises(twodof.TwoDofError, match=f"J⁺ jumps here: σ_min/σ_max = {ratio:.6g} is"):
+        twodof.linearise(ur10, {"q": near, "rcond": ratio})
+    found = [twodof.linearise(ur10, {"q": near, "rcond": f * ratio}) for f in (0.99, 1.01)]
+    assert [model.remarks[0][:15] for model in found] == ["no equilibrium:", "a singular pose"]
+
+
+@pytest.mark.parametrize(("tau", "told"), [(9.9, ""), (10.0, "refused"), (-12.0, "saturated")])
+def test_an_effort_limit_is_refused_or_told(tau, told, bare):
+    """The URDF's is 10 N·m."""
+    at = {"q": [0.3, 0.4], "tau_cmd": [tau, 0.1], "limit_effort": True}
+    if told == "refused":
+        with pytest.raises(twodof.TwoDofError, match="joint 'joint1' is at its effort limit 10"):
+            twodof.linearise(bare, at)
+        return
+    model = twodof.linearise(bare, at, inputs=["tau_cmd"])
+    saturated = "joint 'joint1' is saturated: its effort stays at 10, the controller asks for -12"
+    assert (saturated in model.remarks) == (told == "saturated")
+    assert (model.B[2, 0] == 0.0) == (told == "saturated")
+
+
 def test_a_state_is_given_by_its_elements_too(bare):
     """As settings are: what is not given is at its start, velocities at 0."""
     model = twodof.linearise(bare, {"q[1]": 1.0, "v_start[2]": 0.2, "v[1]": 0.5, "tau_cmd[2]": 0.1})
@@ -138,7 +216,6 @@ def test_the_command_prints_the_model(bare, capsys):
 def test_casadi_takes_the_fmu_and_has_the_same_jacobian(control, native_path, bare, tmp_path):
     """Its states by fmi2SetReal, from their start attributes, and derivatives by fmi2GetReal; as
     differences of the law in Python have it."""
-    needs("casadi")
     import casadi
 
     path = {"task": native_path, "effort": bare}[control]

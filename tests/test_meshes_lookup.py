@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -197,10 +198,10 @@ def test_symbolic_link_out_of_the_places_is_refused(
 
 
 def test_mesh_that_cannot_be_read_is_refused(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(path: Path, _mode: str) -> None:
+    def fail(path: Path, _flags: int) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "open", fail)
+    monkeypatch.setattr(os, "open", fail)
     with pytest.raises(BuildError, match=r"base\.stl.*Permission denied"):
         collect(disk, PACKAGE, "ws")
 

@@ -10,8 +10,9 @@ import subprocess
 import numpy as np
 import pytest
 from fmpy.fmi2 import FMU2Slave
-from harness import Recorded, needs
+from harness import Recorded
 from native_models import GUID, HERE, executable, library, model
+from tools import needs
 
 OK, WARNING, DISCARD, ERROR = range(4)
 
@@ -46,7 +47,7 @@ class FMU2Arm(Recorded, FMU2Slave):
 
     def get(self, name):
         table = self.of.table
-        return self.getReal([i for i, v in enumerate(table) if name in (v.name, v.group)])
+        return self.getReal([i for i, v in enumerate(table, 1) if name in (v.name, v.group)])
 
     def step(self, h=0.01):
         self.doStep(self.time, h)
@@ -112,8 +113,8 @@ CALLS = {
     "doStep": ("doStep", 0.0, 0.01),
     "terminate": ("terminate",),
     "reset": ("reset",),
-    "get": ("getReal", [0]),
-    "set input": ("setReal", [0], [0.1]),
+    "get": ("getReal", [1]),
+    "set input": ("setReal", [1], [0.1]),
     "set parameter": ("set", "rtol", 0.02),
     "getStatus": ("getRealStatus", 2),
 }
@@ -171,19 +172,20 @@ def test_values_that_are_not_finite():
     vr = arm.of.reference("Kp[2]")
     for value, text in ((np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf")):
         # nothing of a refused call is done, its first value neither
-        arm.refused(rf"^Kp\[2\] = {text} is not finite$", "setReal", [0, vr], [0.3, value])
+        arm.refused(rf"^Kp\[2\] = {text} is not finite$", "setReal", [1, vr], [0.3, value])
 
 
 def test_refusals_name_the_culprit():
     arm = Arm()
     vr = arm.of.reference
-    beyond = len(arm.of.table)
-    arm.refused(f"no variable with value reference {beyond}", "getReal", [0, beyond])
+    beyond = len(arm.of.table) + 1
+    arm.refused(f"no variable with value reference {beyond}", "getReal", [1, beyond])
+    arm.refused("no variable with value reference 0$", "getReal", [0])
     arm.refused("no variable with value reference 4294967295", "setReal", [2**32 - 1], [0.0])
     arm.refused(r"q\[1\] is computed and cannot be set", "setReal", [vr("q[1]")], [0.0])
     arm.refused(r"parameter \(max_step\) is not allowed", "setReal", [vr("max_step")], [0.1])
-    arm.refused(r"x_des\[1\] is of type Real", "getInteger", [0])
-    arm.refused(r"x_des\[1\] is of type Real", "setString", [0], ["a"])
+    arm.refused(r"x_des\[1\] is of type Real", "getInteger", [1])
+    arm.refused(r"x_des\[1\] is of type Real", "setString", [1], ["a"])
     arm.refused("communication point 0.1 s is not the time of the FMU, 0 s", "doStep", 0.1, 0.01)
     arm.refused("communication point nan s", "doStep", np.nan, 0.01)
     arm.refused("communication point inf s", "doStep", np.inf, 0.01)
@@ -202,7 +204,7 @@ def test_values_out_of_their_range_are_refused_where_they_are_set():
         ("payload", -0.1, "payload = -0.1 must be >= 0"),
         ("Kp[2]", -1.0, r"Kp\[2\] = -1 must be >= 0"),
     ):
-        arm.refused(message, "setReal", [0, arm.of.reference(name)], [0.3, value])
+        arm.refused(message, "setReal", [1, arm.of.reference(name)], [0.3, value])
 
 
 def test_limits_are_checked_when_initialization_ends():
@@ -266,7 +268,11 @@ def test_a_failed_step_is_discarded_and_changes_nothing():
     arm.messages.clear()
     assert arm.status("doStep", 0.01, 0.01) == DISCARD
     assert arm.messages == [
-        (DISCARD, "fmi2DoStep at 0.01 s: the equations of motion gave a value that is not finite")
+        (
+            DISCARD,
+            "fmi2DoStep at 0.01 s: the equations of motion gave a value that is not finite:"
+            " inputs, payload or speeds are too large",
+        )
     ]
     assert arm.get("q") == before and arm.getRealStatus(2) == 0.01
     arm.setFMUState(saved)
@@ -301,13 +307,16 @@ def forged(arm, field, value):
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
     joints = len(arm.of.robot.joints)
-    layout = struct.Struct(f"={head}s{n + 2}d{2 * joints + 2}i6iQ")
+    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{2 * joints + 3}i6i4xQ")
     fields = list(layout.unpack(blob))
-    names = ["time", "stop_time"]
+    names = ["time", "stop_time", "step_start"]
+    names += [f"step_{kind}[{i + 1}]" for kind in ("q", "v", "a") for i in range(joints)]
+    names += [f"reached_{state}[{i + 1}]" for state in "qv" for i in range(joints)]
+    names += ["reached_at", "passed_by", "step_begun"]
     names += [f"{what}[{i + 1}]" for what in ("held", "watched") for i in range(joints)]
-    names += ["any_held", "any_watched", "phase", "initialised"]
+    names += ["any_held", "any_watched", "rank", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
-    place = n + 1 + names.index(field) if field in names else 1 + arm.of.reference(field)
+    place = n + 1 + names.index(field) if field in names else 1 + arm.of.place(field)
     fields[place] = value
     fields[-1] = fnv(layout.pack(*fields)[:-8])
     return layout.pack(*fields)
@@ -328,6 +337,12 @@ FORGERIES = {
     "phase": ((-1, 4, 5, 7, 77, 2**31 - 1, -(2**31)), UNSOUND),
     "time": ((np.nan, np.inf, -np.inf), UNSOUND),
     "stop_time": ((np.nan, -np.inf), UNSOUND),
+    "step_start": ((np.nan, np.inf), UNSOUND),
+    "step_v[2]": ((np.nan, np.inf), UNSOUND),
+    "reached_q[1]": ((np.nan, -np.inf), UNSOUND),
+    "reached_at": ((np.nan, np.inf), UNSOUND),
+    "passed_by": ((-1, 3), UNSOUND),
+    "step_begun": ((-1, 2), UNSOUND),
     "x_des[1]": ((np.nan, np.inf), UNSOUND),
     "Kn": ((-np.inf,), UNSOUND),
     "q[1]": ((np.nan, np.inf, 3.2, -3.2), UNSOUND),
@@ -396,7 +411,9 @@ def test_interleaved_instances_equal_one_alone():
 
 def test_library_exports_the_standard_needs_libc_alone_and_is_small():
     path = library("twodof")
-    symbols = subprocess.check_output(["nm", "-D", "--defined-only", path], text=True).split()[2::3]
+    symbols = subprocess.check_output(
+        [needs("nm"), "-D", "--defined-only", path], text=True
+    ).split()[2::3]
     header = "\n".join(
         content.decode() for file, content in model("twodof").sources().items()
         if file == "fmi2Functions.h"
@@ -404,7 +421,9 @@ def test_library_exports_the_standard_needs_libc_alone_and_is_small():
     assert sorted(symbols) == sorted(re.findall(r"FMI2_Export \w+TYPE +(\w+);", header))
     needed = subprocess.check_output(["readelf", "-d", path], text=True)
     assert set(re.findall(r"NEEDED.*\[(.*)\]", needed)) <= {"libc.so.6", "libm.so.6"}
-    versions = re.findall(r"GLIBC_2\.(\d+)", subprocess.check_output(["nm", "-D", path], text=True))
+    versions = re.findall(
+        r"GLIBC_2\.(\d+)", subprocess.check_output([needs("nm"), "-D", path], text=True)
+    )
     assert max(map(int, versions)) <= 17
     assert path.stat().st_size <= 200_000
 
@@ -445,6 +464,6 @@ def test_instances_in_threads_share_nothing(length):
 
 def test_run_under_valgrind():
     program = executable(model("twodof"), HERE.parents[1] / "benchmarks" / "native_step.c")
-    command = [needs("valgrind"), "-q", "--error-exitcode=9", "--leak-check=full", program]
+    command = [needs("valgrind"), "-q", "--error-exitcode=9", "--leak-check=full", str(program)]
     done = subprocess.run([*command, "0.01", "5", "2"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -33,17 +33,17 @@ from browser import (
     target_place,
     until,
 )
-from harness import needs
 from mcap_ros2.reader import read_ros2_messages
 from native_models import robots_folder
 from playwright.sync_api import Browser, Page, ViewportSize
 from rosbags.rosbag2 import Reader
+from tools import needs
 
 import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError, PageError
-from twodof.export.arm_page import SCRIPTS
 from twodof.fmu import instantiate
+from twodof.pages.arm import SCRIPTS
 from twodof.plots.track import read_tracks
 from twodof.simulation.experiments import resolve
 
@@ -184,10 +184,20 @@ def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
     with shown(browser, path) as page:
         actual = played(page, {}, script, 400)
         joints, cut = page.evaluate(READOUT)
+        error = page.locator("[data-value=error]")
+        until(page, lambda found: found[0].isdigit(), lambda page: str(error.text_content()))
+        curves = page.locator("#arm-curves canvas").evaluate_all("all => all.map(c => c.ariaLabel)")
+        said = str(error.text_content())
         before = page.evaluate("arm.held('quat_des')")
         assert refused(page, "arm.set('quat_des', 0)") == NO_ORIENTATION
         assert page.evaluate("arm.held('quat_des')") == before
     np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-12)
+    changes = [(0.01 * k, values) for k, values in script.items()]
+    *_, last = twodof.samples(panda, stop_time=4.0, changes=changes)
+    distance, angle = (float(part.split()[0]) for part in said.split(", "))
+    assert distance == pytest.approx(last.error, rel=1e-3)
+    assert angle == pytest.approx(last.turn_error, rel=1e-3)
+    assert curves[-2:] == ["distance from the target, m", "angle from the target orientation, rad"]
     told = ("finger_joint1", "end effector", "target", "error")
     assert joints == [*(f"joint{i}" for i in range(1, 8)), *told]
     assert cut == 0
@@ -397,7 +407,9 @@ def test_the_download_is_a_bag_of_the_samples(browser, panda, tmp_path, capsys) 
     np.testing.assert_allclose(places, rows[:, 2 * n : 2 * n + 3], rtol=0.0, atol=1e-12)
     assert read_tracks([path])[0].motion is not None
     assert main(["info", str(path)]) == 0
-    assert "17 s, 1701 joint states, 100 Hz" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "17 s, 1701 joint states, 100 Hz" in out
+    assert re.search("^made by +a page in the browser$", out, re.M)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(BagError, match="ends in the middle"):
@@ -453,31 +465,15 @@ def test_the_policy_allows_its_own_script_alone(arm) -> None:
     assert "://" not in re.sub(r"<script.*?</script>", "", text, flags=re.S)
 
 
-def test_the_documentation_of_a_native_fmu_is_alive(browser, native_path, tmp_path) -> None:
-    def index(path: Path) -> bytes:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read("documentation/index.html")
-
-    (tmp_path / "index.html").write_bytes(index(native_path))
-    with shown(browser, tmp_path / "index.html") as page:
+def test_the_documentation_of_an_fmu_fits_a_phone(browser, native_path, tmp_path) -> None:
+    with zipfile.ZipFile(native_path) as archive:
+        index = Path(archive.extract("documentation/index.html", tmp_path))
+    with browser.new_context(viewport=PHONE, offline=True, is_mobile=True) as opened:
+        page = opened.new_page()
+        page.goto(index.as_uri())
         assert page.get_by_role("heading", name="Equations").is_visible()
-        press(page, "Pause")
-        page.get_by_role("heading", name="Equations").click()
-        page.keyboard.press(" ")  # which is the page's own, outside of the arm
-        assert page.locator("#arm-play").text_content() == "Play"
-        assert played(page, {}, {}, 100)[-1] == pytest.approx(
-            stepped(native_path, {}, {}, 100)[-1], rel=0.0, abs=1e-12
-        )
-    with shown(browser, tmp_path / "index.html", is_mobile=True) as page:
-        page.set_viewport_size(PHONE)
-        wide = "[innerWidth, document.documentElement.scrollWidth]"
-        until(page, lambda found: found == [390, 390], lambda page: page.evaluate(wide))
-    still = tmp_path / "still.fmu"
-    still.write_bytes(native_path.read_bytes())
-    options = twodof.FmuOptions(native=True, live_documentation=False)
-    assert b"<script" not in index(twodof.build_fmu(still, options))  # which is written anew
-    alive = twodof.build_fmu(still, twodof.FmuOptions(native=True))
-    assert alive.read_bytes() == native_path.read_bytes()
+        wide = page.evaluate("[innerWidth, document.documentElement.scrollWidth]")
+        assert wide == [PHONE["width"]] * 2
 
 
 def test_equal_fmus_make_equal_pages(native_path, arm, tmp_path) -> None:
@@ -488,6 +484,16 @@ def test_an_fmu_without_a_plant_in_c_is_refused(fmu_path, tmp_path) -> None:
     with pytest.raises(PageError, match="has no plant in C"):
         twodof.page(fmu_path, tmp_path / "x.html")
     assert not (tmp_path / "x.html").exists()
+
+
+def test_a_robot_that_cannot_be_drawn_is_named(native_path, tmp_path) -> None:
+    fmu = tmp_path / "A.fmu"
+    with zipfile.ZipFile(native_path) as archive, zipfile.ZipFile(fmu, "w") as other:
+        for name in archive.namelist():
+            other.writestr(name, re.sub(rb'rgba="[^"]*"', b'rgba="1 nan 1 1"', archive.read(name)))
+    reason = "its robot cannot be shown: link 'link1' cannot be drawn: rgba='1 nan"
+    with pytest.raises(PageError, match=reason):
+        twodof.page(fmu, tmp_path / "x.html")
 
 
 def test_the_scripts_are_typed_and_short() -> None:

@@ -2,6 +2,7 @@
 
 import warnings
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -168,7 +169,7 @@ def test_jacobian_and_drift_against_finite_differences(name, request):
         plant.q, plant.v, plant.Kn = q.tolist(), v.tolist(), 0.0
         plant.x_des, plant.rcond = x(q).tolist(), 0.0
         plant.q = q.tolist()
-        qdd, _ = task_control.command(plant)(q, v)
+        qdd, *_ = task_control.command(plant)[0](q, v, None)
         found = -KD * jacobian_of(q) @ v - jacobian_of(q) @ qdd
         expected = central(lambda p: jacobian_of(p) @ v, q, v, 1e-6)  # noqa: B023
         assert np.abs(found - expected).max() <= 1e-6
@@ -189,7 +190,7 @@ def test_mass_matrix_and_nonlinear_effects_against_mujoco(name, request):
         mujoco.mj_forward(model, data)
         plant.q, plant.v = q.tolist(), v.tolist()
         tau = np.array(plant.tau)
-        qdd = np.array(task_control.command(plant)(q, v)[0])
+        qdd = np.array(task_control.command(plant)[0](q, v, None)[0])
         M = np.zeros((n, n))
         mujoco.mj_fullM(model, data, M)
         expected = M @ qdd + data.qfrc_bias
@@ -278,14 +279,16 @@ def test_a_joint_that_grazes_its_limit_at_the_fold_does_not_chatter(monkeypatch)
     plant.q, plant.v = [np.pi, -3.1352186957606243], [0.0, -1.4880270052931837]
     plant.x_des = [-0.11596721002411503, -0.17468495304859388]
     calls = 0
-    acceleration = plant.equations_of_motion()
+    equations = plant.equations_of_motion()
 
-    def counted(q, v):
+    def counted(*state):
         nonlocal calls
         calls += 1
-        return acceleration(q, v)
+        return equations.acceleration(*state)
 
-    monkeypatch.setattr(plant, "equations_of_motion", lambda: counted)
+    monkeypatch.setattr(
+        plant, "equations_of_motion", lambda: replace(equations, acceleration=counted)
+    )
     plant.step(0.01)
     assert calls < 10_000
     assert np.isfinite([*plant.q, *plant.v]).all()
@@ -362,7 +365,7 @@ def test_a_matrix_without_an_inverse_discards_the_step(control, settings):
     plant = model("panda", control).plant()
     vars(plant).update(settings)
     before = plant.q, plant.v
-    with pytest.raises(DiscardError, match="singular or not finite: inputs, payload or speeds"):
+    with pytest.raises(DiscardError, match="not finite: inputs, payload or speeds"):
         plant.step(0.01)
     assert (plant.q, plant.v) == before
 

@@ -156,6 +156,10 @@ def test_a_page_answers(gains: dict[int, Recording], chromium: Any, tmp_path: Pa
         assert told == pytest.approx(2.0, abs=0.1)
         found = [float(cells.nth(i).inner_text().replace("−", "-")) for i in (1, 2)]
         assert found == pytest.approx([gains[50].q[k, 0], gains[50].v[k, 0]], rel=1e-4)
+        ended = shown.locator("#legend tr").nth(2).locator("td")  # Kp 20, which lasts 1 s
+        assert ended.all_inner_texts()[1:] == ["", "", ""]
+        shown.mouse.move(panel["x"] + 0.1 * panel["width"], panel["y"] + 0.5 * panel["height"])
+        browser.until(shown, lambda words: words != "", lambda _: ended.nth(1).inner_text())
     assert said == []
 
 

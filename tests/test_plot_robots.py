@@ -116,7 +116,7 @@ def test_joints_that_slide_have_metres(tmp_path: Path) -> None:
     found = panels(figure)
     assert found.q[0].get_title("left") == "Position in rad or m"
     assert found.v[0].get_title("left") == "Velocity in rad/s or m/s"
-    assert {"j1", "j2\n(m)"} <= set(texts(figure))
+    assert {"j1", "j2", "(m)"} <= set(texts(figure))
     assert not [t for t in texts(figure) if "reach" in t]  # it has no bound of this kind
 
 

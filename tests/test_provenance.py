@@ -26,6 +26,7 @@ from harness import wait_until
 from sinks import Collector
 
 import twodof
+from twodof.bag.provenance import MAX_TAIL
 from twodof.pages.loop import Loop
 from twodof.plots.track import read_tracks
 from twodof.simulation.experiments import Experiment
@@ -134,13 +135,13 @@ def test_the_distance_shown_is_that_of_the_samples(
     samples = Collector()
     way(native_path, tmp_path / "bag", samples)
     (track,) = read_tracks([tmp_path / "bag"])
-    assert track.task is not None and track.task.departure is not None
+    assert track.task is not None and track.task.off is not None
     x = np.array([sample.x for sample in samples])
     targets = np.array([[sample.inputs[f"x_des[{k}]"] for k in (1, 2)] for sample in samples])
     different = len(np.unique(targets, axis=0))  # an answer to a sample comes after its own target
     assert different == 1 if way is by_settings else different >= len(TARGETS)
     np.testing.assert_allclose(track.task.error, np.linalg.norm(x - targets, axis=1), rtol=1e-9)
-    assert track.task.departure <= 1e-9
+    assert track.task.off.max() <= 1e-9
 
 
 LOOP = """
@@ -175,8 +176,8 @@ def test_so_it_is_after_a_kill_up_to_the_last_flush(native_path: Path, tmp_path:
         os.kill(process.pid, signal.SIGKILL)
     assert twodof.recover(bag).counts["/joint_states"] > 20
     (track,) = read_tracks([bag])
-    assert track.task is not None and track.task.departure is not None
-    assert track.task.departure <= 1e-9
+    assert track.task is not None and track.task.off is not None
+    assert track.task.off.max() <= 1e-9
     assert len(track.recording.provenance["input_changes"]) >= len(track.t) - 1
 
 
@@ -327,7 +328,7 @@ def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(
 def test_provenance_says_where_it_was_full(
     run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("twodof.bag.provenance.MAX_SIZE", 20_000)
+    monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", MAX_TAIL + 20_000)
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(1000):
             inputs = {"x_des[1]": k / 7}
@@ -337,7 +338,7 @@ def test_provenance_says_where_it_was_full(
     text = (tmp_path / "bag" / "run.json").read_text()
     provenance = json.loads(text)
     changes = provenance["input_changes"]
-    assert len(text) <= 20_000
+    assert len(text) <= MAX_TAIL + 20_000
     assert 0 < len(changes) < 999
     assert provenance["inputs_known_until"] == round(changes[-1][0] * 100 + 1) / 100
 

@@ -19,14 +19,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
-from harness import cannot_run, needs, wait_until
+from harness import wait_until
 from nodes import (
+    CABLE,
     COMMANDS,
     LATCHED,
     STREAMS,
     Node,
     ended,
     environment,
+    isolated,
     published,
     recorded,
     stamp_of,
@@ -245,18 +247,6 @@ def test_two_publishers_on_one_topic_are_both_heard(
         assert len(mine) > 100 and mine == truth[-len(mine) :]
 
 
-ISOLATED = ("unshare", "--net", "sh", "-c")
-
-
-def isolated(script: str) -> tuple[str, ...]:
-    """A command's beginning that runs it in a network of its own, after a script."""
-    needs("unshare")
-    needs("ip")
-    if subprocess.run([*ISOLATED, "ip link"], capture_output=True, check=False).returncode != 0:
-        cannot_run("networks of one's own cannot be made here")
-    return (*ISOLATED, f'{script}\nexec "$@"', "sh")
-
-
 def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, number: int) -> None:
     bag = tmp_path / "bag"
     options = ["--stop-time", "0.5", "-o", str(bag)]
@@ -268,17 +258,6 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
         "WARNING: there is no network interface: nobody can hear what is published"
     ]
     assert len(recorded(bag)["/joint_states"]) == 51
-
-
-# a network of two interfaces that are each other's cable
-CABLE = """
-ip link set lo up
-for which in all default; do echo 1 > /proc/sys/net/ipv6/conf/$which/disable_ipv6; done 2> /dev/null
-ip link add cable0 type veth peer name cable1
-ip address add 10.200.0.1/24 dev cable0
-ip link set cable0 up
-ip link set cable1 up
-"""
 
 
 def packets(process: subprocess.Popen[str]) -> int:
@@ -532,7 +511,9 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(
             shipped.replace('mass value="0.18', f'mass value="{mass}')
         )
     robots = ["a=one/arm.urdf", "b=other/arm.urdf"]
-    assert main(["publish", *robots, "--stop-time", "0.01"]) == 2
+    assert main(["publish", *robots, "--stop-time", "0.01"]) == 1
+    assert "'arm.fmu' is another FMU, and is not replaced" in capsys.readouterr().err
+    assert main(["publish", *robots, "--stop-time", "0.01", "--overwrite", "-o", "bag"]) == 2
     told = "the FMU of 'other/arm.urdf' would be 'arm.fmu' as the robot before it is"
     assert told in capsys.readouterr().err
 

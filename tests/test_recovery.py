@@ -340,7 +340,7 @@ def test_no_more_profiles_are_read_than_take_no_time(
         return []
 
     monkeypatch.setattr("twodof.bag.recovery.parse_qos", parse)
-    monkeypatch.setattr("twodof.bag.recovery.MAX_YAML", 2000)
+    monkeypatch.setattr("twodof.bag.recovery.MAX_PROFILES", 2000)
     assert set(twodof.recover(tmp_path / "bag").counts.values()) == {1}
     assert read == profiles[:3]
 

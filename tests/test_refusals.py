@@ -317,7 +317,6 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
         (["build", "--scalars"], "--scalars goes with --native --fmi 3"),
         (["build", "--orientation", "--control", "joint"], "--orientation goes with"),
         (["build", "a.urdf", "--urdf", "b"], "given twice"),
-        (["build", "--no-live-documentation"], "without --native"),
         (["build", "--mesh-dir", "."], "without a URDF"),
         (["build", "arm.urdf", "--mesh-dir", ".", "--no-meshes"],
          "--no-meshes does nothing beside --mesh-dir"),
@@ -417,22 +416,63 @@ def test_damaged_default_fmu_is_built_again(
     (folder / "TwoDof.fmu").write_bytes(damaged(fmu_path.read_bytes()))
     assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 0
     assert (folder / "TwoDof.fmu").read_bytes() == fmu_path.read_bytes()
-    assert capfd.readouterr().err == ""
+    said = "no FMU is named: this is TwoDof.fmu, the default planar arm\n"
+    assert capfd.readouterr().err == said
 
 
-def test_a_run_replaces_no_file_that_is_no_fmu(
-    folder: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(
+    folder: Path, native_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """By the name that it chooses itself; and tells where it was another FMU."""
+    """Also where there are others; what `run` could not do is not suggested."""
+    assert main(["build", "--control", "effort", "--no-meshes", "-o", "TwoDof.fmu"]) == 0
+    before = (folder / "TwoDof.fmu").read_bytes()
+    shutil.copy(native_path, folder / "other.fmu")
+    capfd.readouterr()
+    assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 2
+    said = capfd.readouterr().err
+    assert "type 'twodof run TwoDof.fmu' to use it" in said and "--overwrite" not in said
+    assert (folder / "TwoDof.fmu").read_bytes() == before and not (folder / "bag").exists()
+
+
+def test_a_run_replaces_no_file_that_is_not_its_own(
+    folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Neither notes nor an FMU of another state of the URDF, unless it is told to."""
     (folder / "robot.urdf").write_text(urdf())
     (folder / "robot.fmu").write_text("notes")
-    run = ["run", "robot.urdf", "--stop-time", "0.1", "-o", "bag", "--overwrite"]
-    assert main(run) == 1
+    run = ["run", "robot.urdf", "--stop-time", "0.1"]
+    assert main([*run, "-o", "bag"]) == 1
     assert "'robot.fmu' is no FMU, and is not replaced" in capfd.readouterr().err
     assert (folder / "robot.fmu").read_text() == "notes"
     (folder / "robot.fmu").unlink()
-    assert main([*run]) == main([*run]) == 0
-    assert "replaced" not in caplog.text
+    assert main([*run, "-o", "first"]) == main([*run, "-o", "second"]) == 0
+    before = (folder / "robot.fmu").read_bytes()
     (folder / "robot.urdf").write_text(urdf().replace('upper="1"', 'upper="2"'))
-    assert main([*run]) == 0
-    assert "'robot.fmu' was another FMU, and is replaced" in caplog.text
+    assert main([*run, "-o", "third"]) == 1
+    assert "'robot.fmu' is another FMU, and is not replaced" in capfd.readouterr().err
+    assert (folder / "robot.fmu").read_bytes() == before and not (folder / "third").exists()
+    assert main([*run, "-o", "third", "--overwrite"]) == 0
+    assert (folder / "robot.fmu").read_bytes() != before
+
+
+@pytest.mark.parametrize("verb", ["run", "page", "sweep --grid Kp=1:2:2"])
+def test_the_only_fmu_of_a_folder_is_asked_for_by_name(
+    verb: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Another robot's is neither run without its name nor replaced by the default arm's."""
+    folder = tmp_path
+    monkeypatch.chdir(folder)
+    (folder / "robot.urdf").write_text(urdf())
+    assert main(["build", "robot.urdf", "--control", "joint"]) == 0
+    before = (folder / "robot.fmu").read_bytes()
+    (folder / "TwoDof.fmu").write_bytes(before)
+    (folder / "robot.fmu").unlink()
+    capfd.readouterr()
+    assert main(verb.split()) == 2
+    name = verb.partition(" ")[0]
+    assert f"type 'twodof {name} TwoDof.fmu' to use it" in capfd.readouterr().err
+    assert [path.name for path in folder.glob("*.fmu")] == ["TwoDof.fmu"]
+    assert (folder / "TwoDof.fmu").read_bytes() == before

@@ -341,6 +341,17 @@ def test_friction_is_ignored_with_a_warning() -> None:
     assert "friction is not modelled and is ignored: joint 'elbow'" in loaded.warnings[0]
 
 
+@pytest.mark.parametrize("inside", ["", 'lower="0.5" upper="0.5"'])
+def test_a_joint_that_its_limits_freeze_is_warned_of(inside: str) -> None:
+    still = elbow(f'<limit {inside} effort="7" velocity="1"/>')
+    loaded = load_robot(arm(elbow=still), "tip", "xyz")
+    assert loaded.q_min[1] == loaded.q_max[1]
+    (warning,) = loaded.warnings
+    assert "limit are equal or missing, so that nothing moves joint 'elbow'" in warning
+    follower = elbow('<limit effort="7"/><mimic joint="shoulder"/>')
+    assert not load_robot(arm(elbow=follower), "tip", "xyz").warnings
+
+
 EXTRAS = {
     "transmission": '<transmission name="t"><joint name="elbow"><x/></joint></transmission>',
     "gazebo": '<gazebo><joint name="elbow" type="ball"/><link name="tip"/></gazebo>',

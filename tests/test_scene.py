@@ -505,8 +505,9 @@ def test_library_of_colours_is_not_read_with_a_mesh(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     content = f"mtllib {UP}{tmp_path}/pipe\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n"
     code = (
-        "import sys, numpy; from twodof.geometry.meshes import load_mesh;"
-        "print(load_mesh('a.obj', sys.argv[1].encode(), numpy.ones(3)).num_tris)"
+        "import sys; from twodof.geometry.meshes import Meshes\n"
+        "with Meshes({'a.obj': sys.argv[1].encode()}.get) as meshes:\n"
+        "    print(len(meshes.surfaces('a.obj', coloured=False)[0].triangles))"
     )
     command = [sys.executable, "-c", code, content]
     assert subprocess.check_output(command, text=True, timeout=60) == "1\n"

@@ -19,7 +19,7 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
-from harness import Driver, changed_plant, in_child_process
+from harness import Driver, changed_plant, in_child_process, unzipped
 from oracles import position, task_error
 
 from twodof import FmuOptions, build_fmu
@@ -385,7 +385,7 @@ def refuse_a_call(fmu):
 
 def discard_a_step_without_ending_the_run(fmu):
     try:
-        rows = fmpy.simulate_fmu(str(fmu), start_values={"Kp[1]": 1e308, "x_des[1]": 1e300})
+        rows = fmpy.simulate_fmu(unzipped(fmu), start_values={"Kp[1]": 1e308, "x_des[1]": 1e300})
     except FMICallException as error:
         return error.status == DISCARD, False
     return False, rows["time"].tolist() == [0.0, 0.0]
@@ -495,7 +495,7 @@ def test_a_linked_environment_is_found_without_any_variable(linked, tmp_path):
             (packages / entry.name).symlink_to(entry)
     host = subprocess.run(
         [sys.executable, "-S", "-c", HOST_WITHOUT_PINOCCHIO, fmu],
-        env={"PYTHONPATH": f"{packages}:{Path(__file__).parent}"},
+        env={"PYTHONPATH": f"{packages}:{Path(__file__).parent}", "TWODOF_TESTS": str(tmp_path)},
         capture_output=True,
         text=True,
     )

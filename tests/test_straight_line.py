@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections import Counter
 from typing import Any
 
 import numpy as np
 import pytest
+from recordings import chain_urdf
 
+from twodof.export.mechanism import mechanism_source
 from twodof.export.straight_line import Expression, c_function, operations, varied
+from twodof.plant.robot import load_robot
+from twodof.plant.variables import variable_table
 
 
 def test_what_constants_make_0_or_1_leaves_no_operation():
@@ -38,3 +44,19 @@ def test_text_computes_the_expression_and_how_it_varies():
             exec(line, scope)
         assert scope["z"] == pytest.approx(f(*arguments), rel=1e-14)
         assert np.imag(scope["z"]) == pytest.approx(np.imag(f(*arguments)), rel=1e-12)
+
+
+def test_calls_of_the_generator_grow_with_the_joints_alone():
+    def calls(joints: int) -> int:
+        robot = load_robot(chain_urdf("zy" * (joints // 2)), "tip", "xyz")
+        table = variable_table(robot, {"q_start": (0.0,) * joints, "x_des": (0.0,) * 3})
+        counted = Counter[str]()
+        before = sys.getprofile()
+        sys.setprofile(lambda frame, event, argument: counted.update((event,)))
+        try:
+            mechanism_source(robot, table)
+        finally:
+            sys.setprofile(before)
+        return counted["call"]
+
+    assert calls(64) < 2**1.25 * calls(32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from collections import Counter
@@ -238,7 +239,9 @@ def test_a_missing_extra_is_named(
     )  # fmt: skip
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert package in line and f"install the extra '{extra}'" in line
+    assert package in line and f"install the extra '{extra}': {sys.executable} -m pip" in line
+    assert line.endswith(f"[{extra}]'")  # of the folder that it comes from, not of an index
+    assert Path(shlex.split(line)[-1].removesuffix(f"[{extra}]"), "pyproject.toml").is_file()
     assert list(tmp_path.iterdir()) == []
 
 

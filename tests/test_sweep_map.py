@@ -18,7 +18,6 @@ from twodof import sweep
 from twodof.cli.main import main
 from twodof.plots.figure import drawn, save
 from twodof.plots.sweeps import drawing
-from twodof.sweeps.metrics import METRICS
 from twodof.sweeps.results import read_sweep
 
 
@@ -61,15 +60,17 @@ def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_pho
                 assert shown.evaluate("document.documentElement.scrollWidth") == 390
     assert ground == "rgb(20, 20, 20)"
     light, dark = (np.asarray(Image.open(io.BytesIO(picture))) for picture in seen)
-    np.testing.assert_array_equal(light[2:-2, 2:-2], dark[2:-2, 2:-2])  # the edge is mixed
+    inner = (slice(2, -2), slice(2, -2))  # without the edge, which is mixed with the ground
+    apart = np.abs(light[inner].astype(int) - dark[inner])
+    assert apart.max() <= 1  # the browser inverts twice, and rounds where a pixel mixes two cells
+    assert np.count_nonzero(apart) < 1e-4 * apart.size
 
 
 def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Path) -> None:
     table = table_of(grid_sweep)
     found = panels(grid_sweep)
-    assert list(found) == [
-        f"{metric} over Kp and Kd" for metric in METRICS if metric != "time_at_limits"
-    ]
+    told = ("settling_time", "overshoot", "final_error", "rms_error", "peak_effort")
+    assert list(found) == [f"{metric} over Kp and Kd" for metric in (*told, "peak_velocity")]
     for label, axes in found.items():
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, s⁻²", "Kd, s⁻¹")
         metric = label.split()[0]
@@ -80,10 +81,18 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Pat
         assert np.asarray(cells).T.ravel() == pytest.approx(
             table[metric].to_numpy(), nan_ok=True, abs=0
         )
-        (best,) = np.asarray(axes.collections[-1].get_offsets())
-        least = table[metric].min()
-        chosen = table[(table["Kp"] == best[0]) & (table["Kd"] == best[1])]
-        assert chosen[metric].item() == least
+        (below,) = (text.get_text() for text in axes.texts)
+        ascending = np.sort(table[metric].dropna())
+        if ascending[1] - ascending[0] > 1e-12:
+            (best,) = np.asarray(axes.collections[-1].get_offsets())
+            chosen = table[(table["Kp"] == best[0]) & (table["Kd"] == best[1])]
+            assert chosen[metric].item() == ascending[0]
+            assert below == f"★ {ascending[0]:.3g} at Kp {best[0]:g}, Kd {best[1]:g}"
+        else:  # rounding ranks nothing
+            assert metric in ("overshoot", "final_error")
+            equal = np.count_nonzero(ascending - ascending[0] < 1e-12)
+            assert below == f"least in {equal} runs: 0"
+            assert not any(c.get_zorder() == 3 for c in axes.collections)
         edges = np.asarray(mesh.get_coordinates())
         x, y = edges[0, :, 0], edges[:, 0, 1]
         assert (x[:-1] + x[1:]) / 2 == pytest.approx(np.linspace(10, 200, 20))

@@ -19,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import asked, changed_step, children_of, lives, needs, wait_until
+from harness import asked, changed_step, children_of, lives, wait_until
 from tables import BEGUN, COMMAND, same, table_of
+from tools import needs
 
 import twodof
 from twodof import TwoDofError, sweep
@@ -44,12 +45,21 @@ def doors(process: int) -> list[str]:
     return found
 
 
-def test_nobody_else_can_talk_to_workers(native_path: Path) -> None:
+@pytest.fixture
+def started() -> Callable[[], list[int]]:
+    """Return the living processes that the test has started; other tests may have left some."""
+    others = children_of(os.getpid())
+    return lambda: [child for child in children_of(os.getpid()) if child not in others]
+
+
+def test_nobody_else_can_talk_to_workers(
+    native_path: Path, started: Callable[[], list[int]]
+) -> None:
     """No socket has a port or a name, no other user can write where they read; one thread each."""
     before, seen = doors(os.getpid()), {}
 
     def look(done: int, runs: int) -> None:
-        for worker in children_of(os.getpid()):
+        for worker in started():
             assert (doors(worker), doors(os.getpid())) == ([], before)
             status = Path(f"/proc/{worker}/status").read_text()
             threads = int(re.findall(r"Threads:\s+(\d+)", status)[0])
@@ -117,13 +127,18 @@ def test_workers_run_the_package_that_the_program_runs(native_path: Path, tmp_pa
     ],
 )
 def test_workers_that_cannot_start_tell_why(
-    text: str, said: str, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    text: str,
+    said: str,
+    native_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    started: Callable[[], list[int]],
 ) -> None:
     (tmp_path / "numpy.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(TwoDofError, match=said):
         sweep(native_path, grid={"Kp": [1.0, 2.0, 3.0]}, output=tmp_path / "s", workers=3)
-    assert not (tmp_path / "s").exists() and children_of(os.getpid()) == []
+    assert not (tmp_path / "s").exists() and started() == []
 
 
 def test_an_fmu_that_workers_cannot_load_is_named(native_path: Path, tmp_path: Path) -> None:
@@ -138,7 +153,7 @@ def test_an_fmu_that_workers_cannot_load_is_named(native_path: Path, tmp_path: P
 
 @pytest.mark.long
 def test_workers_that_are_killed_cost_no_run(
-    native_path: Path, length: Callable[[int, int], int]
+    native_path: Path, length: Callable[[int, int], int], started: Callable[[], list[int]]
 ) -> None:
     runs, pause, part = length(2000, 100), length(5, 0), length(1, 30)
     most = length(1000, MOST_DEATHS - 1)
@@ -150,7 +165,7 @@ def test_workers_that_are_killed_cost_no_run(
     def kill(done: int, runs: int) -> None:
         """Each so many seconds, and runs that are done; no run so often that it is given up."""
         now = time.monotonic()
-        workers = children_of(os.getpid())
+        workers = started()
         due = now >= killed[-1][0] + pause and done >= killed[-1][1] + part
         if workers and due and len(killed) <= most:
             os.kill(rng.choice(workers), signal.SIGKILL)
@@ -213,13 +228,16 @@ def test_workers_end_with_the_sweep_whatever_they_are_at(fmu_path: Path, tmp_pat
 
 
 def test_a_sweep_can_be_stopped_while_its_workers_start(
-    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    native_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    started: Callable[[], list[int]],
 ) -> None:
     (tmp_path / "numpy.py").write_text("import time; time.sleep(1e6)")
     monkeypatch.syspath_prepend(tmp_path)
     table = sweep(native_path, grid={"Kp": [1.0, 2.0]}, output=tmp_path / "s", stop=asked(5))
     assert len(table) == len(table_of(tmp_path / "s")) == 0
-    assert children_of(os.getpid()) == []
+    assert started() == []
 
 
 def test_a_sweep_can_be_stopped_while_a_scheduler_does_not_answer(native_path: Path) -> None:
@@ -246,7 +264,7 @@ def cluster(
             subprocess.Popen(
                 [sys.executable, "-m", "dask", *program, "--scheduler-file", str(file), *options],
                 stdout=told, stderr=told, start_new_session=True,
-                env={**os.environ, **environment},
+                env={**os.environ, "TMPDIR": str(folder), **environment},
             )
             for program in programs
         ]  # fmt: skip

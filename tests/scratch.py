@@ -1,0 +1,59 @@
+"""A temporary folder for each run of the tests: whatever a test leaves in it fails the run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from multiprocessing.util import Finalize, get_temp_dir
+from pathlib import Path
+
+import pytest
+
+
+def run_folder() -> Path:
+    """The folder of this run, which the last hook below removes."""
+    return Path(os.environ.get("TWODOF_TESTS", tempfile.gettempdir()))
+
+
+class Scratch:
+    """Hooks of the process that the user starts; workers inherit its environment."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="twodof-"))
+        self.left: list[str] = []
+        self.failed = False
+        os.environ["TWODOF_TESTS"] = str(self.folder)
+        os.environ["TMPDIR"] = str(self.folder / "tmp")
+        (self.folder / "tmp").mkdir()
+        tempfile.tempdir = None  # read TMPDIR again
+        if config.option.basetemp is None:
+            config.option.basetemp = str(self.folder / "pytest")
+
+    @pytest.hookimpl(wrapper=True, trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> Iterator[None]:
+        """Look once all workers have ended, and before the summary."""
+        yield
+        own = Path(get_temp_dir()).name  # multiprocessing removes it when this process ends
+        self.left = sorted({path.name for path in (self.folder / "tmp").iterdir()} - {own})
+        if self.left and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+        self.failed = session.exitstatus == pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        if self.left:
+            terminalreporter.section("left in the temporary folder", red=True)
+            terminalreporter.write_line("\n".join(self.left))
+
+        if self.failed:
+            terminalreporter.write_line(f"Temporary files of this run: {self.folder}")
+
+    def pytest_unconfigure(self) -> None:
+        """Keep the folder only where somebody wants to look into it.
+
+        multiprocessing looks for its own folder in it at exit, by a finaliser of priority -100.
+        """
+        if not self.failed:
+            remove = shutil.rmtree
+            Finalize(None, remove, (self.folder,), {"ignore_errors": True}, exitpriority=-200)

@@ -1,0 +1,97 @@
+"""Links in a bag from elsewhere, which would show or copy any file of this machine."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import twodof
+from twodof.cli.main import main
+from twodof.errors import BagError
+
+SECRET = "a word that must not get out"
+
+
+@pytest.fixture(scope="module", params=["mcap", "sqlite3"])
+def bag(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, native_path: Path
+) -> Path:
+    folder = tmp_path_factory.mktemp("links")
+    sink = twodof.Bag(folder / "bag", storage=request.param)
+    twodof.simulate(native_path, sink, stop_time=0.1)
+    return folder / "bag"
+
+
+@pytest.fixture
+def linked(bag: Path, tmp_path: Path) -> Path:
+    """A copy whose writer died, beside a folder of private files."""
+    copy = tmp_path / "bag"
+    shutil.copytree(bag, copy)
+    (copy / "metadata.yaml").unlink()
+    (tmp_path / "private").mkdir()
+    return copy
+
+
+def move_out(file: Path) -> Path:
+    """Put a link in the place of a bag's file, which is then a private one."""
+    target = file.parent.parent / "private" / file.name
+    file.rename(target)
+    file.symlink_to(target)
+    return target
+
+
+@pytest.mark.parametrize("kind", ["link", "chain", "name"])
+def test_a_linked_provenance_is_not_copied(kind: str, linked: Path) -> None:
+    """Its messages are saved without it."""
+    target = move_out(linked / "run.json")
+    content = json.loads(target.read_text())
+    target.write_text(json.dumps({**content, "command_line": SECRET}))
+    if kind == "chain":
+        (linked / "run.json").rename(linked / "other")
+        (linked / "run.json").symlink_to("other")
+    if kind == "name":
+        (linked / "run.json").rename(linked / "run.left.json")
+    assert main(["info", str(linked)]) == 1
+    recovered = twodof.recover(linked)
+    assert recovered.counts == {"/joint_states": 11}
+    files = [path for path in linked.iterdir() if not path.is_symlink()]
+    assert len(files) == 2 and len([*linked.iterdir()]) == 2
+    assert not any(SECRET.encode() in path.read_bytes() for path in files)
+    assert twodof.read_bag(linked).q.shape == (11, 2)
+
+
+def test_linked_messages_are_refused(linked: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = (path for path in linked.iterdir() if path.suffix in (".mcap", ".db3"))
+    target = move_out(file)
+    before = target.read_bytes()
+    for command in ("info", "plot", "view", "recover"):
+        more = ["--export", "x.html"] if command == "view" else []
+        assert main([command, str(linked), *more]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"'{file}' is a link, and links in a bag are not followed" in line
+    with pytest.raises(BagError, match="not followed"):
+        twodof.read_bag(linked)
+    assert target.read_bytes() == before
+    assert sorted(path.name for path in linked.parent.iterdir()) == ["bag", "private"]
+
+
+def test_a_bag_that_the_user_names_by_a_link_is_read(linked: Path) -> None:
+    twodof.recover(linked)
+    (linked.parent / "name").symlink_to(linked)
+    assert twodof.read_bag(linked.parent / "name").q.shape == (11, 2)
+    for file in linked.glob("*.mcap"):
+        (linked.parent / "single.mcap").symlink_to(file)
+        assert twodof.read_bag(linked.parent / "single.mcap").q.shape == (11, 2)
+
+
+def test_linked_metadata_is_not_read(linked: Path) -> None:
+    """It says how many messages there are, by which a whole bag is known."""
+    text = "rosbag2_bagfile_information:\n  message_count: 11\n"
+    (linked.parent / "private/x").write_text(text)
+    (linked / "metadata.yaml").symlink_to(linked.parent / "private/x")
+    recovered = twodof.recover(linked)
+    assert recovered.original is not None
+    assert not (linked / "metadata.yaml").is_symlink()

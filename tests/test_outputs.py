@@ -1,0 +1,172 @@
+"""Files that are written: whole or not at all, where a link leads, with the umask's mode."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+import twodof
+from twodof.cli.main import main
+from twodof.files import write_file
+
+OLD, NEW = b"old", b"new" * 100_000
+
+
+@pytest.fixture
+def umask() -> Iterator[Callable[[int], int]]:
+    """Sets the umask for a test."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_a_link_stays_and_its_target_is_replaced(tmp_path: Path) -> None:
+    folder, other = tmp_path / "a", tmp_path / "b"
+    folder.mkdir()
+    other.mkdir()
+    target, near, far = other / "file", folder / "near", folder / "far"
+    target.write_bytes(OLD)
+    near.symlink_to("../b/file")
+    far.symlink_to("near")
+    held = target.open("rb")
+    write_file(far, NEW)
+    assert far.is_symlink() and near.is_symlink() and not target.is_symlink()
+    assert target.read_bytes() == NEW
+    assert held.read() == OLD  # replaced, and not written over, which a reader would see half
+    target.unlink()
+    write_file(near, OLD)
+    assert target.read_bytes() == OLD and near.is_symlink()
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["a", "b", "far", "file", "near"]
+
+
+def test_a_link_to_itself_is_no_file(tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to("link")
+    with pytest.raises(OSError, match="symbolic links"):
+        write_file(link, NEW)
+    assert link.is_symlink()
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002, 0o027])
+def test_modes_are_those_of_the_umask(
+    mask: int, umask: Callable[[int], int], tmp_path: Path, native_path: Path
+) -> None:
+    """All files that verbs write have the mode of a shell's redirection."""
+    umask(mask)
+    shutil.copyfile(native_path, tmp_path / "a.fmu")
+    twodof.simulate(tmp_path / "a.fmu", twodof.Bag(tmp_path / "bag"), stop_time=0.05)
+    for command in (
+        ["build", "-o", "b.fmu"], ["page", "a.fmu", "-o", "c.html"], ["plot", "bag", "-o", "d.png"],
+        ["plot", "bag", "-o", "e.html"], ["view", "bag", "--export", "f.html"],
+        ["layouts", "a.fmu", "-o", "g"],
+    ):  # fmt: skip
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(tmp_path)
+            assert main(command) == 0
+    modes = {path: mode(path) for path in tmp_path.rglob("*")}
+    assert len(modes) > 12
+    assert modes.pop(tmp_path / "bag") == 0o755 & ~mask  # made by rosbags
+    assert modes == {p: (0o777 if p.is_dir() else 0o666) & ~mask for p in modes}
+
+
+def test_a_file_that_is_replaced_keeps_its_mode(
+    umask: Callable[[int], int], tmp_path: Path
+) -> None:
+    """A private file must not become one that all may read."""
+    umask(0o022)
+    path = tmp_path / "file"
+    for kept in (0o600, 0o664, 0o444):
+        path.write_bytes(OLD)
+        path.chmod(kept)
+        write_file(path, NEW)
+        assert (mode(path), path.read_bytes()) == (kept, NEW)
+        path.chmod(0o600)
+
+
+def test_pipes_and_devices_are_written_to(tmp_path: Path) -> None:
+    pipe, link, null = tmp_path / "pipe", tmp_path / "link", tmp_path / "null"
+    os.mkfifo(pipe)
+    link.symlink_to("pipe")
+    null.symlink_to(os.devnull)
+    before = os.stat(os.devnull)
+    for path in (pipe, link):
+        writer = Thread(target=write_file, args=(path, NEW))
+        writer.start()
+        with pipe.open("rb") as reader:
+            assert reader.read() == NEW
+        writer.join()
+    write_file(null, NEW)
+    assert pipe.is_fifo() and link.is_symlink() and os.path.samestat(before, os.stat(os.devnull))
+    with pytest.raises(OSError, match="No space"):
+        write_file(Path("/dev/full"), NEW)
+    with pytest.raises(IsADirectoryError):
+        write_file(tmp_path, NEW)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "null", "pipe"]
+
+
+def test_a_disk_that_is_full_leaves_the_old_file(disk: Callable[..., Path]) -> None:
+    path = disk(128) / "file"
+    path.write_bytes(OLD)
+    with pytest.raises(OSError, match="No space"):
+        write_file(path, NEW)
+    assert path.read_bytes() == OLD and [*path.parent.iterdir()] == [path]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> Path:
+    folder = tmp_path_factory.mktemp("outputs")
+    twodof.simulate(native_path, twodof.Bag(folder / "bag"), stop_time=0.05)
+    return folder / "bag"
+
+
+def twodof_to(output: int | io.BufferedRandom, *arguments: object) -> bytes:
+    """Return the standard output of a command, which prints its words on standard error."""
+    command = [sys.executable, "-m", "twodof", *map(str, arguments)]
+    done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, check=True)
+    assert done.stderr.splitlines()
+    return done.stdout or b""
+
+
+@pytest.mark.parametrize("name", ["-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
+def test_a_page_goes_to_the_standard_output(name: str, bag: Path, tmp_path: Path) -> None:
+    """A command as root once replaced /dev/stdout. Facts go to stderr, and not into the page."""
+    before = os.readlink("/dev/stdout")
+    if name == "link":
+        (tmp_path / "link").symlink_to("/dev/stdout")
+        name = str(tmp_path / "link")
+    page = twodof_to(subprocess.PIPE, "view", bag, "--export", name)
+    assert page.startswith(b"<!DOCTYPE html>") and page.endswith(b"</html>\n")
+    with (tmp_path / "file").open("w+b") as file:
+        file.write(b"before")
+        file.flush()
+        twodof_to(file, "view", bag, "--export", name)
+        file.seek(0)
+        assert file.read() == b"before" + page
+    assert os.readlink("/dev/stdout") == before
+
+
+def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(
+    bag: Path, native_path: Path, tmp_path: Path
+) -> None:
+    assert twodof_to(subprocess.PIPE, "plot", bag, "-o", "-").startswith(b"\x89PNG")
+    page = twodof_to(subprocess.PIPE, "page", native_path, "-o", "-")
+    assert page.startswith(b"<!DOCTYPE html>") and page.endswith(b"</html>\n")
+    fmu = tmp_path / "x.fmu"
+    with fmu.open("w+b") as file:
+        twodof_to(file, "build", "-o", "/dev/stdout")
+    assert zipfile.ZipFile(fmu).testzip() is None
+    assert twodof.load_fmu(fmu).joints == ("joint1", "joint2")

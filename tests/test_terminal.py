@@ -1,0 +1,83 @@
+"""The terminal: one line each for odd command lines and streams, and no commands in names."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import twodof
+
+TWODOF = [sys.executable, "-m", "twodof"]
+ESCAPES = "\x1b[31mred\x1b[0m‮reversed⁦"
+
+
+def run(
+    *arguments: str | bytes, cwd: Path, shell: str = '"$@"', **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """A command behind a shell, which may close its streams."""
+    return subprocess.run(
+        ["sh", "-c", shell, "sh", *TWODOF, *arguments], cwd=cwd, capture_output=True, text=True,
+        errors="surrogateescape", env={**os.environ, **variables}, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "arguments", [["build", "-o--"], ["plot", "bag", "-o--"], ["run", "--set=--"]]
+)
+def test_a_value_that_argparse_loses_is_refused(arguments: list[str], tmp_path: Path) -> None:
+    done = run(*arguments, cwd=tmp_path)
+    usage, line = done.stderr.splitlines()
+    option = arguments[-1][:-2].rstrip("=")
+    assert (done.returncode, usage[:6]) == (2, "usage:")
+    assert line == f"twodof: error: argument {option}: '--' is no value"
+
+
+@pytest.mark.parametrize("verb", ["sweep", "info", "plot"])
+def test_a_sweep_whose_name_is_no_text_is_refused(
+    verb: str, native_path: Path, tmp_path: Path
+) -> None:
+    name = b"\xff\xfe"
+    if verb == "sweep":
+        arguments: list[str | bytes] = [verb, str(native_path), "--grid", "Kp=10:20:2", "-o", name]
+    else:
+        twodof.sweep(native_path, grid={"Kp": [50.0]}, stop_time=0.1, output=tmp_path / "sweep")
+        os.rename(tmp_path / "sweep", os.fsencode(tmp_path) + b"/" + name)
+        arguments = [verb, name]
+    done = run(*arguments, cwd=tmp_path)
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1 and "is no name in UTF-8" in line
+    assert "Traceback" not in done.stdout
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_streams_that_are_closed_end_no_run(closed: str, native_path: Path, tmp_path: Path) -> None:
+    """Nor is a file of the run taken for one of them."""
+    command = ["run", str(native_path), "--stop-time", "0.1", "-o", "bag"]
+    assert run(*command, cwd=tmp_path, shell=f'"$@" {closed}').returncode == 0
+    assert len(twodof.read_bag(tmp_path / "bag").t) == 11
+
+
+def test_a_notebooks_backend_of_matplotlib_ends_no_plot(native_path: Path, tmp_path: Path) -> None:
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
+    backend = "module://a_package.that_is_not_here"
+    done = run("plot", "bag", "-o", "plot.png", cwd=tmp_path, MPLBACKEND=backend)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_names_are_no_commands_to_the_terminal(native_path: Path, tmp_path: Path) -> None:
+    """In what to type next, in warnings of matplotlib, and in errors of the command line."""
+    name = f"bag {ESCAPES}"
+    command = ["run", str(native_path), "--stop-time", "0.1", "-o", name]
+    ran = run(*command, cwd=tmp_path)
+    drawn = run("plot", name, "-o", f"{ESCAPES}.png", cwd=tmp_path)
+    wrong = run("run", f"--{ESCAPES}", cwd=tmp_path)
+    assert (ran.returncode, drawn.returncode, wrong.returncode) == (0, 0, 2)
+    assert "Glyph" in drawn.stderr and "next" in ran.stdout
+    for done in (ran, drawn, wrong):
+        text = done.stdout + done.stderr
+        assert "\\x1b[31mred" in text and "\\u202e" in text
+        assert all(c.isprintable() or c == "\n" for c in text)

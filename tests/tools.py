@@ -1,0 +1,133 @@
+"""Programs that some tests need and that pip does not install: one table.
+
+``python3 tests/tools.py`` prints the Debian packages of those that are missing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+if TYPE_CHECKING:
+    import pytest
+
+PACKAGES = Path(__file__).with_name("node_modules") / "@foxglove"
+
+
+class Tool(NamedTuple):
+    """A tool: the subject of its tests, its Debian package or another remedy, its names."""
+
+    subject: str
+    package: str = ""
+    names: tuple[str, ...] = ()
+    """Commands or paths, the first that exists; the table's own name if empty."""
+    remedy: str = ""
+    module: str = ""
+
+
+TOOLS = {
+    "binutils": Tool("the symbols of libraries", "binutils", ("readelf",)),
+    "chromium": Tool(
+        "pages in a browser", "chromium", ("chromium", "chromium-browser", "google-chrome")
+    ),
+    "clang": Tool("warnings of another compiler", "clang"),
+    "cmake": Tool("libraries that FMPy rebuilds from the sources", "cmake"),
+    "cyclonedds": Tool(
+        "ROS 2 networks", remedy="use Python 3.13 or older, or build Cyclone DDS",
+        module="cyclonedds",
+    ),
+    "disks": Tool("full disks", names=("mount",), remedy="run as root, where tmpfs can be mounted"),
+    "fastdds": Tool(
+        "ROS 2 networks with Fast DDS", "libfastrtps-dev", ("/usr/include/fastdds/dds",)
+    ),
+    "fastddsgen": Tool("ROS 2 networks with Fast DDS", "fastddsgen"),
+    "foxglove": Tool(
+        "Foxglove's own client", names=(str(PACKAGES),),
+        remedy="npm install --no-package-lock --prefix tests",
+    ),
+    "g++": Tool("ROS 2 networks with Fast DDS", "g++", ("g++", "c++")),
+    "gcc": Tool("the engine's inner functions in C", "gcc", ("gcc", "cc", "clang")),
+    "ip": Tool("separate networks", "iproute2"),
+    "libc-arm64": Tool(
+        "libraries for ARM", "libc6-arm64-cross",
+        ("/usr/aarch64-linux-gnu/lib/ld-linux-aarch64.so.1",),
+    ),
+    "libcosimpy": Tool(
+        "FMUs in libcosim", remedy="use Python 3.11 or newer", module="libcosimpy"
+    ),
+    "libpython": Tool(
+        "C programs that embed Python", remedy="use a Python built with --enable-shared"
+    ),
+    "make": Tool("libraries that FMPy rebuilds from the sources", "make"),
+    "mingw": Tool(
+        "libraries for Windows", "gcc-mingw-w64-x86-64-win32", ("x86_64-w64-mingw32-gcc",)
+    ),
+    "networks": Tool(
+        "separate networks", names=("unshare",), remedy="run as root, where namespaces are allowed"
+    ),
+    "node": Tool("Foxglove's own client", "nodejs"),
+    "nm": Tool("the symbols of libraries", "binutils"),
+    "npm": Tool("Foxglove's own client", "npm"),
+    "openssl": Tool("clusters with keys", "openssl"),
+    "qemu": Tool("libraries for ARM", "qemu-user", ("qemu-aarch64", "qemu-aarch64-static")),
+    "root": Tool("files of another user", names=(), remedy="run as root"),
+    "strace": Tool("the order of writes to a disk", "strace"),
+    "tsc": Tool("types in the pages' scripts", "node-typescript"),
+    "valgrind": Tool("memory errors", "valgrind"),
+    "wine": Tool("libraries for Windows", "wine64", ("wine64", "wine", "/usr/lib/wine/wine64")),
+    "wineserver": Tool("libraries for Windows", "wine64"),
+    "ziglang": Tool(
+        "libraries for other platforms", remedy="pip install '.[native]'", module="ziglang"
+    ),
+}  # fmt: skip
+
+
+def found(name: str) -> str | None:
+    """Return where a tool is, or None."""
+    tool = TOOLS[name]
+    if tool.module:
+        return tool.module if importlib.util.find_spec(tool.module) else None
+    for known in tool.names or (name,):
+        if program := shutil.which(known):
+            return program
+        if Path(known).is_absolute() and Path(known).exists():
+            return known
+    return None
+
+
+def needs(name: str) -> str:
+    """Return where a tool is; without it the test is not run, or fails in CI."""
+    return found(name) or missing(name)
+
+
+def missing(name: str) -> NoReturn:
+    """End a test that this machine cannot run; CI can run all of them."""
+    import pytest
+
+    tool = TOOLS[name]
+    remedy = tool.remedy or f"apt install {tool.package}"
+    reason = f"of {tool.subject} were not run: {remedy}"
+    if os.environ.get("CI"):
+        pytest.fail(f"tests {reason}")
+    pytest.skip(reason)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print one line for each reason for which tests were not run."""
+    reports = terminalreporter.getreports("skipped")
+    reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in reports)
+    for reason, count in sorted(reasons.items()):
+        known = reason.startswith("of ")
+        terminalreporter.write_line(
+            f"{count} tests {reason}" if known else f"{count} tests were not run: {reason}"
+        )
+
+
+if __name__ == "__main__":
+    print(
+        *sorted({tool.package for name, tool in TOOLS.items() if tool.package and not found(name)})
+    )
