@@ -13,10 +13,10 @@ from .fmu import load_fmu as load_fmu
 from .linear import LinearModel as LinearModel
 from .linear import linearise as linearise
 from .pages.arm import page as page
+from .pages.foxglove import Foxglove as Foxglove
 from .pages.live import live as live
 from .pages.replay import view as view
 from .plots.runs import plot as plot
-from .ros.foxglove import Foxglove as Foxglove
 from .ros.layouts import layouts as layouts
 from .ros.publisher import Publisher as Publisher
 from .ros.publisher import publish as publish

@@ -18,6 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or to be ignored
     if heard:
         signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
+    _open_streams()
     from .cli.main import main as command
     from .cli.signals import INTERRUPTED, interrupt
 
@@ -29,6 +30,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _open_streams() -> None:
+    """Open the standard streams that are closed: a file of ours would take their number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            stream = open(number, "w" if number else "r", closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
 
 
 if __name__ == "__main__":
