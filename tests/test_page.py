@@ -181,19 +181,20 @@ def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
     path = twodof.page(panda, tmp_path / "panda.html")
     assert path.stat().st_size < 6e6
     expected = stepped(panda, {}, script, 400)
+    changes = [(0.01 * k, values) for k, values in script.items()]
+    *_, last = twodof.samples(panda, stop_time=4.0, changes=changes)
     with shown(browser, path) as page:
         actual = played(page, {}, script, 400)
         joints, cut = page.evaluate(READOUT)
         error = page.locator("[data-value=error]")
-        until(page, lambda found: found[0].isdigit(), lambda page: str(error.text_content()))
+        shown_error = f"{last.error:.3g}"[:4]  # the readout follows the last step by some frames
+        until(page, lambda found: found.startswith(shown_error), lambda page: str(error.text_content()))
         curves = page.locator("#arm-curves canvas").evaluate_all("all => all.map(c => c.ariaLabel)")
         said = str(error.text_content())
         before = page.evaluate("arm.held('quat_des')")
         assert refused(page, "arm.set('quat_des', 0)") == NO_ORIENTATION
         assert page.evaluate("arm.held('quat_des')") == before
     np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-12)
-    changes = [(0.01 * k, values) for k, values in script.items()]
-    *_, last = twodof.samples(panda, stop_time=4.0, changes=changes)
     distance, angle = (float(part.split()[0]) for part in said.split(", "))
     assert distance == pytest.approx(last.error, rel=1e-3)
     assert angle == pytest.approx(last.turn_error, rel=1e-3)
