@@ -242,8 +242,8 @@ def test_reader_that_leaves_early_gets_no_traceback(line: str, folder: Path) -> 
     reading, writing = os.pipe()
     os.close(reading)
     process = subprocess.Popen(
-        [*COMMAND, *line.split()], cwd=folder, env=ENVIRONMENT, stdout=writing,
-        stderr=subprocess.PIPE, text=True,
+        [*COMMAND, *line.split()], cwd=folder, env=ENVIRONMENT | {"PYTHONUNBUFFERED": ""},
+        stdout=writing, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     os.close(writing)
     _, err = process.communicate(timeout=120)

@@ -52,6 +52,12 @@ class _Parser(argparse.ArgumentParser):
         """End with a wrong command line."""
         super().error(plain(message))
 
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """Write out the help before the process ends, where a closed pipe can still be caught."""
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        super().exit(status, message)
+
 
 def parser() -> argparse.ArgumentParser:
     """The parser; what it gives has the verb's name as ``verb``, and what it does as ``call``."""
