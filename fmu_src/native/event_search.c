@@ -287,8 +287,7 @@ static double sweep(const Step *step, int near[N_JOINTS])
 }
 
 /* What the event at a time within the step is, where the state is y. */
-static void name_event(Step *step, double passed, const double y[N_STATES], int rank_held,
-                       Event *event)
+static void name_event(Step *step, double passed, const double y[N_STATES], Event *event)
 {
     double a[N_JOINTS], pressed[N_JOINTS] = {0};
     if (step->stops.any_watched)
@@ -297,7 +296,6 @@ static void name_event(Step *step, double passed, const double y[N_STATES], int 
         event->stopped[i] = !step->stops.held[i] && limit_margin(step, passed, i) < 0.0;
         event->released[i] = step->stops.watched[i] && pressed[i] < 0.0;
     }
-    event->rank_changed = singular_margin(step, passed, rank_held) < 0.0;
 }
 
 double first_event(Step *step, int rank_held, Event *event)
@@ -326,7 +324,7 @@ double first_event(Step *step, int rank_held, Event *event)
         return 0.0;
     double reached[N_STATES];
     interpolated(step, first, reached);
-    name_event(step, first, reached, rank_held, event);
+    name_event(step, first, reached, event);
     memcpy(step->y_new, reached, sizeof reached);
     for (int i = 0; i < N_JOINTS; i++)
         if (event->stopped[i])

@@ -5,10 +5,10 @@
 #include "dormand_prince.h"
 #include "internal.h"
 
-/* The event at the end of a step: joints that reached a limit, joints that are no longer pressed into
-   theirs, and whether the singular values give J⁺ another rank. */
+/* The event at the end of a step: joints that reached a limit, and joints that are no longer pressed into
+   theirs. */
 typedef struct {
-    int stopped[N_JOINTS], released[N_JOINTS], rank_changed;
+    int stopped[N_JOINTS], released[N_JOINTS];
 } Event;
 
 /* First time in (0, size] at which the regime of the step ends, y_new becoming the state there; 0 where

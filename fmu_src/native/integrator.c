@@ -152,7 +152,7 @@ int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle 
     double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
     Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0};
     int kept[N_JOINTS] = {0}, chattering[N_JOINTS] = {0};
-    Event event = {{0}, {0}, 0};
+    Event event = {{0}, {0}};
     Step step;
     double t = 0.0;
     if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
