@@ -63,6 +63,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
 @pytest.mark.parametrize("control", COMMANDS)
 def test_libcosim(control: str, built: Build) -> None:
     needs("libcosimpy")
+    needs("libatomic")
     in_libcosim(control, *built(control, 2))
 
 
@@ -128,13 +129,13 @@ def test_a_tolerance_of_0_is_refused_where_the_smallest_numbers_are_0(
     flavour: str, native_path: Path, fmu_path: Path, tmp_path: Path
 ) -> None:
     fmu = native_path if flavour == "native" else fmu_path
-    where_the_smallest_are_0(str(fmu), tmp_path)
+    where_the_smallest_are_0(str(fmu), tmp_path, needs("gcc"))
 
 
 @in_child_process
-def where_the_smallest_are_0(fmu: str, folder: Path) -> None:
+def where_the_smallest_are_0(fmu: str, folder: Path, gcc: str) -> None:
     (folder / "csr.c").write_text(SMALLEST_ARE_0)
-    command = [needs("gcc"), "-shared", "-fPIC", "csr.c", "-o", "csr.so"]
+    command = [gcc, "-shared", "-fPIC", "csr.c", "-o", "csr.so"]
     subprocess.run(command, check=True, cwd=folder)
     ctypes.CDLL(str(folder / "csr.so"))
     assert np.float64(5e-324) * np.float64(1.0) == 0.0
@@ -185,6 +186,7 @@ class Controller(Fmi2Slave):
 def test_a_second_fmu_holds_the_arm_in_libcosim(built: Build, tmp_path: Path) -> None:
     """It comes as near the target as the loop inside, by a way that a step of 1 ms leaves near."""
     needs("libcosimpy")
+    needs("libatomic")
     plant, _ = built("effort", 2)
     options = FmuOptions(control="joint", native=True)
     inside = twodof.build_fmu(tmp_path / "in.fmu", options)

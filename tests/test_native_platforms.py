@@ -287,6 +287,7 @@ def test_fmpy_rebuilds_the_library_from_the_sources(shipped, tmp_path, monkeypat
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
     needs("cmake")
     needs("make")
+    needs("gcc")
     fmpy.extract(shipped, tmp_path)
     shutil.rmtree(tmp_path / "binaries")
     fmpy.build.build_platform_binary(tmp_path)

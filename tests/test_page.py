@@ -188,7 +188,11 @@ def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
         joints, cut = page.evaluate(READOUT)
         error = page.locator("[data-value=error]")
         shown_error = f"{last.error:.3g}"[:4]  # the readout follows the last step by some frames
-        until(page, lambda found: found.startswith(shown_error), lambda page: str(error.text_content()))
+        until(
+            page,
+            lambda found: found.startswith(shown_error),
+            lambda page: str(error.text_content()),
+        )
         curves = page.locator("#arm-curves canvas").evaluate_all("all => all.map(c => c.ariaLabel)")
         said = str(error.text_content())
         before = page.evaluate("arm.held('quat_des')")

@@ -56,6 +56,10 @@ TOOLS = {
         "libraries for ARM", "libc6-arm64-cross",
         ("/usr/aarch64-linux-gnu/lib/ld-linux-aarch64.so.1",),
     ),
+    "libatomic": Tool(
+        "FMUs in libcosim", "libatomic1",
+        ("/usr/lib/x86_64-linux-gnu/libatomic.so.1", "/usr/lib64/libatomic.so.1"),
+    ),
     "libcosimpy": Tool(
         "FMUs in libcosim", remedy="use Python 3.11 or newer", module="libcosimpy"
     ),
