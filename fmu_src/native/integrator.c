@@ -19,11 +19,11 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
    joint is back at its limit sooner than PATIENCE after it left, it is held there for FIRST_HOLD, and
    at each repetition LONGER; from HOLD_OF_ALL on, with all joints at limits. Where an acceleration only
    grazes zero, or where impacts drive joints off each other's limits, they would else leave and return
-   without end; joints that return but once or twice are not disturbed. The rank of J⁺ is held in the
+   without end; a joint that returns once is held for some nanoseconds. The rank of J⁺ is held in the
    same way where it drops soon after a rise: the motion leads back to the jump from both sides, and
    slides along it. A higher rank is never held, as its J⁺ has no bound. */
-static const double PATIENCE = 0.5, FIRST_HOLD = 1.0 / 1073741824.0, LONGER = 8.0,
-                    HOLD_OF_ALL = 1.0 / 32768.0;
+static const double PATIENCE = 0.5, FIRST_HOLD = 1.0 / 32768.0, LONGER = 8.0,
+                    HOLD_OF_ALL = 1.0 / 4096.0;
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
 

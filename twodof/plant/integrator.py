@@ -54,12 +54,12 @@ class Equations:
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-PATIENCE, FIRST_HOLD, LONGER, HOLD_OF_ALL = 0.5, 2.0**-30, 8.0, 2.0**-15
+PATIENCE, FIRST_HOLD, LONGER, HOLD_OF_ALL = 0.5, 2.0**-15, 8.0, 2.0**-12
 """As parts of the largest step, of PATIENCE, of the last hold, and of PATIENCE. Anti-chatter: where
 a joint is back at its limit sooner than PATIENCE after it left, it is held there for FIRST_HOLD,
 and at each repetition LONGER; from HOLD_OF_ALL on, with all joints at limits. Where an acceleration
 only grazes zero, or where impacts drive joints off each other's limits, they would else leave and
-return without end; joints that return but once or twice are not disturbed. The rank of J⁺ is held
+return without end; a joint that returns once is held for some nanoseconds. The rank of J⁺ is held
 in the same way where it drops soon after a rise: the motion leads back to the jump from both sides,
 and slides along it. A higher rank is never held, as its J⁺ has no bound."""
 MOST_ROWS = 6
