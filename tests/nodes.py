@@ -115,6 +115,17 @@ class Node:
         """Send a point to somebody who listens."""
         self.say(f"{topic} {frame or '-'} {' '.join(map(repr, xyz))}")
 
+    def leads(self, topic: str, *xyz: float) -> None:
+        """Send a point until /target follows it: a reader may discover a writer seconds later than
+        the writer discovers the reader, and what comes before is lost."""
+
+        def follows() -> bool:
+            self.point(topic, "world", *xyz)
+            self.hears("/target")
+            return self.messages("/target")[-1][1] == list(xyz)
+
+        self.until(follows)
+
     def say(self, line: str) -> None:
         """Send a message to somebody who listens on its topic."""
         self.until(lambda: ["matched", line.split()[0], 1] in self.told)

@@ -165,6 +165,9 @@ def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
     node = listen("/joint_states", "/target", *COMMANDS)
     options = ["--scene", "-o", str(tmp_path / "bag"), "--set", "Kn=5"]
     with published(number, native_path, *options) as process:
+        node.leads("/clicked_point", 0.2, 0.06, 0.0)
+        node.leads("/target_command", 0.21, 0.05, 0.0)
+        before = len(node.messages("/target"))
         for _ in range(3):
             node.point("/clicked_point", "world", float("nan"), 0.1, 0.0)
             node.point("/target_command", "", 0.1, float("inf"), 0.0)
@@ -172,9 +175,7 @@ def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
             node.point("/target_command", "map", 0.1, 0.1, 0.0)
             node.point("/target_command", "\udcff", 0.1, 0.1, 0.0)  # no UTF-8
             node.hears("/target")
-        assert [xyz for _, xyz in node.messages("/target")] == [[0.2, 0.05, 0]] * len(
-            node.messages("/target")
-        )
+        assert all(xyz == [0.21, 0.05, 0] for _, xyz in node.messages("/target")[before:])
         for x in (1e308, -1e308, 1e200, 1e30):
             node.point("/target_command", "world", x, 1e308, 0.0)
             node.hears("/target", 10)
