@@ -1,4 +1,4 @@
-"""Makes docs/arm.png, plot.png, map.png and load.png, and fmu_src/model.png, the icon of FMUs.
+"""Make docs/arm.png, plot.png, map.png and load.png, and fmu_src/model.png, the icon of FMUs.
 
     python docs/make_pictures.py
 
@@ -42,7 +42,7 @@ STEP_IN_DEPTH = 0.0012  # m: an edge is drawn where the depth jumps by more
 
 
 def main() -> None:
-    """Make all of them."""
+    """Make all pictures."""
     plt.rcParams.update({"font.family": "DejaVu Sans", "text.color": INK})
     with tempfile.TemporaryDirectory() as folder:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def draw_arm(samples: list[twodof.Sample], path: Path) -> None:
-    """The arm at the start and at the end, with what its end effector did between."""
+    """Draw the arm at the start and at the end, with the path of its end effector."""
     left, right, bottom, top = WINDOW
     height = round(WIDTH * (top - bottom) / (right - left))
     figure = plt.figure(figsize=(WIDTH / 150, height / 150), dpi=150)
@@ -82,7 +82,7 @@ def draw_arm(samples: list[twodof.Sample], path: Path) -> None:
 
 
 def draw_scale(axes: plt.Axes) -> None:
-    """Scales in metres with the base at 0, and the circle of the arm's reach."""
+    """Draw scales in metres with the base at 0, and the circle of the arm's reach."""
     reach = 2 * LINK
     axes.add_patch(Arc((0, 0), 2 * reach, 2 * reach, color=GREY, lw=1.4, ls=(0, (6, 4)), zorder=1))
     left, _, bottom, _ = WINDOW
@@ -102,7 +102,7 @@ def draw_scale(axes: plt.Axes) -> None:
 
 
 def draw_path(axes: plt.Axes, samples: list[twodof.Sample]) -> None:
-    """The path of the end effector with a dot every half second, its target, and the notes."""
+    """Draw the path of the end effector with a dot every half second, its target, and the notes."""
     x = np.array([sample.x for sample in samples])
     target = np.array([samples[0].inputs[f"x_des[{k}]"] for k in (1, 2)])
     axes.plot(*x.T, color="white", lw=5.5, zorder=4, solid_capstyle="round")
@@ -123,7 +123,7 @@ def draw_path(axes: plt.Axes, samples: list[twodof.Sample]) -> None:
 
 
 def triangles(q: tuple[float, ...]) -> list[tuple[np.ndarray, tuple[float, float, float]]]:
-    """Each link's triangles, n × 3 × 3 in m, where angles q put them, and its colour."""
+    """Return each link's triangles at the angles q, n × 3 × 3 in m, and its colour."""
     elbow = (LINK * np.cos(q[0]), LINK * np.sin(q[0]), 0.0)
     poses = {"link1": (q[0], (0.0, 0.0, 0.0)), "link2": (q[0] + q[1], elbow)}
     placed = []
@@ -135,13 +135,13 @@ def triangles(q: tuple[float, ...]) -> list[tuple[np.ndarray, tuple[float, float
 
 
 def read_stl(path: Path) -> np.ndarray:
-    """Triangles of a binary STL, n × 3 × 3."""
+    """Return the triangles of a binary STL, n × 3 × 3."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
     return np.frombuffer(path.read_bytes(), record, offset=84)["corners"].astype(float)
 
 
 def render(parts: list[tuple[np.ndarray, tuple[float, float, float]]], height: int) -> np.ndarray:
-    """RGBA image of triangles seen from above: a depth buffer, shading and drawn edges."""
+    """Return an RGBA image of triangles seen from above: a depth buffer, shading and drawn edges."""
     rows, columns = height * OVERSAMPLING, WIDTH * OVERSAMPLING
     left, right, _, top = WINDOW
     scale = columns / (right - left)
@@ -170,7 +170,7 @@ def render(parts: list[tuple[np.ndarray, tuple[float, float, float]]], height: i
 
 
 def shade(colour: tuple[float, float, float], normal: np.ndarray) -> np.ndarray:
-    """Diffuse light from the upper left and a soft highlight."""
+    """Return diffuse light from the upper left and a soft highlight."""
     light = LIGHT / np.linalg.norm(LIGHT)
     diffuse = max(0.0, float(normal @ light))
     half = light + np.array([0.0, 0.0, 1.0])
@@ -185,7 +185,7 @@ def fill(
     z: np.ndarray,
     colour: np.ndarray,
 ) -> None:
-    """Draw one triangle, corners in pixels, where it is nearer than what is there."""
+    """Draw one triangle, corners in pixels, where it is nearer than the pixels so far."""
     a, b, c = corners
     low = np.maximum(np.floor(np.min(corners, axis=0)).astype(int), 0)
     high = np.minimum(np.ceil(np.max(corners, axis=0)).astype(int) + 1, depth.shape[::-1])
@@ -207,7 +207,7 @@ def fill(
 
 
 def draw_plot(fmu: Path, path: Path) -> None:
-    """Three runs of the default arm that differ in their gain."""
+    """Draw three runs of the default arm that differ in their gain."""
     bags = [fmu.parent / f"Kp{gain}" for gain in GAINS]
     for gain, bag in zip(GAINS, bags, strict=True):
         run = twodof.experiment(fmu, settings={"Kp": gain})
@@ -217,7 +217,7 @@ def draw_plot(fmu: Path, path: Path) -> None:
 
 
 def draw_map(fmu: Path, grid: dict, settings: dict, path: Path) -> None:
-    """A map of the default arm."""
+    """Draw a map of the default arm."""
     table = fmu.with_name(path.stem)
     twodof.sweep(fmu, grid=grid, settings=settings, output=table)
     figure = drawn(drawing(*twodof.read_sweep(table), path.stem))
@@ -228,7 +228,7 @@ def draw_map(fmu: Path, grid: dict, settings: dict, path: Path) -> None:
 
 
 def draw_icon(path: Path) -> None:
-    """A robot arm in a block, with inputs that come in and outputs that go out."""
+    """Draw a robot arm in a block, with inputs on the left and outputs on the right."""
     figure = plt.figure(figsize=(3.0, 2.0), dpi=100)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, 300), ylim=(0, 200))
@@ -261,7 +261,7 @@ def draw_icon(path: Path) -> None:
 
 
 def arrow(axes: plt.Axes, start: float, end: float, y: float) -> None:
-    """A signal from left to right."""
+    """Draw a signal from left to right."""
     axes.add_patch(
         FancyArrowPatch(
             (start, y), (end, y), arrowstyle="-|>", mutation_scale=13, color=BLUE, lw=1.8,

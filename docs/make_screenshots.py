@@ -1,4 +1,4 @@
-"""Makes docs/view.png, live.png, panda.png and page.png, screenshots of the pages.
+"""Make docs/view.png, live.png, panda.png and page.png, screenshots of the pages.
 
     python docs/make_screenshots.py
 
@@ -31,7 +31,7 @@ INPUTS = "time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n4,0.22,-0.08\n"
 
 
 def main() -> None:
-    """Make all."""
+    """Make all screenshots."""
     browser.VIEWPORT.update(SIZE)
     with tempfile.TemporaryDirectory() as name, browser.chromium() as chromium:
         folder = Path(name)
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def page(chromium: Browser, folder: Path) -> None:
-    """docs/page.png: a Panda in a page of its own."""
+    """Make docs/page.png: a Panda in a page of its own."""
     options = twodof.FmuOptions(
         urdf=robots_folder() / "panda_description/urdf/panda.urdf",
         mesh_dir=robots_folder().parent, frame="panda_hand_tcp", control="pose", native=True,
@@ -63,7 +63,7 @@ def page(chromium: Browser, folder: Path) -> None:
 
 
 def view(chromium: Browser, folder: Path) -> None:
-    """The replay, 0.6 s after the target has changed."""
+    """Make the picture of a replay, 0.6 s after the target has changed."""
     with (
         browser.served("view", "my_bag", cwd=folder) as command,
         browser.opened(chromium, command.url, scale=2) as page,
@@ -73,7 +73,7 @@ def view(chromium: Browser, folder: Path) -> None:
 
 
 def live(chromium: Browser, folder: Path, fmu: Path) -> None:
-    """The live arm, paused on its way to a target that was moved."""
+    """Make the picture of the live arm, paused on its way to a target that was moved."""
     with (
         browser.served("live", fmu, cwd=folder) as command,
         browser.opened(chromium, command.url, scale=2) as page,
@@ -87,7 +87,7 @@ def live(chromium: Browser, folder: Path, fmu: Path) -> None:
 
 
 def panda(chromium: Browser, folder: Path) -> None:
-    """The scene alone, of the run in docs/tutorial.md after a second."""
+    """Make the picture of the scene alone, of the run in docs/tutorial.md after a second."""
     share = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share"
     urdf = share / "example-robot-data/robots/panda_description/urdf/panda.urdf"
     bent = (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8, 0.03)
@@ -108,7 +108,7 @@ def panda(chromium: Browser, folder: Path) -> None:
 
 
 def shoot(page: Page, name: str) -> None:
-    """Save what is shown, with edges smoothed."""
+    """Save a screenshot with smoothed edges."""
     page.wait_for_timeout(3000)
     picture = Image.open(io.BytesIO(page.screenshot()))
     picture.resize((SIZE["width"], SIZE["height"])).save(ROOT / "docs" / name, optimize=True)

@@ -1,4 +1,4 @@
-"""The first page of the site, as mkdocs makes it: the default arm, alive, in place of a picture."""
+"""Replace the picture on the site's first page by the running default arm, for mkdocs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FRAME = (
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """The first page, with the arm in place of its picture."""
+    """Put the arm in place of its picture on the first page."""
     if page.file.src_uri != "index.md":
         return html
     begin = html.rindex("<img", 0, html.index(PICTURE))
@@ -26,7 +26,7 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 
 
 def on_post_build(config: Any, **_: Any) -> None:
-    """The arm beside it."""
+    """Write the arm's page into the site."""
     with tempfile.TemporaryDirectory() as folder:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu", twodof.FmuOptions(native=True))
         twodof.page(fmu, Path(config.site_dir) / PAGE)

@@ -43,7 +43,7 @@ UNSOUND = "the state is none that an instance can be in"
 
 
 def import_plant(site_packages: list[str]):
-    """The plant module of this FMU; says what to install where a package is missing."""
+    """Import this FMU's plant module; name the remedy where a package is missing."""
     with suppress(ModuleNotFoundError):
         return importlib.import_module(f"{PACKAGE}.plant.plant")
     for folder in site_packages:
@@ -64,7 +64,7 @@ def import_plant(site_packages: list[str]):
 
 
 class TwoDofSlave(fmi.Fmi2Slave):
-    """One instance of the FMU. All files are found through ``self.resources``."""
+    """An instance of the FMU; it finds all files through ``self.resources``."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
@@ -168,7 +168,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         return self._outputs[group]
 
     def _set(self, vrs, values, kind):
-        """All of the values, or none where one of them is refused."""
+        """Set all values, or none where one of them is refused."""
         variables = [self._settable(vr, value, kind) for vr, value in zip(vrs, values)]
         if None in variables:
             return
@@ -240,7 +240,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         }  # fmt: skip
 
     def _set_fmu_state(self, state):
-        """Take over a state, which may have come as anybody's bytes: all of it, or nothing."""
+        """Restore an untrusted state entirely, or leave the instance as it was."""
         try:
             plant = self._plant_in(state)
         except ValueError as reason:
@@ -251,7 +251,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         self._outputs.clear()
 
     def _plant_in(self, state):
-        """The plant of a state. ValueError where no instance of this FMU can be in that state."""
+        """Return the plant of a state; raise ValueError for an invalid FMU state."""
         if not isinstance(state, dict) or state.get("identity") != self._identity:
             raise ValueError("the state is not one of this FMU")
         if not (alike(state, self._get_fmu_state()) and state["phase"] in PHASES):
@@ -269,7 +269,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
 
     @staticmethod
     def _fmu_state_from_bytes(state):
-        """What the bytes say, None where that is nothing; it is checked when it is set."""
+        """Deserialise a state, None where it is damaged; setting it checks it."""
         try:
             return json.loads(state) if len(state) <= MAX_STATE else None
         except (ValueError, RecursionError):
@@ -278,7 +278,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
     # --- refusals ---
 
     def _initialise(self):
-        """Warnings of the plant's initialisation, None where its parameters are refused."""
+        """Return warnings of the plant's initialisation, None where its parameters are refused."""
         try:
             warnings = self._plant.initialise()
         except self._plant_module.ParameterError as error:
@@ -308,7 +308,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
 
 
 def alike(value, own):
-    """Whether a value is of the types and sizes of one's own, its numbers finite, its text text."""
+    """Return whether a value has the types and sizes of a reference, with finite numbers and valid text."""
     if type(value) is not type(own):
         return False
     if isinstance(own, dict):

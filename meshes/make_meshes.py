@@ -27,24 +27,24 @@ Chain = Sequence[tuple[Outline, float]]  # outlines of as many corners each, and
 
 
 def arc(centre: complex, r: float, angles: np.ndarray) -> Outline:
-    """Points of a circle, to the nanometre: a sine's last digits depend on the machine."""
+    """Return points of a circle, to the nanometre: a sine's last digits depend on the machine."""
     return np.round(centre + r * np.exp(1j * angles), 6).tolist()
 
 
 def circle(centre: complex, r: float, n: int = 32) -> Shape:
-    """A circle of n corners."""
+    """Return a circle of n corners."""
     return lambda d: arc(centre, r - d, 2 * np.pi / n * np.arange(n))
 
 
 def slot(x0: float, r0: float, x1: float, r1: float, n: int = 18) -> Shape:
-    """Two arcs of n corners and their common tangents."""
+    """Return two arcs of n corners and their common tangents."""
     end = np.pi / 2 - np.arcsin((r0 - r1) / (x1 - x0))
     front, back = np.linspace(-end, end, n), np.linspace(end, 2 * np.pi - end, n)
     return lambda d: arc(x1, r1 - d, front) + arc(x0, r0 - d, back)
 
 
 def wall(shape: Shape, base: float, top: float, radius: float) -> Chain:
-    """A wall with a rounded edge at the top."""
+    """Return a wall with a rounded edge at the top."""
     turn = radius * (1 - np.exp(1j * np.pi / 6 * np.arange(4)))
     return [(shape(0), base), *((shape(t.real), top - radius - t.imag) for t in turn)]
 
@@ -96,13 +96,13 @@ class Body:
         return chain[0][0]
 
     def boss(self, side: int, chain: Chain, holes: Iterable[Outline] = ()) -> Outline:
-        """The same, closed by a face with these holes: something raised, or sunk."""
+        """Return the skin closed by a face with these holes: a raised or sunk boss."""
         for triangle in triangulate(chain[-1][0], holes):
             self._add(side, triangle, [chain[-1][1]] * 3)
         return self.skin(side, chain)
 
     def hub(self, side: int, x: float, r: float, base: float, top: float) -> Outline:
-        """A joint's boss: hexagon sockets around a shaft in its bearing."""
+        """Return a joint's boss: hexagon sockets around a shaft in its bearing."""
         screws = arc(x, 0.77 * r, np.pi / 3 * (np.arange(6) + 0.5))
         sockets = [circle(screw, 0.13 * r, 6)(0) for screw in screws]
         shaft = self.boss(side, wall(circle(x, 0.36 * r), top - 1.5, top + 0.5, 0.8))
@@ -112,7 +112,7 @@ class Body:
         return self.boss(side, wall(circle(x, r), base, top, 1.5), holes)
 
     def facets(self) -> np.ndarray:
-        """Triangles in metres as an STL file holds them."""
+        """Return triangles in metres as an STL file holds them."""
         return (np.array(self.triangles) / 1000 + 0.0).astype("<f4")  # + 0.0: no minus zeros
 
     def _add(self, side: int, corners: Iterable[complex], heights: Iterable[float]) -> None:
@@ -122,7 +122,7 @@ class Body:
 
 
 def link1() -> Body:
-    """A plate with a hub, a seat for link 2 and a pocket with lightening bores on both faces."""
+    """Return a plate with a hub, a seat for link 2 and a pocket with lightening bores on both faces."""
     body, pocket = Body(-14), slot(42, 16, 114, 12.5)
     bores = [circle(x, r, 24)(0) for x, r in ((42, 11), (67, 9.6), (90, 8.4), (111.5, 7.4))]
     for side in (1, -1):
@@ -135,7 +135,7 @@ def link1() -> Body:
 
 
 def link2() -> Body:
-    """A plate with two slots, standing on the elbow with a column and holding a pen."""
+    """Return a plate with two slots, standing on the elbow with a column and holding a pen."""
     body, barrel = Body(20), circle(LENGTH, 5)
     slots = slot(36, 9, 70, 7.6, 14), slot(92, 6.8, 124, 5.4, 14)
     for side in (1, -1):
@@ -153,7 +153,7 @@ def link2() -> Body:
 
 
 def hull(r0: float, r1: float, middle: float, half: float, height: float, slope: float) -> Body:
-    """A convex body around a link: a plate that narrows by slope towards its hubs and pen."""
+    """Return a convex body around a link: a plate that narrows by slope towards its hubs and pen."""
     wider = 1 / np.cos(np.radians(12))  # for long chords to stay outside the arcs of r0 and r1
     body, edge = Body(middle), slot(0, r0 * wider, LENGTH, r1 * wider, 10)
     for side in (1, -1):
@@ -162,7 +162,7 @@ def hull(r0: float, r1: float, middle: float, half: float, height: float, slope:
 
 
 def inertial(facets: np.ndarray) -> str:
-    """The URDF <inertial>, exact: a sum over the tetrahedra of each facet and a common corner.
+    """Return the URDF <inertial>, exact: a sum over the tetrahedra of each facet and a common corner.
 
     With edges a, b, c from that corner, s = a + b + c and the signed volume V = det(a, b, c) / 6,
     the integrals of 1, r and r r^T are V, V s / 4 and V (s s^T + a a^T + b b^T + c c^T) / 20.
@@ -185,7 +185,7 @@ def inertial(facets: np.ndarray) -> str:
 
 
 def write_stl(path: Path, facets: np.ndarray) -> None:
-    """Binary STL: a header of 80 bytes, the count, and 50 bytes a triangle."""
+    """Write a binary STL: a header of 80 bytes, the count, and 50 bytes a triangle."""
     a, b, c = facets.astype(float).transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     normals /= np.sqrt((normals**2).sum(axis=1, keepdims=True))

@@ -1,5 +1,5 @@
 # PYTHON_ARGCOMPLETE_OK
-"""``twodof``, and ``python -m twodof``: the process around the command line."""
+"""Entry point of ``twodof`` and ``python -m twodof``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status.
+    """Run one command; return the exit status.
 
     Ctrl-C ends the process at once while the command line is loaded, and not any more when the
     command has ended.
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Open the standard streams that are closed: a file of ours would take their number."""
+    """Open closed standard streams, so that no file takes their descriptors."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

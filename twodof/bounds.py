@@ -1,5 +1,4 @@
-"""Bounds on untrusted files, in one table; those of a URDF, which FMUs carry too, are in
-``plant/urdf.py``. Sizes are in bytes, times in s of processor time."""
+"""Limits on untrusted files: sizes in bytes, processor times in s; those of URDFs are in ``plant/urdf.py``."""
 
 KIB, MIB = 1024, 1024**2
 

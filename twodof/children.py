@@ -1,4 +1,4 @@
-"""Child processes that each call one function behind an anonymous pipe, and their confinement.
+"""Child processes that each run one function over an anonymous pipe, and their confinement.
 
 A child that parses untrusted bytes confines itself: limits of memory and time hold on every POSIX
 system. On Linux, Landlock leaves the folders that are given, readable, and on x86-64 seccomp leaves
@@ -61,7 +61,7 @@ OPEN, LIMIT = 257, 302  # openat for reading, prlimit64 of the process itself
 
 
 class Child(Connection):
-    """A process that calls one function, and the connection to it; closing it ends the process.
+    """A process that runs one function, and the connection to it; closing it ends the process.
 
     Nobody else can talk to it, as it inherits one end of a socket pair. It imports nothing from the
     working directory, nor the program's main module. The terminal's signals are not for it, and it
@@ -91,12 +91,12 @@ class Child(Connection):
         self.send(partial(_call, function, arguments))
 
     def send(self, value: object) -> None:
-        """Send a value; where the process has ended, ``recv`` says so."""
+        """Send a value; where the process has ended, ``recv`` raises."""
         with suppress(OSError):
             super().send(value)
 
     def recv(self) -> Any:
-        """What the process has sent next.
+        """Return the next value from the process.
 
         Raises:
             TwoDofError: what its function raised.
@@ -114,7 +114,7 @@ class Child(Connection):
         return value
 
     def receive(self, most: int, seconds: float) -> bytes:
-        """The bytes that it sends next, if nothing else is to be believed of it.
+        """Return the next bytes from a process that is not trusted.
 
         Args:
             most: more bytes end it.
@@ -135,7 +135,7 @@ class Child(Connection):
             timer.cancel()
 
     def _end(self) -> str:
-        """How the process has ended."""
+        """Return the error that describes how the process ended."""
         status = self._process.wait()
         return f"exit status {status}" if status >= 0 else str(strsignal(-status))
 
@@ -147,7 +147,7 @@ class Child(Connection):
 
 
 def _path() -> list[str]:
-    """Where modules are found, but for the working directory, unless this package is in it."""
+    """Return the module path without the working directory, unless this package is in it."""
     home = str(Path(__file__).parents[1])
 
     def is_same(entry: str, folder: str) -> bool:
@@ -160,7 +160,7 @@ def _path() -> list[str]:
 
 
 def _call(function: Callable[..., None], arguments: tuple[object, ...], pipe: Connection) -> None:
-    """What the process does, as long as the other end of its pipe is open."""
+    """Run the function in the child, until the other end of its pipe closes."""
     os.set_inheritable(pipe.fileno(), False)  # what an FMU starts must not keep ours open
     closed = poll()
     closed.register(pipe, 0)
@@ -169,7 +169,7 @@ def _call(function: Callable[..., None], arguments: tuple[object, ...], pipe: Co
 
 
 def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
-    """Confine this process for good; import beforehand all that it needs.
+    """Confine this process irrevocably; import everything that it needs beforehand.
 
     Args:
         memory: most of its address space, bytes.
@@ -193,7 +193,7 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
 
 
 def limit_time(seconds: float) -> None:
-    """End this process after that much more processor time; call it again for the next task."""
+    """Limit this process to more processor time from now on; call it again for the next task."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     most = resource.getrlimit(resource.RLIMIT_CPU)[1]
     soft = int(used.ru_utime + used.ru_stime + seconds) + 1
@@ -201,7 +201,7 @@ def limit_time(seconds: float) -> None:
 
 
 def _allow_files(libc: ctypes.CDLL, folders: Sequence[Path]) -> None:
-    """Landlock: read below the folders, and nothing else."""
+    """Restrict file access with Landlock to reading below the folders."""
     version = libc.syscall(LANDLOCK_CREATE, None, 0, 1)
     if version < 1:
         return
@@ -217,7 +217,7 @@ def _allow_files(libc: ctypes.CDLL, folders: Sequence[Path]) -> None:
 
 
 def _allow_calls(libc: ctypes.CDLL) -> None:
-    """seccomp: the system calls of the table, in all threads; every other one fails with EPERM."""
+    """Restrict all threads to a table of system calls with seccomp; others fail with EPERM."""
     load, equal, mask, end = 0x20, 0x15, 0x54, 0x06
     allow, refuse = (end, 0, 0, 0x7FFF0000), (end, 0, 0, 0x00050001)
     number, architecture, first, third = 0, 4, 16, 32  # places in struct seccomp_data

@@ -1,4 +1,4 @@
-"""The exceptions of the package: one root, named leaves; each message is one clear line."""
+"""Exceptions of the package: one root, named leaves; each message is one clear line."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, V
 
 
 class TwoDofError(Exception):
-    """Root of all errors that a user's input or machine can cause."""
+    """Root of all errors caused by a user's input or machine."""
 
 
 class BuildError(TwoDofError):
-    """The FMU cannot be built: the URDF, its meshes, an option or the compiler is at fault."""
+    """The FMU cannot be built because of the URDF, its meshes, an option or the compiler."""
 
 
 class FmuError(TwoDofError):
@@ -23,11 +23,11 @@ class FmuError(TwoDofError):
 
 
 class InputError(TwoDofError):
-    """A ``--set``, an input file or a time of the run is at fault."""
+    """A setting, an input file or a time of the run is invalid."""
 
 
 class SimulationError(TwoDofError):
-    """The FMU refused or failed a call, or gave a value that is not finite.
+    """The FMU refused or failed a call, or returned a value that is not finite.
 
     Attributes:
         k: number of communication steps that were done.
@@ -44,29 +44,29 @@ class BagError(TwoDofError):
 
 
 class SweepError(TwoDofError):
-    """A sweep cannot be run, stored or read: its workers, Dask or the folder is at fault."""
+    """A sweep cannot be run, stored or read because of its workers, Dask or the folder."""
 
 
 class ChildError(TwoDofError):
-    """A process that this one has started failed for no reason of its own that has a name here."""
+    """A child process failed with an unexpected exception."""
 
 
 class PlotError(TwoDofError):
-    """A bag cannot be drawn: matplotlib, the robot, its joints or the output file is at fault."""
+    """A bag cannot be drawn because of matplotlib, the robot, its joints or the output file."""
 
 
 class PageError(TwoDofError):
-    """A page cannot be shown: its port, the robot or the output file is at fault."""
+    """A page cannot be shown because of its port, the robot or the output file."""
 
 
 class PublishError(TwoDofError):
-    """A run cannot be published: Cyclone DDS, the network or a variable of ROS 2 is at fault."""
+    """A run cannot be published because of Cyclone DDS, the network or a ROS 2 variable."""
 
 
 def check_keywords(
     given: Iterable[str], called: Callable[..., object], *more: Callable[..., object]
 ) -> None:
-    """Refuse keywords that neither the function that was called nor those it hands them to take.
+    """Refuse keywords that neither the called function nor its delegates accept.
 
     Raises:
         TypeError: naming the function that was called, and the nearest keyword that it takes.
@@ -86,10 +86,10 @@ def check_keywords(
 
 
 def diverged(k: int, t: float) -> SimulationError:
-    """Of the sample after k steps, at a time."""
+    """Return the error of a sample that is not finite, after k steps, at a time."""
     return SimulationError(f"the FMU gave a value that is not finite at t = {t:g} s", k, "diverged")
 
 
 def step_failure(k: int, t: float, error: SimulationError) -> SimulationError:
-    """Of the step after k steps, at a time."""
+    """Return the error of a failed step, after k steps, at a time."""
     return SimulationError(f"step {k + 1} at t = {t:g} s: {error}", k, error.outcome)

@@ -1,5 +1,4 @@
-"""Files that others made, regular ones only and no larger than can be borne; files written whole;
-folders marked as being written, and folders for a while."""
+"""Size-limited reads of untrusted files, atomic writes, folder locks and temporary folders."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ VALUES = {str: NUMBER}
 
 
 class UnsafeArchiveError(zipfile.BadZipFile):
-    """A zip archive that must not be unzipped."""
+    """A zip archive is unsafe to unzip."""
 
 
 @contextmanager
@@ -55,7 +54,7 @@ def refusing(kind: type[TwoDofError], what: str) -> Iterator[None]:
 
 
 def check_file(path: str | Path, most: int) -> None:
-    """Refuse what is no regular file of at most ``most`` bytes, before it is opened.
+    """Refuse anything but a regular file of at most ``most`` bytes, before it is opened.
 
     A pipe would be waited for, and a device has no end.
 
@@ -73,7 +72,7 @@ def check_file(path: str | Path, most: int) -> None:
 
 
 def read_file(path: str | Path, most: int, *, follow: bool = True) -> bytes:
-    """The content of a regular file of at most ``most`` bytes.
+    """Return the content of a regular file of at most ``most`` bytes.
 
     Raises:
         OSError: it cannot be read, ``check_file`` refuses it, or it is a link and not to follow.
@@ -93,12 +92,12 @@ def head_of(path: Path, size: int) -> bytes:
 
 
 def shown(path: str | Path) -> str:
-    """A path as text that can be written anywhere: what is no UTF-8 in it as escapes."""
+    """Return a path as text that can be written anywhere, with bytes outside UTF-8 as escapes."""
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def check_archive(path: str | Path) -> None:
-    """Refuse a zip archive that cannot be unzipped safely, or has more members than can be listed.
+    """Refuse a zip archive that is unsafe to unzip, or has too many members to list.
 
     zipfile reads the whole list before it can be asked how long it is.
 
@@ -137,7 +136,7 @@ def _check_member(member: zipfile.ZipInfo) -> None:
 
 
 def read_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
-    """A member of an archive, of at most ``most`` bytes.
+    """Return a member of an archive, of at most ``most`` bytes.
 
     Raises:
         KeyError: there is none.
@@ -152,7 +151,7 @@ def read_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
 
 
 class _Archive(io.FileIO):
-    """A zip archive, of which the list of members is by far the most that is read at once."""
+    """A zip archive whose list of members limits what is read at once."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > MAX_DIRECTORY:
@@ -161,7 +160,7 @@ class _Archive(io.FileIO):
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, where a link leads; or into a device, pipe or /dev/stdout.
+    """Write a file atomically, following links; or write into a device, pipe or /dev/stdout.
 
     A new file has the mode that the umask leaves; one that is replaced keeps its mode.
 
@@ -193,7 +192,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def descriptor_of(path: str | Path) -> int | None:
-    """The open file that a name such as /dev/stdout or /dev/fd/3 means; None for other names."""
+    """Return the descriptor that a name such as /dev/stdout or /dev/fd/3 stands for, else None."""
     for _ in range(MAX_LINKS_FOLLOWED):
         folder, name = os.path.split(os.path.abspath(path))
         if name.isdecimal() and os.path.realpath(folder) == f"/proc/{os.getpid()}/fd":
@@ -207,7 +206,7 @@ def descriptor_of(path: str | Path) -> int | None:
 
 @contextmanager
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
-    """A folder that is removed at the end, or, where its process is killed, by the next one.
+    """Make a folder that is removed at the end, or by the next process if this one is killed.
 
     Args:
         parent: where it is made; None: the system's folder for temporary files.
@@ -245,7 +244,7 @@ def _remove_abandoned(folder: Path) -> None:
 
 
 def lock(path: Path, *, wait: bool = False) -> int:
-    """Keep other writers from a folder until the descriptor is closed or the process dies.
+    """Keep other writers from a folder until the descriptor is closed or the process ends.
 
     Args:
         path: the folder.
@@ -271,7 +270,7 @@ def lock(path: Path, *, wait: bool = False) -> int:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a living process writes the folder."""
+    """Return whether a living process writes the folder."""
     folder = os.open(path, os.O_RDONLY)
     try:
         return not _locked(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -292,18 +291,18 @@ def _locked(folder: int, how: int) -> bool:
 def free_name(
     name: str, ending: str = "", replaceable: Callable[[Path], bool] = lambda path: False
 ) -> Path:
-    """The name, or that with the first number from 2 on, under which there is nothing to lose."""
+    """Return the name, or the name with the first number from 2 on, that no file has."""
     names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
     return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
 
 
 def packed(content: bytes) -> str:
-    """Compressed, as base64, for a page: zlib's format is what browsers call deflate."""
+    """Return data compressed (zlib, which browsers call deflate) as base64, for a page."""
     return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
 def sync(*paths: Path) -> None:
-    """Bring files and folders, as far as they are written, to the disk itself."""
+    """Flush files and folders to the disk."""
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -313,14 +312,14 @@ def sync(*paths: Path) -> None:
 
 
 def data_file(*parts: str) -> Path:
-    """A file that the package ships beside its code: inside it when installed, else around it."""
+    """Return the path of a data file of the package, installed or in a checkout."""
     package = Path(__file__).parent
     installed = package.joinpath(*parts)
     return installed if installed.exists() else package.parent.joinpath(*parts)
 
 
 def parsed(text: bytes) -> Any:
-    """JSON from elsewhere.
+    """Parse untrusted JSON.
 
     Raises:
         ValueError, RecursionError: it is none, or would take much more memory than its text.
@@ -331,7 +330,7 @@ def parsed(text: bytes) -> Any:
 
 
 def fits(content: Any, shape: Any) -> bool:
-    """Whether a value of JSON has a shape; numbers are finite.
+    """Return whether a JSON value has a shape, with finite numbers.
 
     [x]: any number of x; (x, y): these two; {str: x}: x by any name; else the type.
     """

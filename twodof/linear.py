@@ -1,4 +1,4 @@
-"""An FMU as a linear system about an operating point.
+"""Linear model of an FMU at an operating point.
 
     ẏ = A y + B u,    z = C y + D u,    y = (q, v)
 
@@ -39,7 +39,7 @@ class Mode(NamedTuple):
 
 
 class LinearModel(NamedTuple):
-    """A linear system; ``control.ss(*model[:4])`` is it in python-control.
+    """A linear system; ``control.ss(*model[:4])`` converts it for python-control.
 
     Attributes:
         A, B, C, D: the matrices, SI units.
@@ -68,13 +68,13 @@ class LinearModel(NamedTuple):
 
     @property
     def modes(self) -> list[Mode]:
-        """Eigenvalues of A, the slowest first; parts that rounding does not tell from 0 are 0."""
+        """Return the eigenvalues of A, the slowest first; parts below rounding are 0."""
         values = sorted(_eigenvalues(self.A), key=lambda z: (abs(z), -z.imag))
         return [Mode(z, -z.real / abs(z) if z else np.nan, abs(z)) for z in values]
 
 
 def _eigenvalues(A: Array) -> list[complex]:
-    """Eigenvalues, their parts 0 within n ε ‖A‖ κ; κ is the condition of each, from its vectors."""
+    """Return eigenvalues, their parts rounded to 0 within n ε ‖A‖ κ (κ: eigenvalue condition numbers)."""
     values, vectors = np.linalg.eig(A)
     condition = np.linalg.norm(np.linalg.pinv(vectors), axis=1)
     error = len(A) * np.finfo(float).eps * np.linalg.norm(A) * condition
@@ -89,7 +89,7 @@ def linearise(
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
 ) -> LinearModel:
-    """The linear model of an FMU about an operating point.
+    """Return the linear model of an FMU at an operating point.
 
     Args:
         fmu: an FMU that gives directional derivatives, as the native flavour does.
@@ -126,7 +126,7 @@ def linearise(
 
 
 def _values(fmu: Fmu, given: Mapping[str, Setting]) -> dict[str, Value]:
-    """Of inputs and parameters; a state, or one of its elements, is set by its parameter."""
+    """Return the values of inputs and parameters; a state, or its element, is set by its parameter."""
     values: dict[str, Value] = {}
     for name, value in given.items():
         group, bracket, index = name.partition("[")
@@ -149,7 +149,7 @@ def _chosen(fmu: Fmu, causality: str, wanted: Sequence[str] | None, argument: st
 
 
 class _Point:
-    """An instance that is put to one state after another."""
+    """An FMU instance that is moved from state to state."""
 
     def __init__(self, fmu: Fmu, instance: Instance, values: Mapping[str, Value]) -> None:
         self._fmu, self._instance, self._values = fmu, instance, dict(values)
@@ -190,7 +190,7 @@ class _Point:
         )
 
     def model(self, inputs: list[str], outputs: list[str]) -> LinearModel:
-        """The linear model at the point."""
+        """Return the linear model at the point."""
         states = [*self._q, *self._v]
         rates = [f"der({name})" for name in states]
         known = [*states, *inputs]
@@ -218,7 +218,7 @@ class _Point:
         )
 
     def _remarks(self) -> list[str]:
-        """Notes on a singular pose and saturated joints. Raises where there is no linear model."""
+        """Return notes on a singular pose and saturated joints; raise where no linear model exists."""
         limits = [self._read(self._fmu.vector(name)) for name in ("q", "q_min", "q_max")]
         for joint, q, low, high in zip(self._fmu.joints, *limits):
             if q in (low, high):
@@ -245,7 +245,7 @@ class _Point:
         return remarks
 
     def _saturated(self) -> list[str]:
-        """Notes on joints whose effort is limited. Raises where one is just at its limit."""
+        """Return notes on joints at their effort limit; raise where one is exactly at it."""
         if not {**self._fmu.start_values, **self._values}.get("limit_effort"):
             return []
         self._instance.reset()

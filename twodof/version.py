@@ -1,4 +1,4 @@
-"""The version of this package, and of others beside it."""
+"""Versions of this package and of its dependencies."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ __version__ = "0.1.0"
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Of this package, and of others as far as they are installed: Pinocchio is not everywhere."""
+    """Return the versions of this package and of its installed dependencies."""
     known = {name: version for name in packages if (version := _version(name)) is not None}
     return {"twodof": __version__, **known}
 
 
 def install(extra: str) -> str:
-    """The remedy where an extra is missing: pip with the folder that this package comes from."""
+    """Return the remedy for a missing extra: pip with the folder that this package comes from."""
     import importlib.metadata as metadata
     import json
     import shlex

@@ -1,1 +1,1 @@
-"""ROS 2 bags: written, read, and mended."""
+"""Write, read and recover ROS 2 bags."""

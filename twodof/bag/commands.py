@@ -1,4 +1,4 @@
-"""Commands that a bag holds, as inputs of an FMU over time."""
+"""Read the commands in a bag as inputs of an FMU over time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read_commands(
     fmu: Fmu | str | Path, path: str | Path, topic: str | None = None, *,
     step: float | None = None, settings: Mapping[str, Setting] | None = None,
 ) -> Changes:  # fmt: skip
-    """Commands of a bag, of this or another writer: times, s, and the inputs that change there.
+    """Return the commands of any bag: times, s, and the inputs that change there.
 
     JointStates, points or poses, as the FMU's control follows them (``ros.commands``), each at the
     time when it was recorded, after the bag's first joint state that is no command; or for control
@@ -83,7 +83,7 @@ def read_commands(
 def _messages(
     path: Path, types: Sequence[str], topic: str | None
 ) -> tuple[dict[str, Stored], dict[str, int]]:
-    """What may be commands, by topic; and of each topic of joint states the time of the first."""
+    """Return candidate command messages by topic, and each joint-state topic's first time."""
     topics: dict[str, Stored] = {}
     begins: dict[str, int] = {}
     try:
@@ -103,7 +103,7 @@ def _messages(
 
 
 def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
-    """Of a bag's start values those that command, its FMU or this one."""
+    """Return the commanding inputs of a bag's start values, for its FMU or this one."""
     commands = {group for law in CONTROLS.values() for group in law.inputs}
 
     def commands_it(name: str) -> bool:
@@ -114,7 +114,7 @@ def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
 
 
 def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Sequence[str]) -> str:
-    """The topic of the commands."""
+    """Return the only topic that can hold commands."""
     if len(topics) == 1:
         return next(iter(topics))
     there = ", ".join(sorted(map(shown, topics)))
@@ -128,7 +128,7 @@ def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Se
 def _read(
     commands: Stored, begin: int, read: Callable[[int, str, bytes], Read], bag: str
 ) -> list[tuple[int, Read]]:
-    """When each came, and what it says; the bag is named in what is wrong."""
+    """Return the time and content of each command; errors name the bag."""
     said = []
     for came, kind, data in commands:
         try:
@@ -145,7 +145,7 @@ def _read(
 def _followed(
     commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str
 ) -> Changes:
-    """Inputs with which joints go along trajectories, where they change from step to step."""
+    """Return inputs with which joints follow trajectories, at the steps where they change."""
     joints = {name: i for i, name in enumerate(fmu.joints)}
     read = _read(
         commands, begin, lambda came, _, data: read_trajectory(data, joints, came, begin), bag

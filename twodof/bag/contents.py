@@ -1,4 +1,4 @@
-"""The files of a bag, and the messages in them."""
+"""Storage files of a bag, and the messages in them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .sqlite import sqlite3_messages
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The files that hold a bag's messages, in the order in which they were written.
+    """Return the files that hold a bag's messages, in the order of writing.
 
     An MCAP file alone, as pages and other tools write them, is a bag too.
 
@@ -32,7 +32,7 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def stated_count(folder: Path) -> int | None:
-    """How many messages a bag's metadata.yaml says that it has; None where it does not.
+    """Return the number of messages in metadata.yaml; None where it states none.
 
     Raises:
         OSError: it cannot be read.
@@ -45,7 +45,7 @@ def stated_count(folder: Path) -> int | None:
 
 
 def read_messages(file: Path, allowance: Allowance) -> Iterator[Batch]:
-    """All messages, those of a channel in the order of the file.
+    """Read all messages of a file; those of a channel are in order.
 
     Args:
         file: one of a bag's.

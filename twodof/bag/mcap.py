@@ -1,4 +1,4 @@
-"""MCAP files, record by record, also where they end in the middle. Source: MCAP's specification."""
+"""Read MCAP files record by record, truncated ones too. Source: MCAP's specification."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ MANY = 1000  # records outside of chunks
 
 
 def mcap_messages(path: Path, allowance: Allowance) -> Iterator[Batch]:
-    """All messages of a file; errors as of ``read_messages``."""
+    """Read all messages of a file; errors as of ``read_messages``."""
     tables = Tables()
     for records in _chunks(path, allowance):
         yield from messages_in(path, records, tables, allowance)
 
 
 def _chunks(path: Path, allowance: Allowance) -> Iterator[bytes]:
-    """The records of each chunk, and those outside of chunks, many at a time."""
+    """Yield the records of each chunk, and those outside of chunks, many at a time."""
     loose: list[bytes] = []
     try:
         for opcode, content in _records(path, allowance):
@@ -58,7 +58,7 @@ def _chunks(path: Path, allowance: Allowance) -> Iterator[bytes]:
 
 
 def read_metadata(path: Path, name: str, key: str) -> str:
-    """An entry of a file's own metadata, "" where it has none; errors as of ``read_messages``."""
+    """Return an entry of a file's own metadata, "" where it has none; errors as of ``read_messages``."""
     with refusing_damage(path):
         for _, content in _records(path, Allowance(), (METADATA,)):
             title, _, position = fields("sI", content, HEAD.size)
@@ -68,7 +68,7 @@ def read_metadata(path: Path, name: str, key: str) -> str:
 
 
 def messages_in(path: Path, chunk: bytes, tables: Tables, allowance: Allowance) -> Iterator[Batch]:
-    """The messages of a chunk.
+    """Return the messages of a chunk.
 
     Where messages of equal lengths come in turns, as a writer's of ROS 2 mostly do, all are taken
     at once: record by record, Python would take a microsecond for each.
@@ -110,7 +110,7 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, allowance: Allowance) 
 
 
 def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
-    """The records that begin at these places, up to an end, and as often as others alike follow.
+    """Return periodic records from given offsets up to an end: one row per repetition.
 
     One row a time; once where a channel has its turn twice, whose messages are to stay in order.
     """
@@ -131,14 +131,14 @@ def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
 
 
 class Tables:
-    """The channels of an MCAP file, as far as they are known."""
+    """The channels of an MCAP file that are known so far."""
 
     def __init__(self, channels: Mapping[int, Channel] = MappingProxyType({})) -> None:
         self._schemas: dict[int, tuple[str, str]] = {0: ("", "")}
         self.channels = dict(channels)
 
     def add(self, path: Path, opcode: int, content: bytes, position: int) -> None:
-        """Take a schema or a channel, whose fields begin at a position."""
+        """Add a schema or a channel, whose fields begin at a position."""
         if opcode == SCHEMA:
             number, name, _, text, _ = fields("Hsss", content, position)
             self._schemas[number] = (name, text)
@@ -152,7 +152,7 @@ class Tables:
             raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
 
     def batch(self, path: Path, rows: Rows) -> Batch:
-        """Messages whose records begin the rows, and are all of one channel and length."""
+        """Return the messages of records that have one channel and one length."""
         _, length, channel, *_ = MESSAGE_HEAD.unpack_from(rows[0])
         end = HEAD.size + length
         if end < MESSAGE_HEAD.size:
@@ -166,7 +166,7 @@ class Tables:
 def _records(
     path: Path, allowance: Allowance, wanted: Sequence[int] = READ
 ) -> Iterator[tuple[int, bytes]]:
-    """Opcode of each record up to the footer that is wanted, and the record with its head.
+    """Yield the opcode of each record up to the requested footer, and the record with its header.
 
     Of a chunk, the content alone.
     """
@@ -198,7 +198,7 @@ def _records(
 
 
 def unpack_chunk(path: Path, content: bytes, allowance: Allowance) -> bytes:
-    """The records of a chunk."""
+    """Return the records of a chunk."""
     _, _, size, crc, compression, length, start = fields("QQQIsQ", content, 0)
     packed = content[start : start + length]
     if size > MAX_CHUNK:
@@ -227,7 +227,7 @@ def _entries(metadata: bytes) -> dict[str, str]:
 
 
 def fields(form: str, content: bytes, position: int) -> list[Any]:
-    """Fields of a record, and where they end; struct's letters, and s for a text and its length."""
+    """Return the fields of a record and their end, by struct's letters, with s for a prefixed text."""
     values: list[Any] = []
     for letter in form:
         if letter == "s":

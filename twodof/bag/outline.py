@@ -1,4 +1,4 @@
-"""Few samples of a long recording, with which its lines over time look as they do with all.
+"""Downsample a recording for plotting without visible change (M4).
 
 Of each of many spans of time the first and the last sample, and those where a line is lowest and
 highest, as in Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB
@@ -20,7 +20,7 @@ Indices = NDArray[np.intp]
 
 
 class Outline:
-    """Chooses samples, from time to time, of those chosen before and those that came since.
+    """Downsampler that chooses among its earlier samples and those that came since.
 
     At most ``most`` samples wait to be chosen from, of which a quarter is left at most; ``lines``
     gives those of a recording beside its positions and velocities, N values each.
@@ -31,7 +31,7 @@ class Outline:
         self._span = 1  # ns
 
     def choose(self, bag: Recording) -> Indices:
-        """Which samples are left."""
+        """Return the indices of the samples to keep."""
         lines = [*bag.q.T, *bag.v.T, *self._lines(bag)]
         duration = int(bag.stamps[-1] - bag.stamps[0])
         while self._span < duration / self.most:
@@ -44,7 +44,7 @@ class Outline:
 
 
 def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
-    """The first and last sample of each part, and where a line is lowest and highest in it.
+    """Return the first and last sample of each part, and those where a line has its extremes.
 
     Parts are numbered, N numbers that ascend from 0 or more; values that are not finite are no
     extremes.

@@ -1,4 +1,4 @@
-"""Where a run came from: run.json, written beside the messages, and never behind them.
+"""Provenance of a run: run.json, flushed before the messages that it describes.
 
 Of several robots in one bag each has its own, run.NAME.json, with its namespace in the name.
 """
@@ -44,7 +44,7 @@ SHAPE = {
 
 
 class ProvenanceFile:
-    """run.json of a bag that is being written: whole at any moment, with the changes so far.
+    """run.json of a bag in progress, complete at any moment with the changes so far.
 
     The changes of inputs stand at its end, before who commanded the robot alone, so that adding
     some writes no other byte anew.
@@ -68,7 +68,7 @@ class ProvenanceFile:
         self._separator, self._full = b"", False
 
     def add(self, changes: Changes) -> None:
-        """Add times and the inputs that changed there, as many as a reader is ready for."""
+        """Append times and the inputs that changed there, up to a reader's limit."""
         commanders = len(self._run.commanders)
         if self._full or (not changes and commanders == self._commanders):
             return
@@ -84,14 +84,14 @@ class ProvenanceFile:
         self._separator, self._commanders = b"," if changes else self._separator, commanders
 
     def text(self) -> str:
-        """What the bag's own metadata holds: the whole, or where that is long no changes."""
+        """Return the metadata entry of the bag: all of it, or without the changes where that is long."""
         content = self.path.read_bytes()
         if len(content) > len(self._head) + MAX_YAML:
             content = self._head + self._tail(self._start)
         return content.decode().strip()
 
     def _tail(self, until: float | None = None) -> bytes:
-        """List the commanders, and the time until which the changes of inputs are complete."""
+        """Return the commanders, and the time until which the changes of inputs are complete."""
         rest: dict[str, Any] = {}
         if self._run.commanders:
             rest["commanders"] = [*self._run.commanders]
@@ -101,7 +101,7 @@ class ProvenanceFile:
 
 
 def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
-    """All but the changes of inputs."""
+    """Return the provenance without the changes of inputs."""
     fmu = run.fmu
     return {
         "format": FORMAT,
@@ -118,17 +118,17 @@ def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
 
 
 def file_of(namespace: str) -> str:
-    """Of a robot's provenance in its bag's folder."""
+    """Return the name of a robot's provenance file in its bag's folder."""
     return f"run.{quote(namespace, safe='')}.json" if namespace else FILE
 
 
 def key_of(namespace: str) -> str:
-    """Of a robot's provenance in its bag's own metadata."""
+    """Return the key of a robot's provenance in the bag's metadata."""
     return f"{KEY}/{namespace}" if namespace else KEY
 
 
 def robots_of(folder: Path) -> list[str]:
-    """Namespaces of the robots whose provenance a bag has, [""] where it is of one or of none."""
+    """Return the namespaces of a bag's robots that have provenance, [""] for one robot or none."""
     if (folder / FILE).exists():
         return [""]
     names = (file.name for file in folder.glob("run.*.json"))  # "run.left (1).json" is a copy
@@ -137,7 +137,7 @@ def robots_of(folder: Path) -> list[str]:
 
 
 def robot_in(path: Path) -> tuple[Path, str]:
-    """A bag's folder and the namespace of its robot that is meant: "pair:left" is one of "pair".
+    """Split an address such as "pair:left" into the bag's folder and the robot's namespace.
 
     Raises:
         BagError: the bag has no such robot, or several and none is chosen.
@@ -157,18 +157,18 @@ def robot_in(path: Path) -> tuple[Path, str]:
 
 
 def each_robot(path: Path) -> list[Path]:
-    """The addresses of a bag's robots, as ``robot_in`` takes them; of one robot the bag itself."""
+    """Return the addresses of a bag's robots, as ``robot_in`` accepts them."""
     robots = robots_of(path) if path.is_dir() else [""]
     return [path] if len(robots) == 1 else [Path(f"{path}:{robot}") for robot in robots]
 
 
 def _as_json(content: Any) -> bytes:
-    """Without a single space: writers of YAML, which holds it too, fold there, not all rightly."""
+    """Return JSON without spaces, because some writers of YAML fold wrongly at a space."""
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
 
 
 def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
-    """The provenance of a bag's robot; {} where there is none, or that of another tool.
+    """Return the provenance of a bag's robot; {} where there is none of this package.
 
     It is in the bag's folder, or in the metadata of a bag that is a single file.
 

@@ -1,4 +1,4 @@
-"""Bags, of this or another writer, read back as arrays."""
+"""Read bags of any writer as arrays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LOG = logging.getLogger(__name__)
 
 
 def read_bag(path: str | Path) -> Recording:
-    """Joint states and targets of a bag, of this or another writer.
+    """Read the joint states and targets of a bag of any writer.
 
     Args:
         path: the bag's folder; of one robot of several, with a colon and its namespace.
@@ -45,7 +45,7 @@ def read_bag(path: str | Path) -> Recording:
 def read_outline(
     path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]
 ) -> Recording:
-    """A bag as ``read_bag`` gives it, but of more than ``most`` samples fewer, for drawing.
+    """Read a bag as ``read_bag`` does, downsampled to at most ``most`` samples for drawing.
 
     Besides those of a chunk of the bag no more are in memory. ``lines`` gives what is drawn over
     time beside positions and velocities, of a part of the bag; what it raises is raised here too.
@@ -54,7 +54,7 @@ def read_outline(
 
 
 def read_ends(path: str | Path) -> Recording:
-    """The first and the last joint state of a bag.
+    """Return the first and the last joint state of a bag.
 
     By the summaries of its files, where all have one that can be believed.
 
@@ -89,7 +89,7 @@ def read_ends(path: str | Path) -> Recording:
 
 
 def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
-    """A bag's folder, what topics of the robot that is meant begin with, and others' of those."""
+    """Return a bag's folder, the topic prefix of the chosen robot, and the prefixes of others."""
     folder, namespace = robot_in(path)
     inside = (name for name in robots_of(folder) if name.startswith(f"{namespace}/"))
     return folder, f"/{namespace}" if namespace else "", tuple(f"/{name}/" for name in inside)
@@ -101,7 +101,7 @@ def _is_within(topic: str, prefix: str, others: tuple[str, ...]) -> bool:
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
-    """Name the bag in what is wrong with its files."""
+    """Name the bag in errors of its files."""
     try:
         yield
     except OSError as error:
@@ -116,7 +116,7 @@ def _refusing(path: Path) -> Iterator[None]:
 def _read(
     path: Path, kind: type[_JointStates], targets: _Targets | None, outline: Outline | None = None
 ) -> Recording:
-    """What a kind of reader keeps of a bag's joint states, and of these an outline."""
+    """Read a bag's joint states by a kind of reader, and downsample them."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states, total = "", kind(path), 0
     allowance, thinned = Allowance(), False
@@ -156,7 +156,7 @@ def _read(
 
 
 def _check_count(path: Path, count: int) -> None:
-    """Warn where a bag's files have not as many messages as its metadata.yaml says."""
+    """Warn where the files and metadata.yaml disagree on the number of messages."""
     stated = stated_count(path) if path.is_dir() else count
     if stated not in (None, count):
         LOG.warning(
@@ -192,7 +192,7 @@ def _recording(
 
 
 def whole_bag(path: Path) -> list[Path]:
-    """The files of a bag that was closed; a BagError where it is none, or unfinished."""
+    """Return the files of a closed bag; raise BagError for an unfinished one or none."""
     files = storage_files(path)
     if not files:
         packed = [*path.glob("*.zstd")]
@@ -209,7 +209,7 @@ def whole_bag(path: Path) -> list[Path]:
 
 
 class _JointStates:
-    """The joint states of one topic, decoded as they come."""
+    """Joint states of one topic, decoded incrementally."""
 
     def __init__(self, path: Path) -> None:
         self.names: tuple[str, ...] = ()
@@ -219,7 +219,7 @@ class _JointStates:
         self._numbers = [array("d") for _ in range(3)]
 
     def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Take N joint states."""
+        """Add N joint states."""
         numbers = self._decoded(messages)
         self._stamps.frombytes(stamps.tobytes())
         for stored, part in zip(self._numbers, numbers, strict=True):
@@ -229,13 +229,13 @@ class _JointStates:
         return len(self._stamps)
 
     def keep(self, chosen: Indices) -> None:
-        """Drop all but some of those that ``arrays`` gives."""
+        """Keep only some of the states that ``arrays`` returns."""
         stamps, *numbers = self.arrays()
         self._stamps = array("q", stamps[chosen].tobytes())
         self._numbers = [array("d", part[chosen].tobytes()) for part in numbers]
 
     def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Stamps, positions, velocities, efforts by ascending stamps."""
+        """Return stamps, positions, velocities and efforts by ascending stamps."""
         stamps = np.asarray(self._stamps)
         q, v, effort = (np.asarray(n).reshape(len(stamps), -1) for n in self._numbers)
         if np.any(np.diff(stamps) < 0):
@@ -263,28 +263,28 @@ class _JointStates:
 
 
 class _Ends(_JointStates):
-    """The first and the last joint state of one topic."""
+    """First and last joint state of one topic."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._ends: list[tuple[int, Rows]] = []
 
     def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Take N joint states, of which one may be the first and one the last."""
+        """Add N joint states."""
         first, last = int(np.argmin(stamps)), len(stamps) - 1 - int(np.argmax(stamps[::-1]))
         some = [*self._ends, *((int(stamps[k]), messages[k : k + 1]) for k in (first, last))]
         earliest = min(some, key=lambda end: end[0])
         self._ends = [earliest, max(reversed(some), key=lambda end: end[0])]
 
     def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Of these two."""
+        """Return stamps, positions, velocities and efforts of the two."""
         for stamp, message in self._ends:
             super().add(np.array([stamp]), message)
         return super().arrays()
 
 
 class _Targets:
-    """The points on /target that were told in one frame."""
+    """Points on /target in one frame."""
 
     def __init__(self) -> None:
         self._frame: bytes | None = None
@@ -292,7 +292,7 @@ class _Targets:
         self._stamps, self._points = array("q"), array("d")
 
     def add(self, stamps: Stamps, messages: Rows) -> None:
-        """Take PointStampeds, or PoseStampeds, which begin alike."""
+        """Add PointStampeds, or PoseStampeds, which begin alike."""
         try:
             frame, points = unpack_points(messages)
         except (MixtureError, IndexError, struct.error):
@@ -306,7 +306,7 @@ class _Targets:
         self._points.frombytes(points[new].tobytes())
 
     def heard(self, stamps: Stamps) -> Heard | None:
-        """The latest by each of these stamps; None where there are none, or not of one frame."""
+        """Return the latest target at each stamp; None where there are none, or several frames."""
         if self._frame is None or not self._sound:
             return None
         own = np.asarray(self._stamps)

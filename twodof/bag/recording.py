@@ -1,4 +1,4 @@
-"""A bag read back: arrays over the samples, and what its provenance says of them."""
+"""A bag read back: arrays over the samples, and the run's settings from its provenance."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TopicCount:
 
 @dataclass(frozen=True)
 class Heard:
-    """The points on a bag's /target: of each sample the latest by then.
+    """Targets received on a bag's /target: for each sample the latest one.
 
     Attributes:
         frame: that they are expressed in.
@@ -54,7 +54,7 @@ class Heard:
 
 @dataclass(frozen=True, repr=False)
 class Recording:
-    """A bag read back; N samples of n joints, m task axes.
+    """A bag read back: N samples of n joints and m task axes.
 
     All samples of the bag, or where it has many and is to be drawn, some of them.
 
@@ -98,12 +98,12 @@ class Recording:
 
     @property
     def axes(self) -> str:
-        """The task axes, of "xyz"; "" where the provenance does not know them."""
+        """Task axes, of "xyz"; "" where the provenance does not know them."""
         return str(self.provenance.get("axes") or "")
 
     @cached_property
     def schedule(self) -> Schedule:
-        """The inputs and parameters that held, each from its communication point on."""
+        """Inputs and parameters in effect, each from its communication point on."""
         try:
             starts = self.provenance.get("start_values", {})
             changes: Sequence[Any] = self.provenance.get("input_changes", [])
@@ -156,7 +156,7 @@ class Recording:
         return self.held("quat_des", 4)
 
     def held(self, group: str, size: int) -> Array:
-        """A vector of inputs in effect up to each sample, N × size; N × 0 where it is not known."""
+        """Return a vector of inputs in effect up to each sample, N × size; N × 0 where unknown."""
         names = [f"{group}[{i + 1}]" for i in range(size)]
         if not size or names[0] not in self.schedule[0][1] or KNOWN_UNTIL in self.provenance:
             return np.empty((len(self.stamps), 0))
@@ -182,7 +182,7 @@ class Recording:
         return path[:, ["xyz".index(axis) for axis in self.axes]]
 
     def to_pandas(self) -> pd.DataFrame:
-        """One row a sample: q, v, and tau, x and target where known; index t in s.
+        """Return a DataFrame with one row per sample; index t in s.
 
         Columns are named as the FMU's variables, "q[1]" of the first joint.
 

@@ -1,4 +1,4 @@
-"""What readers of a bag's files give, and how far they believe what a file claims.
+"""Record types and limits for untrusted bags.
 
 Nothing that a file claims is believed: a length, a table of contents, a size after decompression.
 Memory is bounded by the size of one chunk or message, time by the size of the files.
@@ -28,7 +28,7 @@ Stamps = NDArray[np.int64]
 
 
 class Channel(NamedTuple):
-    """A topic as a bag's file describes it."""
+    """A topic as described by a bag's file."""
 
     topic: str
     type: str
@@ -39,7 +39,7 @@ class Channel(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Messages of a channel that are equally long: log times in ns, N, and N × bytes."""
+    """Messages of a channel with equal lengths: log times in ns, N, and N × bytes."""
 
     channel: Channel
     stamps: Stamps
@@ -47,12 +47,12 @@ class Batch(NamedTuple):
 
 
 class DamageError(Exception):
-    """The file cannot be read from here on; what came before is sound."""
+    """The file is unreadable from here on; earlier messages are sound."""
 
 
 @dataclass
 class Allowance:
-    """What a bag's files together may still unpack to, bytes.
+    """Read budget of a bag: the bytes to which its files may still unpack.
 
     A few bytes can unpack to millions, and to records without end that are all alike. The messages
     of an honest bag differ in their time stamps at least. So after a large chunk no more is
@@ -62,7 +62,7 @@ class Allowance:
     left: int = MAX_CHUNK
 
     def spend(self, size: int) -> None:
-        """Take so many bytes off; a DamageError where they are not left."""
+        """Subtract bytes from the budget; raise DamageError where it is exhausted."""
         self.left -= size
         if self.left < 0:
             raise DamageError(f"it unpacks to more than {MAX_RATIO} times its size")
@@ -70,7 +70,7 @@ class Allowance:
 
 @contextmanager
 def refusing_damage(file: Path) -> Iterator[None]:
-    """Name the file where something in it is not what its place asks for."""
+    """Name the file in the error of a malformed field."""
     try:
         yield
     except (struct.error, UnicodeDecodeError, KeyError, TypeError) as error:

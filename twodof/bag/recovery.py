@@ -1,4 +1,4 @@
-"""Bags whose writer died, made whole again."""
+"""Recover bags whose writer died."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
 
 @dataclass(frozen=True)
 class Recovered:
-    """A bag that was made whole.
+    """A recovered bag.
 
     Attributes:
         path: its folder.
@@ -47,7 +47,7 @@ class Recovered:
 
 
 def recover(path: str | Path) -> Recovered:
-    """Make a bag whose writer died complete: index, metadata.yaml, statistics.
+    """Complete the bag of a writer that died: index, metadata.yaml, statistics.
 
     All messages that can be read are written to a new bag beside it. Only when that is whole and
     on the disk it takes the place of the old one, which is kept as ``<name>.unfinished``.
@@ -89,7 +89,7 @@ def recover(path: str | Path) -> Recovered:
 
 @contextmanager
 def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]:
-    """Keep others from a bag; what a recovery left that was killed is undone, as is this one's.
+    """Lock a bag; undo an earlier recovery that was killed, and this one if it fails.
 
     Between its two renames there is nothing in the bag's place: the lock goes with the old one.
     """
@@ -115,7 +115,7 @@ def _undo(folder: Path, original: Path, work: Path) -> None:
 
 
 def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:
-    """Messages by topic of a bag that lacks nothing and says so alike, else None."""
+    """Return messages by topic of a complete and consistent bag, else None."""
     counts: Counter[str] = Counter()
     try:
         stated = stated_count(folder)
@@ -132,7 +132,7 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
 
 
 def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
-    """Write what can be read into a new bag; messages by topic, and what ended the reading."""
+    """Write readable messages into a new bag; return messages by topic, and the reason why reading ended."""
     damage = []
     allowance = Allowance()
     robots = provenance.robots_of(folder)
@@ -177,7 +177,7 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
 
 
 class _Topics:
-    """Adds topics to a bag as they come."""
+    """Adds topics to a bag as they appear."""
 
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
@@ -198,7 +198,7 @@ class _Topics:
         return self._connections[channel]
 
     def _qos(self, text: str) -> list[Qos]:
-        """Profiles of a topic; none, so that players offer their default, where it has no sound."""
+        """Return the QoS profiles of a topic; none where they are invalid, so that players use defaults."""
         if text not in self._profiles:
             self._profiles[text] = []
             self._yaml += len(text)
@@ -212,7 +212,7 @@ class _Topics:
 
 @cache
 def _hash(kind: str, definition: str) -> str:
-    """ROS 2's hash of a type, from the definition that the file carries."""
+    """Return ROS 2's hash of a type, from the definition in the file."""
     if len(definition) > MAX_DEFINITION:
         return NO_HASH
     store = get_typestore(Stores.EMPTY)

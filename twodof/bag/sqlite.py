@@ -1,4 +1,4 @@
-"""SQLite files of ROS 2, row by row, also those that a writer left unfinished."""
+"""Read SQLite files of ROS 2 row by row, unfinished ones too."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SOME = 1000  # rows that are put together
 
 
 def sqlite3_messages(path: Path) -> Iterator[Batch]:
-    """All messages of a file; errors as of ``read_messages``."""
+    """Read all messages of a file; errors as of ``read_messages``."""
     try:
         with _database(path) as database:
             channels = _sqlite3_channels(path, database)
@@ -54,7 +54,7 @@ def sqlite3_messages(path: Path) -> Iterator[Batch]:
 
 @contextmanager
 def _database(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database of tables alone, without changing it.
+    """Open a database of plain tables without changing it.
 
     Where a writer died over it, a copy is repaired. A journal can name that of several databases,
     which SQLite would look for, anywhere, and delete; a copy that is longer names none.
@@ -85,13 +85,13 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _unfinished(path: Path) -> list[Path]:
-    """The files that a writer which died leaves beside its database."""
+    """Return the files that a killed writer leaves beside its database."""
     files = [path.with_name(path.name + suffix) for suffix in ("-journal", "-wal")]
     return [f for f in files if f.is_file() and not f.is_symlink() and f.stat().st_size]
 
 
 def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Channel]:
-    """Topics by their id."""
+    """Return topics by their id."""
     definitions = {row[1]: row[3] for row in _rows(path, database, "message_definitions")}
     channels = {}
     for number, topic, kind, serialization, qos, digest in _rows(path, database, "topics"):
@@ -106,7 +106,7 @@ def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Cha
 
 
 def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:
-    """The rows of a table of ROS 2, NULL in the columns that it has not or computes.
+    """Yield the rows of a table of ROS 2, with NULL in missing and computed columns.
 
     No more is believed to lie in them than there is room for in the files: pages can be linked in
     a circle, or be part of many rows. Nor may there be others before them, to be passed by.
@@ -130,7 +130,7 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
 
 
 def _batches(channel: Channel, messages: Iterable[tuple[int, bytes]]) -> Iterator[Batch]:
-    """Stamps and messages, put together as long as they are equally long."""
+    """Yield stamps and messages, grouped while they have equal lengths."""
     for size, group in groupby(messages, lambda message: len(message[1])):
         stamps, contents = zip(*group)
         rows = np.frombuffer(b"".join(contents), np.uint8).reshape(len(stamps), size)

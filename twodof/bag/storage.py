@@ -1,4 +1,4 @@
-"""rosbags' writer, with storages that can be brought to the disk while they are being written.
+"""rosbags' writer with storages that can be flushed to the disk during a run.
 
 rosbags commits sqlite3 only at the end and cuts MCAP chunks at 1 MiB, so that a process that is
 killed leaves little or nothing.
@@ -51,14 +51,14 @@ FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # place of the summary, of its o
 
 
 class McapStorage(McapWriter):
-    """MCAP whose chunks are cut at each flush."""
+    """MCAP storage that closes its chunk at each flush."""
 
     durable = False  # wait for the disk at the end
 
     _end = 0  # of the last chunk that got through
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Write messages, of each connection one by each of N stamps."""
+        """Write messages, one of each connection for each of N stamps."""
         if not messages:
             return
         parts, ends, chunk = [], [0], self.chunk
@@ -79,7 +79,7 @@ class McapStorage(McapWriter):
             of.message_end_time = max(of.message_end_time, max(times))
 
     def close_chunk(self) -> None:
-        """Write the pending chunk and its index, which rosbags would, number by number."""
+        """Write the pending chunk and its index in one piece, faster than rosbags does."""
         chunk, data, begin = self.chunk, self.chunk.bio.getvalue(), self.bio.tell()
         times = struct.pack("<QQ", chunk.message_start_time, chunk.message_end_time)
         self._write(CHUNK, times + struct.pack("<QIIQ", len(data), 0, 0, len(data)), data)
@@ -98,7 +98,7 @@ class McapStorage(McapWriter):
         self.bio.writelines((HEAD.pack(opcode, sum(map(len, parts))), *parts))
 
     def flush(self, sync: bool) -> None:
-        """Hand all messages to the operating system, and with ``sync`` to the disk."""
+        """Pass all messages to the operating system, and with ``sync`` to the disk."""
         if self.chunk.msgs:
             self.close_chunk()
         self.bio.flush()
@@ -120,7 +120,7 @@ class McapStorage(McapWriter):
                 os.fsync(file.fileno())
 
     def salvage(self) -> None:
-        """After a failed flush: bring the file into a state from which the next can go on."""
+        """Restore a valid file after a failed flush, so that the next can continue."""
         self.bio.flush()
         if self.chunk.msgs:  # the chunk did not get through: cut off what did of it
             self.bio.seek(self._end)
@@ -128,7 +128,7 @@ class McapStorage(McapWriter):
 
 
 class Sqlite3Storage(Sqlite3Writer):
-    """SQLite whose messages are inserted and committed at each flush, all or none."""
+    """SQLite storage that inserts and commits all messages of a flush, or none."""
 
     durable = False  # wait for the disk at the end
 
@@ -141,13 +141,13 @@ class Sqlite3Storage(Sqlite3Writer):
         self._rows: list[tuple[int, int, bytes]] = []
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Keep messages until the next flush, of each connection one by each of N stamps."""
+        """Keep messages until the next flush, one of each connection for each of N stamps."""
         parts = [(number, rows.tobytes(), rows.shape[1]) for number, rows in messages.items()]
         for k, stamp in enumerate(stamps.tolist()):
             self._rows += [(n, stamp, data[k * size : (k + 1) * size]) for n, data, size in parts]
 
     def flush(self, sync: bool) -> None:
-        """Hand all messages to the operating system, and with ``sync`` to the disk."""
+        """Pass all messages to the operating system, and with ``sync`` to the disk."""
         if sync and not self.conn.in_transaction:  # new topics open one, the next flush waits
             self.conn.execute(SYNCHRONOUS[True])
         self.conn.executemany(
@@ -157,11 +157,11 @@ class Sqlite3Storage(Sqlite3Writer):
         self._rows.clear()
 
     def salvage(self) -> None:
-        """After a failed flush: bring the file into a state from which the next can go on."""
+        """Restore a valid file after a failed flush, so that the next can continue."""
         self.conn.rollback()
 
     def close(self, version: int, metadata: str) -> None:
-        """Bring everything to the file, and close it."""
+        """Write everything to the file, and close it."""
         self.flush(sync=False)
         super().close(version, metadata)
         if self.durable:
@@ -169,7 +169,7 @@ class Sqlite3Storage(Sqlite3Writer):
 
 
 class BagWriter(Writer):
-    """rosbags' writer on these storages; with ``fsync`` it waits for the disk at each flush."""
+    """rosbags' writer with these storages; with ``fsync`` each flush waits for the disk."""
 
     STORAGE_PLUGINS = MappingProxyType(
         {StoragePlugin.MCAP: McapStorage, StoragePlugin.SQLITE3: Sqlite3Storage}
@@ -181,13 +181,13 @@ class BagWriter(Writer):
         self._fsync = fsync
 
     def open(self) -> None:
-        """Make the folder and its files."""
+        """Create the folder and its files."""
         super().open()
         assert self.storage is not None
         self.storage.durable = self._fsync
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Write messages, of each connection one by each of N stamps; they wait for a flush."""
+        """Write messages, one of each connection for each of N stamps, at the next flush."""
         assert self.storage is not None
         self.storage.write_all(stamps, messages)
         for connection in messages:
@@ -196,7 +196,7 @@ class BagWriter(Writer):
         self.max_timestamp = max(self.max_timestamp, int(stamps.max()))
 
     def flush(self) -> None:
-        """Hand all messages to the operating system.
+        """Pass all messages to the operating system.
 
         Raises:
             OSError, sqlite3.Error: the disk is full, or the file is gone.
@@ -208,7 +208,7 @@ class BagWriter(Writer):
 
 
 def check_path(path: Path, storage: str) -> None:
-    """Refuse a place where a bag of this storage would not be found again, by a BagError.
+    """Raise BagError for a path under which a bag of this storage would not be found again.
 
     Its name is written into metadata.yaml; rosbags makes a URI of a database's whole path.
     """

@@ -1,4 +1,4 @@
-"""A bag's folder while it is written: its files, its lock, and the thread that stores."""
+"""The folder of a bag in progress: its files, its lock, and the storing thread."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAUSE = 0.0005  # s between two looks at how far the thread is
 
 
 class Part(Protocol):
-    """What one robot gives to a bag."""
+    """The contribution of one robot to a bag."""
 
     namespace: str
 
@@ -38,18 +38,17 @@ class Part(Protocol):
         """Add the robot's topics to the store, and its provenance to the folder."""
 
     def hand_over(self) -> None:
-        """Give the store what is queued; called by the store's thread."""
+        """Pass the queue to the store; the store's thread calls it."""
 
     def stored(self) -> int:
-        """How many samples are in the bag."""
+        """Return the number of samples in the bag."""
 
     def metadata(self) -> tuple[str, str]:
-        """Key and text of the robot's provenance; an OSError where that was removed."""
+        """Return key and text of the robot's provenance; raise OSError where that was removed."""
 
 
 class Store:
-    """A folder with the messages of one robot, or of several: opened by the first of them, closed
-    by the last.
+    """A folder with the messages of one robot or several; the first opens it, the last closes it.
 
     Arguments and errors are those of ``Bag``. ``writer`` takes messages while it is open.
     """
@@ -69,7 +68,7 @@ class Store:
         _check_free(path, overwrite)
 
     def enter(self, part: Part) -> None:
-        """Take one robot's part; the first makes the folder.
+        """Add one robot's part; the first one creates the folder.
 
         Raises:
             BagError: it cannot be written, or has samples already.
@@ -104,7 +103,7 @@ class Store:
         self._entered += 1
 
     def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
-        """Numbers of new connections, in the order of the topics."""
+        """Return the numbers of new connections, in the order of the topics."""
         add = self.writer.add_connection
         return [
             add(name, kind, typestore=store_of(kind), offered_qos_profiles=[qos]).id
@@ -112,7 +111,7 @@ class Store:
         ]
 
     def check(self) -> None:
-        """Raise what has ended the thread, if anything has; BagError where the bag is not open."""
+        """Raise the error that ended the thread, if any; BagError where the bag is not open."""
         if self._failure is not None:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
@@ -120,7 +119,7 @@ class Store:
             raise BagError(f"the bag '{self.path}' is not open: it is a context, 'with bag:'")
 
     def flush(self) -> None:
-        """Have the thread store what is queued; it begins with the first, when all are there.
+        """Make the thread store the queue; the first flush starts the thread.
 
         It is a thread so that Ctrl-C, which Python raises in the main one, never comes between the
         bytes of a message, and what is written reaches the disk also while the FMU takes its time.
@@ -131,7 +130,7 @@ class Store:
         self._wait(lambda: self._stores > before)
 
     def leave(self, exception: object) -> None:
-        """End one robot's part; the last closes the bag.
+        """End one robot's part; the last one closes the bag.
 
         A full disk or a lost folder is a BagError, unless such an exception is on its way already.
         """
@@ -149,7 +148,7 @@ class Store:
             raise self._error(self._failure) from self._failure
 
     def _create(self) -> None:
-        """Create the bag's folder, or leave nothing of it."""
+        """Create the bag's folder, or leave nothing behind."""
         self.writer = BagWriter(self.path, self._storage, fsync=self.fsync)
         self._lock = -1  # no descriptor yet
         self._due: SimpleQueue[None] = SimpleQueue()
@@ -183,7 +182,7 @@ class Store:
                 Thread(target=self._keep_storing, name="bag writer").start()
 
     def _wait(self, done: Callable[[], bool]) -> None:
-        """Wait until something is done, or the thread has ended.
+        """Wait until a condition holds or the thread has ended.
 
         Without a lock, an event or a join: Ctrl-C, which Python raises between any two instructions
         of this thread, would leave a lock taken for ever if it came when that had just been.
@@ -192,7 +191,7 @@ class Store:
             time.sleep(PAUSE)
 
     def _keep_storing(self) -> None:
-        """The thread: stores what is queued twice a second, and when asked to; then closes."""
+        """Store the queue twice a second and on request, then close the bag: the thread's function."""
         try:
             closing = False
             while not closing:
@@ -218,7 +217,7 @@ class Store:
         self.writer.flush()
 
     def _close(self) -> None:
-        """Close the bag; after a failure give up the reserve and store what is still there."""
+        """Close the bag; after a failure release the reserve and store the rest."""
         storage = self.writer.storage
         assert storage is not None
         if self._failure is not None:
@@ -237,7 +236,7 @@ class Store:
         self._closed = True
 
     def _error(self, failure: Exception) -> Exception:
-        """What the main thread raises for a failure of the thread."""
+        """Return the main thread's error for a failure of the thread."""
         if not isinstance(failure, OSError | sqlite3.Error):
             return failure
         gone = not self.path.exists()  # the storage fails with this or that then
@@ -259,7 +258,7 @@ def _reason(error: Exception) -> str:
 
 
 def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
-    """Refuse what is in a bag's place; with ``clear``, remove what may be overwritten."""
+    """Refuse an existing folder; with ``clear``, remove one that may be overwritten."""
     try:
         if not path.exists():
             return
@@ -282,7 +281,7 @@ def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
 
 
 def _is_bag(path: Path) -> bool:
-    """A folder with rosbag2's metadata, or with our provenance where the writer died."""
+    """Return whether a folder has rosbag2's metadata, or the provenance of a writer that died."""
     try:
         metadata = read_file(path / "metadata.yaml", MAX_METADATA)
         return metadata.startswith(b"rosbag2_bagfile_information:")

@@ -1,4 +1,4 @@
-"""What an MCAP file's own summary says, where it can be believed.
+"""Read the summary of an MCAP file where its checksum is valid.
 
 It is at the end of a file that was closed, with a checksum over all of it:
 
@@ -29,7 +29,7 @@ CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, place, length, by
 
 @dataclass(frozen=True)
 class Chunk:
-    """Log times in ns, place and length of a chunk's record, and the channels in it."""
+    """Log times in ns, offset and length of a chunk's record, and its channels."""
 
     first: int
     last: int
@@ -40,7 +40,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class McapSummary:
-    """A file's channels by number, how many messages each has, and its chunks."""
+    """A file's channels by number, their message counts, and its chunks."""
 
     path: Path
     channels: dict[int, Channel]
@@ -48,7 +48,7 @@ class McapSummary:
     chunks: list[Chunk]
 
     def ends(self, topic: str, allowance: Allowance) -> Iterator[Batch]:
-        """Batches among which are the first and the last message of a topic.
+        """Return batches that include the first and the last message of a topic.
 
         Raises:
             DamageError: a chunk is not where it should be, or not sound.
@@ -65,7 +65,7 @@ class McapSummary:
         self, chunks: list[Chunk], topic: str, allowance: Allowance,
         beyond: Callable[[Chunk, list[int]], bool],
     ) -> Iterator[Batch]:  # fmt: skip
-        """The topic's messages, chunk by chunk, until one cannot have an earlier or later one."""
+        """Yield the topic's messages chunk by chunk, while a chunk can have an earlier or later one."""
         stamps: list[int] = []
         with self.path.open("rb") as file, refusing_damage(self.path):
             for chunk in chunks:
@@ -84,7 +84,7 @@ class McapSummary:
 
 
 def read_summary(path: Path) -> McapSummary | None:
-    """The summary of an MCAP file; None where it has none that can be believed.
+    """Return the summary of an MCAP file; None where it has no valid one.
 
     Raises:
         OSError: the file cannot be read.
@@ -111,7 +111,7 @@ def read_summary(path: Path) -> McapSummary | None:
 
 
 def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
-    """Of the records of a summary that begins at a place; None where they do not fit together."""
+    """Return a summary from its records at an offset; None where they are inconsistent."""
     tables, chunks, counts = Tables(), [], None
     position, said, chunk_count = 0, 0, 0
     while position < len(content):

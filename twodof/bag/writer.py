@@ -64,7 +64,7 @@ class Bag(Sink):
         self.count = 0
 
     def of(self, namespace: str) -> Bag:
-        """A sink of one of several robots, whose topics are in a namespace of the same bag.
+        """Return a sink for one of several robots, whose topics have a namespace in the same bag.
 
         Raises:
             InputError: it is no name of ROS 2.
@@ -76,16 +76,16 @@ class Bag(Sink):
 
     @property
     def address(self) -> str:
-        """What readers take: the folder, with a robot's namespace where it has one."""
+        """Address for readers: the folder, with a robot's namespace where it has one."""
         return f"{self.path}:{self.namespace}" if self.namespace else str(self.path)
 
     @property
     def topic(self) -> str:
-        """Of the joint states."""
+        """Topic of the joint states."""
         return self._named(JOINT_STATES)
 
     def begin(self, run: Experiment) -> Bag:
-        """Take the experiment whose samples come.
+        """Receive the experiment of the samples to come.
 
         Raises:
             BagError: the FMU has not what is asked for.
@@ -129,7 +129,7 @@ class Bag(Sink):
         self._connections = dict(zip(self._messages.topics, self._store.add_topics(topics)))
 
     def hand_over(self) -> None:
-        """Give the store what is queued: changes of inputs before the messages that show them."""
+        """Pass the queue to the store: changes of inputs before the messages that show them."""
         samples, changes = list(self._queue), list(self._changes)
         self._provenance.add(changes)
         for _ in changes:
@@ -146,11 +146,11 @@ class Bag(Sink):
             self._taken += len(samples)
 
     def stored(self) -> int:
-        """How many samples are in the bag."""
+        """Return the number of samples in the bag."""
         return self._store.writer.counts[self._connections[JOINT_STATES]]
 
     def metadata(self) -> tuple[str, str]:
-        """Key and text of the provenance; an OSError where that was removed."""
+        """Return key and text of the provenance; raise OSError where that was removed."""
         return self._provenance.key, self._provenance.text()
 
     def _named(self, topic: str) -> str:
@@ -161,7 +161,7 @@ class Bag(Sink):
         self._store.writer.write_all(stamps, rows)
 
     def _note(self, sample: Sample) -> None:
-        """Queue what changed of the inputs since the sample before."""
+        """Queue the inputs that changed since the sample before."""
         changed = {n: v for n, v in sample.inputs.items() if v != self._inputs.get(n)}
         if changed:
             self._changes.append((sample.since, changed))

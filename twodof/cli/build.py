@@ -1,4 +1,4 @@
-"""build: an FMU from a URDF."""
+"""Verb build: build an FMU from a URDF."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .printing import print_next, print_table, quote
 
 
 def add(build: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu")
     option(
@@ -64,7 +64,7 @@ def add(build: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     if options.urdf and options.robot:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
     check_company(

@@ -1,4 +1,4 @@
-"""The FMU that a command line asks for, built if need be."""
+"""The FMU that a command line names, built on demand."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .printing import quote, say
 
 
 def is_robot(path: str | None) -> bool:
-    """Whether a URDF, or a xacro file, is named in place of an FMU."""
+    """Return whether a name is that of a URDF or xacro file, not of an FMU."""
     return bool(path) and Path(str(path)).suffix in (".urdf", ".xacro")
 
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
-    """The FMU that is named, else that of the URDF or of the default arm."""
+    """Return the named FMU, or that of the URDF or of the default arm."""
     of_urdf = is_robot(options.fmu)
     if options.frame is not None and not of_urdf:
         what = "an FMU" if options.fmu else "none"
@@ -40,7 +40,7 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
 
 
 def fast_fmu(options: argparse.Namespace) -> Path:
-    """The FMU that is named, else the default arm's, native where it can be built."""
+    """Return the named FMU, or the default arm's, native where it can be built."""
     if options.fmu:
         return Path(options.fmu)
     try:
@@ -51,7 +51,7 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 
 def _default_arm(verb: str, *, native: bool = False) -> Path:
-    """Return the default arm's FMU, built if need be; no other FMU is in its place or alone."""
+    """Return the default arm's FMU, built on demand; refuse to guess beside other FMUs."""
     from ..export.package import is_default_arm, is_fmu
 
     there = [path for path in sorted(Path().glob("*.fmu")) if is_fmu(path)]

@@ -1,4 +1,4 @@
-"""info: what is in an FMU or a bag."""
+"""Verb info: show the contents of an FMU, a bag or a sweep."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def add(info: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path)
     add_options(info, "--json")
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     path = options.path
     folder = Path(str(path).rpartition(":")[0] or path)
     if path.is_dir() and any(path.glob("*.parquet")):
@@ -48,7 +48,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _show_bags(path: Path, as_json: bool) -> None:
-    """Of each robot that the bag has."""
+    """Show each robot of the bag."""
     from ..bag.provenance import each_robot
     from ..bag.reader import read_ends
 
@@ -165,7 +165,7 @@ def _print_fmu(fmu: Fmu) -> None:
 
 
 def controlled(fmu: Fmu) -> str:
-    """What an FMU controls."""
+    """Return the frame and axes, or joints, that an FMU controls."""
     if not fmu.frame:
         return "unknown"
     of = f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}"

@@ -1,4 +1,4 @@
-"""layouts: files in which other tools show a robot."""
+"""Verb layouts: write files with which other tools show a robot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .printing import print_next, print_table, quote
 
 
 def add(layouts: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     layouts.description = (
         "Write files in which RViz, PlotJuggler and Foxglove show a robot that is published, or"
         " recorded with --scene and --effort."
@@ -24,7 +24,7 @@ def add(layouts: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..ros.layouts import layouts
 
     chosen = chosen_fmu(options)

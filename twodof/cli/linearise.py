@@ -1,4 +1,4 @@
-"""linearise: an FMU as a linear system about an operating point."""
+"""Verb linearise: show the linear model of an FMU at an operating point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add(linearise: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     linearise.add_argument("fmu", metavar="FMU")
     linearise.add_argument(
         "--at", action="append", default=[], metavar="NAME=VALUE",
@@ -24,7 +24,7 @@ def add(linearise: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..linear import linearise
 
     model = linearise(options.fmu, parse_settings(options.at, "--at"))

@@ -1,4 +1,4 @@
-"""live: an FMU driven in the browser."""
+"""Verb live: drive an FMU in the browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .view import open_page, place
 
 
 def add(live: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     live.description = "Step an FMU in real time behind a page in the browser: drag the target."
     add_fmu(live, "the default arm's", "FMU")
     add_output(live, "BAG", "name of recordings")
@@ -20,7 +20,7 @@ def add(live: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..pages.live import live
 
     settings = parse_settings(options.settings)

@@ -1,4 +1,4 @@
-"""The command line: calls the function behind each verb, and prints.
+"""The command line: parse, call the function behind each verb, and print.
 
 Imports are inside the verbs, so that ``twodof --help`` is instant.
 """
@@ -43,13 +43,13 @@ LONGEST_LINE = 2000
 
 
 class _Parser(argparse.ArgumentParser):
-    """Takes options in full alone: what is short today is ambiguous tomorrow."""
+    """Parser that accepts no abbreviations: a short form may become ambiguous later."""
 
     def __init__(self, **named: Any) -> None:
         super().__init__(allow_abbrev=False, **named)
 
     def error(self, message: str) -> NoReturn:
-        """End with a wrong command line."""
+        """Exit with a usage error."""
         super().error(plain(message))
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
@@ -60,7 +60,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser; what it gives has the verb's name as ``verb``, and what it does as ``call``."""
+    """Return the parser; it sets the verb's name as ``verb`` and its function as ``call``."""
     program = _Parser(
         prog="twodof",
         description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
@@ -84,14 +84,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 class _Words(logging.Formatter):
-    """The library's messages, with the options that its arguments have here."""
+    """Formatter that replaces arguments by options in messages of the library."""
 
     def format(self, record: logging.LogRecord) -> str:
         return in_options(super().format(record))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status."""
+    """Run one command; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost a tenth of a short run
     os.environ.pop("MPLBACKEND", None)  # that of a notebook, which may not be installed here
@@ -124,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:
-    """What the arguments say, and output and messages as the command line has them."""
+    """Parse the arguments, and configure output and messages."""
     program = parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
@@ -150,7 +150,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _facts_beside(output: str | None) -> AbstractContextManager[object]:
-    """Facts go to stderr where the standard output is the file that is written."""
+    """Print facts to stderr where the standard output is the written file."""
     from ..files import descriptor_of
 
     beside = output is not None and descriptor_of(output) == 1
@@ -166,6 +166,6 @@ def _fail(message: str, status: int = 1) -> int:
 
 
 def _silence() -> None:
-    """What is still in the output's buffer cannot be written and must not fail again at exit."""
+    """Discard unwritable buffered output, so that it does not fail again at exit."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Options that several verbs have, and what they say."""
+"""Options that several verbs share."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 class CommandLineError(InputError):
-    """An option is wrong, or does not go with another."""
+    """An option is invalid, or conflicts with another."""
 
 
 def not_empty(text: str) -> str:
-    """A text that is not empty, as that of a variable is which a shell does not know."""
+    """Reject an empty string, for example an unset shell variable."""
     if not text:
         raise argparse.ArgumentTypeError("it is empty")
     return text
@@ -29,7 +29,7 @@ STANDARD_OUTPUT = "/dev/stdout"
 
 
 def output_file(text: str) -> str:
-    """A file to be written; "-" is the standard output."""
+    """Return the path of an output file; "-" is the standard output."""
     return STANDARD_OUTPUT if text == "-" else not_empty(text)
 
 
@@ -93,19 +93,19 @@ def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def add_fmu(parser: argparse.ArgumentParser, default: str, metavar: str = "FMU|URDF") -> None:
-    """Add what is run, which can be left out."""
+    """Add the optional FMU or URDF to run."""
     parser.add_argument(
         "fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}"
     )
 
 
 def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
-    """Add where what is made goes."""
+    """Add the option for the output file."""
     parser.add_argument("-o", dest="output", type=not_empty, metavar=metavar, help=text)
 
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
-    """Add the robot of a bag from elsewhere."""
+    """Add the options for the robot of a third-party bag."""
     parser.add_argument(
         "--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none"
     )
@@ -113,7 +113,7 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
 
 
 def said(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """What options say that are called as arguments of the library."""
+    """Return keyword arguments of the library from options of the same meaning."""
     return {name: getattr(options, name) for name in names}
 
 
@@ -122,7 +122,7 @@ def check_company(
     needs: dict[str, str] | None = None,
     excludes: dict[str, str] | None = None,
 ) -> None:
-    """Refuse options that would do nothing, without another or beside another, and name both."""
+    """Refuse options that have no effect without, or beside, another one; name both."""
     for option, other in (needs or {}).items():
         if _given(options, option) and not _given(options, other):
             raise CommandLineError(f"{option} does nothing without {other}")
@@ -132,14 +132,14 @@ def check_company(
 
 
 def _given(options: argparse.Namespace, option: str) -> bool:
-    """Whether an option is on the command line; such ones have no defaults of their own."""
+    """Return whether an option is on the command line; such options have no default of their own."""
     names = SAME.get(option, (option.lstrip("-").replace("-", "_"),))
     return any(value is not None and value is not False and value != []
                for value in said(options, *names).values())  # fmt: skip
 
 
 def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:
-    """NAME=VALUE texts of an option: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
+    """Parse NAME=VALUE texts: ``Kp=80``, ``x_des=0.25,0.1``, ``limit_effort=true``."""
     settings: dict[str, Setting] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -163,7 +163,7 @@ def _parse_value(name: str, text: str) -> Setting:
 
 
 def dated(stem: str) -> Path:
-    """The default name of what a run leaves."""
+    """Return the default name of a run's output."""
     from ..files import free_name
 
     return free_name(time.strftime(f"{stem}_%Y_%m_%d-%H_%M_%S"))

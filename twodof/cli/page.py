@@ -1,4 +1,4 @@
-"""page: a native FMU in one HTML file."""
+"""Verb page: write a native FMU as one HTML file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .printing import print_table
 
 
 def add(page: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     page.description = (
         "Write a native FMU as one HTML file: the robot in 3D, its plant running in the browser, a"
         " target to drag. It needs no network and no server."
@@ -24,7 +24,7 @@ def add(page: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..files import free_name
     from ..pages.arm import is_page, page
 

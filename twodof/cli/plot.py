@@ -1,4 +1,4 @@
-"""plot: bags, or the map of a sweep, in one figure."""
+"""Verb plot: draw bags, or the map of a sweep, into one figure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add(plot: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     plot.description = (
         "Draw joint positions, velocities and efforts, the end effector's path and its error; of a"
         " sweep, each metric over the variables."
@@ -31,7 +31,7 @@ def add(plot: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..plots.figure import file_kind
 
     if options.output is not None:
@@ -73,7 +73,7 @@ def _plot_bags(options: argparse.Namespace) -> int:
 
 
 def _show_or_save(drawing: Drawing, output: str | None, *results: tuple[str, str]) -> None:
-    """A window where there is a terminal and a display, else a file and a word about it."""
+    """Show a window where there is a terminal and a display; else save a file and print its name."""
     from ..plots.figure import save, show
 
     if output is None and sys.stdout.isatty() and show(drawing):

@@ -1,4 +1,4 @@
-"""All output to the terminal: lines, tables, facts as JSON, the library's messages in options."""
+"""All output to the terminal: lines, tables, JSON, and the library's messages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POSE = "control 'pose'"
 
 
 def in_options(text: str) -> str:
-    """A message of the library, which has its arguments in backticks, for the command line."""
+    """Replace arguments, which the library puts in backticks, by options of the command line."""
     text = text.replace(POSE, "control 'task --orientation'")
     return plain(ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text))
 
@@ -38,26 +38,26 @@ def plain(text: str) -> str:
 
 
 def quote(path: Path) -> str:
-    """A path as a shell takes it."""
+    """Quote a path for the shell."""
     return shlex.quote(str(path))
 
 
 def say(text: str = "", *, error: bool = False) -> None:
-    """Print a line, on the standard error where it is one; every verb prints by this function."""
+    """Print a line, on the standard error for an error; every verb prints by this function."""
     print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def print_table(
     *rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = ""
 ) -> None:
-    """Texts in columns, a row a line; each line begins with what is to stand before."""
+    """Print rows of texts in aligned columns, each line after a prefix."""
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:
         say(before + "  ".join(map(align, row, widths)).rstrip())
 
 
 def print_next(*commands: str) -> None:
-    """Print what to type next, as this shell finds it; without what is not installed."""
+    """Print the next command to type in this shell, if what it needs is installed."""
     from ..version import install
 
     missing = {verb for verb, module in NEEDS.items() if find_spec(module) is None}
@@ -71,7 +71,7 @@ def print_next(*commands: str) -> None:
 
 
 def _program() -> str:
-    """This program for the shell: its name where that finds it, else its path."""
+    """Return this program's name where the shell finds it, else its path."""
     own = Path(sys.executable).with_name("twodof")
     found = shutil.which("twodof")
     if found is not None and own.exists() and own.samefile(found):
@@ -83,6 +83,6 @@ def _program() -> str:
 
 
 def print_json(**facts: object) -> None:
-    """Facts for another program, in SI units; null where there is no finite number."""
+    """Print facts for another program, in SI units; null for numbers that are not finite."""
     finite = json.loads(json.dumps(facts), parse_constant=lambda _: None)
     say(json.dumps(finite, indent=2))

@@ -1,4 +1,4 @@
-"""publish: an FMU in real time on a ROS 2 network."""
+"""Verb publish: run an FMU in real time on a ROS 2 network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def add(publish: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     publish.description = (
         "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
         " Ctrl-C. Commands from others drive the robot: joint states on /joint_commands, or points"
@@ -63,7 +63,7 @@ def add(publish: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..ros.network import network
     from ..ros.publisher import Publisher, publish, publish_together
     from ..simulation.pace import RealTime
@@ -116,7 +116,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
-    """What is to be run, by namespace; what is alone needs none."""
+    """Return the FMUs by namespace; a single one needs none."""
     from ..export.options import identifier
     from ..ros.messages import check_name
 

@@ -1,4 +1,4 @@
-"""recover: a bag whose writer died, made complete."""
+"""Verb recover: complete a bag whose writer died."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from .printing import print_next, print_table, quote, say
 
 
 def add(recover: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     recover.description = "Make a bag whose writer died complete, so that every reader opens it."
     recover.add_argument("bag", metavar="BAG", type=Path)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..bag.recovery import recover
 
     done = recover(options.bag)

@@ -1,4 +1,4 @@
-"""run: an FMU simulated, and its bag."""
+"""Verb run: simulate an FMU, and write its bag."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def add(run: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "default: rosbag2_<date and time>")
     add_options(run, "--stop-time", "--step")
@@ -41,7 +41,7 @@ def add(run: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from ..simulation.master import simulate
     from ..simulation.pace import RealTime
 
@@ -66,7 +66,7 @@ def call(options: argparse.Namespace) -> int:
 def experiment_of(
     options: argparse.Namespace, stop_time: float | None, step: float | None
 ) -> Experiment:
-    """The experiment that the options ask for."""
+    """Return the experiment of the options."""
     from ..fmu import load_fmu
     from ..simulation.experiments import experiment
 
@@ -89,7 +89,7 @@ def experiment_of(
 
 
 def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
-    """The bag that the options ask for."""
+    """Return the bag of the options."""
     from ..bag.writer import Bag
 
     names = ("storage", "scene", "effort", "overwrite", "fsync", "command_line")
@@ -99,7 +99,7 @@ def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
 def facts_of(
     run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None
 ) -> dict[str, Any]:
-    """How a run went, for another program."""
+    """Return the facts of a run for another program."""
     last = summary.last
     return dict(
         fmu=str(run.fmu.path),
@@ -120,7 +120,7 @@ def print_summary(
     options: argparse.Namespace, run: Experiment, bag: Bag | None, summary: Summary,
     pace: RealTime | None,
 ) -> None:  # fmt: skip
-    """How a run went."""
+    """Print the summary of a run."""
     last = summary.last
     rows = [("FMU", f"{run.fmu.path}")]
     for name, value in parse_settings(options.settings).items():
@@ -158,7 +158,7 @@ def print_summary(
 
 
 def _progress() -> list[Sink]:
-    """A sink that shows a bar on a terminal; none in a pipe."""
+    """Return a sink that shows a progress bar on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
         return []
     from tqdm import tqdm

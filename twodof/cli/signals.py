@@ -1,4 +1,4 @@
-"""Ctrl-C and its like."""
+"""Handling of Ctrl-C and of termination signals."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _interrupts: list[int] = []
 
 
 def interrupt(number: int, _frame: object) -> None:
-    """Ctrl-C; noted, as a module in C that is being imported makes an ImportError of it."""
+    """Raise KeyboardInterrupt, and note it, because a C module in import turns it into an ImportError."""
     _interrupts.append(number)
     raise KeyboardInterrupt
 
 
 def is_interrupt(error: ImportError | OSError) -> bool:
-    """Whether an error is what became of Ctrl-C.
+    """Return whether an error is a consequence of Ctrl-C.
 
     An OSError is where it came while a file was closed, which then is closed again and fails. So
     does ``shutil.rmtree``, which removes the folder that an FMU was unzipped to.
@@ -35,7 +35,7 @@ def is_interrupt(error: ImportError | OSError) -> bool:
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Whether a signal asked the run to end; read between steps, so that a step is never cut.
+    """Return whether a signal asked the run to end; read between steps, so that no step is cut.
 
     SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once, and
     so does the clock where the first has no effect; more are ignored, as all that is left is

@@ -1,4 +1,4 @@
-"""sweep: an FMU over many gains."""
+"""Verb sweep: run an FMU over many gains."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def add(sweep: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     sweep.description = (
         "Run an FMU over a grid or random values of any of its inputs and parameters. The native"
         " default FMU is built where none is named."
@@ -56,7 +56,7 @@ def add(sweep: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     from tqdm import tqdm
 
     from ..sweeps.coordinator import sweep
@@ -112,7 +112,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def best_runs(table: DataFrame) -> DataFrame:
-    """The first few of the ranked runs: variables, metrics known."""
+    """Return the first few of the ranked runs: variables, and known metrics."""
     from ..sweeps.ranking import ranked
 
     best = ranked(table).head(5)
@@ -121,7 +121,7 @@ def best_runs(table: DataFrame) -> DataFrame:
 
 
 def best_facts(table: DataFrame) -> dict[str, object]:
-    """The best runs, and how many exceed the URDF's limits, for another program."""
+    """Return the best runs, and how many exceed the URDF's limits, for another program."""
     from ..sweeps.ranking import beyond_limits
 
     best = best_runs(table).to_dict("records")
@@ -129,7 +129,7 @@ def best_facts(table: DataFrame) -> dict[str, object]:
 
 
 def print_best(table: DataFrame) -> None:
-    """The best runs, with units; nothing is called best that is equal to others."""
+    """Print the best runs with units; no run is called best that equals others."""
     from ..sweeps.metrics import METRICS
     from ..sweeps.ranking import RANKED, equals, ranked, remark
 
@@ -148,7 +148,7 @@ def print_best(table: DataFrame) -> None:
 
 
 def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
-    """Of --grid: evenly spaced values, both ends included."""
+    """Return the grids of --grid: evenly spaced values, both ends included."""
     import numpy as np
 
     from ..bounds import MAX_RUNS
@@ -165,7 +165,7 @@ def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
 
 
 def _ranges(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Of --range."""
+    """Return the ranges of --range."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in texts:
         name, (low, high) = _parse("--range", text, "NAME=LOW:HIGH", ranges)

@@ -1,4 +1,4 @@
-"""view: the replay of a bag in the browser."""
+"""Verb view: replay a bag in the browser."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .signals import asked_to_stop
 
 
 def add(view: argparse.ArgumentParser) -> None:
-    """The verb's options."""
+    """Add the options of the verb."""
     view.description = "Replay a bag in the browser, or write a page that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path)
     view.add_argument(
@@ -30,7 +30,7 @@ def add(view: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Do it; the exit status."""
+    """Run the verb; return the exit status."""
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
     from ..pages.replay import export, view
 
@@ -48,14 +48,14 @@ def call(options: argparse.Namespace) -> int:
 
 
 def place(options: argparse.Namespace) -> dict[str, Any]:
-    """Where a page is served, as far as the options say it."""
+    """Return the host and port options of a served page."""
     return {key: value for key, value in said(options, "host", "port").items() if value is not None}
 
 
 def open_page(
     options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None
 ) -> None:
-    """Tell where the page is, and open it where there is a display."""
+    """Print the URL of a page, and open it where there is a display."""
     _print_remarks(remarks)
     what = f"{fmu}; " if fmu is not None else ""
     say(f"open  {url} ({what}Ctrl-C ends)")

@@ -1,1 +1,1 @@
-"""From a URDF to an FMU."""
+"""Build an FMU from a URDF."""

@@ -1,4 +1,4 @@
-"""The constants of a robot: its bodies, where their joints are, and which of these follow others.
+"""Constants of a robot: its bodies, the transforms of its joints, and their coupling.
 
 Vectors and matrices of a body are in the frame of its joint, whose axis is z: frames are turned
 here, once, so that all else knows one kind of axis. Pinocchio has read the URDF.
@@ -23,7 +23,7 @@ Frame = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body: what is linear in the masses that it consists of.
+    """A rigid body by its parameters that enter the dynamics linearly.
 
     Attributes:
         mass: kg.
@@ -36,19 +36,19 @@ class Body:
     inertia: Array
 
     def with_point(self, mass: Any, place: Array) -> Body:
-        """Together with a point mass."""
+        """Return the body with an added point mass."""
         points = place * mass
         tensor = np.eye(3) * place.dot(points) - np.outer(place, points)
         return self + Body(mass, points, tensor)
 
     def __add__(self, other: Body) -> Body:
-        """Both as one, in the same frame."""
+        """Return two bodies as one, in the same frame."""
         return Body(
             self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia
         )
 
     def moved(self, R: Array, p: Array) -> Body:
-        """The same in the frame in which its own is placed at (R, p)."""
+        """Return the body in the frame in which its own frame has the pose (R, p)."""
         d = R.dot(self.moment)
         # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
         half = d + p * (0.5 * self.mass)
@@ -64,13 +64,13 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def symmetric(S: Array) -> Array:
-    """S, whose upper triangle is taken to be its lower one."""
+    """Return the symmetric matrix with the upper triangle of S."""
     return np.where(np.tri(3, dtype=bool), S, S.T)
 
 
 @dataclass(frozen=True)
 class JointTree:
-    """The constants of a robot whose N joints have axes along z; n of them move on their own.
+    """Constants of a robot whose N joints have axes along z; n of them are independent.
 
     Attributes:
         parent: of each joint, −1 for the root.
@@ -95,7 +95,7 @@ class JointTree:
 
 
 def joint_tree(robot: Robot) -> JointTree:
-    """The constants of a robot, read by Pinocchio, in frames and bodies that leave few of them."""
+    """Return the constants of a robot, from Pinocchio, in frames that leave few of them."""
     model = robot.model
     subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
     slides = tuple(bool(axis[:3].any()) for axis in subspaces)
@@ -137,7 +137,7 @@ SKEW = 0.1
 def _frames(
     axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]
 ) -> list[Frame]:
-    """A frame for each joint, in that of Pinocchio, and at last the root's.
+    """Return a frame for each joint, in that of Pinocchio, and the root's as the last.
 
     z is the joint's axis, x its common normal with the next one's, from which the origin is taken;
     so rotations to the next frame are about x, and the place of that has a component less. Source:
@@ -162,7 +162,7 @@ def _frames(
 
 
 def _rotation_to(z: Array, x: Array) -> Array:
-    """A rotation to axes z and, where that has a length, x."""
+    """Return a rotation to axes z and, where its length is not 0, x."""
     length = np.linalg.norm(x)
     if length < 1e-9:
         x = np.roll(np.eye(3)[0], int(np.argmax(np.abs(z))) + 1)  # after the largest component
@@ -173,7 +173,7 @@ def _rotation_to(z: Array, x: Array) -> Array:
 
 
 def _without_turn(R: Array) -> tuple[Array, float]:
-    """A and φ with R = A R_z(φ), in which A has a zero."""
+    """Return A and φ with R = A R_z(φ), in which A has a zero."""
     tilted = np.hypot(R[2, 0], R[2, 1]) > 1e-6
     angle = np.arctan2(R[2, 0], R[2, 1]) if tilted else np.arctan2(R[1, 0], R[0, 0])
     c, s = np.cos(angle), np.sin(angle)
@@ -181,13 +181,13 @@ def _without_turn(R: Array) -> tuple[Array, float]:
 
 
 def _without_rounding(values: Array) -> Array:
-    """What is a whole number but for rounding made one."""
+    """Round values that are within 1e-15 of a whole number."""
     whole = values.round()
     return np.where(np.abs(values - whole) < 1e-15, whole, values)
 
 
 def _regrouped(robot: JointTree) -> tuple[Body, ...]:
-    """The bodies without what a joint cannot tell from a part of its parent's.
+    """Return the bodies without the parameters that a joint cannot tell from its parent's.
 
     That is a rod along the axis of a joint that turns: m, z and I_yy of its body, which become 0.
     The task frame's body, whose payload varies, is left whole. Source: Gautier & Khalil, "Direct
@@ -206,7 +206,7 @@ def _regrouped(robot: JointTree) -> tuple[Body, ...]:
 
 
 def _subspace(joint: object) -> Array:
-    """Velocity of a joint with one coordinate, in its own frame: linear, angular; one is zero."""
+    """Return the velocity of a joint with one coordinate in its own frame: linear, angular; one is zero."""
     data = joint.createData()  # type: ignore[attr-defined]
     joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
     return np.asarray(data.S).reshape(6)

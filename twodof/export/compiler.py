@@ -1,4 +1,4 @@
-"""Compiling the C sources of an FMU, for every platform from any platform."""
+"""Compile the C sources of an FMU, for every platform on any platform."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ DIGEST = hashlib.sha256().digest_size
 
 
 def standard_headers() -> dict[str, bytes]:
-    """The headers of FMI 2.0 and 3.0 by file name, as FMPy brings them."""
+    """Return the headers of FMI 2.0 and 3.0 by file name, from FMPy."""
     fmpy = importlib.util.find_spec("fmpy")
     assert fmpy is not None and fmpy.origin is not None
     headers = (Path(fmpy.origin).parent / "c-code").glob("fmi[23]*.h")
@@ -77,7 +77,7 @@ def compile_library(
     units: Sequence[str] = UNITS,
     flags: Sequence[str] = (),
 ) -> bytes:
-    """The shared library of an FMU.
+    """Compile the shared library of an FMU.
 
     Args:
         sources: contents of the C files and headers by file name, ``model.h`` and the headers of
@@ -107,7 +107,7 @@ def compile_library(
 def compile_web_module(
     sources: Mapping[str, bytes], units: Sequence[str], functions: Sequence[str]
 ) -> bytes:
-    """A WebAssembly module of these of the C files, that imports nothing and exports functions.
+    """Compile C files to a WebAssembly module without imports that exports functions.
 
     Its ``_initialize`` is to be called first.
 
@@ -125,12 +125,12 @@ def compile_web_module(
 
 
 def compiles_for_the_web() -> bool:
-    """Whether there is a compiler for WebAssembly."""
+    """Return whether there is a compiler for WebAssembly."""
     return importlib.util.find_spec("ziglang") is not None
 
 
 def host_platform(fmi: int = 2) -> str:
-    """FMI platform of this machine, in a version's words; "" where there is no name for it."""
+    """Return the FMI platform of this machine in a version's terms; "" where it has no name."""
     machine = host.machine().lower()
     architecture = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
     if fmi == 3:
@@ -142,7 +142,7 @@ def host_platform(fmi: int = 2) -> str:
 
 
 def universal(libraries: Sequence[bytes]) -> bytes:
-    """Mach-O libraries of several architectures as one file.
+    """Join Mach-O libraries of several architectures into one file.
 
     Its header is that of ``mach-o/fat.h``: magic and count, and per architecture CPU type and
     subtype (from its own header), offset, size and alignment (2¹⁴), big-endian.
@@ -160,7 +160,7 @@ def universal(libraries: Sequence[bytes]) -> bytes:
 
 
 def _compilers(platform: str) -> list[list[str]]:
-    """Commands that compile for a platform, one for each architecture."""
+    """Return the commands that compile for a platform, one for each architecture."""
     if compiles_for_the_web():  # zig, which compiles for everything
         return [[*ZIG, target] for target in TARGETS[platform]]
     own = next((cc for cc in ("cc", "gcc", "clang") if shutil.which(cc)), None)
@@ -179,7 +179,7 @@ def _compilers(platform: str) -> list[list[str]]:
 
 
 def _link_flags(output: str) -> list[str]:
-    """Flags that leave nothing of this machine and this moment in the library."""
+    """Return flags that keep this machine and the time out of the library."""
     flags = ["-shared", "-s"]
     if output.endswith(".so"):
         return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
@@ -195,7 +195,7 @@ def _link_flags(output: str) -> list[str]:
 
 
 def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) -> bytes:
-    """What a command makes of C files; what zig has made is kept for the next time."""
+    """Compile C files by a command; cache the output of zig."""
     with temporary_folder() as folder:
         environment, kept = dict(os.environ), None
         if command[: len(ZIG)] == [*ZIG]:
@@ -218,7 +218,7 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
 
 
 def _kept(file: Path) -> bytes | None:
-    """What is kept in a file, or None: there is none, or it is damaged."""
+    """Return the content of a cache file; None where it is missing or damaged."""
     try:
         if not _is_ours(file):
             return None
@@ -231,7 +231,7 @@ def _kept(file: Path) -> bytes | None:
 
 
 def _keep(file: Path, content: bytes) -> None:
-    """Keep it where there is room, and nothing beside it that was not used for long."""
+    """Store content in the cache where there is room, and remove entries that are long unused."""
     with suppress(OSError):
         file.parent.mkdir(mode=0o700, exist_ok=True)
         write_file(file, hashlib.sha256(content).digest() + content)
@@ -257,7 +257,7 @@ def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -
 
 
 def zig_cache() -> Path | None:
-    """Where zig keeps the C library that it has compiled; None where home has no room for it.
+    """Return the folder in which zig caches its C library; None where the home folder has no room.
 
     Raises:
         BuildError: ``ZIG_GLOBAL_CACHE_DIR`` names a folder that cannot be.
@@ -286,6 +286,6 @@ def zig_cache() -> Path | None:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether no other user but root can have changed a file or folder."""
+    """Return whether only this user and root can have changed a file or folder."""
     state = path.stat()
     return state.st_uid == os.geteuid() and not state.st_mode & 0o022

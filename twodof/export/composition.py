@@ -1,4 +1,4 @@
-"""What goes into an FMU's zip, and its digest: of a URDF and options."""
+"""Contents of an FMU's archive and their digest, from a URDF and options."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
 
 
 def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
-    """The flavour, what the GUID is of, and what gives all other files: it compiles.
+    """Return the flavour, the files that the GUID covers, and a function that compiles the others.
 
     Raises:
         BuildError, RobotError: naming what is wrong; so does what compiles.
@@ -69,7 +69,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
 
     def finish() -> Files:
-        """What the GUID is not of: binaries and documentation."""
+        """Return the files that the GUID does not cover: binaries and documentation."""
         described = documentation(options, robot, table, flavour, guid, urdf)
         return {**flavour.signed(guid), **described}
 
@@ -108,7 +108,7 @@ def _flavour(
 
 
 def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[str, Any]]:
-    """The robot, its variables, and the start values that are not the table's own."""
+    """Return the robot, its variables, and the start values that differ from the table's."""
     shipped = options.urdf is None
     axes = ("xy" if shipped else "xyz") if options.axes is None else options.axes
     assert options.frame is not None

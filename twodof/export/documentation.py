@@ -1,4 +1,4 @@
-"""The FMU's documentation/ folder: equations, variables, provenance, needs and licences."""
+"""Documentation folder of the FMU: equations, variables, provenance, requirements and licences."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def documentation(
     options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour,
     guid: str, urdf: str,
 ) -> Files:  # fmt: skip
-    """Files of the folder by their path in the FMU, which has the URDF's text."""
+    """Return the files of the folder by their path in the FMU, which includes the URDF's text."""
     frame = html.escape(robot.frame)
     rows = []
     for v in table:

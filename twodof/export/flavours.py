@@ -1,4 +1,4 @@
-"""The two flavours of the FMU: what each adds to the files that both carry."""
+"""The two flavours of the FMU: the files that each adds to the common ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ PYTHONFMU_FILES = (
 
 @dataclass(frozen=True)
 class Flavour:
-    """What one flavour adds.
+    """Files that one flavour adds.
 
     Attributes:
         native: whether it is in C: with sources, Model Exchange and derivatives.
@@ -62,7 +62,7 @@ class Flavour:
 def python_flavour(
     options: FmuOptions, robot: Robot, urdf: str, starts: Mapping[str, Any]
 ) -> Flavour:
-    """The plant as Python code behind pythonfmu's wrapper, for linux64."""
+    """Return the Python flavour: the plant behind pythonfmu's wrapper, for linux64."""
     folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     folders += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
     config: dict[str, Any] = {
@@ -93,7 +93,7 @@ def python_flavour(
 
 
 def engine_sources(control: str, fmi: int = 2) -> Files:
-    """The engine's C files with one control law and the functions of one version of FMI."""
+    """Return the engine's C files with one control law and the functions of one FMI version."""
     law = "task" if control == "pose" else control
     left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
     left_out |= set() if law == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
@@ -109,7 +109,7 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
 def native_flavour(
     options: FmuOptions, robot: Robot, table: Sequence[Variable], fmi: int, platforms: Sequence[str]
 ) -> Flavour:
-    """The plant as C99 sources, compiled for the platforms."""
+    """Return the native flavour: the plant as C99 sources, compiled for the platforms."""
     name, control, arrays = options.name, options.control, options.arrays and fmi == 3
     headers = standard_headers()
     sources = engine_sources(control, fmi)
@@ -150,7 +150,7 @@ def native_flavour(
 
 
 def _slave_sources() -> Files:
-    """The Python code of the FMU under names that no other FMU's code has."""
+    """Return the Python code of the FMU under names that are unique to it."""
     plant = Path(__file__).parents[1] / "plant"
     package = {f"plant/{path.name}": path.read_bytes() for path in plant.glob("*.py")}
     for name in PYTHONFMU_FILES:

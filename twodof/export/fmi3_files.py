@@ -1,4 +1,4 @@
-"""The XML files that FMI 3.0 has beside modelDescription.xml. FMI 3.0.2, sections 2.5 and 2.6."""
+"""XML files of FMI 3.0 besides modelDescription.xml. FMI 3.0.2, sections 2.5 and 2.6."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ TERMINALS = {
 
 
 def xml_text(root: ET.Element) -> bytes:
-    """As it stands in a file."""
+    """Return an XML element as the text of a file."""
     ET.indent(root)
     text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
 
 
 def build_description(identifier: str, units: Sequence[str]) -> bytes:
-    """The text of sources/buildDescription.xml: what a tool compiles."""
+    """Return the text of sources/buildDescription.xml, which lists the sources to compile."""
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=identifier)
     files = ET.SubElement(build, "SourceFileSet", language="C99")
@@ -33,7 +33,7 @@ def build_description(identifier: str, units: Sequence[str]) -> bytes:
 
 
 def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
-    """The text of terminalsAndIcons.xml: how the icon lies, and what belongs together in a plug."""
+    """Return the text of terminalsAndIcons.xml: the icon's extent and the terminals."""
     targets = {v.group for v in table if v.group.endswith(("_des", "_cmd"))}
     terminals = {"targets": targets, "joints": {"q", "v", "tau"}, "forces": set(DISTURBANCES)}
     root = ET.Element("fmiTerminalsAndIcons", fmiVersion="3.0")

@@ -1,4 +1,4 @@
-"""The robot's kinematics and dynamics as C: ``mechanism.c`` of the native flavour."""
+"""Generate ``mechanism.c`` of the native flavour: the robot's kinematics and dynamics as C."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .straight_line import Expression, Value, Varied, c_function, operations, va
 
 
 def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
-    """The text of ``mechanism.c``: the robot's kinematics and dynamics, without loops."""
+    """Return the text of ``mechanism.c``: the robot's kinematics and dynamics as straight-line code."""
     n, constants = len(robot.joints), joint_tree(robot)
     joint = np.array(
         [
@@ -76,7 +76,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
 def _forward_dynamics(
     robot: JointTree, bodies: Sequence[Body], joint: Array, in_all: str
 ) -> list[str]:
-    """Forward dynamics, and those with held joints, by factors of M or by recursion.
+    """Return forward dynamics, and those with held joints, by factors of M or by recursion.
 
     Whichever takes fewer operations.
     """
@@ -122,7 +122,7 @@ LOWER = np.tril_indices(3)
 
 
 def _solution(solution: Array, inertial: Array) -> list[Varied]:
-    """a = M⁻¹τ and how it varies, M δa = δτ − δM a; ``inertial`` is M a of the variables a."""
+    """Return a = M⁻¹τ and its derivative, M δa = δτ − δM a; ``inertial`` is M a of the variables a."""
     n = len(solution)
     names = [(f"a[{i}]", f"tau[{i}]") for i in range(n)]
     value = [a for a, _ in varied(solution, held=HELD)]
@@ -146,7 +146,7 @@ def _places(robot: JointTree) -> dict[str, Value]:
 
 
 def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
-    """The bodies, that with the payload as variables; and what these are."""
+    """Return the bodies, the last with the payload as variables, and the names of these."""
     carrier, place = robot.path[-1], _variables("place", 3)
     loaded = robot.body[carrier].with_point(
         Expression("payload"), robot.frame_p + robot.frame_R.dot(place)
@@ -166,7 +166,7 @@ def _variables(name: str, count: int) -> Array:
 
 
 def _elements(name: str, values: Array) -> dict[str, Value]:
-    """Each element of an array by its name in C."""
+    """Return each element of an array by its name in C."""
     return {
         name + "".join(f"[{i}]" for i in place): value for place, value in np.ndenumerate(values)
     }

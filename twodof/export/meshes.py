@@ -1,4 +1,4 @@
-"""The mesh files of a URDF: found, and renamed to where they lie inside an FMU."""
+"""Find the mesh files of a URDF, and rename them to their paths inside an FMU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOG = logging.getLogger(__name__)
 
 
 def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str, dict[str, bytes]]:
-    """The URDF with its meshes renamed to ``package://meshes/…``, and the files by that name.
+    """Return the URDF with its meshes renamed to ``package://meshes/…``, and the files by that name.
 
     The URDF may be anybody's, and the FMU is mailed: a mesh comes from ``mesh_dir``, the URDF's
     folder or its package, however it is named or linked, or it is refused. Those that are not there
@@ -63,7 +63,7 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
 
 
 def places_of(folder: Path, mesh_dir: Path | None) -> list[Path]:
-    """The folders from which a URDF may have files: ``mesh_dir``, its own and its package.
+    """Return the folders from which a URDF may read files: ``mesh_dir``, its own and its package.
 
     The URDF's package is the nearest folder upwards with a package.xml. A folder that carries the
     package's name is not enough: ``package://home/alice/.netrc`` names one too.
@@ -74,7 +74,7 @@ def places_of(folder: Path, mesh_dir: Path | None) -> list[Path]:
 
 
 def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
-    """The file of a mesh, its links followed, inside one of the places that it may come from."""
+    """Return the file of a mesh, links resolved, inside one of the allowed folders."""
     own, places = folder.resolve(), places_of(folder, mesh_dir)
     scheme, separator, rest = uri.partition("://")
     if not separator or scheme == "file":
@@ -101,7 +101,7 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
 
 
 def _colours(path: Path, content: bytes, mesh_dir: Path | None) -> bytes:
-    """The material libraries of an OBJ file that are there."""
+    """Return the existing material libraries of an OBJ file."""
     libraries = b""
     if path.suffix.lower() != ".obj":
         return libraries
@@ -113,7 +113,7 @@ def _colours(path: Path, content: bytes, mesh_dir: Path | None) -> bytes:
 
 
 def _inside(path: Path, files: dict[str, bytes]) -> str:
-    """A name under meshes/ that keeps as much of the original path as tells files apart."""
+    """Return a name under meshes/ that keeps enough of the original path to be unique."""
     parts = [re.sub(r"[^A-Za-z0-9._-]", "_", part) for part in path.parts[1:]]
     for depth in range(1, len(parts) + 1):
         name = "/".join(("meshes", *parts[-depth:]))

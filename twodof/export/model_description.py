@@ -1,4 +1,4 @@
-"""modelDescription.xml of either flavour, from the variable table.
+"""Write modelDescription.xml of either flavour and version from the variable table.
 
 Source: FMI 2.0.4, section 2.2; FMI 3.0.2, section 2.4, where elements of vectors become arrays, or
 stay scalars for tools that know no arrays.
@@ -94,7 +94,7 @@ IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
 def model_description(
     options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour, guid: str
 ) -> bytes:
-    """The XML text, of variables as ``engine_variables`` gives them; the GUID may still be ""."""
+    """Return the XML text of variables given by ``engine_variables``; the GUID may still be ""."""
     fmi, law = flavour.fmi, CONTROLS[options.control]
     names = [replace(v, index=None).name if flavour.arrays else v.name for v in table]
     reference = {name: str(i) for i, name in enumerate(dict.fromkeys(names), start=1)}
@@ -182,7 +182,7 @@ def _units(root: ET.Element, used: Collection[str], fmi: int) -> None:
 
 
 def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
-    """What a logger needs to know beyond variable names."""
+    """Add the vendor annotation: facts that a logger needs besides variable names."""
     task = ET.SubElement(
         tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes,
         control=control,
@@ -192,7 +192,7 @@ def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
 
 
 def _range(robot: Robot, variable: Variable) -> Range:
-    """Of values: the URDF's limits of a joint's position, else what the FMU refuses to leave."""
+    """Return the range of values: the URDF's position limits, else the range that the FMU accepts."""
     if variable.group == "q" and variable.index is not None:
         limits = robot.q_min[variable.index], robot.q_max[variable.index]
         low, high = (side if abs(side) < UNBOUNDED else math.inf * side for side in limits)
@@ -201,7 +201,7 @@ def _range(robot: Robot, variable: Variable) -> Range:
 
 
 def _nominal(robot: Robot, variable: Variable) -> float:
-    """The size of values, 1 where there is no better one to be known."""
+    """Return the nominal value, 1 where no better one is known."""
     if variable.group in SMALL:
         return float(variable.start or 1.0)
     if variable.group in EFFORTS and variable.index is not None:
@@ -249,7 +249,7 @@ def _variables(
 def _attributes(
     robot: Robot, variable: Variable, start: Value | None, exchanges: bool
 ) -> dict[str, str]:
-    """Of a scalar, or an element of a vector."""
+    """Return the attributes of a scalar, or of an element of a vector."""
     attributes = {
         "description": variable.description,
         "causality": variable.causality,
@@ -280,7 +280,7 @@ def _attributes(
 
 
 def _description(elements: Sequence[dict[str, str]]) -> str:
-    """What the vector is, and what each of its elements is, with its unit where that differs."""
+    """Return a description of the vector and of each element, with its unit where units differ."""
     texts = [element["description"] for element in elements]
     if len({*texts}) == 1:
         return texts[0]
@@ -318,7 +318,7 @@ def _structure(
         at_the_start["tau"] = (("limit_effort", *control.inputs), own)
 
     def known(unknown: Variable, groups: Sequence[str], whose: str) -> dict[str, None]:
-        """References of variables that an unknown depends on, in their order."""
+        """Return references of the variables on which an unknown depends, in order."""
         return {
             reference: None
             for variable, reference in zip(table, references)

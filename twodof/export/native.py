@@ -1,4 +1,4 @@
-"""The native flavour: the header of a robot's constants, and compiling the C engine with it.
+"""The native flavour: a header with the robot's constants for the C engine.
 
 The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``model.h``; the robot's
 dynamics are ``mechanism.c``. Pinocchio has read the URDF.
@@ -27,7 +27,7 @@ def model_header(
     fmi: int = 2,
     arrays: bool = True,
 ) -> str:
-    """The text of ``model.h``: all constants of a robot and its variables, exact to the bit.
+    """Return the text of ``model.h``: constants of a robot and its variables, exact to the bit.
 
     Names from the URDF, which may be anybody's, are string literals and nothing else. At as many
     joints as a URDF may have the engine's working memory, which is on the stack, is 0.2 MB.
@@ -64,7 +64,7 @@ def model_header(
 def engine_variables(
     robot: Robot, table: Sequence[Variable], control: str, fmi: int
 ) -> Sequence[Variable]:
-    """The variables by place: in FMI 3.0 event indicators and the time are among them."""
+    """Return the variables in engine order; in FMI 3.0 with event indicators and the time."""
     if fmi == 2:
         return table
     first = next(i for i, variable in enumerate(table) if variable.causality == "parameter")
@@ -97,7 +97,7 @@ def _ranges(groups: Sequence[str]) -> str:
 
 
 def _references(table: Sequence[Variable], arrays: bool) -> str:
-    """Value references, from 1 on as some importers need them, of variables or whole vectors."""
+    """Return value references, from 1 on as some importers require, of variables or whole vectors."""
     places = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
     return (
         "/* The values of a reference, from 1 on: from PLACE[vr] to before PLACE[vr + 1]. */\n"
@@ -125,7 +125,7 @@ def _literal(value: object) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A C string literal; what is not printable ASCII as octal escapes of its UTF-8."""
+    """Return a C string literal; all but printable ASCII as octal escapes of its UTF-8."""
     escaped = "".join(
         chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
         for byte in text.encode()

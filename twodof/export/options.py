@@ -1,4 +1,4 @@
-"""What an FMU is asked to be."""
+"""Options of an FMU's build."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEFAULT_NAME = "TwoDof"
 
 @dataclass(frozen=True)
 class FmuOptions:
-    """What an FMU is made of.
+    """Options of an FMU's build.
 
     Attributes:
         urdf: the URDF or xacro file; None for the shipped planar arm.
@@ -76,7 +76,7 @@ class FmuOptions:
 
 
 def identifier(robot: str | Path) -> str:
-    """A robot's name for a program, from that of its file."""
+    """Return a robot's name as an identifier, from the name of its file."""
     stem = Path(robot).name.removesuffix(".xacro").removesuffix(".urdf").removesuffix(".fmu")
     name = re.sub(r"\W", "_", stem, flags=re.ASCII)
     return name if name.isidentifier() else f"robot_{name}"

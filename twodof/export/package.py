@@ -1,4 +1,4 @@
-"""An FMU's file: whether it is there already, and the zip."""
+"""Build an FMU file: find out whether it exists already, else write the archive."""
 
 from __future__ import annotations
 
@@ -72,17 +72,17 @@ def build_fmu(
 
 
 def is_fmu(path: Path) -> bool:
-    """Whether a file is a zip archive with a model description."""
+    """Return whether a file is a zip archive with a model description."""
     return _fits(path, lambda zipped: "modelDescription.xml" in zipped.namelist())
 
 
 def is_default_arm(path: Path) -> bool:
-    """Whether a file is an FMU of the shipped arm with its default settings."""
+    """Return whether a file is an FMU of the shipped arm with its default settings."""
     return _fits(path, lambda zipped: zipped.comment.startswith(DEFAULT_ARM))
 
 
 def _shipped(options: FmuOptions) -> bytes:
-    """A digest of all that the shipped arm's native FMU is made of, on this machine."""
+    """Return a digest of all inputs of the shipped arm's native FMU on this machine."""
     digest = hashlib.sha256()
     machine = host_platform(2), host_platform(3), compiles_for_the_web()
     digest.update(repr((versions(*TOOLS), options, machine)).encode())
@@ -95,7 +95,7 @@ def _shipped(options: FmuOptions) -> bytes:
 
 
 def _fits(path: Path, fits: Callable[[zipfile.ZipFile], bool]) -> bool:
-    """Whether a file is a sound zip archive of which something holds."""
+    """Return whether a file is a sound zip archive for which a condition holds."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -105,7 +105,7 @@ def _fits(path: Path, fits: Callable[[zipfile.ZipFile], bool]) -> bool:
 
 
 def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str]) -> bool:
-    """Whether it is already this FMU; its guid is a digest of all that matters."""
+    """Return whether a file is already this FMU; its GUID is a digest of all relevant inputs."""
     built_for = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
     with archive.open("modelDescription.xml") as file:
         same = file.read(len(description) + 1) == description
@@ -113,7 +113,7 @@ def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str
 
 
 def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
-    """Sorted entries with fixed dates, so that equal inputs give equal bytes; whole or not."""
+    """Write sorted entries with fixed dates, so that equal inputs give equal bytes; atomically."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.comment = comment

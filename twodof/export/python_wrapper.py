@@ -16,7 +16,7 @@ WRAPPER = "4be156a552c16f30eb4395805c59855d8d4086056d0f165442565f6c5fbac0c9"
 
 
 def repaired_wrapper(library: bytes) -> bytes | None:
-    """The wrapper without its exit function; None: not the library of pythonfmu 0.7.0.
+    """Return the wrapper without its exit function; None unless it is pythonfmu 0.7.0's.
 
     The function resets a static shared_ptr that C++ has destroyed before, in memory that is free.
     It is the second of two; the first one has C++ destroy static objects, and stays.
@@ -28,7 +28,7 @@ def repaired_wrapper(library: bytes) -> bytes | None:
 
 
 def check_python_wrapper(fmu: Path, library: Path, folder: Path) -> None:
-    """Refuse an unzipped FMU whose wrapper crashes, and repair it where another tool packed it.
+    """Refuse an unzipped FMU whose wrapper would crash; repair a wrapper of another packager.
 
     The wrapper decodes no escape but %20, and needs its module.
     """

@@ -1,4 +1,4 @@
-"""Kinematics and dynamics of a robot, as recursions over its joints.
+"""Kinematics and dynamics of a robot as recursions over its joints.
 
 They are written for arrays of numbers or of expressions (``straight_line``): from the one comes a
 value, from the other the C code that computes it. Vectors and matrices of a body are in the frame
@@ -16,7 +16,7 @@ from .bodies import Array, Body, JointTree, cross, symmetric
 
 
 def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]]:
-    """R(q), p(q) of each joint's frame in its parent's: a = R b + p.
+    """Return R(q), p(q) of each joint's frame in its parent's: a = R b + p.
 
     ``joint`` is N × 2: cosine and sine of a joint's angle, or the displacement of one that slides.
     """
@@ -33,7 +33,7 @@ def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]
 
 
 def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-    """The task frame in the root's axes: position, rotation, Jacobian and drift.
+    """Return position, rotation, Jacobian and drift of the task frame in the root's axes.
 
         J_i = z_i × (x − o_i), or z_i of a sliding joint;   ω_i = ω_p + z_i v_i of one that turns
         J̇ v = Σ (ω_p + ω_i) × J_i v_i,   and of the turning Σ ω_p × z_i v_i
@@ -70,7 +70,7 @@ def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, 
 def inverse_dynamics(
     robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
 ) -> Array:
-    """τ = M(q) a + h(q, v): outwards the motion, inwards the forces.
+    """Return τ = M(q) a + h(q, v): motion outwards, forces inwards.
 
         f = m a + α × d + ω × (ω × d),   n = I α + ω × I ω + d × a     with d = m c
 
@@ -115,7 +115,7 @@ def inverse_dynamics(
 def effort_bounds(
     robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
 ) -> Array:
-    """What no |τ| of ``inverse_dynamics`` exceeds: its recursion with lengths in place of vectors.
+    """Return bounds of |τ| of ``inverse_dynamics``, by its recursion with norms in place of vectors.
 
     |x × y| ≤ |x| |y|, |I x| ≤ ‖I‖ |x| with Frobenius' norm, |x + y| ≤ |x| + |y|.
     """
@@ -153,7 +153,7 @@ def _length(a: Array) -> Any:
 
 
 def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array) -> Array:
-    """M(q), n × n, by composite bodies: what each joint and all behind it weigh.
+    """Return M(q), n × n, by the composite-rigid-body algorithm.
 
     Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2.
     """
@@ -181,7 +181,7 @@ def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array) -> Array:
 
 
 def operations_of_factors(parent: Sequence[int]) -> int:
-    """Operations that factorise the M of a tree, without zeros in it: n³/3 of a chain."""
+    """Count the operations that factorise M of a tree, zeros left out: n³/3 of a chain."""
     ancestors: list[int] = []
     for above in parent:
         ancestors.append(ancestors[above] + 1 if above >= 0 else 0)
@@ -189,18 +189,18 @@ def operations_of_factors(parent: Sequence[int]) -> int:
 
 
 def solve_by_factors(M: Array, tau: Array) -> Array:
-    """M⁻¹τ by the factors of ``hybrid_by_factors``."""
+    """Return M⁻¹τ by the factors of ``hybrid_by_factors``."""
     return hybrid_by_factors(M, tau, np.ones(len(tau)), np.zeros(len(tau)))[0]
 
 
 def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, tau: Array) -> Array:
-    """M⁻¹τ by articulated bodies; no joint mimics another."""
+    """Return M⁻¹τ by articulated bodies; no joint may mimic another."""
     n = len(tau)
     return hybrid_by_recursion(robot, body, joint, tau, np.ones(n), np.zeros(n))[0]
 
 
 def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[Array, Array]:
-    """a and λ of M a = τ + λ, where free joints have no λ and the others the acceleration held.
+    """Return a and λ of M a = τ + λ: free joints have λ = 0, the others the prescribed a.
 
     By M = Lᵀ D L of the free joints, from the last joint inwards: between branches of a tree all
     stays 0. Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 6.5 and 9.2.
@@ -229,7 +229,7 @@ def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[A
 def hybrid_by_recursion(
     robot: JointTree, body: Sequence[Body], joint: Array, tau: Array, free: Array, held: Array
 ) -> tuple[Array, Array]:
-    """a and λ as those of ``hybrid_by_factors``, by articulated bodies; no joint mimics another.
+    """Return a and λ as ``hybrid_by_factors`` does, by articulated bodies without mimic joints.
 
         n = A α + B a,  f = Bᵀ α + C a                    what a joint feels, inwards
         U = I s,  D = sᵀ U,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
@@ -281,7 +281,7 @@ def hybrid_by_recursion(
 def _passed_on(
     blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, free: Any
 ) -> tuple[Array, Array, Array]:
-    """I − U Uᵀ/D of a body; along its axis a free joint passes on nothing, another all."""
+    """Return I − U Uᵀ/D of a body; along its axis a free joint transmits nothing, another everything."""
     A, B, C = blocks
     angular, linear = (B[:, 2], C[:, 2]) if slides else (A[:, 2], B[2])
     left = (
@@ -300,7 +300,7 @@ def _passed_on(
 
 
 def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -> list[Array]:
-    """A, B, C in the frame in which their own is placed at (R, p)."""
+    """Return A, B, C in the frame in which their own has the pose (R, p)."""
     A, B, C = blocks
     A, B, C = (R.dot(block).dot(R.T) for block in (A, B, C))
     A, C, P = symmetric(A), symmetric(C), _skew(p)
@@ -309,5 +309,5 @@ def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -
 
 
 def _skew(a: Array) -> Array:
-    """[a]×, so that [a]× b = a × b."""
+    """Return [a]×, so that [a]× b = a × b."""
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])

@@ -1,4 +1,4 @@
-"""C code without loops or branches, from calculations that Python has done with expressions.
+"""Generate C code without loops or branches from calculations on expressions.
 
 What is 0 or 1 in a robot's constants leaves no arithmetic behind, what appears twice is computed
 once. Source: Frigerio, Buchli, Caldwell & Semini, "RobCoGen", J. Softw. Eng. Robot. 7(1), 2016,
@@ -21,7 +21,7 @@ STRUCTS = {"turn": "JointPosition"}
 
 @dataclass(frozen=True, eq=False)
 class Expression:
-    """A value of C: the name of a variable, or an operation on expressions and numbers."""
+    """A value in C: a variable, or an operation on expressions and numbers."""
 
     operation: str
     operands: tuple[Value, ...] = ()
@@ -69,7 +69,7 @@ class Expression:
         return Expression("fabs", (self,))
 
     def sqrt(self) -> Value:
-        """NumPy calls it."""
+        """Return the square root; NumPy calls it."""
         return Expression("sqrt", (self,))
 
     __radd__ = __add__
@@ -80,7 +80,7 @@ Value = Expression | float
 
 
 def operations(results: Iterable[Value]) -> int:
-    """How many operations a calculation takes."""
+    """Count the operations of a calculation."""
     nodes, _ = _ordered(results)
     return sum(1 for _, operands in nodes if operands)
 
@@ -92,7 +92,7 @@ Varied = tuple[Value, Value]
 def varied(
     results: Iterable[Value], parts: Mapping[str, Varied] | None = None, held: Sequence[str] = ()
 ) -> list[Varied]:
-    """Real parts of values, and how these vary, by the rules of differentiation.
+    """Return the real parts of values, and their derivatives by the rules of differentiation.
 
     Complex numbers are x + i h dx with an h whose square vanishes, so that real parts are computed
     as such. ``parts`` has those of variables by name; of others they are the real and the imaginary
@@ -128,7 +128,7 @@ def varied(
 def c_function(
     head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None
 ) -> str:
-    """A function that assigns each result to its lvalue, which is a variable of no result.
+    """Return a function that assigns each result to its lvalue, which is a variable of no result.
 
     If numbers are complex, ``complexes`` has of each result the real part and how it varies.
     """
@@ -172,7 +172,7 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
 
 
 def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]], list[int]]:
-    """Operations in an order in which they can be done, equal ones once; the results' places."""
+    """Return the operations in a computable order, equal ones once, and the indices of the results."""
     nodes: list[tuple[str, tuple[int, ...]]] = []
     place_of: dict[tuple[str, tuple[int, ...]], int] = {}
     seen: dict[int, int] = {}
@@ -218,5 +218,5 @@ def _c(operation: str, operands: list[str]) -> str:
 
 
 def _bare(text: str) -> str:
-    """Without the parentheses around all of it."""
+    """Remove the parentheses around a whole expression."""
     return text[1:-1] if text.startswith("(") else text

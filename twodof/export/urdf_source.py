@@ -1,4 +1,4 @@
-"""The URDF that an FMU is made of: read, its joints locked, its meshes left out, its end found."""
+"""Read the URDF of a build, lock its joints, and find its end effector."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DEFAULT_FRAME = "EndEffector"
 
 
 def read_text(path: Path, mesh_dir: Path | None) -> str:
-    """The text of a URDF, or of what a xacro file makes; BuildError where there is none."""
+    """Return the text of a URDF, or of an expanded xacro file; raise BuildError where there is none."""
     if path.suffix == ".xacro":
         return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
     with refusing(BuildError, f"read the URDF '{path}'"):
@@ -33,14 +33,14 @@ def read_text(path: Path, mesh_dir: Path | None) -> str:
 
 
 def last_links(urdf: Urdf) -> list[str]:
-    """Those without a child that a joint moves."""
+    """Return the links without a child that a joint moves."""
     parents = {joint.parent for joint in urdf.joints.values()}
     ends = [link for link in urdf.links if link not in parents]
     return [link for link in ends if any(joint.moves for joint in urdf.chain(link))]
 
 
 def end_effector(urdf: Urdf) -> str:
-    """The link that is controlled where none is named."""
+    """Return the default controlled link."""
     leaves = last_links(urdf)
     if DEFAULT_FRAME in urdf.links:
         return DEFAULT_FRAME
@@ -56,7 +56,7 @@ def end_effector(urdf: Urdf) -> str:
 
 
 def without_meshes(text: str) -> str:
-    """A URDF without the visuals and collisions that are meshes."""
+    """Return a URDF without the visuals and collisions that are meshes."""
     tree = ET.fromstring(text)
     for link in tree.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
@@ -66,7 +66,7 @@ def without_meshes(text: str) -> str:
 
 
 def lock_joints(text: str, locks: Mapping[str, float]) -> str:
-    """A URDF with joints, by name or shell pattern, fixed at positions, rad or m.
+    """Return a URDF with joints, by name or shell pattern, fixed at positions, rad or m.
 
     Joints that mimic one of them are fixed too.
 

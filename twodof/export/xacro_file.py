@@ -1,4 +1,4 @@
-"""A xacro file expanded to a URDF, by the xacro package in a process that is confined.
+"""Expand a xacro file to a URDF, by the xacro package in a confined process.
 
 A xacro file is a program: its expressions are Python's, it includes files and asks the environment.
 Here simpleeval computes its expressions, with numbers, texts and data alone; files are read in the
@@ -34,7 +34,7 @@ ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
 
 
 def expand(path: Path, folders: Sequence[Path], most: int) -> str:
-    """The URDF that a xacro file makes with its arguments at their defaults.
+    """Return the URDF of a xacro file with its arguments at their defaults.
 
     It and what it includes, packages too, are in the folders; each file and the URDF have ``most``
     bytes at most. A BuildError names what the file asks for in vain.
@@ -58,7 +58,7 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
 
 
 def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) -> None:
-    """In the child: sends the URDF, and what xacro remarks."""
+    """Expand the file in the child; send the URDF and the remarks of xacro."""
     import xacro
     from xacro import substitution_args
 
@@ -87,7 +87,7 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) ->
 
 
 def _reason(error: Exception) -> str:
-    """In one line, with the remedy where there is one."""
+    """Return an error in one line, with the remedy where there is one."""
     from xacro.substitution_args import ArgException
 
     cause = error
@@ -105,14 +105,14 @@ def _reason(error: Exception) -> str:
 
 
 class _Every(set[str]):
-    """All names."""
+    """Set of all names."""
 
     def __contains__(self, name: object) -> bool:
         return True
 
 
 def _evaluate(expression: str, symbols: dict[str, Any], _: object = None) -> object:
-    """The value of an expression, in place of xacro's own function, which calls ``eval``."""
+    """Return the value of an expression, in place of xacro's own function, which calls ``eval``."""
     import xacro
     from simpleeval import BASIC_ALLOWED_ATTRS, EvalWithCompoundTypes
 
@@ -132,7 +132,7 @@ def _refuse_eval(*_: object) -> str:
 
 
 def _package(name: str, folders: Sequence[Path]) -> Path:
-    """The folder of a package, by its own name or what its package.xml says."""
+    """Return the folder of a package, found by its folder's name or by its package.xml."""
     for folder in folders:
         for candidate in (folder / name, folder):
             declared = candidate / "package.xml"
@@ -148,7 +148,7 @@ def _package(name: str, folders: Sequence[Path]) -> Path:
 
 
 def _guard(folders: Sequence[Path], most: int) -> Any:
-    """An audit hook that lets files in the folders be read, and nothing else of the system."""
+    """Install an audit hook that allows reading files in the folders, and no other system access."""
 
     def guard(event: str, arguments: tuple[Any, ...]) -> None:
         if event in ("glob.glob", "open", "os.listdir", "os.scandir"):

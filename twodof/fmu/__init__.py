@@ -1,4 +1,4 @@
-"""An FMU's file and an instance of it, whoever made it. All of FMPy is here."""
+"""Read an FMU's file and run an instance of it; all uses of FMPy are here."""
 
 from contextlib import redirect_stdout
 

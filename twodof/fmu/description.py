@@ -1,4 +1,4 @@
-"""An FMU's file: what its description says, read and checked. Nothing of it is run."""
+"""Read and check the description of an FMU, without running it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ..files import UnsafeArchiveError, check_archive, read_member
 
 @dataclass(frozen=True)
 class Scalar:
-    """A scalar variable, or one element of an array of FMI 3.0.
+    """A scalar variable, or an element of an array of FMI 3.0.
 
     Attributes:
         name: of an element with its 1-based indices, e.g. "q[1]", "der(q[1])".
@@ -49,7 +49,7 @@ class Scalar:
 
     @property
     def start_value(self) -> float | bool | None:
-        """Of a number or Boolean that has one."""
+        """Start value of a number or Boolean that has one."""
         if self.start is None or self.type not in ("Real", "Boolean"):
             return None
         return float(self.start) if self.type == "Real" else self.start in ("true", "1")
@@ -94,7 +94,7 @@ class Fmu:
 
     @property
     def version(self) -> int:
-        """Of FMI: 2 or 3."""
+        """Version of FMI: 2 or 3."""
         return int(str(self.description.fmiVersion).partition(".")[0])
 
     @property
@@ -104,18 +104,18 @@ class Fmu:
 
     @property
     def guid(self) -> str:
-        """The FMU's GUID; for FMUs of this package the digest of all that matters."""
+        """GUID of the FMU; in FMUs of this package, a digest of all relevant inputs."""
         return str(self.description.guid)
 
     @property
     def library(self) -> str:
-        """Name of its binary on this platform."""
+        """File name of its binary on this platform."""
         identifier = self.description.coSimulation.modelIdentifier
         return f"{identifier}{fmpy.sharedLibraryExtension}"
 
     @property
     def urdf(self) -> str | None:
-        """The text of resources/robot.urdf, None where there is none."""
+        """Text of resources/robot.urdf, None where there is none."""
         content = read_resource(self, "robot.urdf")
         try:
             return None if content is None else content.decode("utf-8")
@@ -124,19 +124,19 @@ class Fmu:
 
     @property
     def start_values(self) -> dict[str, float | bool]:
-        """Of inputs and parameters, as the description has them."""
+        """Return start values of inputs and parameters, as described."""
         settable = (v for v in self.variables.values() if v.causality in ("input", "parameter"))
         return {v.name: v.start_value for v in settable if v.start_value is not None}
 
     def vector(self, group: str) -> list[str]:
-        """Names of the elements of a vector in order, or of the scalar; empty if there is none."""
+        """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
         if group in self.variables:
             return [group]
         names = (f"{group}[{i}]" for i in count(1))
         return list(takewhile(self.variables.__contains__, names))
 
     def groups(self, causality: str) -> dict[str, list[str]]:
-        """Vectors and scalars of one causality by group name."""
+        """Return vectors and scalars of one causality by group name."""
         groups: dict[str, list[str]] = {}
         for name, variable in self.variables.items():
             if variable.causality == causality:
@@ -145,7 +145,7 @@ class Fmu:
 
 
 def load_fmu(path: str | Path) -> Fmu:
-    """Read and check an FMU's description; nothing of it is run or unzipped.
+    """Read and check an FMU's description, without unzipping or running it.
 
     Raises:
         FmuError: the file is missing, no zip, not FMI 2.0 or 3.0 co-simulation, unsafe to unzip, or
@@ -194,7 +194,7 @@ def load_fmu(path: str | Path) -> Fmu:
 
 
 def _check_starts(fmu: Fmu) -> None:
-    """Refuse start values that are no numbers, and task vectors that are not those of the axes."""
+    """Refuse start values that are not numbers, and task vectors of a wrong length."""
     for name, variable in fmu.variables.items():
         try:
             _ = variable.start_value
@@ -215,7 +215,7 @@ def _check_starts(fmu: Fmu) -> None:
 
 @contextmanager
 def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
-    """The FMU's file, which is still the one whose description was read.
+    """Open the FMU's file, if it is still the file whose description was read.
 
     Raises:
         FmuError: it is another one by now, or what is done with it fails.
@@ -230,14 +230,14 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
 
 
 def read_resource(fmu: Fmu, name: str) -> bytes | None:
-    """A file of the FMU's resources/ folder, None where it has no such file."""
+    """Return a file of the FMU's resources/ folder, None where there is none."""
     with opened(fmu) as archive, suppress(KeyError):
         return read_member(archive, f"resources/{name}", MAX_RESOURCE)
     return None
 
 
 def _read(path: Path) -> tuple[bytes, dict[str, int]]:
-    """modelDescription.xml and the members' checksums, once it is sure that unzipping is safe."""
+    """Return modelDescription.xml and the members' checksums of an archive that is safe to unzip."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -258,7 +258,7 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
 
 
 def _is_plain_xml(xml: bytes) -> bool:
-    """Whether XML declares no entities, in an encoding in which such a declaration is ASCII."""
+    """Return whether XML declares no entities, in an encoding with an ASCII declaration."""
     text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
     declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
     encoding = declared[1].lower() if declared else b"utf-8"
@@ -268,7 +268,7 @@ def _is_plain_xml(xml: bytes) -> bool:
 
 
 def _check_arrays(root: ET.Element) -> None:
-    """Refuse arrays of FMI 3.0 with too many elements, or sizes that are no numbers: ValueError."""
+    """Raise ValueError for arrays of FMI 3.0 with too many elements or invalid sizes."""
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
     room = MAX_ELEMENTS
     for variable in root.iterfind("ModelVariables/*"):
@@ -299,7 +299,7 @@ def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:
 
 
 def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
-    """What our own FMUs say of the robot; nothing, and no joints, where others made the FMU."""
+    """Return the robot's facts from the vendor annotation; none in third-party FMUs."""
     places = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
     robots = (root.find(f"{place}/Robot") for place in places)
     robot = next((robot for robot in robots if robot is not None), ET.Element("Robot"))
@@ -311,7 +311,7 @@ def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
 
 
 def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
-    """A scalar variable itself, or the elements of an array."""
+    """Return a scalar variable itself, or the elements of an array."""
     kind = "Real" if variable.type == "Float64" else variable.type
     rest = (variable.causality, kind, variable.unit)
     text = variable.description or ""

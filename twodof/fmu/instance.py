@@ -1,4 +1,4 @@
-"""An instance of an FMU. All of FMPy that runs something is here."""
+"""Run an instance of an FMU; all uses of FMPy that run code are here."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ Values = Array[c_double]
 
 
 class _Staying:
-    """The module os, but that it stays in the working directory."""
+    """The module os with a ``chdir`` that does nothing."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(os, name)
 
     def chdir(self, folder: str) -> None:
-        """Stay."""
+        """Stay in the working directory."""
 
 
 @contextmanager
 def _loading() -> Iterator[None]:
-    """While FMPy loads a library.
+    """Prevent FMPy from changing the working directory while it loads a library.
 
     It goes to the library's folder meanwhile, as Windows needs it, and all threads of the process
     with it, whose own files are elsewhere then.
@@ -62,7 +62,7 @@ def _loading() -> Iterator[None]:
 
 
 class Instance:
-    """One instance of an FMU, from instantiation on, in the order of calls that FMI allows.
+    """An instance of an FMU, from instantiation on, in the order of calls that FMI allows.
 
     FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
     SimulationError with the FMU's own words.
@@ -109,7 +109,7 @@ class Instance:
     def initialise(
         self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
     ) -> None:
-        """Set start values and go through initialisation mode; the stop time may be infinite."""
+        """Set start values and pass initialisation mode; the stop time may be infinite."""
         self.set(values)
         self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
         self._accept(self._slave.exitInitializationMode)
@@ -119,7 +119,7 @@ class Instance:
         self._accept(self._slave.enterInitializationMode)
 
     def reset(self) -> None:
-        """Back to where it was when it was instantiated."""
+        """Reset to the state after instantiation."""
         self._accept(self._slave.reset)
 
     def set(self, values: Mapping[str, float | bool]) -> None:
@@ -132,7 +132,7 @@ class Instance:
                 self._accept(setter, references, [values[variable.name] for variable in chosen])
 
     def step(self, t: float, h: float) -> None:
-        """One communication step from t to t + h."""
+        """Do one communication step from t to t + h."""
         self._said = ""
         self._t.value, self._h.value = t, h
         status = self._do_step(*self._step_arguments)
@@ -140,7 +140,7 @@ class Instance:
             self._refuse(status)
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
-        """A function that reads these Real variables, each time into the same place."""
+        """Return a function that reads Real variables, always into the same buffer."""
         n = len(names)
         references = (c_uint * n)(*(self._fmu.variables[name].reference for name in names))
         values = (c_double * n)()
@@ -158,7 +158,7 @@ class Instance:
         return read
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
-        """∂unknown/∂known at the instance's state, a row each of the unknown."""
+        """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
         references = [[self._fmu.variables[n].reference for n in u] for u in (unknown, known)]
         try:
             columns = [
@@ -179,14 +179,14 @@ class Instance:
         self._slave.freeInstance()
 
     def _refuse(self, status: int) -> NoReturn:
-        """Raise what a call's status means, in the FMU's own words where it said something."""
+        """Raise the error of a call's status, with the FMU's own message where there is one."""
         self._fatal = status == fmi2.fmi2Fatal
         outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
         reason = f"a call failed, status {status}" if status > WARNING else "the FMU ends the run"
         raise SimulationError(self._said or reason, outcome=outcome)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
-        """A call that must leave no error in the log: pythonfmu's wrapper can give no status."""
+        """Make a call that must log no error: pythonfmu's wrapper cannot return a status."""
         self._said = ""
         try:
             function(*arguments, **named)
@@ -205,7 +205,7 @@ class Instance:
 
 
 class Instance3(Instance):
-    """One of FMI 3.0, whose vectors are set and read whole."""
+    """An instance of FMI 3.0, whose vectors are set and read whole."""
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
         super().__init__(fmu, folder)
@@ -222,7 +222,7 @@ class Instance3(Instance):
         return slave
 
     def _starts(self) -> dict[int, list[float | bool]]:
-        """Values of all that can be set, by value reference."""
+        """Return the values of all settable variables, by value reference."""
         arrays: dict[int, list[float | bool]] = {}
         for variable in self._fmu.variables.values():
             if variable.type in ("Real", "Boolean"):
@@ -234,12 +234,12 @@ class Instance3(Instance):
         self._accept(self._slave.enterInitializationMode, **times)
 
     def reset(self) -> None:
-        """Back to where it was when it was instantiated."""
+        """Reset to the state after instantiation."""
         super().reset()
         self._arrays = self._starts()
 
     def set(self, values: Mapping[str, float | bool]) -> None:
-        """Set variables by name; of a vector the others keep what was set last."""
+        """Set variables by name; other elements of a vector keep their last values."""
         variables = [self._fmu.variables[name] for name in values]
         arrays = {v.reference: list(self._arrays[v.reference]) for v in variables}
         for variable in variables:
@@ -252,7 +252,7 @@ class Instance3(Instance):
         self._arrays.update(arrays)
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
-        """A function that reads these Real variables, each time into the same place."""
+        """Return a function that reads Real variables, always into the same buffer."""
         wanted = [self._fmu.variables[name] for name in names]
         distinct = list(dict.fromkeys(variable.reference for variable in wanted))
         first = dict(zip(distinct, accumulate((self._sizes[r] for r in distinct), initial=0)))
@@ -274,7 +274,7 @@ class Instance3(Instance):
         return read_elements
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
-        """∂unknown/∂known at the instance's state, a row each of the unknown."""
+        """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
         rows = [self._fmu.variables[name] for name in unknown]
         columns = [self._fmu.variables[name] for name in known]
         outer = {v.reference: np.zeros((self._sizes[v.reference], 0)) for v in rows}
@@ -292,7 +292,7 @@ class Instance3(Instance):
 
 @contextmanager
 def instantiate(fmu: Fmu) -> Iterator[Instance]:
-    """An instance of the FMU, freed at the end.
+    """Instantiate an FMU from a temporary folder, and free the instance at the end.
 
     It is unzipped into a temporary folder, but for what is there to be read by people.
 

@@ -1,4 +1,4 @@
-"""Forward kinematics of a URDF, for all samples at a time: for transforms, plots and pages.
+"""Forward kinematics of a URDF for many samples at a time, for transforms, plots and pages.
 
     p_child = p_parent + R_parent (xyz + R(rpy) a q),  R_child = R_parent R(rpy)            sliding
     p_child = p_parent + R_parent xyz,                 R_child = R_parent R(rpy) exp[a q]×  turning
@@ -27,7 +27,7 @@ BLOCK = 10_000  # samples, whose arrays a cache holds
 
 
 class Placement(NamedTuple):
-    """Where a frame is in another, at N samples: N × 3, m, and N × 3 × 3; one may stand for all.
+    """Transforms of a frame in another at N samples: N × 3, m, and N × 3 × 3; or one for all samples.
 
     Matrices: SciPy takes ten times as long for the product of two Rotations.
     """
@@ -36,18 +36,18 @@ class Placement(NamedTuple):
     rotation: Array
 
     def __mul__(self, inner: Placement) -> Placement:  # type: ignore[override]
-        """Where a frame is that is placed in this one."""
+        """Compose two transforms."""
         translation = self.translation + turned(self.rotation, inner.translation)
         return Placement(translation, self.rotation @ inner.rotation)
 
 
 def turned(rotation: Array, vectors: ArrayLike) -> Array:
-    """R v at N samples."""
+    """Return R v at N samples."""
     return np.asarray(np.einsum("...ij,...j->...i", rotation, np.asarray(vectors)))
 
 
 class Kinematics:
-    """A robot's geometry.
+    """Forward kinematics of a robot.
 
     Args:
         urdf: the robot.
@@ -67,17 +67,17 @@ class Kinematics:
         }
 
     def moves(self, joint: Joint) -> bool:
-        """Whether a joint's position depends on q."""
+        """Return whether a joint's position depends on q."""
         return self.column(joint)[0] is not None
 
     def column(self, joint: Joint) -> tuple[int | None, float, float]:
-        """Which column of q moves a joint, and how; for one at rest the column is None."""
+        """Return the column of q that moves a joint, with ratio and offset; None for a joint at rest."""
         if joint.name in self._columns:
             return self._columns[joint.name], 1.0, 0.0
         return self._columns.get(joint.leader), joint.ratio, joint.offset
 
     def _in_parent(self, joint: Joint, q: ArrayLike) -> Placement:
-        """Where a joint's child is in its parent; one where it rests."""
+        """Return the transforms of a joint's child in its parent."""
         origin, along = self.origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
             return Placement(joint.xyz + turned(origin, along), origin[None])
@@ -85,7 +85,7 @@ class Kinematics:
         return Placement(np.asarray(joint.xyz, dtype=np.float64)[None], origin @ turn)
 
     def pose(self, joint: Joint, q: ArrayLike) -> Array:
-        """Where a joint's child is in its parent; q is N × joints, rad or m.
+        """Return the pose of a joint's child in its parent; q is N × joints, rad or m.
 
         N × 7, or 1 × 7 where it rests: m, and a unit quaternion x, y, z, w.
         """
@@ -98,7 +98,7 @@ class Kinematics:
         return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
 
     def _moved(self, joint: Joint, q: ArrayLike) -> Array:
-        """A joint's coordinate, N × 1, rad or m; 1 × 1 where it rests. Infinity is nowhere."""
+        """Return a joint's coordinate, N × 1, rad or m; 1 × 1 at rest, NaN for infinity."""
         column, ratio, offset = self.column(joint)
         if column is None:
             return np.full((1, 1), offset)
@@ -106,7 +106,7 @@ class Kinematics:
         return np.where(np.isinf(moved), np.nan, moved)
 
     def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
-        """Where the root is, and the child of each joint of a chain that begins there."""
+        """Return the transforms of the root and of the child of each joint of a chain from the root."""
         n = len(np.asarray(q))
         places = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
         for joint in chain:
@@ -114,7 +114,7 @@ class Kinematics:
         return places
 
     def path(self, link: str, q: ArrayLike) -> Array:
-        """Positions of a link's origin in the root frame, N × 3, m."""
+        """Return positions of a link's origin in the root frame, N × 3, m."""
         q = np.asarray(q, dtype=np.float64)
         path = np.empty((len(q), 3))
         for k in range(0, len(q), BLOCK):
@@ -125,7 +125,7 @@ class Kinematics:
         return path
 
     def _seen_from_parent(self, joint: Joint, q: Array, point: Array) -> Array:
-        """A point of the child, in the parent; N × 3, or 1 × 3 where none before it moves.
+        """Transform a point of the child to the parent; N × 3, or 1 × 3 where nothing moves.
 
         By Rodrigues' formula, p = a (a·p) + cos q (p − a (a·p)) + sin q a × p.
         """
@@ -139,13 +139,13 @@ class Kinematics:
         return np.asarray(joint.xyz + point @ (along @ origin) + beside)
 
     def angle(self, link: str, q: ArrayLike, quat: ArrayLike) -> float:
-        """Angle between a link's orientation at one sample and a quaternion x, y, z, w, rad."""
+        """Return the angle between a link's orientation at one sample and a quaternion x, y, z, w, rad."""
         rotation = self.along(self.urdf.chain(link), np.asarray(q)[None])[-1].rotation
         apart = Rotation.from_matrix(rotation[0]).inv() * Rotation.from_quat(quat)
         return float(apart.magnitude())
 
     def jacobian(self, link: str, q: ArrayLike) -> Array:
-        """Of the link in the root's axes, N × 6 × joints: linear, then angular velocity is J v."""
+        """Return the Jacobian of the link in the root's axes, N × 6 × joints: linear, then angular rows."""
         chain = self.urdf.chain(link)
         places = self.along(chain, q)
         end = places[-1].translation

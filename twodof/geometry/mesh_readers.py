@@ -1,4 +1,4 @@
-"""Mesh files read by assimp (coal) and by trimesh, in a confined child process of `meshes.py`.
+"""Mesh files read by assimp (coal) and by trimesh, in a confined child process of ``meshes``.
 
 Both have unsafe or unbounded code: assimp overruns its heap on damaged files. Nothing but their
 arrays leaves the process, as bytes and never as a pickle.
@@ -26,7 +26,7 @@ NO_COLOUR = (-1, -1, -1)
 
 
 def serve(pipe: Connection, kind: str, folder: Path) -> None:
-    """In the child: read the files of the folder that the pipe names, one after another."""
+    """Read the mesh files that the parent names over the pipe, one after another."""
     try:
         read = {"shape": _coal, "colours": _trimesh}[kind]()
     except ImportError as missing:
@@ -62,7 +62,7 @@ def _refusing(reason: str) -> Reader:
 
 
 def _reason(error: Exception, path: Path) -> str:
-    """In one line; coal's has its own file, the mesh's and a hint around assimp's."""
+    """Return an error as one line, without the file and hint that coal adds."""
     text = " ".join(str(error).split()) or type(error).__name__
     text = text.rpartition(" message: ")[2].partition(" Hint: ")[0]
     text = text.removeprefix(f"Could not load resource {path} ")

@@ -1,4 +1,4 @@
-"""Meshes as they are drawn: triangles, in surfaces of one colour each."""
+"""Meshes for drawing: triangles in surfaces of one colour each."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each takes
 
 
 class Surface(NamedTuple):
-    """Vertices V × 3 in m and triangles T × 3, with their colour where the file says one."""
+    """Vertices V × 3 in m and triangles T × 3, with their colour where the file has one."""
 
     vertices: Array
     triangles: NDArray[np.uint32]
@@ -41,15 +41,15 @@ class Surface(NamedTuple):
 
 
 class _KilledError(ValueError):
-    """A mesh ended its reader."""
+    """A mesh terminated its reader."""
 
 
 class _AnswerError(Exception):
-    """A reader has answered as none does that is sound."""
+    """A reader sent an invalid answer."""
 
 
 class Meshes:
-    """The mesh files of one robot, read in confined child processes that start when needed.
+    """Mesh files of one robot, read in confined child processes that start on demand.
 
     A context manager. The meshes share a process: they are of one robot, so one that spoils the
     memory of its reader can only spoil the picture of its own robot.
@@ -76,7 +76,7 @@ class Meshes:
         self._stack.close()
 
     def scaled(self, name: str, scale: Array) -> list[Surface]:
-        """The surfaces of a mesh, m; none, with a warning, where it cannot be read."""
+        """Return the surfaces of a mesh, m; none, with a warning, where it is unreadable."""
         try:
             surfaces = [s._replace(vertices=s.vertices * scale) for s in self.surfaces(name)]
             if not all(np.isfinite(surface.vertices).all() for surface in surfaces):
@@ -89,7 +89,7 @@ class Meshes:
             return []
 
     def surfaces(self, name: str, coloured: bool = True) -> list[Surface]:
-        """The surfaces of a mesh file, in the file's own unit; none where it is not at hand.
+        """Return the surfaces of a mesh file in its own unit; none where the file is missing.
 
         Textures are not shown. An OBJ's colours are those of the file beside it that a build gives
         its name and ``.mtl``.
@@ -135,7 +135,7 @@ class Meshes:
     def _parsed(
         self, kind: str, suffix: str, content: bytes, library: bytes | None
     ) -> list[Surface]:
-        """What a reader makes of a file.
+        """Return a reader's surfaces of a file.
 
         A reader that has read other meshes may die of one of these: a fresh one tries again.
         """
@@ -164,7 +164,7 @@ class Meshes:
 
 
 def _received(reader: Child) -> list[Surface]:
-    """The answer of a reader, checked, as a reader may be in the power of the file.
+    """Return the checked answer of a reader, which a malicious file may control.
 
     Raises:
         ValueError: the file is refused.

@@ -1,4 +1,4 @@
-"""What a robot's links look like: the visual shapes of its URDF as triangles."""
+"""Visual shapes of a robot's links, as triangles."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIDES = 24  # of what is round
 
 
 class Shape(NamedTuple):
-    """Triangles on a link: V × 3 in m, in the axes of a place in the link's frame, and T × 3."""
+    """Triangles on a link: V × 3 in m in the axes of a frame fixed to the link, and T × 3."""
 
     link: str
     place: Placement
@@ -34,7 +34,7 @@ class Shape(NamedTuple):
 
 
 def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
-    """The visual shapes of all links, and the names of the meshes that are not at hand.
+    """Return the visual shapes of all links, and the names of missing meshes.
 
     Where there are none, sticks and balls show where the joints are.
 
@@ -73,7 +73,7 @@ def _file(element: ET.Element) -> str:
 
 
 def _surfaces(element: ET.Element, meshes: Meshes) -> list[Surface]:
-    """Of a URDF's geometry; none where it is of an unknown kind or its mesh is of no use."""
+    """Return the surfaces of a URDF geometry; none for an unknown kind or an unusable mesh."""
 
     def number(key: str) -> float:
         (value,) = floats(element, key, "1")
@@ -98,18 +98,18 @@ BOX = np.array(
 
 
 def sphere(radius: float) -> tuple[Array, Indices]:
-    """About the origin."""
+    """Return a sphere about the origin."""
     polar = np.linspace(0.0, math.pi, SIDES // 2 + 1)
     return _turned(radius * np.sin(polar), -radius * np.cos(polar))
 
 
 def cylinder(radius: float, length: float) -> tuple[Array, Indices]:
-    """About the origin, along z."""
+    """Return a cylinder about the origin, along z."""
     return _turned(np.array([0.0, radius, radius, 0.0]), length / 2 * np.array([-1, -1, 1, 1]))
 
 
 def _turned(radii: Array, heights: Array) -> tuple[Array, Indices]:
-    """The surface that a line of points turns into about z."""
+    """Return the surface of revolution of a polyline about z."""
     angle = np.linspace(0.0, 2 * math.pi, SIDES, endpoint=False)
     x, y = np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle))
     vertices = np.stack([x, y, np.repeat(heights[:, None], SIDES, axis=1)], axis=-1)
@@ -123,7 +123,7 @@ def _turned(radii: Array, heights: Array) -> tuple[Array, Indices]:
 
 
 def _sticks(robot: Urdf) -> list[Shape]:
-    """A ball at each joint, and a stick from each link's origin to those of its children."""
+    """Return a ball at each joint, and a stick from each link's origin to those of its children."""
     joints = list(robot.joints.values())
     radius = 0.05 * max((float(np.linalg.norm(joint.xyz)) for joint in joints), default=0.0)
     still = np.eye(3)
@@ -141,7 +141,7 @@ def _sticks(robot: Urdf) -> list[Shape]:
 
 
 def _colour(visual: ET.Element, named: Mapping[str | None, ET.Element]) -> Colour:
-    """Its material's own, or that of the robot's material of this name."""
+    """Return the colour of a material, its own or that of the robot's material of this name."""
     material = visual.find("material")
     if material is not None:
         for candidate in (material, named.get(material.get("name"))):
@@ -152,7 +152,7 @@ def _colour(visual: ET.Element, named: Mapping[str | None, ET.Element]) -> Colou
 
 
 def floats(element: ET.Element | None, key: str, default: str) -> Array:
-    """The numbers of an attribute.
+    """Return the numbers of an attribute.
 
     Raises:
         ValueError: it has others.
@@ -165,6 +165,6 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
 
 
 def origin(element: ET.Element | None) -> Placement:
-    """URDF's xyz and rpy, about the fixed axes x, y and z."""
+    """Return the rotation and position of URDF's xyz and rpy, about the fixed axes x, y and z."""
     rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0")).as_matrix()
     return Placement(floats(element, "xyz", "0 0 0"), rotation)

@@ -1,4 +1,4 @@
-"""An arm in a page: its robot, and what moves it: its engine, samples of a run, or a server.
+"""The HTML page of an arm, driven by its engine, by samples of a run, or by a server.
 
 All is in the page itself: it asks no network for anything, and its Content-Security-Policy allows
 its own script alone. Text from the URDF is in it as JSON, and shown as text.
@@ -54,7 +54,7 @@ CONTAINER = b'<div class="arm" id="arm"'
 
 @dataclass(frozen=True)
 class Arm:
-    """What a page of a robot is made of.
+    """Contents of a robot's page.
 
     Attributes:
         name: of the FMU.
@@ -87,7 +87,7 @@ def page(
     step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
 ) -> Path:
-    """Write an FMU as a page: the robot in 3D, its plant alive, what it is told and does; its path.
+    """Write an FMU as a page with the robot in 3D and its running plant; return its path.
 
     The FMU's own C sources are compiled to WebAssembly: its numbers are the FMU's.
 
@@ -128,12 +128,12 @@ def page(
 
 
 def is_page(path: Path) -> bool:
-    """Whether a file is such a page."""
+    """Return whether a file is such a page."""
     return CONTAINER in head_of(path, MAX_HEAD)
 
 
 def arm_of(run: Experiment) -> Arm:
-    """What a page of a run's FMU is made of.
+    """Return the page contents of a run's FMU.
 
     Raises:
         PageError: its robot cannot be shown.
@@ -163,7 +163,7 @@ def arm_of(run: Experiment) -> Arm:
 
 
 def _sources(fmu: Fmu) -> dict[str, bytes]:
-    """The C files of sources/ and their headers, by file name."""
+    """Return the C files of sources/ and their headers, by file name."""
     with opened(fmu) as archive:
         return {
             Path(name).name: read_member(archive, name, MAX_SOURCE)
@@ -175,7 +175,7 @@ def _sources(fmu: Fmu) -> dict[str, bytes]:
 def arm_page(
     title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: Any
 ) -> bytes:
-    """The HTML of an arm.
+    """Return the HTML of an arm.
 
     Args:
         title: of the page.
@@ -211,7 +211,7 @@ def _asset(name: str) -> str:
 
 
 def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
-    """What the page knows of its FMU, and the content of its meshes."""
+    """Return the page's facts about its FMU, and the content of its meshes."""
     urdf = read_urdf(arm.urdf)
     ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
     packed = [_mesh(shape) for shape in [ball, *arm.shapes]]
@@ -234,7 +234,7 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
 
 
 def _joint(name: str, joint: Joint | None) -> dict[str, Any]:
-    """Of a joint that moves on its own; null where it has no limit, or none is known."""
+    """Return an independent joint's facts; null for an unknown or missing limit."""
     if joint is None:
         return {"name": name, "prismatic": False, "low": None, "high": None, "effort": None}
     limits = {"low": joint.low, "high": joint.high, "effort": joint.effort}
@@ -243,7 +243,7 @@ def _joint(name: str, joint: Joint | None) -> dict[str, Any]:
 
 
 def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dict[str, int]]:
-    """The tree of links, parents first, with the joint above each; the number of each link."""
+    """Return the tree of links, parents first, with the joint above each, and link numbers by name."""
     kinematics = Kinematics(urdf, joints)
     number = {urdf.root: 0}
     links: list[dict[str, Any]] = [{"parent": -1}]
@@ -265,7 +265,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
 
 
 def _matrix(place: Placement) -> list[float]:
-    """4 × 4, by columns, as WebGL has it."""
+    """Return a 4 × 4 matrix by columns, as WebGL requires."""
     matrix = np.eye(4)
     matrix[:3, :3] = place.rotation
     matrix[:3, 3] = place.translation
@@ -274,7 +274,7 @@ def _matrix(place: Placement) -> list[float]:
 
 
 def _mesh(shape: Shape) -> tuple[dict[str, Any], bytes]:
-    """Its vertices as whole parts of its size, each once, and its triangles: 16 and 32 bits."""
+    """Return a mesh with unique 16-bit vertices relative to its size, and 32-bit triangle indices."""
     low = shape.vertices.min(axis=0)
     size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-9)
     grains = np.round((shape.vertices - low) / size * GRAIN).astype("<u2")

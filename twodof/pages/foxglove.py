@@ -1,4 +1,4 @@
-"""A run for Foxglove, without ROS: the bag's messages over a WebSocket, and gains from there.
+"""Serve a run to Foxglove without ROS: the bag's messages over a WebSocket, and gains as parameters.
 
 Foxglove's SDK answers any website. So it listens where no website finds it, on an address of the
 loopback network that is drawn at random, and browsers are answered by the door of the pages.
@@ -71,7 +71,7 @@ class Foxglove(Sink):
         self._scene, self._effort, self._set_gains = scene, effort, set_gains
 
     def begin(self, run: Experiment) -> Foxglove:
-        """Take the experiment whose samples come.
+        """Receive the experiment of the samples to come.
 
         Raises:
             BagError: the FMU has not what is asked for.
@@ -105,7 +105,7 @@ class Foxglove(Sink):
         return self
 
     def write(self, sample: Sample) -> None:
-        """Send one sample; and what holds for the whole run to those who have just subscribed."""
+        """Send one sample, and latched messages to new subscribers."""
         self._gains.held = sample.inputs
         if sample.k == 0:
             self._latched = self._messages.latched(sample.stamp)
@@ -118,7 +118,7 @@ class Foxglove(Sink):
             self._channels[name].log(rows.tobytes(), log_time=stamp)
 
     def command(self) -> dict[str, Value]:
-        """Gains that were set since the last call, as inputs of the FMU."""
+        """Return gains that were set since the last call, as inputs of the FMU."""
         return self._gains.take()
 
     def __exit__(self, *exception: object) -> None:
@@ -127,7 +127,7 @@ class Foxglove(Sink):
 
 
 class _Gains(ServerListener):
-    """The gains as parameters; its methods are called by threads of the server."""
+    """Gains as parameters; threads of the server call its methods."""
 
     def __init__(self, run: Experiment, control: bool) -> None:
         self._fmu, self._control, self._warn = run.fmu, control, warner(LOG)
@@ -137,16 +137,16 @@ class _Gains(ServerListener):
         self._lock, self._asked, self._new = Lock(), dict[str, Value](), False
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Somebody listens to a topic from now on."""
+        """Register a subscription to a topic."""
         self._new = True
 
     def greet(self) -> bool:
-        """Whether somebody has subscribed since the last call."""
+        """Return whether anyone has subscribed since the last call."""
         new, self._new = self._new, False
         return new
 
     def take(self) -> dict[str, Value]:
-        """Values set since the last call."""
+        """Return values set since the last call."""
         with self._lock:
             asked, self._asked = self._asked, {}
         return asked
@@ -154,7 +154,7 @@ class _Gains(ServerListener):
     def on_get_parameters(
         self, client: Any, param_names: list[str], request_id: str | None = None
     ) -> list[Any]:
-        """Gains by name, all where none is named."""
+        """Return gains by name, all where no name is given."""
         with self._lock:
             values = {**self.held, **self._asked}
         return [
@@ -166,7 +166,7 @@ class _Gains(ServerListener):
     def on_set_parameters(
         self, client: Any, parameters: list[Any], request_id: str | None = None
     ) -> list[Any]:
-        """Take gains, one number for all elements or one each; and tell what then holds."""
+        """Set gains, one number for all elements or one each; return the values in effect."""
         for parameter in parameters:
             try:
                 if not self._control:
@@ -184,7 +184,7 @@ class _Gains(ServerListener):
 
 
 def _numbers(value: Any) -> Any:
-    """Integers are numbers too; a list of one is for all elements."""
+    """Return a parameter's numbers; an integer counts, and one number is for all elements."""
     if isinstance(value, list):
         return value[0] if len(value) == 1 else value
     return value

@@ -1,4 +1,4 @@
-"""An FMU in real time behind a page in the browser: the page, and what joins it to the loop."""
+"""Drive an FMU in real time from a page in the browser."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def live(
     bag: str | None = None,
     command_line: str = "",
 ) -> list[Path]:
-    """Step an FMU in real time behind a page until ``stop`` is true; the bags recorded.
+    """Step an FMU in real time behind a page until ``stop`` is true; return the recorded bags.
 
     Args:
         fmu: the FMU or its path.
@@ -52,7 +52,7 @@ def live(
 
 
 def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Server:
-    """The server of a loop's page.
+    """Return the server of a loop's page.
 
     Raises:
         PageError: it cannot be shown.
@@ -63,7 +63,7 @@ def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Server:
 
 
 async def _talk(loop: Loop, connection: Connection) -> None:
-    """Tell one page the news, at its own pace, and the loop what the page asks for."""
+    """Send one page the news at its own pace, and pass its requests to the loop."""
     heard, seen, before = 0, {"run": 0, "seen": 0}, None
 
     async def listen() -> None:

@@ -1,4 +1,4 @@
-"""The loop that steps an FMU in real time as pages ask; it knows them by what they tell alone.
+"""The loop that steps an FMU in real time at the request of pages.
 
 They are served by a thread of its own, which tells what their controls ask for, to be done between
 two steps, and asks for the news. Neither waits for the other.
@@ -34,7 +34,7 @@ TOLD = ("x_des", "quat_des", "q_des")
 
 
 class Excerpt(Bag):
-    """A bag that begins in the midst of a run, with the sample that is at hand.
+    """A partial bag that begins during a run, at the current sample.
 
     Its provenance is that of a run which starts there: from the joint positions and velocities and
     with the inputs of its first sample. Its stamps start at the wall clock's time.
@@ -59,7 +59,7 @@ class Excerpt(Bag):
 
 
 class Loop:
-    """Steps an FMU as a page asks.
+    """Steps an FMU at the request of pages.
 
     Args:
         run: what to run; a long one.
@@ -113,7 +113,7 @@ class Loop:
             self._take(sample)  # in one go: there are no news of a run without a sample
 
     def play(self, stop: Callable[[], bool]) -> None:
-        """Step the FMU as pages ask, until ``stop`` is true."""
+        """Step the FMU as pages request, until ``stop`` is true."""
         try:
             while not stop():
                 if self._playing and self.viewers and not self._broken:
@@ -129,7 +129,7 @@ class Loop:
             self._source.close()
 
     def tell(self, order: str, value: Any = None) -> None:
-        """Ask for something to be done between two steps; from any thread.
+        """Queue a request for execution between two steps; callable from any thread.
 
         Orders of one kind that follow each other become one, in which the newest values win.
 
@@ -160,17 +160,17 @@ class Loop:
 
     @property
     def behind(self) -> bool:
-        """Whether too many orders wait; from any thread."""
+        """Return whether too many requests wait; callable from any thread."""
         return len(self._orders) >= MOST_ORDERS
 
     def note(self, text: str) -> None:
-        """Tell a text on all pages; from any thread."""
+        """Show a text on all pages; callable from any thread."""
         with self._lock:
             self._notes.append(text)
             self._noted += 1
 
     def news(self, run: int = 0, seen: int = 0) -> dict[str, Any]:
-        """What has happened since somebody was told before; from any thread.
+        """Return the events since a page's last news; callable from any thread.
 
         Args:
             run, seen: as of the news before.
@@ -219,7 +219,7 @@ class Loop:
             self._record()
 
     def _change(self, values: Mapping[str, Value]) -> None:
-        """Inputs from the next step on; a parameter begins the run anew."""
+        """Change inputs from the next step on; a parameter restarts the simulation."""
         inputs = self._sample.inputs
         self._changes |= {name: values[name] for name in values if name in inputs}
         with self._lock:
@@ -261,7 +261,7 @@ class Loop:
                 self._recording = None
 
     def _restart(self, values: Mapping[str, Value], first: Experiment | None = None) -> None:
-        """The arm back to its start; inputs and parameters stay, but for values, or as at first."""
+        """Restart the simulation; inputs and parameters keep their values unless given or reset."""
         self._end_recording()
         self._source.close()
         now, self._changes = {**self._sample.inputs, **self._changes}, {}
@@ -273,7 +273,7 @@ class Loop:
                 self.note(str(error))
 
     def _starting(self, values: Mapping[str, Value]) -> Experiment:
-        """The run, but for these values, from the start."""
+        """Return the run with these start values."""
         run = self._run
         return replace(
             run, start_values={**run.start_values, **values}, given={**run.given, **values}
@@ -301,7 +301,7 @@ class Loop:
 
 
 def _joined(order: str, before: Any, value: Any) -> Any:
-    """The value of an order that does the same as two of its kind."""
+    """Merge the values of two successive requests of one kind."""
     if order == "change":
         return {**before, **value}
     if order == "step":

@@ -1,4 +1,4 @@
-"""Replay of a bag in the browser, from a server or from a file: all samples are in the page."""
+"""Replay of a bag in the browser, from a server or from a file; the page contains all samples."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def replay(
     frame: str | None = None,
     fmu: str | Path | None = None,
 ) -> tuple[bytes, Sequence[str]]:
-    """A page that replays a bag: its HTML, and what is not as it should be, one line each.
+    """Return the HTML of a bag's replay, and its remarks, one line each.
 
     Args:
         bag: the bag, or its folder.
@@ -86,7 +86,7 @@ def replay(
 
 
 def _groups(track: Track) -> dict[str, Array]:
-    """What a sample holds, as far as it is known: N × elements, by the names of groups."""
+    """Return the known values of each sample by group: N × elements."""
     bag, task, joints = track.recording, track.task, track.joints
     groups = {"q": bag.q, "q_des": bag.held("q_des", len(joints))}
     groups["v"] = np.column_stack([joint.v for joint in joints])
@@ -98,7 +98,7 @@ def _groups(track: Track) -> dict[str, Array]:
 
 
 def _variables(track: Track, groups: dict[str, Array]) -> Iterator[dict[str, Any]]:
-    """Those of the groups, and the parameters that pictures need."""
+    """Return the variables of the groups, and the parameters that pictures need."""
     values: dict[str, float | None] = {
         f"{name}[{i + 1}]": None for name, rows in groups.items() for i in range(rows.shape[1])
     }
@@ -119,7 +119,7 @@ def _robot(
     fmu: str | Path | None,
     remarks: list[str],
 ) -> tuple[str, ReadMesh]:
-    """The URDF's text, and where its meshes are from."""
+    """Return the URDF's text, and the source of its meshes."""
     if urdf is not None:
         packages = None if mesh_dir is None else Path(mesh_dir)
         text, folder = read_text(Path(urdf), packages), Path(urdf).parent
@@ -175,7 +175,7 @@ def view(
 
 
 def export(bag: Recording | str | Path, path: str | Path, **robot: Any) -> Sequence[str]:
-    """Write a replay as one HTML file; what is not as it should be. Options as ``replay``'s.
+    """Write a replay as one HTML file; return its remarks. Options are those of ``replay``.
 
     Raises:
         PageError: it cannot be written.

@@ -1,4 +1,4 @@
-"""A server on a thread of its own: one page for browsers with its websocket, or a websocket alone.
+"""A server thread for one page and its websocket, or for a websocket alone.
 
 It answers requests of its own page, and of origins that are named: whatever else a browser has
 open cannot read it.
@@ -63,7 +63,7 @@ _silent.setLevel(logging.CRITICAL + 1)
 
 
 class Server:
-    """A page that is served as long as the context lasts.
+    """A page that is served while the context lasts.
 
     Args:
         page: its HTML; None: there is none, and a websocket on any path.
@@ -139,12 +139,12 @@ class Server:
 
 
 class _Answering(ServerConnection):
-    """A connection that says so where it is asked for what websockets hangs up on."""
+    """A connection that answers requests which the websockets library would drop."""
 
     _asked = False
 
     def data_received(self, data: bytes) -> None:
-        """Take what comes, which begins with a request."""
+        """Receive data, which begins with a request."""
         if self._asked or b"GET ".startswith(data[:4]):
             self._asked = True
             super().data_received(data)
@@ -154,7 +154,7 @@ class _Answering(ServerConnection):
 
 
 def user_token() -> str:
-    """A secret of this user, kept for the pages of later servers; a new one where it cannot be."""
+    """Return the user's secret, stored for the pages of later servers; a new one where storing fails."""
     with suppress(OSError, RuntimeError):
         home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
         path, private = Path(home, "twodof", "token"), partial(os.open, mode=0o600)
@@ -170,7 +170,7 @@ def user_token() -> str:
 
 
 async def relay(url: str, connection: Connection) -> None:
-    """Pass messages between a websocket and that of another server, until one of them ends."""
+    """Pass messages between a websocket and that of another server, until one of them closes."""
     protocols = [connection.subprotocol] if connection.subprotocol else None
     async with connect(
         url, subprotocols=protocols, compression=None, max_size=None, proxy=None, logger=_silent
@@ -188,7 +188,7 @@ async def relay(url: str, connection: Connection) -> None:
 
 
 def _is_own(request: Request, host: str, address: str, others: Collection[str] = ()) -> bool:
-    """Whether a request is for this page, by what was asked to listen on, and not another's.
+    """Return whether a request is for this page, by the address that the server was asked to use.
 
     Any website may have its own name resolve to this machine, and then its Origin is the Host that
     it asks for. An address is not resolved, so where all are listened on, any is good.
@@ -218,7 +218,7 @@ def _is_address(name: str) -> bool:
 
 
 def _listen(host: str, port: int) -> tuple[socket.socket, str]:
-    """A socket that is bound, and the address that it is bound to."""
+    """Return a bound socket, and its address."""
     if not 0 <= port <= 65535:
         raise PageError(f"port {port} is not in 0…65535")
     if not host:  # which to the operating system is all of them

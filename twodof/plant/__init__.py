@@ -1,1 +1,1 @@
-"""The plant: what also runs inside the FMU, with numpy and Pinocchio and nothing else."""
+"""The plant, which also runs inside the FMU; it needs numpy and Pinocchio alone."""

@@ -42,14 +42,14 @@ STAGES = 6
 
 @lru_cache(maxsize=8)  # most steps are of one size
 def _weights(step: float) -> list[list[float]]:
-    """The rows of A, and E, times the step."""
+    """Return the rows of A, and E, times the step."""
     return [[step * weight for weight in row] for row in (*A, E)]
 
 
 def dormand_prince(
     rates: Callable[[State], State], y: State, step: float, k1: State
 ) -> tuple[State, list[State]]:
-    """One step from y, where the derivative is k1: y_new and the derivatives at the stages.
+    """Take one step from y with the derivative k1; return y_new and the derivatives at the stages.
 
     Args:
         rates: ẏ at a state.
@@ -82,7 +82,7 @@ def dormand_prince(
 def error_norm(
     K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float
 ) -> float:
-    """Root mean square of the error over its tolerance; the step passes below 1."""
+    """Return the root mean square of the error over its tolerance; a step passes below 1."""
     a, _, b, c, d, e, f = _weights(step)[-1]
     k1, _, k3, k4, k5, k6, k7 = K
     total = 0.0
@@ -95,7 +95,7 @@ def error_norm(
 
 
 def interpolant(y: State, y_new: State, K: list[State], step: float) -> Callable[[float], State]:
-    """State at a time within the step that these are of, to fourth order; y_new at its end."""
+    """Return the fourth-order interpolant of a step, as a function of the time within it."""
     start, Q = np.array(y), np.array(K).T.dot(P)
 
     def state(passed: float) -> State:

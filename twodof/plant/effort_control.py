@@ -1,4 +1,4 @@
-"""No control: joint efforts are inputs, for a controller of the user's own.
+"""Effort control: joint efforts are inputs, for an external controller.
 
 τ = tau_cmd
 """
@@ -12,7 +12,7 @@ from .integrator import Array, Ratios, Response
 
 
 def command(plant: Any) -> tuple[Response, Ratios]:
-    """τ as a function of the state, n values; inputs held. It has no J⁺."""
+    """Return τ as a function of the state, n values, inputs held; this law has no J⁺."""
     tau = list(plant.tau_cmd)
 
     def effort(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:

@@ -1,4 +1,4 @@
-"""Find the first event within an integration step, on its dense output.
+"""Locate the first event within an integration step, on its dense output.
 
 An event is where a margin becomes negative: the distance of a joint to a limit, the force that
 presses a joint at rest into its limit, or the margin of the rank of J⁺. Positions are polynomials,
@@ -47,7 +47,7 @@ def search(
     margin: Margin, rate: float, a: float, at_a: float, b: float, at_b: float, step: float,
     halvings: int = HALVINGS,
 ) -> float:  # fmt: skip
-    """First time in (a, b] at which a margin is negative, infinity where it is not.
+    """Return the first time in (a, b] at which a margin is negative, infinity where there is none.
 
     Args:
         margin: the margin.
@@ -73,7 +73,7 @@ def search(
 def locate(
     margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float
 ) -> float:  # fmt: skip
-    """First time in (a, b] at which a margin is negative, as it is at b, to the last bits.
+    """Return the first time in (a, b] at which a margin is negative, given that it is at b.
 
     The interpolation is kept near the middle, so that it never needs many more looks than
     bisection. Source: Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS
@@ -114,7 +114,7 @@ def first_crossing(
     slope: Sequence[float],
     step: float,
 ) -> float:
-    """First time at which a joint is past a limit, infinity where it never is.
+    """Return the first time at which a joint is past a limit, infinity where there is none.
 
     Args:
         state: the state (q, v) at a time within the step.
@@ -175,7 +175,7 @@ def _polynomial(coefficients: Sequence[float], x: float) -> float:
 
 
 def may_vanish(forces: Sequence[float]) -> bool:
-    """Tell whether a force on a joint may vanish in a step, by its values at the stages."""
+    """Return whether a contact force may vanish within a step, from its values at the stages."""
     low, high = min(forces), max(forces)
     return not low >= high - low
 
@@ -188,7 +188,7 @@ def first_release(
     step: float,
     before: float,
 ) -> float:
-    """First time before another at which a joint is no longer pressed into its limit, else inf.
+    """Return the first time before another at which a contact force vanishes, else infinity.
 
     Args:
         press: how all joints are pressed at a time within the step.
@@ -223,7 +223,7 @@ def first_release(
 
 
 def _doubtful_minima(forces: Sequence[float]) -> list[float]:
-    """Return the extrema, perhaps below zero, of the polynomial through the looks at a force."""
+    """Return the extrema, possibly below zero, of the polynomial through sampled values of a force."""
     c = THROUGH_LOOKS.dot(forces).tolist()
     slope = [k * coefficient for k, coefficient in enumerate(c)][1:]
     bound = DOUBT * (max(forces) - min(forces))

@@ -68,7 +68,7 @@ NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast
 
 
 class StepError(ArithmeticError):
-    """A communication step that cannot be done within the tolerances and the budget.
+    """A communication step that fails the tolerances or exceeds the budget.
 
     Attributes:
         too_fine: no integration step was small enough, so that a larger budget would not help.
@@ -108,7 +108,7 @@ class _Motion:
         self.margins: list[float] = []
 
     def set_out(self, y: State, keep: Sequence[bool], rank_held: bool) -> State:
-        """Find the regime at a state after an impact; ẏ in it.
+        """Determine the regime at a state after an impact; return ẏ in it.
 
         Args:
             y: the state (q, v).
@@ -122,7 +122,7 @@ class _Motion:
         return y[self.n :] + a
 
     def acceleration(self, y: State) -> tuple[list[float], list[float], float]:
-        """q̈ at y in the regime, how joints at rest are pressed, and the margin of the rank."""
+        """Return q̈ at y in the regime, the contact forces of joints at rest, and the rank's margin."""
         a, _, margin = self._acceleration(y, self.rank)
         return a, self.stops.restrain(y, a), margin
 
@@ -133,7 +133,7 @@ class _Motion:
         return list(a), rank, margin
 
     def rates(self, y: State) -> State:
-        """ẏ at a stage of a step; not a number where the equations have no answer there."""
+        """Return ẏ at a stage of a step; NaN where the equations have no solution there."""
         try:
             a, pressed, margin = self.acceleration(y)
         except np.linalg.LinAlgError:
@@ -145,7 +145,7 @@ class _Motion:
     def until_event(
         self, y: State, rates: State, t: float, end: float
     ) -> tuple[float, State, events.Event]:
-        """Integrate from t until an event or until the end: the time, the state, the event.
+        """Integrate from t until an event or the end; return the time, the state and the event.
 
         rates is ẏ at y.
         """
@@ -186,7 +186,7 @@ class _Motion:
                 raise self._too_fast(y, too_fine=False)
 
     def _too_fast(self, y: State, *, too_fine: bool) -> StepError:
-        """Name the joint whose own acceleration answers most to its position or velocity at y."""
+        """Return the error that names the joint whose acceleration is most sensitive to its own state."""
         a, _, _ = self.acceleration(y)
         rates = []
         for i, order in product(range(self.n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
@@ -200,7 +200,7 @@ class _Motion:
     def _first_event(
         self, y: State, y_new: State, step: float, K: list[State]
     ) -> tuple[float, State, events.Event] | None:
-        """First time in (0, step] at which the regime ends, the state there, and the event."""
+        """Return the time in (0, step] at which the regime ends, the state there, and the event; or None."""
         n, stops = self.n, self.stops
         reach = [events.REACH * step * max(map(abs, speeds)) for speeds in zip(*(k[:n] for k in K))]
         near = [
@@ -237,7 +237,7 @@ class _Motion:
         return first, *self._event(state(first))
 
     def _event(self, y: State) -> tuple[State, events.Event]:
-        """The event at a state, which is put onto the limits that it is past."""
+        """Return a state projected onto the limits that it exceeds, and the event there."""
         y = list(y)
         event = events.Event()
         if self.stops.watched:
@@ -250,7 +250,7 @@ class _Motion:
         return y, event
 
     def _singular_margin(self, y: State) -> float:
-        """The margin of the rank; of one that is held only that against a lower one."""
+        """Return the margin of the rank; of a held rank, the margin against a lower one."""
         self.evaluations += 1
         ratios, rank = self._equations.ratios(np.array(y[: self.n])), self.rank
         if self.rank_held:
@@ -260,13 +260,13 @@ class _Motion:
 
 @dataclass
 class _Hold:
-    """Hold of joints at their limits, or of the rank of J⁺: its end and its length, s."""
+    """A hold of joints at their limits, or of the rank of J⁺: its end and its length, s."""
 
     until: float = -inf
     wait: float = 0.0
 
     def again(self, t: float, patience: float) -> None:
-        """Hold from t on, longer than the last time where that was within the patience."""
+        """Begin a hold at t, longer than the last one where that ended within the anti-chatter time."""
         repeated = t - self.until < patience
         self.wait = min(LONGER * self.wait, patience) if repeated else FIRST_HOLD * patience
         self.until = t + self.wait
@@ -282,7 +282,7 @@ def advance(
     atol: float,
     max_step: float,
 ) -> tuple[list[float], list[float]]:
-    """State one communication step later.
+    """Integrate the state over one communication step.
 
     Args:
         equations: of motion; autonomous, as inputs are held over the step.
@@ -305,7 +305,7 @@ def advance(
 
 
 def _regimes(motion: _Motion, y: State, h: float) -> State:
-    """The state after h, integrated from one event to the next."""
+    """Return the state after h, integrated from event to event."""
     n, stops, t = motion.n, motion.stops, 0.0
     patience = PATIENCE * min(motion.max_step, h)
     joint_hold, rank_hold = _Hold(), _Hold()

@@ -14,7 +14,7 @@ from .integrator import Array, Ratios, Response
 
 
 def command(plant: Any) -> tuple[Response, Ratios]:
-    """q̈_cmd as a function of the state, n values; inputs held. It has no J⁺."""
+    """Return q̈_cmd as a function of the state, n values, inputs held; this law has no J⁺."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 
     def commanded_acceleration(

@@ -1,4 +1,4 @@
-"""Kinematics and dynamics of a robot, in the coordinates of the joints that move on their own.
+"""Kinematics and dynamics of a robot in its independent joint coordinates.
 
 Joints that mimic others follow exactly: with the positions G q + c of all joints,
 
@@ -27,7 +27,7 @@ WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 class Mechanism:
-    """A robot with a gravity and a point mass in its task frame; n joints move on their own.
+    """A robot with gravity and a point mass (payload) in its task frame; n independent joints.
 
     Args:
         robot: the robot.
@@ -54,7 +54,7 @@ class Mechanism:
         self._position: Array = self._placement.translation
 
     def observe(self, q: Array, v: Array) -> tuple[list[float], list[list[float]], list[float]]:
-        """The task frame's position, Jacobian (6 × n: linear, angular), and drift J̇ v, 6 values.
+        """Return position, Jacobian (6 × n: linear, angular) and drift J̇ v (6) of the task frame.
 
         In the root's axes.
         """
@@ -72,12 +72,12 @@ class Mechanism:
 
     @property
     def rotation(self) -> Array:
-        """The task frame's rotation matrix where it was last observed."""
+        """Return the rotation matrix of the task frame at the last observed state."""
         rotation: Array = self._placement.rotation
         return rotation
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        """τ = M(q) a + h(q, v), N·m or N, n values."""
+        """Return τ = M(q) a + h(q, v), N·m or N, n values."""
         G = self._G
         if G is None:
             return np.asarray(pin.rnea(self._model, self._data, q, v, a))
@@ -85,21 +85,21 @@ class Mechanism:
         return np.asarray(G.T @ tau)
 
     def forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        """q̈ = M(q)⁻¹ (τ − h(q, v)), rad/s² or m/s², n values."""
+        """Return q̈ = M(q)⁻¹ (τ − h(q, v)), rad/s² or m/s², n values."""
         if self._G is None:
             return np.asarray(pin.aba(self._model, self._data, q, v, tau))
         h = self.inverse_dynamics(q, v, np.zeros(len(q)))
         return np.asarray(np.linalg.solve(self.mass_matrix(q), tau - h))
 
     def mass_matrix(self, q: Array) -> Array:
-        """M(q), n × n."""
+        """Return M(q), n × n."""
         G = self._G
         M = pin.crba(self._model, self._data, q if G is None else G @ q + self._c)
         M = np.triu(M) + np.triu(M, 1).T
         return M if G is None else np.asarray(G.T @ M @ G)
 
     def inverse_mass(self, q: Sequence[float] | Array) -> Array:
-        """M(q)⁻¹, n × n."""
+        """Return M(q)⁻¹, n × n."""
         if self._G is not None:
             return np.asarray(np.linalg.inv(self.mass_matrix(np.array(q))))
         inverse = pin.computeMinverse(self._model, self._data, np.array(q))

@@ -1,4 +1,4 @@
-"""Orientations as ROS has them: unit quaternions x, y, z, w."""
+"""Orientations as unit quaternions x, y, z, w, the order of ROS."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from .integrator import Array
 
 
 def quaternion(rotation: Array) -> list[float]:
-    """The unit quaternion of a rotation matrix, w ≥ 0."""
+    """Return the unit quaternion of a rotation matrix, w ≥ 0."""
     x, y, z, w = pin.Quaternion(rotation).coeffs().tolist()
     return [-x, -y, -z, -w] if w < 0.0 else [x, y, z, w]
 
 
 def rotation_error(target: Sequence[float], rotation: Array) -> list[float]:
-    """log(R_des Rᵀ), rad about the root's axes: the short way from R to R_des, at most π.
+    """Return log(R_des Rᵀ), the shortest rotation from R to R_des, rad about the root's axes, ≤ π.
 
     With the quaternion (a, w) of R_des Rᵀ it is 2 atan2(|a|, w) a/|a|. Source: Siciliano,
     Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 2.6 and 3.7.3.

@@ -1,4 +1,4 @@
-"""The plant: a robot under a control law, with its state, inputs and parameters.
+"""The plant: a robot under a control law, with its state, inputs, outputs and parameters.
 
     τ = M(q) q̈_cmd + h(q, v)                                    inverse dynamics (RNEA)
     q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v))     forward dynamics (ABA)
@@ -35,16 +35,16 @@ LAWS = {
 
 
 class ParameterError(ValueError):
-    """A parameter or input with a value that makes no sense; the message names it."""
+    """A parameter or input has an invalid value; the message names it."""
 
 
 class DiscardError(ArithmeticError):
-    """A communication step that cannot be done; the message names the culprit and the remedy."""
+    """A communication step cannot be completed; the message names the culprit and the remedy."""
 
 
 @contextlib.contextmanager
 def refusing(kind: type[Exception]) -> Iterator[None]:
-    """Linear algebra that has no answer is refused by an exception of this kind."""
+    """Convert a failure of linear algebra into an exception of the given kind."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -122,7 +122,7 @@ class Plant:
         self.prepare()
 
     def initialise(self) -> list[str]:
-        """Check the parameters and set the state to its start; what was clamped, a line each.
+        """Check the parameters and set the state to its start; return a line for each clamped value.
 
         Raises:
             ParameterError: naming the parameter and what it must be.
@@ -149,7 +149,7 @@ class Plant:
         return warnings
 
     def prepare(self) -> None:
-        """Take over parameters that were set directly, as after restoring a state."""
+        """Apply parameters that were set directly, for example by restoring a state."""
         place = self.payload_com
         self._real = self.known = Mechanism(self.robot, self.gravity, self.payload, place)
         if self.payload and not getattr(self, "payload_known", False):
@@ -245,14 +245,14 @@ class Plant:
         return rates
 
     def equations_of_motion(self) -> Equations:
-        """The equations of motion under the present inputs."""
+        """Return the equations of motion with the present inputs held."""
         command, ratios = self._law(self)
         acceleration = self._acceleration(command)
         rcond = self.rcond if "rcond" in CONTROLS[self.control].parameters else 0.0
         return Equations(acceleration, ratios, rcond, self._swing)
 
     def _acceleration(self, command: Response) -> Response:
-        """q̈ under a control law."""
+        """Return q̈ under a control law."""
         damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
         force = np.array(self.f_ext)
         # q̈ = q̈_cmd + M⁻¹(…): rounding of M q̈_cmd + h − h would move joints that are at rest
@@ -276,7 +276,7 @@ class Plant:
         return acceleration
 
     def stops(self) -> Stops:
-        """The limits as the integrator meets them, rigid or not."""
+        """Return the joint limits as the integrator's stops, rigid or clamping."""
         limits = list(zip(self.q_min, self.q_max))
         return Stops(limits, self._real.inverse_mass if self.rigid_stops else None)
 

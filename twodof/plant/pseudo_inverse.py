@@ -1,4 +1,4 @@
-"""The truncated pseudo-inverse of a task Jacobian.
+"""Truncated pseudo-inverse of a task Jacobian.
 
 With three rows or fewer a call into a linear-algebra library costs more than the arithmetic, so
 rows are plain lists of floats.
@@ -23,7 +23,7 @@ PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 def apply_pseudo_inverse(
     rows: list[list[float]], b: list[float], rcond: float, rank: int | None = None
 ) -> tuple[list[float], int, float]:
-    """J⁺b, where J⁺ keeps as many of the largest singular values as its rank says.
+    """Return J⁺b with the largest singular values up to the given rank.
 
     Args:
         rows: J, m rows of n.
@@ -99,7 +99,7 @@ def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
 
 
 def singular_ratios(rows: Sequence[Sequence[float]]) -> list[float]:
-    """σ/σ_max of a matrix in descending order; 0 where all are 0."""
+    """Return σ/σ_max of a matrix in descending order; 0 where all are 0."""
     orthogonal, _ = _orthogonal([list(row) for row in rows], [0.0] * len(rows))
     return _ratios([_dot(row, row) for row in orthogonal])
 
@@ -110,7 +110,7 @@ def _ratios(squares: Sequence[float]) -> list[float]:
 
 
 def _orthogonal(rows: list[list[float]], b: list[float]) -> tuple[list[list[float]], list[float]]:
-    """Rows and b after rotations from the left that make the rows orthogonal.
+    """Rotate rows and b from the left until the rows are orthogonal.
 
     Row k becomes σ_k v_kᵀ and b_k becomes u_kᵀb, so J⁺b = Σ_k row_k b_k / |row_k|² over the
     singular values that are kept. Up to three rows by one-sided Jacobi rotations (Hestenes,

@@ -1,4 +1,4 @@
-"""The robot: a URDF, checked, as a Pinocchio model and the joints in it that move on their own.
+"""A checked URDF as a Pinocchio model and its independent joints.
 
 Pinocchio loads several things silently that this plant cannot simulate, so the XML is
 checked before Pinocchio sees it, and every refusal names the joint or the link.
@@ -30,7 +30,7 @@ from .urdf import (
 
 @dataclass(frozen=True)
 class Robot:
-    """A fixed-base robot, n of whose joints move on their own, and its task frame.
+    """A fixed-base robot with n independent joints, and its task frame.
 
     Attributes:
         name: the URDF's robot name.
@@ -67,11 +67,11 @@ class Robot:
     warnings: tuple[str, ...]
 
     def moves_frame(self) -> tuple[bool, ...]:
-        """Per joint, whether it lies between the root and the task frame."""
+        """Whether each joint lies between the root and the task frame."""
         return tuple(bool(column.any()) for column in self._path().T)
 
     def swing(self) -> tuple[float, ...]:
-        """Per joint, a bound on how fast it changes σ/σ_max of the task Jacobian, 1/rad or 1/m.
+        """Bound on how fast each joint changes σ/σ_max of the task Jacobian, 1/rad or 1/m.
 
         A joint i of a chain changes column j of the Jacobian by the cross product of an axis with
         column max(i, j), so that ‖∂J/∂q_i‖ ≤ √n σ_max for n joints; by Weyl's inequality no
@@ -83,14 +83,14 @@ class Robot:
         return tuple(bound.tolist())
 
     def _path(self) -> NDArray[np.float64]:
-        """The rows of the coupling of joints between the root and the task frame."""
+        """Rows of the coupling of joints between the root and the task frame."""
         support = list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
         coupling = np.eye(len(self.joints)) if self.coupling is None else self.coupling
         return coupling[[i - 1 for i in support]]
 
 
 def load_robot(text: str, frame: str, axes: str) -> Robot:
-    """Robot from the text of a URDF.
+    """Load a robot from the text of a URDF.
 
     Args:
         text: XML text.
@@ -154,7 +154,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
 def _coupling(
     moving: Sequence[Joint], joints: Sequence[Joint]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
-    """G and c of all joints' positions G q + c; no G where they are q itself."""
+    """Return G and c of all joint positions G q + c; G is None where they equal q."""
     offset = np.array([joint.offset for joint in moving])
     if len(moving) == len(joints):
         return None, offset
@@ -166,7 +166,7 @@ def _coupling(
 
 
 def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
-    """The range in which a joint and all that follow it are within their limits."""
+    """Return the range in which a joint and all its followers are within their limits."""
     low, high = leader.low, leader.high
     for joint in moving:
         if joint.leader != leader.name or joint is leader or not joint.ratio:
@@ -187,7 +187,7 @@ def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
 
 
 def _mass(urdf: Urdf, joint: Joint, odd: list[str]) -> float:
-    """Of a moving body, that is a link with all that is fixed to it, whose inertia is physical."""
+    """Return the mass of a moving body (a link with all links fixed to it), with a physical inertia."""
     fixed = [other for other in urdf.joints.values() if not other.moves]
     body = [joint.child]
     for name in body:
@@ -200,7 +200,7 @@ def _mass(urdf: Urdf, joint: Joint, odd: list[str]) -> float:
 
 
 def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
-    """The link's mass, after the checks; ``odd`` gets it if its inertia is slightly off."""
+    """Check a link and return its mass; append it to ``odd`` if its inertia is slightly off."""
     if missing := _missing(inertial):
         raise RobotError(f"link '{link}': its <inertial> has no {missing}")
     mass = attribute(inertial, "mass", "value", 0.0)
@@ -224,7 +224,7 @@ _INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def _missing(inertial: ET.Element) -> str:
-    """The first element and those of its attributes that are not there; "" where all are."""
+    """Return the first element whose attributes are missing, and those attributes; "" where none is."""
     for tag, keys in (("mass", ("value",)), ("inertia", _INERTIA_KEYS)):
         element = inertial.find(tag)
         missing = [key for key in keys if element is None or element.get(key) is None]
@@ -234,7 +234,7 @@ def _missing(inertial: ET.Element) -> str:
 
 
 def _mechanism(urdf: Urdf) -> ET.Element:
-    """The URDF of the bare mechanism: inertias, joints, limits, and nothing else.
+    """Return a URDF reduced to inertias, joints and limits.
 
     urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here, and
     takes a number with a space behind it for 0. Continuous joints become revolute without limits,
@@ -263,7 +263,7 @@ def _mechanism(urdf: Urdf) -> ET.Element:
 
 
 def _check_mass_matrix(robot: Robot) -> None:
-    """Every joint, the outermost first, must have something to move."""
+    """Refuse a joint that moves no mass, the outermost first."""
     model, n = robot.model, len(robot.joints)
     G = np.eye(n) if robot.coupling is None else robot.coupling
     M = pin.crba(model, model.createData(), np.zeros(model.nq))

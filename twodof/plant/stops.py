@@ -1,4 +1,4 @@
-"""Joint-limit stops: which joints rest at a limit, what a stop does, and when it lets go.
+"""Joint-limit stops: which joints rest at a limit, the reaction of a stop, and when it releases.
 
 A stop is plastic and unilateral: a joint that reaches it loses its velocity there, and rests there
 while it is pressed into it. Without a reaction, as a clamp, that is all: it is pressed while its
@@ -30,7 +30,7 @@ ROUNDING = 2.0**-40
 
 
 class Stops:
-    """The stops of a robot, and the joints that rest there.
+    """Stops of a robot, and the joints that rest at them.
 
     Args:
         limits: of the joints.
@@ -47,7 +47,7 @@ class Stops:
         self.watched: list[int] = []
 
     def impact(self, y: list[float], kept: Sequence[bool]) -> None:
-        """Take the velocity that points into a limit, from the state (q, v).
+        """Remove the velocity that points into a limit from the state (q, v).
 
         Args:
             y: the state; changed.
@@ -75,7 +75,7 @@ class Stops:
             y[n + i] = 0.0
 
     def hold(self, y: Sequence[float], a: list[float], kept: Sequence[bool]) -> list[float]:
-        """Find the joints that rest, at (q, v) after an impact; makes their acceleration 0.
+        """Find the joints that rest at (q, v) after an impact, and make their acceleration 0.
 
         Returns how each is pressed into its limit, as ``restrain``.
 
@@ -106,7 +106,7 @@ class Stops:
         return self.restrain(y, a)
 
     def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:
-        """Make the acceleration of held joints 0; how each is pressed into its limit."""
+        """Make the acceleration of held joints 0; return the contact force of each."""
         pressed = [0.0] * len(a)
         if not self.held:
             return pressed
@@ -122,7 +122,7 @@ class Stops:
         return pressed
 
     def at_limits(self, y: Sequence[float]) -> list[bool]:
-        """Tell for each joint whether it is at a limit, in the state (q, v)."""
+        """Return for each joint whether it is at a limit, in the state (q, v)."""
         return [not low < q < high for (low, high), q in zip(self.limits, y)]
 
     def _has_no_range(self, i: int) -> bool:
@@ -133,7 +133,7 @@ class Stops:
         return 1.0 if y[i] >= self.limits[i][1] else -1.0
 
     def _contacts(self, y: Sequence[float]) -> list[tuple[int, float]]:
-        """Joints at a limit, and the sign of the way back into the range."""
+        """Return the joints at a limit, with the sign of the direction back into the range."""
         return [
             (i, -1.0 if q >= high else 1.0)
             for i, ((low, high), q) in enumerate(zip(self.limits, y))
@@ -143,7 +143,7 @@ class Stops:
     def _complementary(
         self, W: Array, contacts: Sequence[tuple[int, float]], b: Sequence[float], both: list[int]
     ) -> Array:
-        """z of n values: 0 ≤ E z ⟂ E (b + W z) ≥ 0 at the contacts, 0 elsewhere.
+        """Return z, n values: 0 ≤ E z ⟂ E (b + W z) ≥ 0 at the contacts, 0 elsewhere.
 
         All contacts that are wrong change sides at a time; where that does not lessen their number
         for a while only the last one does, which ends for every positive definite W. A joint in

@@ -22,7 +22,7 @@ from .pseudo_inverse import apply_pseudo_inverse, singular_ratios
 
 
 def command(plant: Any) -> tuple[Response, Ratios]:
-    """q̈_cmd as a function of the state, and the singular values of its J; inputs held."""
+    """Return q̈_cmd as a function of the state, and the singular values of its J; inputs held."""
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]
     law = list(zip(axes, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))

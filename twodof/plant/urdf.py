@@ -1,4 +1,4 @@
-"""A URDF as the tree of links and joints that it describes, read once and checked.
+"""A URDF as a checked tree of links and joints.
 
 What only a simulation needs, masses and inertias, is checked where the model is made. Imports the
 standard library alone.
@@ -30,12 +30,12 @@ Vector = tuple[float, float, float]
 
 
 class RobotError(ValueError):
-    """A robot description that cannot be used; the message names the culprit."""
+    """A robot description is unusable; the message names the culprit."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint.
+    """A joint of a URDF.
 
     Attributes:
         name: its name.
@@ -69,18 +69,18 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether it is not fixed."""
+        """Whether the joint is not fixed."""
         return self.type != "fixed"
 
     @property
     def prismatic(self) -> bool:
-        """Whether its coordinate is a length."""
+        """Whether the coordinate is a length."""
         return self.type == "prismatic"
 
 
 @dataclass(frozen=True)
 class Urdf:
-    """A robot as its URDF describes it.
+    """A robot as described by its URDF.
 
     Attributes:
         name: the robot's.
@@ -99,7 +99,7 @@ class Urdf:
     warnings: tuple[str, ...]
 
     def chain(self, link: str) -> list[Joint]:
-        """The joints from the root to a link."""
+        """Return the joints from the root to a link."""
         above = {joint.child: joint for joint in self.joints.values()}
         chain = []
         while link in above:
@@ -109,7 +109,7 @@ class Urdf:
 
 
 def check_axes(axes: str) -> None:
-    """Refuse what are no task axes.
+    """Refuse invalid task axes.
 
     Raises:
         RobotError: they are not one to three different letters of "xyz".
@@ -119,7 +119,7 @@ def check_axes(axes: str) -> None:
 
 
 def read_urdf(text: str) -> Urdf:
-    """The robot from the text of a URDF.
+    """Read a robot from the text of a URDF.
 
     Raises:
         RobotError: anything that is not supported, naming the joint, link or attribute.
@@ -224,7 +224,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
 
 
 def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
-    """What a joint's <mimic> says; nothing where there is none."""
+    """Return a joint's leader, ratio and offset from <mimic>; nothing where there is none."""
     mimic = None if element is None else element.find("mimic")
     if mimic is None:
         return {"leader": name}
@@ -241,7 +241,7 @@ def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
 
 
 def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:
-    """The joint, with the one that its <mimic> leads to in the end, and how it follows that."""
+    """Return the joint with the leader at the end of its chain of <mimic> elements."""
     seen = [joint.name]
     while joint.leader != seen[-1]:
         leader = joints.get(joint.leader)
@@ -293,7 +293,7 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
 
 
 def number(word: str) -> float:
-    """A number that other readers read as Python does: without underscores and other digits."""
+    """Parse a number as other readers do: without Python's underscores and non-ASCII digits."""
     if not word.isascii() or "_" in word:
         raise ValueError(word)
     return float(word)
@@ -333,7 +333,7 @@ def _link(joint: ET.Element, side: str) -> str:
 
 
 def attribute(element: ET.Element, tag: str, key: str, default: float) -> float:
-    """A number of an element's first child of some tag, not beyond the largest double."""
+    """Return a number of an element's first child with a tag, at most the largest double."""
     child = element.find(tag)
     value = default if child is None else float(child.get(key, default))
     return max(-UNBOUNDED, min(UNBOUNDED, value))

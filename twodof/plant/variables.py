@@ -1,4 +1,4 @@
-"""The one table of FMI variables, from which the slave and both flavours' XML are made.
+"""The table of FMI variables, from which the slave and the XML of both flavours are made.
 
 Names are FMI structured names with 1-based indices; a variable's place in the table, from 1 on, is
 its value reference.
@@ -20,7 +20,7 @@ Value = float | bool
 
 @dataclass(frozen=True)
 class Range:
-    """Values that a variable may have, both ends among them, and how to say it."""
+    """Closed range of valid values of a variable, and its description."""
 
     low: float
     high: float
@@ -43,7 +43,7 @@ RANGES = {
 
 @dataclass(frozen=True)
 class Variable:
-    """One scalar variable of the FMU.
+    """A scalar variable of the FMU.
 
     Attributes:
         group: the vector's name and the plant's attribute, e.g. "x_des"; ``index`` its 0-based
@@ -71,7 +71,7 @@ class Variable:
 
     @property
     def derivative_of(self) -> str:
-        """Group of the state that it is the derivative of, "" where it is none."""
+        """Group of the state whose derivative this is, "" where it is none."""
         return self.group.removeprefix("der_") if self.group.startswith("der_") else ""
 
     @property
@@ -80,7 +80,7 @@ class Variable:
         return "Boolean" if isinstance(self.start, bool) else "Real"
 
     def refusal(self, value: Value) -> str:
-        """Why it cannot have a value, "" where it can."""
+        """Return why a value is invalid, "" where it is valid."""
         within = RANGES.get(self.group, NO_RANGE)
         fits = within.low <= value <= within.high
         return "" if fits else f"{self.name} = {value:g} must be {within.words}"
@@ -88,7 +88,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Control:
-    """A control law: what drives the robot.
+    """A control law: the source of joint accelerations or efforts.
 
     Attributes:
         title: in words, for "{frame}".
@@ -138,7 +138,7 @@ Starts = Mapping[str, Value | tuple[float, ...]]
 
 
 def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[Variable]:
-    """The variables of a robot's FMU, in value-reference order.
+    """Return the variables of a robot's FMU, in the order of their value references.
 
     Args:
         robot: the robot; n joints and m task axes give the vectors' lengths.
@@ -184,7 +184,7 @@ def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]
 
 
 def _rows(robot: Robot, control: str) -> list[Row]:
-    """Group, causality, owners of its elements (none of a scalar), their units, description."""
+    """Return group, causality, owners of elements (none of a scalar), units and description."""
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
     root = [f"axis {letter} of {robot.root}" for letter in "xyz"]
@@ -244,7 +244,7 @@ def _rows(robot: Robot, control: str) -> list[Row]:
 
 
 def count_event_indicators(robot: Robot, control: str) -> int:
-    """Of Model Exchange: two limits a joint, and the singular values that J⁺ may drop."""
+    """Count the event indicators of Model Exchange: two per joint, and droppable singular values."""
     law = CONTROLS[control]
     rows = len(robot.axes) + 3 * ("quat_des" in law.inputs) if "rcond" in law.parameters else 1
     return 2 * len(robot.joints) + rows - 1

@@ -1,4 +1,4 @@
-"""The motion of the end effector in closed form.
+"""Closed-form motion of the end effector.
 
 While its inputs are held, each task axis obeys, away from singularities and limits,
 
@@ -24,7 +24,7 @@ SERIES_TERMS = 18
 
 
 class Held(NamedTuple):
-    """Inputs that are held for a while, m task axes each: m, m/s, m/s², 1/s² and 1/s."""
+    """Constant inputs over a time, m task axes each: m, m/s, m/s², 1/s² and 1/s."""
 
     x_des: tuple[float, ...]
     xd_des: tuple[float, ...]
@@ -34,7 +34,7 @@ class Held(NamedTuple):
 
 
 class Responses(NamedTuple):
-    """Responses of ẍ + Kd ẋ + Kp x over time; the letters are those above."""
+    """Responses of ẍ + Kd ẋ + Kp x over time, named by the letters above."""
 
     phi: Array
     psi: Array
@@ -43,7 +43,7 @@ class Responses(NamedTuple):
 
 
 def responses(t: Array, Kp: float, Kd: float) -> Responses:
-    """Responses at times t ≥ 0 (s), accurate at, near and away from critical damping.
+    """Return responses at times t ≥ 0 (s), accurate at, near and away from critical damping.
 
     ψ and γ are divided differences of exp(p t) over the roots p of p² + Kd p + Kp, and over 0 and
     the roots. They are computed in forms that do not cancel where roots meet or vanish.
@@ -74,7 +74,7 @@ def responses(t: Array, Kp: float, Kd: float) -> Responses:
 
 
 def _series(t: Array, Kp: float, Kd: float) -> Array:
-    """γ for times that are short against the roots: Σ hₖ tᵏ⁺² / (k + 2)!"""
+    """Return γ for times short against the roots: Σ hₖ tᵏ⁺² / (k + 2)!."""
     h, before = 1.0, 0.0
     term = 0.5 * t * t
     total = np.zeros_like(t)
@@ -92,7 +92,7 @@ def task_error(
     step: float,
     steps: NDArray[np.int64],
 ) -> Array:
-    """x − x_des at N communication points, N × m.
+    """Return x − x_des at N communication points, N × m.
 
     Args:
         x0, xd0: position and velocity at the start, m and m/s, m values each.

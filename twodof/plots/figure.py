@@ -1,4 +1,4 @@
-"""Style, head and files of all figures, of bags and of sweeps."""
+"""Style, header and files of all figures, of bags and of sweeps."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ TICK_STYLE: dict[str, Any] = {
 
 
 class Plot(Figure):
-    """A figure that notebooks show without being asked."""
+    """A figure that notebooks display automatically."""
 
     def _repr_png_(self) -> bytes:
         return _rendered(self, "png")
 
 
 class Drawing(NamedTuple):
-    """What can be drawn into a figure, or stand on a page.
+    """Content of a figure or page.
 
     Attributes:
         name: of the file where the user gives none.
@@ -69,12 +69,12 @@ class Drawing(NamedTuple):
 
 
 def drawn(drawing: Drawing) -> Figure:
-    """A figure of it."""
+    """Return a figure of a drawing."""
     return _draw(drawing, Plot())
 
 
 def save(drawing: Drawing, output: str | Path | None = None) -> Path:
-    """Draw into a file, written whole or not at all; its path.
+    """Save a drawing atomically to a file; return its path.
 
     Args:
         output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the
@@ -93,7 +93,7 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
 
 
 def file_kind(path: str | Path) -> str:
-    """The kind of file that a name asks for: "png", "svg", "pdf" or "html".
+    """Return the kind of file by its name: "png", "svg", "pdf" or "html".
 
     Raises:
         PlotError: any other.
@@ -106,7 +106,7 @@ def file_kind(path: str | Path) -> str:
 
 
 def show(drawing: Drawing) -> bool:
-    """Draw in a window and wait until it is closed; False where there is no display."""
+    """Show a figure in a window until it is closed; return False where there is no display."""
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
         return False  # saves the third of a second that pyplot takes
     from matplotlib import pyplot as plt
@@ -130,7 +130,7 @@ def draw_head(
     size: tuple[float, float],
     handles: Sequence[Line2D] = (),
 ) -> SubFigure:
-    """Draw a title, texts and a key; return the part for the panels, of a size in inches."""
+    """Draw a title, texts and a legend; return the part for the panels, of a size in inches."""
     letters = int((size[0] - 0.3) / LETTER)
     lines = [line for text in texts for line in textwrap.wrap(text, letters)]
     for handle in handles:
@@ -152,7 +152,7 @@ def draw_head(
 
 
 def _end(text: str, letters: int) -> str:
-    """As much of a text's end as there is room for."""
+    """Return as much of a text's end as fits."""
     return text if len(text) <= letters else f"…{text[1 - letters :]}"
 
 
@@ -166,7 +166,7 @@ def _draw(drawing: Drawing, figure: Figure) -> Figure:
 
 
 def _rendered(figure: Figure, kind: str) -> bytes:
-    """The figure as a file's content; equal figures give equal bytes."""
+    """Return the figure as a file's content; equal figures give equal bytes."""
     metadata: dict[str, dict[str, str | None]] = {
         "png": {"Software": f"twodof {__version__}"},
         "svg": {"Creator": f"twodof {__version__}", "Date": None},
@@ -179,7 +179,7 @@ def _rendered(figure: Figure, kind: str) -> bytes:
 
 
 def _html(drawing: Drawing) -> bytes:
-    """A page that needs nothing else: its own body or the figure as SVG, and a table."""
+    """Return a self-contained page: the drawing's own body or the figure as SVG, and a table."""
     if drawing.body:
         body = drawing.body()
     else:

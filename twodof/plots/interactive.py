@@ -1,4 +1,4 @@
-"""The figure of runs on a page: zoom, a cursor through all panels, joints and bags switched.
+"""Interactive figure of runs on a page: zoom, a cursor through all panels, switchable joints and bags.
 
 Of each quantity one panel has the curves of all joints. What stands on the page is plotly's figures
 as it has them, data and layout, and its library, packed; ``interactive.js`` unpacks and joins them.
@@ -41,7 +41,7 @@ AXIS: dict[str, Any] = {
 
 
 def body(tracks: Sequence[Track]) -> str:
-    """What stands on the page.
+    """Return the HTML body of the page.
 
     Raises:
         PlotError: plotly is missing.
@@ -64,7 +64,7 @@ def body(tracks: Sequence[Track]) -> str:
 
 
 def _numbers(values: Array) -> dict[str, str]:
-    """As plotly has arrays: bytes, which are exact."""
+    """Return numbers in plotly's binary form, which is exact."""
     content = np.ascontiguousarray(values, dtype="<f8").tobytes()
     return {"dtype": "f8", "bdata": base64.b64encode(content).decode()}
 
@@ -75,7 +75,7 @@ def _line(stroke: Stroke) -> dict[str, Any]:
 
 
 def _trace(stroke: Stroke) -> dict[str, Any]:
-    """A line or marks, of a track's joint, in which the legend tells what is of a kind."""
+    """Return a line or markers of a track's joint; the legend groups it by kind."""
     mark: dict[str, Any] = {"color": stroke.colour}
     if stroke.mark == "+":
         mark = {"symbol": "cross-thin-open", "size": 13, "color": INK, "line": {"width": 1.6}}
@@ -93,7 +93,7 @@ def _trace(stroke: Stroke) -> dict[str, Any]:
 
 
 def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
-    """Which samples are drawn, where they are not all: a line for each track."""
+    """Return the samples to draw where they are too many: a line for each track."""
     text = ""
     for i, track in enumerate(tracks):
         own = (trace["x"]["bdata"] for trace in figure["data"] if trace["meta"][0] == i)
@@ -108,7 +108,7 @@ def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
 
 
 def _looks(tracks: Sequence[Track]) -> Looks:
-    """Colours tell apart what there is more of, tracks or joints, dashes the other."""
+    """Return styles: colours distinguish the larger of tracks and joints, dashes the other."""
     bags, joints = looks(labels(tracks)), looks(joint_names(tracks))
     by_bag = len(bags) > len(joints)
     own = {}
@@ -121,7 +121,7 @@ def _looks(tracks: Sequence[Track]) -> Looks:
 
 
 def _rows(tracks: Sequence[Track]) -> list[dict[str, Any]]:
-    """Of the legend: each track, and each of its joints."""
+    """Return the legend's rows: each track, and each of its joints."""
     return [
         {
             "bag": i, "joint": joint, "label": look.label, "colour": look.colour,
@@ -135,7 +135,7 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, Any]]:
 
 
 def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
-    """A row for each quantity, on one axis of time."""
+    """Return a figure with a row for each quantity, on one time axis."""
     own = _looks(tracks)
     rows: dict[str, list[Panel]] = {}
     for panel in sorted(panels_of(tracks, own), key=lambda panel: [*KINDS].index(panel.kind)):
@@ -192,7 +192,7 @@ def _heading(text: str, top: float) -> dict[str, Any]:
 
 
 def in_workspace(tracks: Sequence[Track]) -> list[dict[str, Any]]:
-    """A figure for each view."""
+    """Return a figure for each view."""
     return [_view(view, workspace_title(tracks)) for view in views(tracks, _looks(tracks))]
 
 
@@ -213,7 +213,7 @@ def _view(view: View, title: str) -> dict[str, Any]:
 
 
 def _whole_lines(stroke: Stroke) -> list[dict[str, Any]]:
-    """Where a coordinate alone is meant, which is not one of a trace."""
+    """Return shapes for lines at one coordinate, which traces cannot draw."""
     up = [{"x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper"} for x in stroke.x]
     across = [{"x0": 0, "x1": 1, "y0": y, "y1": y, "xref": "paper"} for y in stroke.y]
     return [{"type": "line", "line": _line(stroke), **ends} for ends in up + across]

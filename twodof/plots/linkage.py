@@ -1,4 +1,4 @@
-"""A robot as pictures need it: where its links are, what it can reach, where it is singular."""
+"""Geometry of a robot for pictures: links, reach and singularities."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOOKS = 2000  # for singularities, along the way
 
 @dataclass(frozen=True)
 class Reach:
-    """The circle that a planar arm cannot leave, m; its normal is the root's x, y or z: 0, 1, 2."""
+    """Reach circle of a planar arm, m; its normal is the root's x, y or z: 0, 1, 2."""
 
     centre: Array
     radius: float
@@ -27,7 +27,7 @@ class Reach:
 
 @dataclass(frozen=True)
 class Motion:
-    """What the robot's geometry makes of the joints' motion; points in the root frame, m.
+    """Motion of the robot's links; points in the root frame, m.
 
     Attributes:
         frame, root: the end effector's link, and the link that points are expressed in.
@@ -46,7 +46,7 @@ class Motion:
 
 
 class Linkage(NamedTuple):
-    """Geometry, limits and damping of a robot for pictures; its masses need not make sense.
+    """Geometry, limits and damping of a robot for pictures; its masses may be invalid.
 
     Attributes:
         moving: joints that move on their own; those that mimic one too where a bag has them.
@@ -62,24 +62,24 @@ class Linkage(NamedTuple):
 
     @property
     def chain(self) -> list[Joint]:
-        """The joints that move the frame, from the root on."""
+        """Joints that move the frame, from the root on."""
         return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
 
     def motion(self, q: Array) -> Motion:
-        """What q, N × ``moving``, rad or m, moves."""
+        """Return the motion of the links for q, N × ``moving``, rad or m."""
         start, end = self._skeletons(q[[0, -1]])
         path, reach = self.kinematics.path(self.frame, q), self._reach()
         return Motion(self.urdf.name, self.frame, self.urdf.root, path, start, end, reach)
 
     def _skeletons(self, q: Array) -> Array:
-        """Origins of the root, of joints that move the frame, and of the frame; N × points × 3."""
+        """Return origins of the root, of the frame's joints, and of the frame; N × points × 3."""
         chain = self.urdf.chain(self.frame)
         places = self.kinematics.along(chain, q)
         shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), -1]
         return np.stack([places[i].translation for i in shown], axis=1)
 
     def _reach(self) -> Reach | None:
-        """The circle, where all joints turn about one of the root's axes.
+        """Return the reach circle, where all joints rotate about one of the root's axes.
 
         Distances between neighbouring joints do not change, so no point is farther than their sum;
         in a plane the stretched arm is that long. For arms in space the sum would be too large.
@@ -101,7 +101,7 @@ class Linkage(NamedTuple):
         return Reach(points[0], float(np.linalg.norm(links, axis=1).sum()), normal)
 
     def is_singular(self, q: Array, rcond: float, turns: bool) -> bool:
-        """Whether it has been where it cannot follow any command: σ_min ≤ rcond·σ_max of J.
+        """Return whether σ_min ≤ rcond·σ_max of the task Jacobian at any sample.
 
         That has the rows of the task axes, and where an orientation is followed three of turning.
         """
@@ -112,7 +112,7 @@ class Linkage(NamedTuple):
 
 
 def load_linkage(text: str, frame: str, axes: str, names: Sequence[str]) -> Linkage:
-    """Linkage of a URDF's text; without a frame, to "EndEffector" or the link behind most joints.
+    """Load the linkage of a URDF's text; the default frame is "EndEffector" or the deepest link.
 
     ``names`` are the joints whose positions are known.
 

@@ -1,4 +1,4 @@
-"""What the panels of a run hold, whoever draws them: strokes over time, limits and ranges."""
+"""Contents of a run's panels for any renderer: lines over time, limits and ranges."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ class Panel(NamedTuple):
 
 
 def title(tracks: Sequence[Track]) -> str:
-    """The robots, or where they are not known the bags."""
+    """Return the names of the robots, or of the bags where robots are unknown."""
     robots = dict.fromkeys(t.motion.robot for t in tracks if t.motion and t.motion.robot)
     return ", ".join(robots or dict.fromkeys(track.name for track in tracks))
 
 
 def joint_names(tracks: Sequence[Track]) -> list[str]:
-    """Of all joints of all tracks, each once."""
+    """Return the names of all joints of all tracks, each once."""
     return list(dict.fromkeys(joint.name for track in tracks for joint in track.joints))
 
 
 def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
-    """The tracks with those joints alone, in that order.
+    """Return the tracks with the named joints only, in that order.
 
     Raises:
         PlotError: no track has a joint of such a name.
@@ -77,12 +77,12 @@ def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
 
 
 def duration(tracks: Sequence[Track]) -> float:
-    """Of the time axis, s."""
+    """Return the length of the time axis, s."""
     return max(float(track.t[-1]) for track in tracks) or 1.0
 
 
 def panels_of(tracks: Sequence[Track], looks: Looks) -> list[Panel]:
-    """Panels of each joint in turn, of the KINDS that any has; last the error if it is known."""
+    """Return panels of each joint in turn, of the KINDS that any has; then the error if it is known."""
     joints = [joint for track in tracks for joint in track.joints]
     kinds = [kind for kind in UNITS if any(getattr(joint, kind).size for joint in joints)]
     names = joint_names(tracks)
@@ -150,7 +150,7 @@ def _note(limits: Sequence[float]) -> str:
 
 
 def _error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
-    """Distance from the target over whole decades, and in closed form; None without a target."""
+    """Return the distance from the target over whole decades, with the closed form; None without a target."""
     tasks = [(i, track.t, track.task) for i, track in enumerate(tracks) if track.task]
     if not tasks:
         return None

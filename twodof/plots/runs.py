@@ -1,4 +1,4 @@
-"""One figure of one run or of several: joints, the arm in its workspace, and the error.
+"""Figure of one run or several: joints, the arm in its workspace, and the error.
 
 Sizes are in inches of paper. Printed 17 cm wide, as the text of an A4 page is, the smallest letters
 are 5 pt high; more than ROWS joints take a wider page.
@@ -46,7 +46,7 @@ POINTS = 4000  # of a curve; panels are fewer pixels wide
 def plot(
     *bags: Recording | str | Path, urdf: str | Path | None = None, frame: str | None = None
 ) -> Figure:
-    """A figure of one bag, or of several for comparison.
+    """Return a figure of one bag, or of several for comparison.
 
     Args:
         bags: bags, or their folders; all robots of one that has several.
@@ -59,13 +59,13 @@ def plot(
 
 
 def each_of(bags: Sequence[Recording | str | Path]) -> list[Recording | Path]:
-    """Bags, and of those that have several robots each robot's."""
+    """Return the bags, with each robot of a bag that has several."""
     parts = ([bag] if isinstance(bag, Recording) else each_robot(Path(bag)) for bag in bags)
     return [part for several in parts for part in several]
 
 
 def drawing(tracks: Sequence[Track]) -> Drawing:
-    """What to draw of tracks; the table has a column for each."""
+    """Return the drawing of tracks; its table has a column for each."""
     first, *others = tracks
     table = [summary(first), *(summary(other, first) for other in others)]
     name = first.name + (f"-and-{len(tracks) - 1}-more" if len(tracks) > 1 else "")
@@ -73,7 +73,7 @@ def drawing(tracks: Sequence[Track]) -> Drawing:
 
 
 def _draw(tracks: Sequence[Track], figure: Figure) -> None:
-    """Joints with the error below them, and beside them the workspace."""
+    """Draw the joints with the error below them, and beside them the workspace."""
     bags = looks(labels(tracks))
     names = ["", *joint_names(tracks)]
     own = {(i, name): look for i, look in enumerate(bags) for name in names}
@@ -125,13 +125,13 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
 
 
 def _units(panels: Sequence[Panel]) -> list[list[str]]:
-    """Units of all panels that are of each panel's kind."""
+    """Return the units of all panels of each panel's kind."""
     found = {(panel.kind, unit) for panel in panels for unit in panel.unit.split(" or ")}
     return [[u for u in UNITS[panel.kind] if (panel.kind, u) in found] for panel in panels]
 
 
 def _wrapped(name: str, height: float) -> str:
-    """A joint's name broken after its underscores into the lines that its row has room for."""
+    """Return a joint's name broken after underscores into the lines that its row can hold."""
     lines = re.findall(r".{1,11}$|.{1,10}_|.{1,11}", name)
     room = int(height / 0.13)
     if len(lines) > room:
@@ -194,12 +194,12 @@ def _draw_error(axes: Axes, panel: Panel) -> None:
 
 
 def _line(colour: str, dashes: Sequence[float]) -> dict[str, Any]:
-    """A look as matplotlib's lines have it."""
+    """Return matplotlib's line properties of a style."""
     return {"color": colour, "linestyle": (0, tuple(dashes)) if dashes else "-"}
 
 
 def _draw_strokes(axes: Axes, strokes: Iterable[Stroke]) -> None:
-    """Draw them, each over those before that are as deep."""
+    """Draw lines, the deepest first."""
     for stroke in strokes:
         look = {**_line(stroke.colour, stroke.dashes), "label": stroke.label}
         look |= {"linewidth": stroke.width, "zorder": stroke.depth}
@@ -227,7 +227,7 @@ def _marks(stroke: Stroke) -> dict[str, Any]:
 
 
 def _key(strokes: Iterable[Stroke]) -> list[Line2D]:
-    """One handle for each label; those of several tracks in grey."""
+    """Return one legend handle for each label; labels of several tracks are grey."""
     handles: dict[str, Stroke] = {}
     for stroke in strokes:
         first = handles.setdefault(stroke.label, stroke)
@@ -243,12 +243,12 @@ def _key(strokes: Iterable[Stroke]) -> list[Line2D]:
 
 
 def _set_ticks(axis: Axis, most: int) -> None:
-    """Round numbers, at most so many steps between them."""
+    """Set round tick numbers, with a maximum number of steps between them."""
     axis.set_major_locator(MaxNLocator(most, steps=(1, 2, 2.5, 5, 10)))
     axis.set_major_formatter(lambda value, _position: number(value))
 
 
 def _power_of_ten(value: float, _position: float) -> str:
-    """A tick of a logarithmic axis."""
+    """Return the label of a tick on a logarithmic axis."""
     digits = str(round(log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{digits}"

@@ -1,4 +1,4 @@
-"""What a run was told, in words and numbers."""
+"""Text summaries of a run's settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNITS = {
 
 
 def settings_of(bag: Recording) -> dict[str, str]:
-    """What the run was told, vectors and scalars by group, e.g. {"Kp": "50 s⁻²"}; {} if unknown."""
+    """Return the settings of a run by group, e.g. {"Kp": "50 s⁻²"}; {} if unknown."""
     provenance = bag.provenance
     if not provenance:
         return {}
@@ -40,13 +40,13 @@ def _group(name: str) -> str:
 
 
 def _text(values: Sequence[Any]) -> str:
-    """One value where all are equal, as gains often are, else all of them."""
+    """Return one value where all are equal, as gains often are, else all of them."""
     texts = [str(v).lower() if isinstance(v, bool) else number(v) for v in values]
     return texts[0] if len(set(texts)) == 1 else f"({', '.join(texts)})"
 
 
 def number(value: float) -> str:
-    """Six digits, with the minus sign of typography; the largest double means none."""
+    """Format a number with six digits and a typographic minus; the largest double means none."""
     if abs(value) >= UNBOUNDED:
         return "none"
     return f"{value + 0.0:.6g}".replace("-", "\N{MINUS SIGN}")  # + 0.0: no negative zero

@@ -1,4 +1,4 @@
-"""Strokes, of which pictures consist whoever draws them; colours, and the smallest sizes shown."""
+"""Renderer-independent lines and markers, their colours, and the smallest visible sizes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALLEST_ERROR = 1e-12  # m: what is below is rounding
 
 
 class Look(NamedTuple):
-    """What tells a curve from the others: a colour and one of DASHES."""
+    """Style of a curve: a colour and one of DASHES."""
 
     label: str
     colour: str
@@ -31,7 +31,7 @@ class Look(NamedTuple):
 
 
 class Stroke(NamedTuple):
-    """A line in a picture, or marks.
+    """A line in a picture, or markers.
 
     Attributes:
         track: whose, or None.
@@ -59,16 +59,16 @@ class Stroke(NamedTuple):
 
     @property
     def is_limit(self) -> bool:
-        """Whether it is a limit, and not a curve that is called so."""
+        """Whether this is a limit, and not a curve with that label."""
         return self.label == "limit" and not self.kind
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is whole lines."""
+        """Whether this consists of lines across the whole picture."""
         return len(self.x) != len(self.y)
 
     def thinned(self, most: int) -> Stroke:
-        """The same with an outline of y over x, in so many points."""
+        """Return the line downsampled to a number of points."""
         if len(self.x) <= most:
             return self
         kept = outline(self.y, most)
@@ -76,7 +76,7 @@ class Stroke(NamedTuple):
 
 
 def looks(names: Iterable[str]) -> list[Look]:
-    """A look for each name."""
+    """Return a style for each name."""
     return [
         Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)])
         for i, name in enumerate(names)
@@ -84,7 +84,7 @@ def looks(names: Iterable[str]) -> list[Look]:
 
 
 def outline(values: Array, most: int) -> Indices:
-    """Indices of so many samples at most, with which a line looks as it does with all of them.
+    """Return indices of a limited number of samples that draw the same line (M4).
 
     From near by too, so that a jump is one: of parts as short as may be the first, last, smallest
     and largest, and both sides of the greatest rise and fall.

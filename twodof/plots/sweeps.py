@@ -1,4 +1,4 @@
-"""The gain map: what a sweep's metrics look like over the variables that were varied.
+"""The gain map: metrics of a sweep over the varied variables.
 
 One variable: a curve for each metric. Two: a heat map for each, or dots where values are random.
 More: a row of such maps for each pair, which show the best over all others.
@@ -46,7 +46,7 @@ MISSING: dict[str, Any] = dict(facecolor=HAIR, hatch="////", edgecolor="#c3cad1"
 
 
 class _Panel(NamedTuple):
-    """One picture: a metric over one variable or two."""
+    """A picture of a metric over one or two variables."""
 
     metric: str
     x: str
@@ -54,7 +54,7 @@ class _Panel(NamedTuple):
 
 
 def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -> Drawing:
-    """What to draw of a sweep, as ``read_sweep`` gives it.
+    """Return the drawing of a sweep, given the result of ``read_sweep``.
 
     Raises:
         PlotError: it has no finished run.
@@ -130,7 +130,7 @@ def _draw(
 
 
 def _panels(table: pandas.DataFrame, varied: Sequence[str]) -> tuple[list[_Panel], int]:
-    """The panels, and how many are side by side."""
+    """Return the panels, and how many are side by side."""
     metrics = [metric for metric in METRICS if metric not in USE]
     telling = [metric for metric in metrics if table[metric].nunique() > 1]
     telling = telling or [metric for metric in metrics if table[metric].notna().any()]
@@ -173,7 +173,7 @@ def _draw_dots(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
 
 
 def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
-    """Where e'' + Kd e' + Kp e = 0 is critically damped: Kd = 2 √Kp."""
+    """Draw the curve of critical damping of e'' + Kd e' + Kp e = 0: Kd = 2 √Kp."""
     if {panel.x, panel.y} == {"Kp", "Kd"}:
         (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
         gains = np.linspace(max(left, 0.0), right, 200)
@@ -183,7 +183,7 @@ def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
 
 
 def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
-    """Mark the run with the least value among the candidates; none where several are equal."""
+    """Mark the candidate with the least value; none where several are equal."""
     runs = candidates(table).dropna(subset=[panel.metric])
     least = runs[places(runs[panel.metric].to_numpy(dtype=float)) == 0]
     metric = METRICS[panel.metric]
@@ -212,7 +212,7 @@ def _label_decades(axis: Axis) -> None:
 
 
 def _edges(values: Array) -> Array:
-    """Edges of the cells around ascending values."""
+    """Return edges of the cells around ascending values."""
     if len(values) == 1:  # a sweep that has just begun
         return np.array([values[0] - 0.5, values[0] + 0.5])
     middles = (values[1:] + values[:-1]) / 2
@@ -220,7 +220,7 @@ def _edges(values: Array) -> Array:
 
 
 def _norm(values: Array) -> Normalize:
-    """Colours of values, linear or logarithmic."""
+    """Return the colour scale of values, linear or logarithmic."""
     known = values[np.isfinite(values)]
     if not known.size:
         return Normalize(0.0, 1.0)

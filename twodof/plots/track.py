@@ -1,4 +1,4 @@
-"""What a bag and its robot say about a run: limits, the end effector's path, target and error."""
+"""Derived quantities of a bag and its robot: limits, path, target and error of the end effector."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class JointTrack:
 
     @property
     def at_limit(self) -> bool:
-        """Whether it has been at one of its limits."""
+        """Whether the joint was at a limit at any sample."""
         return any(
             bool((np.abs(self.q - limit) <= AT_LIMIT * max(1.0, abs(limit))).any())
             for limit in (self.low, self.high)
@@ -61,7 +61,7 @@ class JointTrack:
 
 @dataclass(frozen=True)
 class Task:
-    """What the controller was told and how well it did; m task axes.
+    """Target and error of the controller; m task axes.
 
     Attributes:
         target: position in effect up to each sample, N × m; not a number where none was known yet.
@@ -84,7 +84,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Track:
-    """All that is drawn of one bag.
+    """Everything drawn of one bag.
 
     Attributes:
         settings: how it was made, as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
@@ -102,7 +102,7 @@ class Track:
 
     @property
     def name(self) -> str:
-        """The bag's name, with that of one of its robots."""
+        """Name of the bag, with that of one of its robots."""
         folder, robot = robot_in(self.recording.path)
         return shown("-".join([folder.resolve().name, *filter(None, robot.split("/"))]))
 
@@ -114,7 +114,7 @@ def read_tracks(
     frame: str | None = None,
     most: int = MOST,
 ) -> list[Track]:
-    """Read bags, or the bags in folders, and compute what there is to draw.
+    """Read bags, or the bags in folders, and compute the drawn quantities.
 
     A single folder with more than ``most`` samples is downsampled without a visible change of lines
     over time; several bags are compared sample by sample.
@@ -139,7 +139,7 @@ def read_tracks(
 
 
 def _lines(track: Track) -> list[Array]:
-    """What is drawn over time beside positions and velocities, N values each."""
+    """Return other quantities drawn over time besides positions and velocities, N values each."""
     lines = [joint.tau for joint in track.joints if joint.tau.size]
     if track.motion is not None:
         lines += [*track.motion.path.T]
@@ -214,7 +214,7 @@ def _joints(
 
 
 def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: Array) -> Array:
-    """Columns of a bag's q or v for the linkage's joints; 0 for those that do not move the frame.
+    """Return a bag's columns of q or v for the linkage's joints; 0 for irrelevant joints.
 
     Raises:
         PlotError: a joint that moves the frame is not in the bag.

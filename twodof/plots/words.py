@@ -1,4 +1,4 @@
-"""What is told of tracks in words and numbers: beside figures, and on the command line."""
+"""Text summaries of runs, for figures and the command line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TOLD = {
 
 
 def labels(tracks: Sequence[Track]) -> list[str]:
-    """What tells each track from the others: up to three settings, or else the bag's name."""
+    """Return a distinguishing label of each track: up to three settings, or else the bag's name."""
     every = list(dict.fromkeys(key for track in tracks for key in track.settings))
     differing = [key for key in every if len({track.settings.get(key) for track in tracks}) > 1]
     words = [
@@ -38,7 +38,7 @@ def labels(tracks: Sequence[Track]) -> list[str]:
 
 
 def common_settings(tracks: Sequence[Track]) -> str:
-    """What tracks have in common and a reader wants to know."""
+    """Return relevant settings that all tracks share."""
     words = []
     for key, silent in TOLD.items():
         values = {track.settings.get(key, silent) for track in tracks}
@@ -56,7 +56,7 @@ def _setting(key: str, text: str) -> str:
 
 
 def outcome(track: Track) -> str:
-    """Errors at the end, and what exceeds the URDF's limits; "" if nothing of it is known."""
+    """Return errors at the end and exceeded URDF limits; "" if none is known."""
     texts = []
     if track.task is not None:
         texts.append(f"{track.task.error[-1]:.3g} m from its target at the end")
@@ -74,7 +74,7 @@ def outcome(track: Track) -> str:
 
 
 def _beyond_limits(joint: JointTrack) -> str:
-    """Which of the URDF's limits a joint exceeds, and by how much; "" if none."""
+    """Return the URDF limits that a joint exceeds, and by how much; "" if none."""
     unit = "N" if joint.unit == "m" else "N·m"
     peaks = [("effort", joint.tau, joint.effort, unit)]
     peaks.append(("velocity", joint.v, joint.speed, f"{joint.unit}/s"))
@@ -86,7 +86,7 @@ def _beyond_limits(joint: JointTrack) -> str:
 
 
 def difference(first: Track, other: Track) -> str:
-    """How far the joints of a run are from those of another, while both last; "" if none is theirs.
+    """Return the largest joint difference of two runs while both last; "" without common joints.
 
     Positions of the other are interpolated linearly to the times of the first.
     """
@@ -110,7 +110,7 @@ def difference(first: Track, other: Track) -> str:
 
 
 def summary(track: Track, first: Track | None = None) -> dict[str, str]:
-    """The main numbers of a run in words, by what they are; and how far it is off the first."""
+    """Return the main numbers of a run by name, and its difference from the first."""
     told = ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
     stopped = [joint.name for joint in track.joints if joint.at_limit]
     rows = {

@@ -1,4 +1,4 @@
-"""Strokes of the arm in its workspace: start, end, the end effector's path, targets, reach."""
+"""Lines of the arm in its workspace: start, end, path, targets and reach."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ class View(NamedTuple):
 
 
 def workspace_title(tracks: Sequence[Track]) -> str:
-    """Whose path, in what."""
+    """Return the title: whose path, and in which view."""
     frames = dict.fromkeys(f"{t.motion.frame} in {t.motion.root}" for t in tracks if t.motion)
     return f"Path of {', '.join(frames)}"
 
 
 def views(tracks: Sequence[Track], looks: Looks) -> list[View]:
-    """One where all lies in a plane, else from above and from the side; none without a robot."""
+    """Return one view for planar motion, else from above and from the side; none without a robot."""
     return [_view(plane, tracks, looks) for plane in _planes(tracks)]
 
 
 def _planes(tracks: Sequence[Track]) -> list[tuple[int, int]]:
-    """Axes (0, 1, 2 for x, y, z) of each view."""
+    """Return the axes (0, 1, 2 for x, y, z) of each view."""
     points = [p for t in tracks if t.motion for p in (t.motion.path, t.motion.start, t.motion.end)]
     if not points:
         return []
@@ -79,7 +79,7 @@ def _stroke(label: str, track: int | None, points: Array, *look: Any, **more: An
 
 
 def _arms(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Iterator[Stroke]:
-    """At the start, once where several start alike, and at the end.
+    """Return the arms at the start, drawn once where equal, and at the end.
 
     Those at the end are ever thinner: arms that end in the same place are all seen.
     """
@@ -108,7 +108,7 @@ def _paths(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Ite
 
 
 def _target(plane: tuple[int, int], i: int, task: Task) -> Stroke:
-    """Targets in the order in which they held: marks, or where there are many a line."""
+    """Return targets in order of time: markers, or a line where there are many."""
     known = task.target[np.isfinite(task.target).all(axis=1)]
     changed = np.r_[True, (known[1:] != known[:-1]).any(axis=1)]
     along = dict(zip(task.axes, known[changed].T))
@@ -121,7 +121,7 @@ def _target(plane: tuple[int, int], i: int, task: Task) -> Stroke:
 
 
 def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
-    """Each different circle of reach that lies in the plane."""
+    """Return each different reach circle that lies in the plane."""
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     circles: dict[tuple[float, ...], Stroke] = {}
@@ -138,7 +138,7 @@ def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
 
 
 def _drawable(points: Array) -> Array:
-    """The points, × 2, of a path: all, as matplotlib merges what lies on a line.
+    """Return the points, × 2, of a path: all, because matplotlib merges collinear ones.
 
     Where that leaves too many corners, as of noise, those with which both coordinates over time
     look the same.

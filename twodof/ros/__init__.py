@@ -1,1 +1,1 @@
-"""What ROS 2 says and hears, and how."""
+"""ROS 2 messages, topics and DDS transport."""

@@ -1,4 +1,4 @@
-"""Messages as they are serialised, many of a topic packed and unpacked at a time.
+"""Pack and unpack many serialised messages (CDR) of a topic at a time.
 
     message     4 bytes, the second of which is 1 where numbers are little endian; header; the rest
     header      stamp, int32 s and uint32 ns; frame_id
@@ -29,21 +29,21 @@ FRAME = 16  # where a frame_id begins, behind its length
 
 
 class Numbers(NamedTuple):
-    """So many numbers of 64 bits, one behind the other, in a message."""
+    """A number of consecutive 64-bit numbers in a message."""
 
     size: int
 
 
 class Stamp(NamedTuple):
-    """A message's time; with a frame_id behind it, its header."""
+    """Time of a message; with a frame_id after it, its header."""
 
 
 class MixtureError(Exception):
-    """Messages are not all of the same joints, or have not equally many numbers."""
+    """Messages differ in joint names or array lengths."""
 
 
 class Layout:
-    """Serialised messages that differ in stamps and numbers alone, as all of a topic's in a run do.
+    """Layout of serialised messages that differ only in stamps and numbers, as those of a run do.
 
     Args:
         parts: a stamp, a text, the length of a sequence, or numbers, as they follow each other.
@@ -76,7 +76,7 @@ class Layout:
         return len(self._plain)
 
     def pack(self, stamps: ArrayLike, *numbers: Array) -> Rows:
-        """N messages with their stamps, ns, and numbers, N × count each."""
+        """Pack N messages with their stamps, ns, and numbers, N × count each."""
         rows = np.tile(self._plain, (np.size(stamps), 1))
         time = np.stack(np.divmod(stamps, NANOSECONDS), axis=-1).astype("<u4").view(np.uint8)
         for at in self._stamps:
@@ -87,7 +87,7 @@ class Layout:
         return rows
 
     def unpack(self, rows: Rows) -> list[Array] | None:
-        """Numbers of N messages, N × count each; None where they differ in anything else."""
+        """Return the numbers of N messages, N × count each; None where other bytes differ."""
         if rows.shape[1] != self.size or (rows[:, self._fixed] != self._plain[self._fixed]).any():
             return None
         return [
@@ -97,7 +97,7 @@ class Layout:
 
 
 class JointStateLayout(Layout):
-    """Serialised JointStates of a run.
+    """Layout of the serialised JointStates of a run.
 
     Args:
         names: joint names.
@@ -112,7 +112,7 @@ class JointStateLayout(Layout):
         super().__init__(Stamp(), frame, len(names), *names, *parts)
 
     def read(self, rows: Rows) -> list[Array]:
-        """Positions, velocities, efforts of N messages, N × size each.
+        """Return positions, velocities and efforts of N messages, N × size each.
 
         Raises:
             MixtureError: they are not all of these joints and sizes.
@@ -124,7 +124,7 @@ class JointStateLayout(Layout):
         return parts
 
     def _read_one(self, row: Rows) -> list[Array]:
-        """Of one in another frame or byte order, or with anything in its gaps.
+        """Read a message with another frame, byte order or padding.
 
         A serialiser would take seconds a megabyte for the names.
         """
@@ -149,7 +149,7 @@ class JointStateLayout(Layout):
 
 
 def unpack_points(rows: Rows) -> tuple[bytes, Array]:
-    """Frame and coordinates, N × 3, of PointStampeds, or of PoseStampeds, which begin alike.
+    """Return frame and coordinates, N × 3, of PointStampeds, or of PoseStampeds, which begin alike.
 
     Raises:
         MixtureError: they are in different frames.
@@ -170,7 +170,7 @@ def unpack_points(rows: Rows) -> tuple[bytes, Array]:
 
 
 def _header(message: bytes) -> tuple[str, int]:
-    """Byte order, in struct's letters, and where the frame ends."""
+    """Return the byte order, in struct's letters, and the end of the frame_id."""
     order = "<" if message[1] else ">"
     return order, FRAME + int(struct.unpack_from(f"{order}I", message, FRAME - 4)[0])
 
@@ -185,7 +185,7 @@ def _text(text: str, order: str) -> bytes:
 
 
 def _names(names: Sequence[str], order: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The bytes of a list of names, and whether they say something: gaps may hold anything."""
+    """Return the bytes of a list of names, and a mask of the meaningful ones: padding is arbitrary."""
     count = struct.pack(f"{order}I", len(names))
     texts = [_text(name, order) for name in names]
     plain, other = (

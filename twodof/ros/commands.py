@@ -1,4 +1,4 @@
-"""What messages of others ask of an FMU, as values of its inputs; and what is done without any.
+"""Map ROS 2 commands to FMU inputs; command time-out.
 
 A control law (``plant.variables.CONTROLS``) follows messages of one type: points or poses of the
 frame, or JointStates, whose joints are matched by name.
@@ -25,7 +25,7 @@ Inputs = dict[str, float]
 
 
 def warner(log: logging.Logger) -> Callable[[str, str], None]:
-    """A function that warns of each kind of fault once."""
+    """Return a function that logs one warning for each kind of fault."""
     warned: set[str] = set()
 
     def warn(kind: str, text: str) -> None:
@@ -37,7 +37,7 @@ def warner(log: logging.Logger) -> Callable[[str, str], None]:
 
 
 class CommandError(Exception):
-    """A message that is no command.
+    """A message is not a valid command.
 
     Attributes:
         kind: of the fault, one word.
@@ -49,7 +49,7 @@ class CommandError(Exception):
 
 
 class Command(NamedTuple):
-    """What a message asks for.
+    """The inputs that a message commands.
 
     Attributes:
         stamp: ns since the epoch; 0 where it has none.
@@ -63,7 +63,7 @@ class Command(NamedTuple):
 
 
 def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
-    """A message of a type, of so many bytes at most.
+    """Deserialise a message of a type, of limited size.
 
     Raises:
         CommandError: the bytes, which are anybody's, are none.
@@ -77,7 +77,7 @@ def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
 
 
 def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[int, int]]:
-    """Of joints that a message names those of the robot: index there, index in the message.
+    """Match joints by name: (robot index, message index) pairs.
 
     Raises:
         CommandError: there are none, or it names one twice.
@@ -92,7 +92,7 @@ def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[
 
 
 def sized(part: Sequence[float], what: str, names: Sequence[str]) -> Sequence[float]:
-    """Numbers of a message, one for each joint that it names.
+    """Return numbers of a message, one for each joint that it names.
 
     Raises:
         CommandError: there are not as many.
@@ -103,7 +103,7 @@ def sized(part: Sequence[float], what: str, names: Sequence[str]) -> Sequence[fl
 
 
 class Commands:
-    """The messages that an FMU can follow.
+    """The message types that an FMU can follow.
 
     Args:
         fmu: that is commanded.
@@ -127,7 +127,7 @@ class Commands:
         self.type = next(iter(self.types), "")
 
     def read(self, kind: str, cdr: bytes) -> Command:
-        """What a message of one of ``types`` asks for.
+        """Return the command in a message of one of ``types``.
 
         Points and poses are in the frame of the robot's root, which an empty frame_id means too.
 
@@ -162,7 +162,7 @@ class Commands:
         return given
 
     def _of_joints(self, message: Any) -> Inputs:
-        """Efforts, or positions and velocities, which are 0 where there are none."""
+        """Return efforts, or positions and velocities; missing velocities are 0."""
         names = message.name
         known = known_joints(names, self._joints)
         if effort := self._groups["tau_cmd"]:
@@ -176,7 +176,7 @@ class Commands:
 
 
 class Watchdog:
-    """What is done when commands stop, so that the robot is safe.
+    """Command time-out: the safe inputs after the last command.
 
     Targets are held, without the velocity that went with them; efforts are ramped to 0.
 
@@ -199,12 +199,12 @@ class Watchdog:
         self._warn = warner(LOG)
 
     def heard(self, t: float, inputs: Inputs) -> None:
-        """Take a command that came at a time, s."""
+        """Register a command that arrived at a time, s."""
         self._since = t
         self._last |= inputs
 
     def asked(self, t: float) -> Inputs:
-        """What inputs are to be at a time, s, where no command has come."""
+        """Return the inputs at a time, s, at which no command has arrived."""
         late = t - self._since - self.timeout
         if not self._last or late < 0.0:
             return {}

@@ -1,4 +1,4 @@
-"""What DDS carries: messages that are serialised already, under ROS 2's names for their types.
+"""DDS types and topics for serialised messages, under ROS 2's type names.
 
 Names, types and qualities of service are those of ROS 2 (REP 2011's type hashes, rmw_cyclonedds of
 Jazzy), so that its tools see the run as they see any node's.
@@ -23,7 +23,7 @@ except ImportError as missing:
 
 
 class Carrier:
-    """What every DDS type does with its messages: carry them serialised.
+    """Base of every DDS type: it carries messages already serialised.
 
     What the bytes mean is rosbags' business.
     """
@@ -32,22 +32,22 @@ class Carrier:
         self.cdr = cdr
 
     def serialize(self, **_options: object) -> bytes:
-        """The bytes, as Cyclone DDS asks for them."""
+        """Return the bytes for Cyclone DDS."""
         return self.cdr
 
     @classmethod
     def deserialize(cls, cdr: bytes) -> Carrier:
-        """A message that has come."""
+        """Return a received message."""
         return cls(cdr)
 
     @classmethod
     def deserialize_key(cls, _key: bytes) -> None:
-        """A notice without a message, that a writer has left."""
+        """Return a notice without a message: a writer has left."""
 
 
 @functools.cache
 def dds_type(name: str) -> Any:
-    """The DDS type of a ROS 2 message type, with the names that rosidl_generator_dds_idl gives."""
+    """Return the DDS type of a ROS 2 message type, named as rosidl_generator_dds_idl names it."""
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
     struct = idl.make_idl_struct(
@@ -67,7 +67,7 @@ def _field_type(node: Nodetype, of: Any) -> Any:
 
 
 def dds_qos(offered: Qos, type_name: str) -> Any:
-    """Quality of service of a writer or reader.
+    """Return the quality of service of a writer or reader.
 
     A write never waits for a reader: one that does not keep up misses messages.
     """
@@ -82,5 +82,5 @@ def dds_qos(offered: Qos, type_name: str) -> Any:
 
 
 def dds_topic(participant: Any, name: str, type_name: str) -> Any:
-    """A topic of ROS 2 in DDS."""
+    """Return a topic of ROS 2 in DDS."""
     return topic.Topic(participant, f"rt{name}", dds_type(type_name))

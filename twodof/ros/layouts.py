@@ -1,4 +1,4 @@
-"""Layouts in which other tools show a robot: RViz's, PlotJuggler's and Foxglove's files.
+"""Write layout files with which RViz, PlotJuggler and Foxglove show a robot.
 
 Topics and their types are those that ``Messages`` has, in a namespace.
 """
@@ -26,7 +26,7 @@ DESCRIPTION = "/robot_description"
 def layouts(
     fmu: Fmu | str | Path, folder: str | Path = ".", *, namespace: str = "", overwrite: bool = False
 ) -> list[Path]:
-    """Write the files in which RViz, PlotJuggler and Foxglove show an FMU's robot.
+    """Write the files with which RViz, PlotJuggler and Foxglove show an FMU's robot.
 
     Args:
         fmu: whose robot is published or recorded, with ``scene`` and ``effort``.
@@ -71,7 +71,7 @@ def layouts(
 
 
 def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
-    """RViz reads YAML, which JSON is."""
+    """Return RViz's layout as JSON, which is YAML."""
 
     def topic(name: str, *, latched: bool = False) -> dict[str, Any]:
         durability = "Transient Local" if latched else "Volatile"
@@ -113,7 +113,7 @@ def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
 
 
 def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
-    """A plot of each part of the joint states, under the names that PlotJuggler gives them."""
+    """Return a plot of each part of the joint states, under PlotJuggler's names."""
     root = ET.Element("root")
     window = ET.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
     tab = ET.SubElement(window, "Tab", tab_name=fmu.name, containers="1")
@@ -137,7 +137,7 @@ def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
 
 
 def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[str, str]) -> str:
-    """The robot in 3D above its gains, if any, beside a plot of each part of the joint states."""
+    """Return a layout of the robot in 3D with its gains, beside plots of the joint states."""
     shown = [prefix + DESCRIPTION, *(name for name, kind in types.items() if kind == POSE)]
     panels: dict[str, Any] = {
         "3D!robot": {

@@ -1,4 +1,4 @@
-"""Readers of a ROS 2 network: commands, the nodes that send them, and orders to pause."""
+"""Readers of a ROS 2 network: commands, their senders, and requests to pause."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PROPERTIES = {
 
 
 class Commanders:
-    """The nodes whose commands are followed, recorded in the experiment; conflicts are warned of.
+    """The nodes whose commands are followed, recorded in the experiment, with a warning of conflicts.
 
     Args:
         participant: of the DDS domain.
@@ -49,7 +49,7 @@ class Commanders:
         self._warn = warner(LOG)
 
     def note(self, reader: Any, writer: int, t: float) -> None:
-        """Take the writer of a command, by its handle, and the time of the run, s."""
+        """Register the writer of a command, by its handle, at a time of the run, s."""
         if writer not in self._names:
             self._names[writer] = self._record(reader, writer, t)
         name, now = self._names[writer], time.monotonic()
@@ -59,7 +59,7 @@ class Commanders:
         self._latest, self._since = name, now
 
     def _record(self, reader: Any, writer: int, t: float) -> str:
-        """The GUID of a writer's participant, which is recorded with its host and process."""
+        """Return the GUID of a writer's participant, and record its host and process."""
         endpoint = reader.get_matched_publication_data(writer)
         if endpoint is None:  # it has left
             return f"writer {writer:x}"
@@ -76,7 +76,7 @@ class Commanders:
 
 
 class Listener:
-    """Readers of commands, and of orders to pause and to step.
+    """Readers of commands, and of requests to pause and to step.
 
     Args:
         participant: of the DDS domain.
@@ -106,15 +106,15 @@ class Listener:
         self._warn = warner(LOG)
 
     def wait(self) -> bool:
-        """Wait until something has come, or a while; whether it has."""
+        """Wait until data has arrived, or briefly; return whether it has."""
         return bool(self._news.wait(LOOK))
 
     def is_matched(self, name: str) -> bool:
-        """Whether somebody publishes on a topic."""
+        """Return whether a topic has a publisher."""
         return bool(self._readers[name].get_matched_publications())
 
     def commands(self, sample: Sample) -> Iterator[Command]:
-        """Commands that have come; what is none is ignored with a warning a kind."""
+        """Return received commands; log one warning per kind of invalid message."""
         for name, kind in self._heard.items():
 
             def read(cdr: bytes, kind: str = kind) -> Command:
@@ -134,7 +134,7 @@ class Listener:
                 yield command
 
     def await_go(self, stop: Callable[[], bool], pace: RealTime | None) -> None:
-        """Wait while the run is paused, but for the steps that are asked for.
+        """Wait while the run is paused, except for requested steps.
 
         Args:
             stop: asked while it waits; True ends that.
@@ -161,7 +161,7 @@ class Listener:
     def _come(
         self, name: str, read: Callable[[bytes], Read], what: str
     ) -> Iterator[tuple[Read, int]]:
-        """Messages of a topic, the last few at most, as they are read, and their writers."""
+        """Return the last few messages of a topic, as read, with their writers."""
         for message in self._readers[name].take(STREAM.depth):
             if message.sample_info.valid_data:
                 try:

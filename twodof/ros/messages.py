@@ -1,4 +1,4 @@
-"""What is said of a sample, and on which topic: ROS 2 messages and their quality of service."""
+"""ROS 2 messages of a sample, their topics and quality of service."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ _STORE = get_typestore(Stores.EMPTY)
 
 @cache
 def store_of(kind: str) -> Typestore:
-    """rosbags' store of types, with one and those that it is made of; all of them take time."""
+    """Return rosbags' store of types for one type and its parts; loading all types is slow."""
     for line in DEFINITIONS[kind].splitlines():
         package, slash, name = line.partition(" ")[0].removesuffix("[]").partition("/")
         if slash:
@@ -85,7 +85,7 @@ def store_of(kind: str) -> Typestore:
 
 
 def check_name(argument: str, name: str) -> None:
-    """Refuse what is no name of ROS 2.
+    """Refuse an invalid ROS 2 name.
 
     Raises:
         InputError: naming the argument.
@@ -166,7 +166,7 @@ class Messages:
         return sum(layout.size for layout in self._layouts.values())
 
     def numbers(self, sample: Sample) -> bytes:
-        """What one sample's messages are made of; those of several, joined, give their messages.
+        """Return the numbers of one sample's messages; several, joined, give all their messages.
 
         Raises:
             struct.error: the sample is not of this run.
@@ -180,11 +180,11 @@ class Messages:
         return self._pack(sample.stamp, *sample.q, *sample.v, *given)
 
     def of(self, sample: Sample) -> dict[str, Rows]:
-        """Messages of one sample, by topic."""
+        """Return the messages of one sample, by topic."""
         return self.of_all(self.numbers(sample))[1]
 
     def of_all(self, numbers: bytes) -> tuple[NDArray[np.int64], dict[str, Rows]]:
-        """Stamps of N samples, ns, and their messages by topic."""
+        """Return the stamps of N samples, ns, and their messages by topic."""
         table = np.frombuffer(numbers, self._numbers)
         parts = {CLOCK: [], JOINT_STATES: [table["q"], table["v"], table["tau"]]}
         if self._scene is not None:
@@ -201,7 +201,7 @@ class Messages:
         return stamps, {t: layout.pack(stamps, *parts[t]) for t, layout in self._layouts.items()}
 
     def latched(self, stamp: int | np.int64) -> dict[str, Rows]:
-        """Messages that hold for the whole run: robot description, fixed transforms.
+        """Return messages that hold for the whole run: robot description, fixed transforms.
 
         Their stamp is given in ns since the epoch.
         """
@@ -227,7 +227,7 @@ def _load_scene(run: Experiment) -> Scene:
 
 
 def _tf_layout(joints: Iterable[Joint]) -> Layout:
-    """Of a TFMessage: a transform for each joint, from the parent link to the child link."""
+    """Return the layout of a TFMessage: a transform for each joint, from parent to child link."""
     parts: list[Stamp | str | Numbers] = []
     for joint in joints:
         parts += (Stamp(), joint.parent, joint.child, Numbers(7))

@@ -1,4 +1,4 @@
-"""The network of ROS 2: who can hear a run, as its environment variables say, and the DDS domain.
+"""ROS 2 network settings: the reach of a run by environment variables, and the DDS domain.
 
 Variables are those of rcl and rmw_cyclonedds of Jazzy.
 """
@@ -41,7 +41,7 @@ LOAD, EQUAL, ACCEPT = 0x20, 0x15, 0x06  # instructions of a packet filter
 
 
 class Network(NamedTuple):
-    """Where a run is published.
+    """Network settings of a publisher.
 
     Attributes:
         domain: ROS_DOMAIN_ID.
@@ -59,7 +59,7 @@ class Network(NamedTuple):
 
     @property
     def reach(self) -> str:
-        """Who can hear, in words."""
+        """Hosts that can receive, in words."""
         if self.loopback:
             return "loopback alone (ROS_LOCALHOST_ONLY)"
         hosts = f"this host and {', '.join(self.peers)}" if self.peers else "this host alone"
@@ -68,7 +68,7 @@ class Network(NamedTuple):
 
     @contextmanager
     def guarded(self) -> Iterator[None]:
-        """Limit the sockets that Cyclone DDS opens meanwhile to the hosts of ``reach``.
+        """Limit the sockets that Cyclone DDS opens in this context to the hosts of ``reach``.
 
         Cyclone DDS listens on all addresses, whatever its interfaces, and answers whoever finds
         its ports. So the kernel drops packets that come neither by the loopback interface, as all
@@ -101,7 +101,7 @@ class Network(NamedTuple):
             raise PublishError(f"cannot keep to {self.reach}: {error.strerror}") from error
 
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
-        """What Cyclone DDS is told, as rmw_cyclonedds of Jazzy does.
+        """Return the configuration of Cyclone DDS, equivalent to that of rmw_cyclonedds of Jazzy.
 
         LOCALHOST looks for others by messages to this host's own addresses, and so is heard by
         nobody else. Unlike there it keeps doing so each second: a participant that starts later,
@@ -141,7 +141,7 @@ class Network(NamedTuple):
 
 
 def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) -> Network:
-    """The network that the environment variables of ROS 2 ask for.
+    """Return the network that ROS 2's environment variables select.
 
     Unlike ROS 2, whose default range is SUBNET, nothing leaves the host unless asked for.
 
@@ -172,7 +172,7 @@ def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) 
 
 
 def _sockets() -> set[int]:
-    """File descriptors of this process that are sockets of the internet's protocols."""
+    """Return file descriptors of this process that are internet sockets."""
     found = set()
     for name in os.listdir("/proc/self/fd"):
         with suppress(OSError):  # it is closed by now
@@ -194,7 +194,7 @@ def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
 
 
 class OpenDomain(NamedTuple):
-    """A DDS domain, which is closed with its last reference; several publishers may share it.
+    """A DDS domain that closes with its last reference; several publishers may share it.
 
     Attributes:
         place: the network.
@@ -208,7 +208,7 @@ class OpenDomain(NamedTuple):
 
 
 def open_domain(place: Network) -> OpenDomain:
-    """The DDS domain of a network.
+    """Open the DDS domain of a network.
 
     Raises:
         PublishError: saying what Cyclone DDS says.
@@ -237,7 +237,7 @@ def open_domain(place: Network) -> OpenDomain:
 
 
 def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
-    """A domain or None, the addresses of the interfaces in use by name, and what went wrong.
+    """Return a domain or None, the addresses of the interfaces in use by name, and the error.
 
     Cyclone DDS tells interfaces in its trace, and reasons of a failure on the standard error alone.
     """

@@ -1,4 +1,4 @@
-"""A run on a ROS 2 network: the messages of the bag over DDS, and commands from others."""
+"""Publish a run on a ROS 2 network, and receive its commands, over DDS."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LOCKSTEP_TIMEOUT = 10.0  # s
 
 
 class Publisher(Sink):
-    """A sink that publishes each sample, and hears of targets and commands.
+    """A sink that publishes each sample, and receives targets and commands.
 
     Args:
         place: the network, or one that is open already; None: what the environment asks for.
@@ -96,7 +96,7 @@ class Publisher(Sink):
         self._warn = warner(LOG)
 
     def begin(self, run: Experiment) -> Publisher:
-        """Take the experiment whose samples come.
+        """Receive the experiment of the samples to come.
 
         Raises:
             BagError: the FMU has not what is asked for.
@@ -136,13 +136,13 @@ class Publisher(Sink):
         return self
 
     def _named(self, name: str) -> str:
-        """The name on the network of a topic of ours."""
+        """Return the network name of one of our topics."""
         if name == CLOCK:  # there is one
             return name
         return self._resolved(self._state_topic if name == JOINT_STATES else name[1:])
 
     def _resolved(self, name: str) -> str:
-        """As ROS 2 resolves names: one that does not begin with "/" is in the namespace."""
+        """Resolve a name as ROS 2 does: without a leading "/" it is in the namespace."""
         return name if name.startswith("/") else f"{self._prefix}/{name}"
 
     def __enter__(self) -> Publisher:
@@ -187,7 +187,7 @@ class Publisher(Sink):
     def command(
         self, stop: Callable[[], bool] = lambda: False, pace: RealTime | None = None
     ) -> Mapping[str, Setting] | None:
-        """What others ask of the FMU from the latest sample on, as inputs, if they do.
+        """Return the inputs commanded from the latest sample on, or None.
 
         Waits while the run is paused and, in lockstep, for the command that belongs to the sample.
 
@@ -211,7 +211,7 @@ class Publisher(Sink):
         return asked
 
     def _await_command(self, stop: Callable[[], bool]) -> Inputs | None:
-        """The command that has the latest sample's stamp; the last sample needs none."""
+        """Return the command with the latest sample's stamp; the last sample needs none."""
         sample, latest, begun = self._sample, None, time.monotonic()
         while sample.k < self._run.steps and not stop():
             for command in self._listener.commands(sample):
@@ -230,7 +230,7 @@ class Publisher(Sink):
         return None
 
     def _missing(self, latest: int | None) -> str:
-        """Who is missing, by the stamp of the latest command."""
+        """Name the missing participant, by the stamp of the latest command."""
         (name,) = self.commands
         if latest is not None:
             own = self._sample.stamp / NANOSECONDS
@@ -243,7 +243,7 @@ class Publisher(Sink):
         return f"who publishes on {name} is silent"
 
     def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
-        """What a run goes on with where a step was discarded: who commands ends no run."""
+        """Return start values to continue after a discarded step: commands must not end a run."""
         rest = at_rest(self._run.fmu, sample) if self.commands else None
         if rest is not None:
             self._warn("rest", f"{error}: the robot is stopped, and its target is where it is")
@@ -263,7 +263,7 @@ def publish(
     steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
     **options: Any,
 ) -> Summary:
-    """Step an FMU in real time on a ROS 2 network, until it is asked to stop.
+    """Step an FMU in real time on a ROS 2 network until it is asked to stop.
 
     Args:
         run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
@@ -297,7 +297,7 @@ def publish_together(
     stop: Callable[[], bool] = lambda: False,
     **options: Any,
 ) -> dict[str, Summary]:
-    """Step several FMUs in one loop on a ROS 2 network, each in a namespace of its own.
+    """Step several FMUs in one loop on a ROS 2 network, each in its own namespace.
 
     Args:
         robots: an experiment by namespace, all of the same times; their first stamp is one.
@@ -338,7 +338,7 @@ def _member(
     stop: Callable[[], bool],
     steer: Callable[[], Mapping[str, Setting] | None],
 ) -> Member:
-    """A run that is published, and follows what it is told; commands have the last word."""
+    """Return a published run that follows commands; those from the network take precedence."""
 
     def asked() -> Mapping[str, Setting]:
         commands = wire.command(stop, pace) or {}

@@ -1,4 +1,4 @@
-"""What RViz, Foxglove and rerun need to show a robot: a description and transforms.
+"""Robot description and transforms with which RViz, Foxglove and rerun show a robot.
 
 Transforms are those of robot_state_publisher: one for each joint, parent link to child link.
 """
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 class Scene:
-    """A robot to be shown.
+    """The geometry of a robot for ROS 2 viewers.
 
     Args:
         urdf: XML text whose meshes are named ``package://meshes/…``.
@@ -55,14 +55,14 @@ class Scene:
         self.description = ET.tostring(robot.tree, encoding="unicode")
 
     def transforms(self, joints: Iterable[Joint], q: Array) -> list[Array]:
-        """Of some joints' children in their parents, at N positions q, rad or m.
+        """Return transforms of joints' children in their parents, at N positions q, rad or m.
 
         One N × 7 array each, or 1 × 7 where it is fixed: m, and a unit quaternion x, y, z, w.
         """
         return [self._kinematics.pose(joint, q) for joint in joints]
 
     def end_effector(self, q: Array) -> Array:
-        """Positions of the end effector in the root frame, N × 3, m."""
+        """Return positions of the end effector in the root frame, N × 3, m."""
         return self._kinematics.path(self._frame, q)
 
 
@@ -88,7 +88,7 @@ def _replace_meshes(tree: ET.Element, meshes: Meshes) -> None:
 
 
 def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement] | None:
-    """Smallest box or cylinder along the mesh's principal axes or its own, and its pose."""
+    """Return the smallest box or cylinder along the mesh's principal or own axes, and its pose."""
     vertices = _vertices(uri, scale, meshes)
     if vertices is None:
         return None

@@ -1,4 +1,4 @@
-"""Trajectories of joints, and what an FMU is told of them.
+"""Joint trajectories as inputs of an FMU.
 
 From one point to the next a joint's position is a polynomial, by what both points have:
 
@@ -45,7 +45,7 @@ NODES, WEIGHTS = leggauss(3)  # exact up to degree 5
 
 
 class Trajectory(NamedTuple):
-    """Where joints are to go.
+    """A trajectory of joints.
 
     Attributes:
         start: from when on, s.
@@ -63,7 +63,7 @@ class Trajectory(NamedTuple):
 
 
 def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int) -> Trajectory:
-    """A JointTrajectory.
+    """Read a JointTrajectory.
 
     It starts when it came, and its points are as long after its stamp, or where that is 0 after
     its start, as they say.
@@ -100,12 +100,12 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
 
 
 def _nanoseconds(time: Any) -> int:
-    """Of a Time or a Duration."""
+    """Return a Time or Duration in ns."""
     return int(time.sec * NANOSECONDS + time.nanosec)
 
 
 class _Path:
-    """What is wanted of a joint over time: polynomials, each until the next begins.
+    """Desired motion of a joint over time: polynomials, each until the next begins.
 
     Args:
         begin: from when on there is anything, s.
@@ -116,18 +116,18 @@ class _Path:
         self._begins, self._pieces = [begin], [np.array([q, *[0.0] * DEGREE])]
 
     def before(self, t: float) -> Array:
-        """Position, velocity and acceleration just before a time after the begin."""
+        """Return position, velocity and acceleration just before a time after the begin."""
         i = bisect_left(self._begins, t) - 1
         values: Array = _moved(self._pieces[i], t - self._begins[i])[:3] * FACTORIALS[:3]
         return values
 
     def replace(self, begins: Sequence[float], pieces: Sequence[Array]) -> None:
-        """Go on with others, from the first of their begins on."""
+        """Replace the polynomials from the first of the new begins on."""
         keep = bisect_left(self._begins, begins[0])
         self._begins[keep:], self._pieces[keep:] = begins, pieces
 
     def means(self, grid: Array) -> Array:
-        """Position, velocity and acceleration, means of N times from each to the next, N − 1 × 3.
+        """Return position, velocity and acceleration, means between N successive times, N − 1 × 3.
 
         All that begins does so within them.
         """
@@ -152,7 +152,7 @@ class _Path:
 def follow(
     trajectories: Iterable[Trajectory], rest: Sequence[float], grid: Array
 ) -> dict[int, Array]:
-    """What joints do that go along trajectories, each along the latest that names it.
+    """Return the motion of joints along trajectories, each along the latest that names it.
 
     Where a trajectory has points after its start alone, it goes to the first of them from what was
     wanted just before the start.
@@ -185,7 +185,7 @@ def follow(
 
 
 def _piece(T: float, start: Array, end: Array) -> Array:
-    """Of n joints the polynomials between two points T apart, 6 × n, by what both of them have."""
+    """Return the polynomials of n joints between two points T apart, 6 × n."""
     k, piece = min(len(start), len(end)), np.zeros((DEGREE + 1, start.shape[1]))
     piece[:k] = start[:k] / FACTORIALS[:k, None]
     missed = end[:k] - _moved(piece, T)[:k] * FACTORIALS[:k, None]
@@ -195,6 +195,6 @@ def _piece(T: float, start: Array, end: Array) -> Array:
 
 
 def _moved(piece: Array, by: float) -> Array:
-    """A polynomial that begins so much later: q(by + s) in powers of s."""
+    """Return a polynomial shifted in time: q(by + s) in powers of s."""
     moved: Array = BINOMIALS * by ** np.maximum(ORDERS - ORDERS[:, None], 0) @ piece
     return moved

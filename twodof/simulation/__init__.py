@@ -1,1 +1,1 @@
-"""What an FMU is to do, and the master that has it done."""
+"""Experiments and the co-simulation master."""

@@ -1,4 +1,4 @@
-"""The experiment: what is to be run, checked: settings, inputs over time, times and stamps."""
+"""Checked settings of a run: start values, inputs over time, times and stamps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 se
 
 @dataclass(frozen=True, repr=False)
 class Experiment:
-    """One run of an FMU, checked before anything is instantiated; made by ``experiment``.
+    """A run of an FMU, checked before anything is instantiated; made by ``experiment``.
 
     Attributes:
         fmu: the FMU.
@@ -67,11 +67,11 @@ class Experiment:
         )
 
     def time(self, k: float) -> float:
-        """Time after k steps, s; never accumulated."""
+        """Return the time after k steps, s; never accumulated."""
         return self.start_time + k * self.step
 
     def first_stamp(self) -> int:
-        """Stamp of the first sample if the run began now, ns since the epoch.
+        """Return the stamp of the first sample if the run began now, ns since the epoch.
 
         Raises:
             InputError: ROS 2 has no such time.
@@ -97,7 +97,7 @@ def experiment(
     changes: Sequence[tuple[float, Mapping[str, Setting]]] | None = None,
     stamp_start: float | None = None,
 ) -> Experiment:
-    """Check what a run is asked to do.
+    """Check the settings of a run.
 
     Args:
         fmu: the FMU or its path.
@@ -148,7 +148,7 @@ def experiment(
 
 
 def _tell_late(run: Experiment, source: str) -> None:
-    """Warn of inputs whose time never comes."""
+    """Warn of inputs whose time is after the stop time."""
     end = run.time(run.steps)
     if late := sum(t > end + TIME_TOLERANCE * run.step for t, _ in run.changes):
         LOG.warning(
@@ -158,7 +158,7 @@ def _tell_late(run: Experiment, source: str) -> None:
 
 
 def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str, Value]:
-    """What the changes that are due by t set; they are due no more."""
+    """Remove the changes that are due by t, and return the values that they set."""
     values: dict[str, Value] = {}
     while due and due[0][0] <= t:
         values |= due.popleft()[1]
@@ -166,7 +166,7 @@ def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str,
 
 
 def _inputs_at(fmu: Fmu, t: float, asked: Mapping[str, Setting]) -> dict[str, Value]:
-    """What a change sets, each an input."""
+    """Return the inputs that a change sets."""
     values = resolve(fmu, asked)
     for name in values:
         if fmu.variables[name].causality != "input":
@@ -192,13 +192,13 @@ def _steps(start: float, stop: float, h: float) -> float:
 
 
 def default(fmu: Fmu, name: str, fallback: float) -> float:
-    """A number of the FMU's default experiment."""
+    """Return a number of the FMU's default experiment."""
     number = getattr(fmu.description.defaultExperiment, name, None)
     return fallback if number is None else float(number)
 
 
 def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
-    """Values by variable name; a group's name sets all of its elements.
+    """Return values by variable name; a group's name sets all of its elements.
 
     Raises:
         InputError: an unknown name (with the nearest that exists), an output, a wrong count or
@@ -239,7 +239,7 @@ def _checked(fmu: Fmu, name: str, value: object) -> Value:
 
 
 def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
-    """Refuse inputs with which an FMU would end its run, and that may come at any time.
+    """Refuse inputs that would end a run and may arrive at any time.
 
     Raises:
         InputError: a gain below 0, or with the others that are held a quaternion of zeros.
@@ -253,7 +253,7 @@ def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Valu
 
 
 def _of_another(fmu: Fmu, name: str) -> str:
-    """How many elements a vector has, or of which controls it is; "" where there is none."""
+    """Return a vector's length, or the controls that have a variable; "" where there is none."""
     group = name.partition("[")[0]
     having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
     elements = fmu.vector(group)
@@ -266,7 +266,7 @@ def _of_another(fmu: Fmu, name: str) -> str:
 
 
 def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
-    """What is said of a name that none of these has: whose it is, or which are like it."""
+    """Return the message for an unknown name: its control law, or the nearest names."""
     groups = {g: names for causality in causalities for g, names in fmu.groups(causality).items()}
     known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
     by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
@@ -276,7 +276,7 @@ def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
 
 
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
-    """Inputs over time from a CSV in FMPy's form: a column ``time`` and one for each input.
+    """Read inputs over time from a CSV in FMPy's form: a column ``time``, and one for each input.
 
     Columns are named as in settings: that of a vector sets all of its elements.
     A row's values hold from its time until the next row's; before the first row the start
@@ -322,7 +322,7 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
 
 
 def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
-    """The inputs that a column sets: one, or all elements of a vector."""
+    """Return the inputs that a column sets: one, or all elements of a vector."""
     elements = [name] if name in fmu.variables else fmu.vector(name)
     if not elements:
         raise InputError(f"'{path}': {_no_variable(fmu, name, 'input')}")
@@ -332,7 +332,7 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
 
 
 def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not empty, with their line numbers: a line is a row, also inside quotes."""
+    """Yield non-empty rows with their line numbers; quotes do not span lines."""
     cells = 0
     try:
         check_file(path, MAX_TABLE)

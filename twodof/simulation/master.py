@@ -1,4 +1,4 @@
-"""The master: steps an FMU at a fixed communication step and yields one sample a step.
+"""The master: steps an FMU at a fixed communication step and yields one sample per step.
 
     for k in 0..N-1:   t = start + k·h        never accumulated
         set the inputs at t; doStep(t, h); read the outputs; one sample at start + (k+1)·h
@@ -54,7 +54,7 @@ def samples(
     instance: Instance | None = None,
     **options: Any,
 ) -> Samples:
-    """Run an FMU; the initial state, then one sample a communication step.
+    """Run an FMU; yield the initial state, then one sample per communication step.
 
     A loop of one's own may answer a sample with new inputs, ``run.send({"x_des": (0.2, 0.1)})``,
     which hold from that sample's time on.
@@ -82,7 +82,7 @@ def _stepped(
     run: Experiment, watch: Callable[[Values], object], pace: RealTime | None, stop: Stop,
     ready: Callable[[], object], resume: Resume, instance: Instance | None,
 ) -> Samples:  # fmt: skip
-    """The samples of a run; ``watch`` takes the outputs of each as a buffer."""
+    """Yield the samples of a run; ``watch`` receives the outputs of each as a buffer."""
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
@@ -118,7 +118,7 @@ def as_experiment(
     called: Callable[..., object], run: Experiment | Fmu | str | Path, options: Mapping[str, Any],
     **usual: Any,
 ) -> Experiment:  # fmt: skip
-    """The experiment, or that of an FMU, with the options of ``experiment`` or else the usual ones.
+    """Return the experiment itself, or that of an FMU with the options of ``experiment``.
 
     Raises:
         FmuError, InputError: as ``experiment``; or an experiment has options beside it.
@@ -136,7 +136,7 @@ def as_experiment(
 def _sampler(
     instance: Instance, run: Experiment, watch: Callable[[Values], object]
 ) -> Callable[[int, Mapping[str, Value], float], Sample]:
-    """A function that reads the outputs after k steps, with the inputs and since when they hold."""
+    """Return a function that reads the outputs after k steps, with the inputs and their start time."""
     groups = [run.fmu.vector(group) for group in OUTPUTS]
     ends = list(accumulate(map(len, groups)))
     read, unpack = instance.reader([*chain(*groups)]), Struct(f"{ends[-1]}d").unpack
@@ -159,7 +159,7 @@ def _sampler(
 def _resumed(
     run: Experiment, sample: Sample, error: SimulationError, resume: Resume
 ) -> dict[str, Value]:
-    """Start values to go on with after a step that failed; where there are none, its failure."""
+    """Return start values with which a run continues after a failed step; raise where there are none."""
     failure = step_failure(sample.k, sample.t, error)
     settings = resume(sample, failure) if error.outcome == "discarded" else None
     if settings is None:
@@ -168,7 +168,7 @@ def _resumed(
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
-    """Start values of a robot that rests where a sample has it, and is meant to be there.
+    """Return start values of a robot that rests at a sample's position and is meant to stay there.
 
     With them a run can go on after a discarded step: across a singularity, speeds can escape to
     infinity in finite time. None where the FMU has no such variables.
@@ -185,7 +185,7 @@ def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a run went.
+    """Summary of a run.
 
     Attributes:
         last: the last sample.
@@ -202,17 +202,17 @@ class Summary:
 
     @property
     def error(self) -> float | None:
-        """Distance of the end effector from its target at the end, m; None without a target."""
+        """Final distance of the end effector from its target, m; None without a target."""
         return self.last.error
 
     @property
     def turn_error(self) -> float | None:
-        """Angle of the end effector from its target orientation at the end, rad; None without."""
+        """Final angle of the end effector from its target orientation, rad; None without a target."""
         return self.last.turn_error
 
     @property
     def joint_error(self) -> float | None:
-        """Largest distance of a joint from its target at the end, rad or m; None without one."""
+        """Final largest distance of a joint from its target, rad or m; None without a target."""
         return self.last.joint_error
 
 
@@ -226,7 +226,7 @@ def simulate(
     resume: Resume = lambda sample, error: None,
     **options: Any,
 ) -> Summary:
-    """Run an FMU and hand every sample to every sink, which is opened once the FMU is initialised.
+    """Run an FMU and pass every sample to every sink; sinks open once the FMU is initialised.
 
     Other arguments and errors as in ``samples``.
 
@@ -239,7 +239,7 @@ def simulate(
 
 
 class Member(NamedTuple):
-    """One of several runs that go on together; the fields are the arguments of ``simulate``."""
+    """One of several runs that advance together; its fields are the arguments of ``simulate``."""
 
     run: Experiment
     sinks: Sequence[Sink]
@@ -251,7 +251,7 @@ class Member(NamedTuple):
 def simulate_together(
     members: Sequence[Member], *, pace: RealTime | None = None, stop: Stop = lambda: False
 ) -> list[Summary]:
-    """Run FMUs in one loop: all reach a communication point before one goes on from it.
+    """Run FMUs in one loop: all reach a communication point before any continues.
 
     Args:
         members: of one start time, step, stop time and, where there are several, first stamp.
@@ -268,7 +268,7 @@ def simulate_together(
     with ExitStack() as stack:
 
         def begin() -> None:
-            """Called by the last one: where another fails before, no sink has been opened."""
+            """Open the sinks; the last run calls it, so that none is open if another fails before."""
             for sink in [sink.begin(run) for run, sinks, *_ in members for sink in sinks]:
                 stack.enter_context(sink)
 

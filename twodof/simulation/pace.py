@@ -1,4 +1,4 @@
-"""When a sample is due: the pace of a run by the wall clock."""
+"""Pace of a run by the wall clock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
 
 
 class RealTime:
-    """Paces a run to the wall clock.
+    """Pace a run to the wall clock.
 
     Args:
         speed: s of the run in a second.
@@ -30,11 +30,11 @@ class RealTime:
         self._start: float | None = None
 
     def restart(self) -> None:
-        """The next sample is due at once, and those after it by that."""
+        """Make the next sample due at once, and count from it."""
         self._start = None
 
     def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until ``elapsed`` s of the run are due since the first call, or ``stop`` is true."""
+        """Wait until ``elapsed`` s of the run have passed since the first call, or ``stop`` is true."""
         now = time.perf_counter()
         elapsed /= self._speed
         if self._start is None:

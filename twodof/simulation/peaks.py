@@ -1,4 +1,4 @@
-"""Peak efforts and speeds of a run, and which of them exceed the URDF's limits."""
+"""Peak efforts and speeds of a run, and those that exceed the URDF's limits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Excess(NamedTuple):
 
 
 def limits_of(fmu: Fmu) -> Limits:
-    """Limits in the FMU's URDF, if any; a velocity limit of a follower counts for its leader.
+    """Return the limits in the FMU's URDF; a follower's velocity limit counts for its leader.
 
     Raises:
         FmuError: the URDF cannot be read.
@@ -60,7 +60,7 @@ class Peaks:
         self._rows, self._most = bytearray(), 8 * BLOCK * len(outputs)
 
     def add(self, row: Values) -> None:
-        """Take the outputs at one sample."""
+        """Add the outputs at one sample."""
         self._rows += row
         if len(self._rows) >= self._most:
             self._compare()
@@ -71,7 +71,7 @@ class Peaks:
         self._rows.clear()
 
     def beyond(self, limits: Limits, fmu: Fmu) -> tuple[Excess, ...]:
-        """Peaks that exceed a limit, the worst first."""
+        """Return the peaks that exceed a limit, the worst first."""
         self._compare()
         peaks = dict(zip(self._outputs, self._largest.tolist()))
         found = [

@@ -1,4 +1,4 @@
-"""A sample of a run: what is known at one communication point, and who takes it."""
+"""A sample of a run at a communication point, and the interface of its consumers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Sample(NamedTuple):
-    """What is known at one communication point.
+    """State, outputs and inputs at one communication point.
 
     Attributes:
         k: communication steps done so far.
@@ -41,12 +41,12 @@ class Sample(NamedTuple):
 
     @property
     def target(self) -> tuple[float, ...] | None:
-        """x_des, m, one value for each of x; None where the FMU has no such inputs."""
+        """Target x_des, m, one value for each of x; None where the FMU has no such inputs."""
         return self._given("x_des", len(self.x))
 
     @property
     def target_quat(self) -> tuple[float, ...] | None:
-        """quat_des at length 1; None where the FMU has no such inputs, or they are 0."""
+        """Unit quaternion of quat_des; None where the FMU has no such inputs, or they are 0."""
         given = self._given("quat_des", len(self.quat)) or ()
         length = hypot(*given)
         return tuple(value / length for value in given) if length else None
@@ -57,7 +57,7 @@ class Sample(NamedTuple):
 
     @property
     def joint_target(self) -> tuple[float, ...] | None:
-        """q_des, rad or m, one value a joint; None where the FMU has no such inputs."""
+        """Target q_des, rad or m, one value a joint; None where the FMU has no such inputs."""
         return self._given("q_des", len(self.q))
 
     @property
@@ -85,7 +85,7 @@ class Sample(NamedTuple):
 
 
 class Sink:
-    """Consumer of samples: a context that is given the experiment and then each sample.
+    """Consumer of samples: a context that receives the experiment and then each sample.
 
     One of one's own needs ``write`` alone; the rest does nothing here.
 
@@ -97,7 +97,7 @@ class Sink:
     """
 
     def begin(self, run: Experiment) -> Self:
-        """Take the experiment whose samples come; itself, to be entered."""
+        """Receive the experiment of the samples to come; return self, to be entered."""
         return self
 
     def __enter__(self) -> Self:
@@ -107,4 +107,4 @@ class Sink:
         pass
 
     def write(self, sample: Sample) -> None:
-        """Take one sample."""
+        """Receive one sample."""

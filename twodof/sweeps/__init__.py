@@ -1,1 +1,1 @@
-"""Gain maps: many runs of an FMU, on one machine or on a cluster, and what they tell."""
+"""Gain maps: many runs of an FMU on one machine or a cluster, and their metrics."""

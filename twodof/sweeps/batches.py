@@ -1,4 +1,4 @@
-"""The runs of a sweep as workers take them, and what becomes of those whose worker dies."""
+"""Batches of a sweep's runs for workers, and retries of runs whose worker died."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOK = 0.2  # s between two looks at whether to go on
 
 
 class Batches:
-    """Cuts points into batches of about a quarter of a second.
+    """Divides points into batches of about a quarter of a second.
 
     A run whose worker dies is done again, with nothing beside it that could be at fault. Where that
     kills its worker twice more, it has the outcome "crashed".
@@ -34,12 +34,12 @@ class Batches:
         self._deaths: Counter[int] = Counter()
 
     def next(self, *, alone: bool) -> list[Point]:
-        """The next one; empty if all are taken, or if what is left must run alone and would not."""
+        """Return the next batch; empty if all are taken, or the rest must run alone and cannot now."""
         batch = list(islice(self._points, self._size))
         return [self._suspects.popleft()] if not batch and alone and self._suspects else batch
 
     def done(self, rows: list[Row], duration: float) -> list[Row]:
-        """The rows of a batch, after a look at the time it took, s."""
+        """Return the rows of a batch, and adapt the batch size to its time, s."""
         self.left -= len(rows)
         if duration > 0.0:
             fitting = int(BATCH_TIME * len(rows) / duration)
@@ -47,7 +47,7 @@ class Batches:
         return rows
 
     def died(self, batch: list[Point]) -> list[Row]:
-        """Rows of those runs of a batch that are given up, now that its worker has died."""
+        """Return rows of the runs of a dead worker's batch that are given up."""
         self._deaths.update(number for number, _ in batch)
         self._suspects.extend(p for p in batch if self._deaths[p[0]] < MOST_DEATHS)
         given_up = [p for p in batch if self._deaths[p[0]] >= MOST_DEATHS]

@@ -1,4 +1,4 @@
-"""Runs of a sweep on the workers of a Dask cluster that runs already. All of Dask is here.
+"""Run a sweep on the workers of an existing Dask cluster; all uses of Dask are here.
 
 Who reaches its scheduler runs code on its workers, and in this process. What keeps others away is
 Dask's own configuration, ``distributed.comm.tls``.
@@ -30,14 +30,14 @@ IN_HAND = 2  # tasks a worker, so that it never waits for the next
 
 
 class JobPlugin(WorkerPlugin):  # type: ignore[misc]
-    """Brings a job to each worker once, also to those that come later."""
+    """Sends a job to each worker once, later workers included."""
 
     def __init__(self, job: Job, version: str) -> None:
         self._job, self._version = job, version
         self._runner: Runner | None = None
 
     def setup(self, worker: Worker) -> None:
-        """Refuse to mix versions, whose results might differ."""
+        """Refuse mixed versions, whose results might differ."""
         if __version__ != self._version:
             raise SweepError(
                 f"worker {worker.address} has twodof {__version__}, not {self._version}"
@@ -51,7 +51,7 @@ class JobPlugin(WorkerPlugin):  # type: ignore[misc]
                 self._runner.__exit__(None, None, None)
 
     def run_all(self, points: Sequence[Point]) -> tuple[list[Row], float]:
-        """Rows of some points, and the time they took, s."""
+        """Return the rows of some points, and the time they took, s."""
         with self._lock:
             if self._runner is None:
                 self._runner = Runner(self._job)
@@ -59,13 +59,13 @@ class JobPlugin(WorkerPlugin):  # type: ignore[misc]
 
 
 def run_batch(name: str, points: Sequence[Point]) -> tuple[list[Row], float]:
-    """What a task does on a worker."""
+    """Run a batch on a worker."""
     plugin: JobPlugin = get_worker().plugins[name]
     return plugin.run_all(points)
 
 
 class Cluster:
-    """The workers of a cluster; a context, in which one at least is there.
+    """The workers of a cluster, as a context that needs at least one of them.
 
     Dask is asked in a thread, since it waits for what does not answer, and mostly for ever.
 
@@ -97,7 +97,7 @@ class Cluster:
             self._thread.join(PATIENCE)  # it takes back the job
 
     def _next(self) -> list[Row] | None:
-        """What the thread tells next; None at its end, or if the sweep is to stop."""
+        """Return the thread's next message; None at its end, or if the sweep is to stop."""
         while not self._stop():
             with suppress(Empty):
                 news = self._news.get(timeout=LOOK)
@@ -164,7 +164,7 @@ def _client(address: str) -> Iterator[Client]:
 
 @contextmanager
 def _registered(client: Client, job: Job) -> Iterator[str]:
-    """Name of the job's plugin, which the scheduler hands to every worker, and takes back."""
+    """Register the job's plugin at the scheduler, which sends it to every worker; unregister at the end."""
     name = f"twodof-{os.urandom(8).hex()}"
     try:
         client.register_plugin(JobPlugin(job, __version__), name=name)

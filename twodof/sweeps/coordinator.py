@@ -1,4 +1,4 @@
-"""Many runs of one FMU: a design, its runs in other processes, and a table of their metrics."""
+"""Coordinate many runs of one FMU: a design, runs in other processes, and a table of metrics."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def sweep(
     stop: Callable[[], bool] = lambda: False,
     command_line: str = "",
 ) -> pandas.DataFrame:
-    """Run every point of a design; the table, one row a run.
+    """Run every point of a design; return the table, one row per run.
 
     The columns are ``run``, the variables that are varied, the metrics (``METRICS``), ``end_time``
     in s, ``outcome`` (finished, discarded, diverged, failed or crashed) and ``message``.
@@ -96,7 +96,7 @@ def _collect(
     results: Results,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Store rows as they come; nothing is written before the workers are there."""
+    """Store rows as they arrive; nothing is written before the workers have started."""
     progress(int(results.done.sum()), len(results.done))
     with staff as news, results:
         for rows in news:
@@ -127,7 +127,7 @@ def _workers(
     job: Job, design: Design, missing: NDArray[np.bool_],
     count: int | None, scheduler: str | None, stop: Callable[[], bool],
 ) -> AbstractContextManager[Iterable[list[Row]]]:  # fmt: skip
-    """A context of the rows that come from them."""
+    """Return a context that yields rows from the workers."""
     numbers, values = np.flatnonzero(missing).tolist(), design.points()
     if not numbers:
         return nullcontext(())

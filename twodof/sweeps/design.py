@@ -1,4 +1,4 @@
-"""The design of a sweep: which values which variables take in which run."""
+"""Design of a sweep: the values of the variables in each run."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Design:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The variables, grids first."""
+        """Names of the variables, grids first."""
         return (*self.grids, *self.ranges)
 
     def __len__(self) -> int:
-        """Number of runs."""
+        """Return the number of runs."""
         return prod(map(len, self.grids.values())) * self.draws
 
     def points(self) -> NDArray[np.float64]:
-        """Values of ``names`` in each run, N × number of variables."""
+        """Return values of ``names`` in each run, N × number of variables."""
         low, high = np.array([*self.ranges.values()]).reshape(-1, 2).T
         drawn = np.random.default_rng(self.seed).uniform(low, high, (self.draws, len(low)))
         combinations = np.array([*product(*self.grids.values())])
@@ -59,7 +59,7 @@ def make_design(
     seed: int,
     settings: Mapping[str, Setting],
 ) -> Design:
-    """The design, checked against the FMU and what else is set.
+    """Return the design, checked against the FMU and the other settings.
 
     Raises:
         InputError: naming the variable or the number that is wrong.

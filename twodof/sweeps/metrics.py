@@ -1,4 +1,4 @@
-"""What one run is judged by, from its samples at the communication points t_0 … t_N.
+"""Metrics of one run, from its samples at the communication points t_0 … t_N.
 
 With e_k = x_des − x_k, the end effector's error at t_k, or under joint control e_k = q_des − q_k,
 and d = e_0 / |e_0|, its first direction; |·| is the Euclidean norm over the task axes or joints, h
@@ -83,7 +83,7 @@ For all of them less is better."""
 
 
 def measure(t: Array, run: Mapping[str, Array], limits: Limits) -> dict[str, float]:
-    """All metrics of one run of N + 1 samples of n joints and m task axes.
+    """Return all metrics of one run of N + 1 samples of n joints and m task axes.
 
     Args:
         t: N + 1 times, s.
@@ -124,17 +124,17 @@ def measure(t: Array, run: Mapping[str, Array], limits: Limits) -> dict[str, flo
 
 
 def angles(quat: Array, target: Array) -> Array:
-    """Angle of each unit quaternion from a target of any length but 0, rad."""
+    """Return the angle of each unit quaternion from a target of any length but 0, rad."""
     target = target / np.linalg.norm(target)
     apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
     return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))
 
 
 def _use(values: Array, limits: tuple[float, ...]) -> float:
-    """Largest magnitude as a share of its limit; NaN where there is no limit."""
+    """Return the largest magnitude as a share of its limit; NaN where there is no limit."""
     return float((np.abs(values) / limits).max()) if min(limits) < inf else nan
 
 
 def _settled(error: Array) -> int:
-    """The sample from which on an error stays within the band; the number of samples if none."""
+    """Return the sample from which an error stays within the band; the number of samples if none."""
     return int(np.flatnonzero(error > BAND * error[0])[-1]) + 1  # the first sample is outside

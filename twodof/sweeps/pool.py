@@ -1,4 +1,4 @@
-"""Runs of a sweep in processes of this machine, to which nobody else can talk."""
+"""Run a sweep in processes of this machine, over private pipes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_FAILURES = 5  # of workers that start, one after the other
 
 
 class Pool:
-    """Worker processes, replaced where they die; a context, in which one at least has started.
+    """Worker processes, replaced where they die, as a context that needs at least one of them.
 
     Args:
         job: what all runs share.
@@ -63,7 +63,7 @@ class Pool:
             yield from self._look()
 
     def _look(self) -> Iterator[list[Row]]:
-        """Rows that come within a moment, while all workers have something to do."""
+        """Return rows that arrive within a moment, while all workers are busy."""
         while len(self._workers) < self._count and self._failures < MOST_FAILURES:
             environment = {**ONE_THREAD, "TMPDIR": str(self._folder)}
             child = Child(work, self._folder, environment=environment, output=DEVNULL)
@@ -91,7 +91,7 @@ class Pool:
 
 
 def work(pipe: Connection, folder: Path) -> None:
-    """What a worker does: it tells that it has started, then rows and durations of batches."""
+    """Report the start, then rows and durations of batches: the function of a worker."""
     with Runner(pickle.loads((folder / "job").read_bytes())) as runner:
         pipe.send(([], 0.0))
         while True:

@@ -1,4 +1,4 @@
-"""The best runs of a sweep: within the URDF's limits, and better by more than rounding."""
+"""Rank the runs of a sweep within the URDF's limits, up to rounding."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ROUNDING = 1e-12  # relative, and absolute below 1: values that are nearer count
 
 
 def places(values: Array) -> NDArray[np.int64]:
-    """Place of each value, 0 for the least; those equal to the least of a place share it.
+    """Return the rank of each value, 0 for the least; values equal up to rounding share it.
 
     NaN have the last place.
     """
@@ -43,32 +43,32 @@ def places(values: Array) -> NDArray[np.int64]:
 
 
 def beyond_limits(table: pandas.DataFrame) -> pandas.Series:
-    """Which runs exceed an effort or velocity limit of the URDF."""
+    """Return which runs exceed an effort or velocity limit of the URDF."""
     return (table[USE] > 1.0 + EXACT).any(axis=1)
 
 
 def candidates(table: pandas.DataFrame) -> pandas.DataFrame:
-    """Finished runs within the URDF's limits; all finished runs where none is within them."""
+    """Return finished runs within the URDF's limits; all finished runs where none is within them."""
     finished = table[table["outcome"] == "finished"]
     possible = finished[~beyond_limits(finished)]
     return finished if possible.empty else possible
 
 
 def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
-    """The candidates, the best first: by settling time, effort and errors at the end."""
+    """Return the candidates, the best first: by settling time, effort and errors at the end."""
     runs = candidates(table)
     keys = [places(runs[name].to_numpy(dtype=float)) for name in RANKED]
     return runs.iloc[np.lexsort(keys[::-1])] if len(runs) else runs
 
 
 def equals(runs: pandas.DataFrame) -> int:
-    """How many of ranked runs are as good as the first, up to rounding."""
+    """Count the ranked runs that equal the first, up to rounding."""
     keys = np.array([places(runs[name].to_numpy(dtype=float)) for name in RANKED])
     return int((keys == keys[:, :1]).all(axis=0).sum()) if len(runs) else 0
 
 
 def remark(table: pandas.DataFrame) -> str:
-    """How many finished runs exceed the URDF's limits; "" where none does."""
+    """Return how many finished runs exceed the URDF's limits; "" where none does."""
     finished = table[table["outcome"] == "finished"]
     count = int(beyond_limits(finished).sum())
     beyond = "the URDF's effort or velocity limits"

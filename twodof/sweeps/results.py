@@ -1,4 +1,4 @@
-"""The table of a sweep: a folder of Parquet files that any reader of Parquet opens as one.
+"""The table of a sweep: a folder of Parquet files that any reader opens as one table.
 
 While the sweep runs, its rows come in parts; when all are there, they become one file, in the order
 of the runs. A table may come from elsewhere: what is read is what is written here, in bounded
@@ -63,7 +63,7 @@ TEXTS = ["outcome", "message"]
 
 
 class Results:
-    """The table of one sweep, while it is made.
+    """The table of a sweep in progress.
 
     Args:
         path: the folder; it must not exist, unless ``resume``.
@@ -112,7 +112,7 @@ class Results:
             os.close(self._lock)
 
     def _begin(self) -> None:
-        """A part without rows says from the first moment on which sweep this is."""
+        """Write a part without rows, which identifies the sweep from the first moment."""
         with refusing(SweepError, f"make '{self.path}'"):
             try:
                 self.path.mkdir(parents=True)
@@ -140,7 +140,7 @@ class Results:
             raise SweepError(f"'{self.path}' is no sweep; there is nothing to resume")
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Take rows, stored within a second or two."""
+        """Add rows, stored within a second or two."""
         for row in rows:
             self._rows.append(row)
             self.done[row[0]] = True
@@ -160,7 +160,7 @@ class Results:
         self._part += 1
 
     def _unite(self) -> None:
-        """One file in place of the parts, which go when it is whole."""
+        """Write one file in place of the parts, and remove them when it is complete."""
         parts = [file for file in _files(self.path) if file.name != WHOLE]
         if parts:
             tables = pa.concat_tables(table for _, table in _read(parts))
@@ -170,7 +170,7 @@ class Results:
 
 
 def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
-    """A sweep's table in the order of the runs, and its provenance; it need not be finished.
+    """Return a sweep's table in the order of the runs, and its provenance, also if unfinished.
 
     The table's ``attrs["units"]`` holds its columns' units, "" for a number without one.
 
@@ -207,14 +207,14 @@ def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, An
 
 
 def _files(path: Path) -> list[Path]:
-    """The whole table; the parts where there is none."""
+    """Return the file of the whole table; the parts where there is none."""
     if (path / WHOLE).exists():
         return [path / WHOLE]
     return sorted(filter(_is_part, path.iterdir()))
 
 
 def _named(path: Path) -> Path:
-    """The path, where pyarrow takes its name."""
+    """Name the path in errors of pyarrow."""
     try:
         path.as_posix().encode()
     except UnicodeEncodeError as error:
@@ -227,7 +227,7 @@ def _is_part(file: Path) -> bool:
 
 
 def _read(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
-    """Each file with its table."""
+    """Yield each file with its table."""
     room = MAX_SWEEP
     for file in files:
         try:
@@ -248,7 +248,7 @@ def _read(files: Iterable[Path]) -> Iterator[tuple[Path, pa.Table]]:
 
 
 def _check_schema(file: Path, schema: pa.Schema) -> int:
-    """Refuse a table whose columns are not those of a sweep; how many runs its design has."""
+    """Refuse a table without a sweep's columns; return the number of runs of its design."""
     design = _provenance(file, schema)["design"]
     names = [*design["grids"], *design["ranges"]]
     runs: int = prod(map(len, design["grids"].values())) * design["draws"]
@@ -258,7 +258,7 @@ def _check_schema(file: Path, schema: pa.Schema) -> int:
 
 
 def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> None:
-    """Refuse a table that says of itself that it is larger than it can be, before it is read."""
+    """Refuse a table whose stated size exceeds the limit, before it is read."""
     groups = [content.row_group(i) for i in range(content.num_row_groups)]
     size = sum(g.column(j).total_uncompressed_size for g in groups for j in range(g.num_columns))
     if size > room or sum(group.num_rows for group in groups) > runs:
@@ -266,13 +266,13 @@ def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> N
 
 
 def _expanded(texts: pa.ChunkedArray) -> int:
-    """Bytes of texts of which each is stored once, were they stored for each row."""
+    """Return the bytes of dictionary-encoded texts if each row stored its own."""
     lengths = (pc.binary_length(chunk.dictionary).take(chunk.indices) for chunk in texts.chunks)
     return sum(pc.sum(of, min_count=0).as_py() for of in lengths)
 
 
 def _check_values(file: Path, table: pa.Table, count: int) -> None:
-    """Refuse runs that the design has not, and numbers that are none."""
+    """Refuse runs outside the design, and invalid numbers."""
     runs = table.column("run")
     numbers = [column for column in table.columns if pa.types.is_float64(column.type)]
     if len(table) and not (
@@ -316,7 +316,7 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
 
 
 def _differing(there: dict[str, Any], wanted: dict[str, Any]) -> str:
-    """Of a design or options: what was asked for then, where it is not what is now."""
+    """Return the settings of a design or of options that differ from the stored ones."""
     return ", ".join(
         f"{key.replace('_', ' ')} {json.dumps(value):.200}"
         for key, value in there.items()

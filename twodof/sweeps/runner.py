@@ -1,4 +1,4 @@
-"""One run of a sweep after the other, on one instance of the FMU: what a worker does."""
+"""Run the points of a sweep one after another on one instance of the FMU: a worker's task."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Row = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Job:
-    """What all runs of a sweep share.
+    """Common settings of all runs of a sweep.
 
     Attributes:
         content: the FMU file's bytes.
@@ -48,7 +48,7 @@ class Job:
 
 
 class Runner:
-    """Runs points of a job; a context that frees the FMU at its end.
+    """Runs points of a job, as a context that frees the FMU at its end.
 
     Raises:
         InputError, FmuError: the job cannot be run.
@@ -74,7 +74,7 @@ class Runner:
         self._folder.close()
 
     def run(self, point: Point) -> Row:
-        """Simulate one point; its row.
+        """Simulate one point; return its row.
 
         Raises:
             FmuError: the FMU cannot be loaded.
@@ -93,7 +93,7 @@ class Runner:
         return (number, *values, *metrics, run.time(run.steps), "finished", None)
 
     def _outputs(self, run: Experiment, number: int) -> Mapping[str, Array]:
-        """Simulate, with a bag where the job wants one; the outputs at all samples."""
+        """Simulate, with a bag where the job requests one; return the outputs at all samples."""
         if self._job.bags is None:
             return trace(run, self._fresh())
         from ..bag.writer import Bag  # rosbags takes half a second to import
@@ -104,7 +104,7 @@ class Runner:
         return {name: np.array([getattr(s, name) for s in kept.samples]) for name in OUTPUTS}
 
     def _metrics(self, run: Experiment, outputs: Mapping[str, Array]) -> dict[str, float]:
-        """What a run is judged by."""
+        """Return the metrics of a run."""
         n, m = outputs["q"].shape[1], outputs["x"].shape[1]
         t = run.start_time + np.arange(len(outputs["q"]), dtype=np.float64) * run.step
         sizes = {"x_des": m, "quat_des": 4, "q_des": n, "q_min": n, "q_max": n}
@@ -112,12 +112,12 @@ class Runner:
         return measure(t, {**outputs, **given}, self._limits)
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
-        """Rows of some points, and the time they took, s; errors as of ``run``."""
+        """Return the rows of some points, and the time they took, s; errors as of ``run``."""
         begin = time.perf_counter()
         return [self.run(point) for point in points], time.perf_counter() - begin
 
     def _fresh(self) -> Instance:
-        """The instance as it was instantiated."""
+        """Return the instance in its state after instantiation."""
         if self._instance is None:
             self._instance = self._used.enter_context(instantiate(self._base.fmu))
         else:
@@ -130,13 +130,13 @@ class Runner:
 
 
 def lost(point: Point, end: float, outcome: str, message: str) -> Row:
-    """The row of a run that was not finished."""
+    """Return the row of an unfinished run."""
     number, values = point
     return (number, *values, *[nan] * len(METRICS), end, outcome, message)
 
 
 def trace(run: Experiment, instance: Instance) -> dict[str, Array]:
-    """The outputs q, v, x, tau and quat at all samples of a run without changes, N + 1 × values.
+    """Return the outputs q, v, x, tau and quat at all samples of a run without changes, N + 1 × values.
 
     For whoever needs the numbers alone, without a ``Sample`` for each; errors as of ``samples``.
     """
@@ -176,7 +176,7 @@ class _Kept(Sink):
 
 
 def _given(run: Experiment, group: str, size: int) -> Array:
-    """Start values of a vector; NaN where the FMU does not have it so."""
+    """Return start values of a vector; NaN where the FMU has no such vector."""
     values: Sequence[Value | None]
     values = [run.start_values.get(name) for name in run.fmu.vector(group)]
     if len(values) != size or None in values:
