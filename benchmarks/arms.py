@@ -33,9 +33,11 @@ STEP = 0.01  # s
 STEPS = 500  # of the default run
 Q_START, X_DES = (0.5, 0.35), (0.2, 0.05)
 STARTS = {
-    "q_start": Q_START, "x_des": X_DES, "gravity": (0.0, -9.81, 0.0),
+    "q_start": Q_START,
+    "x_des": X_DES,
+    "gravity": (0.0, -9.81, 0.0),
     "quat_des": (0.0, 0.0, math.sin(sum(Q_START) / 2), math.cos(sum(Q_START) / 2)),
-}  # fmt: skip
+}
 Sources = dict[str, bytes]
 
 
@@ -82,9 +84,7 @@ def chain(n: int) -> Arm:
     return spatial_arm(tree, f"l{n}", (0.2,) * n)
 
 
-def spatial_arm(
-    tree: ET.Element, frame: str, q_start: tuple[float, ...], control: str = "task"
-) -> Arm:
+def spatial_arm(tree: ET.Element, frame: str, q_start: tuple[float, ...], control: str = "task") -> Arm:
     """An arm of three task axes whose target is 0.1 m from its start along each."""
     robot = load_robot(ET.tostring(tree, encoding="unicode"), frame, "xyz")
     starts: dict[str, Any] = {"q_start": q_start, "x_des": (0.0, 0.0, 0.0)}
@@ -103,11 +103,7 @@ def without_shapes(urdf: str) -> ET.Element:
 
 
 def compiled(
-    arm: Arm,
-    folder: Path,
-    program: str,
-    change: Callable[[Sources], None] = lambda _: None,
-    flags: Sequence[str] = (),
+    arm: Arm, folder: Path, program: str, change: Callable[[Sources], None] = lambda _: None, flags: Sequence[str] = ()
 ) -> ctypes.CDLL:
     """A program in C that includes the engine's files, compiled as the FMU is.
 
@@ -129,10 +125,7 @@ def compiled(
 
 
 def native_cost(
-    arm: Arm,
-    folder: Path,
-    change: Callable[[Sources], None] = lambda _: None,
-    flags: Sequence[str] = (),
+    arm: Arm, folder: Path, change: Callable[[Sources], None] = lambda _: None, flags: Sequence[str] = ()
 ) -> Callable[[], float]:
     """Times a step in a run of the native engine in C, s."""
     step_cost = compiled(arm, folder, "native_step.c", change, flags).step_cost

@@ -56,9 +56,7 @@ def process(*arguments: str, folder: Path) -> tuple[float, float]:
     """
     command = [sys.executable, "-S", "-c", MEASURE, *TWODOF, *arguments]
     caching = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}
-    done = subprocess.run(
-        command, cwd=folder, check=True, stdout=subprocess.PIPE, text=True, env=caching
-    )
+    done = subprocess.run(command, cwd=folder, check=True, stdout=subprocess.PIPE, text=True, env=caching)
     seconds, memory = map(float, done.stdout.split())
     return seconds, memory
 
@@ -76,9 +74,7 @@ def big_bag(fmu: twodof.Fmu, path: Path, messages: int) -> None:
         source.close()
 
 
-def steps_around(
-    fmu: twodof.Fmu, in_c: Callable[[int, bool], float], folder: Path
-) -> Iterator[Figure]:
+def steps_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float], folder: Path) -> Iterator[Figure]:
     run = twodof.experiment(fmu, stop_time=SAMPLES * STEP, step=STEP)
 
     def logged(**options: bool) -> float:
@@ -97,8 +93,9 @@ def steps_around(
     yield Figure(
         f"a sample of a run of {SAMPLES} in twodof.simulate with its bag, MCAP without fsync /"
         " doStep, getReal, CDR and fwrite in a loop of C, flags as in the FMU",
-        f"{ratio:.2f}", "<= 2.2",
-    )  # fmt: skip
+        f"{ratio:.2f}",
+        "<= 2.2",
+    )
     ratio = median(turn[2] / turn[1] for turn in turns)
     yield Figure("the same with scene=True / without", f"{ratio:.2f}", "<= 2")
 
@@ -110,8 +107,7 @@ def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterato
     with Runner(job) as runner:
         runner.run(points[0])
         turns = [
-            (RUNS * STEPS * in_c(STEPS * RUNS, False), spent(lambda: runner.run_all(points))[0])
-            for _ in range(TURNS)
+            (RUNS * STEPS * in_c(STEPS * RUNS, False), spent(lambda: runner.run_all(points))[0]) for _ in range(TURNS)
         ]
     bare, swept = (1e3 * median(times) / RUNS for times in zip(*turns))
     ratio = median(turn[1] / turn[0] for turn in turns)
@@ -123,8 +119,9 @@ def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterato
     yield Figure(
         f"a run of a sweep, {STEPS} steps with metrics and row, in this process / as many bare"
         " doSteps in a loop of C, flags as in the FMU",
-        f"{ratio:.2f}", "<= 1.5",
-    )  # fmt: skip
+        f"{ratio:.2f}",
+        "<= 1.5",
+    )
 
 
 def workers_around(fmu: twodof.Fmu) -> Iterator[Figure]:
@@ -153,10 +150,7 @@ def workers_around(fmu: twodof.Fmu) -> Iterator[Figure]:
         ),
     )
     shared = median(2 * turn[0][1][1] / turn[1][1].sum() for turn in turns)
-    yield Figure(
-        "a run more of a sweep: 2 workers on two free cores / 1, in speed", f"{shared:.2f}",
-        ">= 1.7",
-    )  # fmt: skip
+    yield Figure("a run more of a sweep: 2 workers on two free cores / 1, in speed", f"{shared:.2f}", ">= 1.7")
 
 
 def processes(folder: Path, messages: int) -> Iterator[Figure]:
@@ -188,9 +182,7 @@ def main(messages: int = MESSAGES) -> list[Figure]:
         options = twodof.FmuOptions(native=True)
         fmu = twodof.load_fmu(twodof.build_fmu(folder / "Native.fmu", options))
         in_c = floor(folder)
-        figures = [
-            *steps_around(fmu, in_c, folder), *sweep_around(fmu, in_c), *workers_around(fmu)
-        ]  # fmt: skip
+        figures = [*steps_around(fmu, in_c, folder), *sweep_around(fmu, in_c), *workers_around(fmu)]
         big_bag(fmu, folder / "big", messages)
         return [*figures, *processes(folder, messages)]
 

@@ -109,9 +109,7 @@ def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float,
     side_cost.restype = ctypes.c_double
     names = [variable.name for variable in variable_table(arm.robot, arm.starts, arm.control)]
     known, unknown = names.index("q[1]"), names.index("der(q[1])")
-    rounds = [
-        [side_cost(derivative, calls, known, unknown) for derivative in (0, 1)] for _ in range(200)
-    ]
+    rounds = [[side_cost(derivative, calls, known, unknown) for derivative in (0, 1)] for _ in range(200)]
     side, derivative = map(min, zip(*rounds))
     return side, derivative
 
@@ -156,8 +154,13 @@ def figures_of(n: int, rounds: list[Costs]) -> Iterator[Figure]:
 
 def main(joints: Sequence[int] = JOINTS) -> list[Figure]:
     """Measure and print; the figures of which something is wanted."""
-    head = ("joints", *PATHS, *(f"/ CasADi, {path}" for path in PATHS), "limits on / off",
-            *(f"cc / zig, {path}" for path in PATHS))  # fmt: skip
+    head = (
+        "joints",
+        *PATHS,
+        *(f"/ CasADi, {path}" for path in PATHS),
+        "limits on / off",
+        *(f"cc / zig, {path}" for path in PATHS),
+    )
     rows, times, figures = [], [], []
     for n, rounds in measured(joints):
         figures += (here := [*figures_of(n, rounds)])
@@ -179,8 +182,14 @@ def main(joints: Sequence[int] = JOINTS) -> list[Figure]:
         rows = [("", "right-hand side", "derivative", "ratio")]
         for arm, control in itertools.product((shipped_arm, ur5, panda), CONTROLS):
             side, derivative = derivative_costs(arm(control), folder)
-            rows.append((f"{arm.__name__}, {control}", f"{1e6 * side:.3f} µs",
-                         f"{1e6 * derivative:.3f} µs", f"{derivative / side:.2f}"))  # fmt: skip
+            rows.append(
+                (
+                    f"{arm.__name__}, {control}",
+                    f"{1e6 * side:.3f} µs",
+                    f"{1e6 * derivative:.3f} µs",
+                    f"{derivative / side:.2f}",
+                )
+            )
         print_rows("A directional derivative", *rows)
     worst = max(float(row[-1]) for row in rows[1:])
     what = "a directional derivative / the right-hand side, at most"

@@ -17,12 +17,7 @@ import numpy as np
 from arms import Arm, by_own_compiler, native_cost
 
 from twodof.export.bodies import Array, joint_tree
-from twodof.export.recursions import (
-    mass_matrix,
-    solve_by_factors,
-    solve_by_recursion,
-    task_frame,
-)
+from twodof.export.recursions import mass_matrix, solve_by_factors, solve_by_recursion, task_frame
 from twodof.plant.robot import Robot
 
 INPUTS = ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn", "tau_ext")
@@ -129,9 +124,7 @@ def with_rival(arm: Arm, way: str | None) -> Callable[[dict[str, bytes]], None]:
 def rivals(arm: Arm, folder: Path, general: bool) -> dict[str, Callable[[], float]]:
     """Times runs of each build of the rival in C, by its settings; see native_cost."""
     return {
-        " ".join(filter(None, (compiler, way, *flags))): cost(
-            arm, folder, with_rival(arm, way), flags
-        )
+        " ".join(filter(None, (compiler, way, *flags))): cost(arm, folder, with_rival(arm, way), flags)
         for compiler, cost in {"zig": native_cost, "cc": by_own_compiler}.items()
         for way in (WAYS if general else [None])
         for flags in FLAGS

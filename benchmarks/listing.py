@@ -41,13 +41,9 @@ class PendulumSimulator:
         pin.computeJointJacobians(self.model, self.data, q)
         x = self.data.oMf[self.ee_frame_id].translation[:2]
         # first mistake: LOCAL, where x_des - x is in the world's axes
-        J = pin.getFrameJacobian(self.model, self.data, self.ee_frame_id, pin.ReferenceFrame.LOCAL)[
-            :2, :
-        ]
+        J = pin.getFrameJacobian(self.model, self.data, self.ee_frame_id, pin.ReferenceFrame.LOCAL)[:2, :]
         # second mistake: nothing has called computeJointJacobiansTimeVariation, so this is 0
-        dJ = pin.getFrameJacobianTimeVariation(
-            self.model, self.data, self.ee_frame_id, pin.ReferenceFrame.LOCAL
-        )[:2, :]
+        dJ = pin.getFrameJacobianTimeVariation(self.model, self.data, self.ee_frame_id, pin.ReferenceFrame.LOCAL)[:2, :]
         x_ddot = self.Kp @ (self.x_des - x) - self.Kd @ (J @ v)
         q_ddot = np.linalg.pinv(J) @ (x_ddot - dJ @ v)
         M = pin.crba(self.model, self.data, q)

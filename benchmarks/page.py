@@ -81,16 +81,15 @@ def pages(folder: Path) -> Iterator[Path]:
     yield twodof.page(arm, folder / "arm.html")
     robot = {
         "urdf": ROBOTS / "panda_description/urdf/panda.urdf",
-        "mesh_dir": ROBOTS.parent, "frame": "panda_hand_tcp", "native": True,
-    }  # fmt: skip
+        "mesh_dir": ROBOTS.parent,
+        "frame": "panda_hand_tcp",
+        "native": True,
+    }
     options = twodof.FmuOptions(**robot, control="pose")
     panda = twodof.build_fmu(folder / "panda.fmu", options)
     yield twodof.page(panda, folder / "panda.html")
     random = np.random.default_rng(0)
-    changes = [
-        (t, {"x_des": random.uniform((0.3, -0.2, 0.3), (0.6, 0.2, 0.6))})
-        for t in np.arange(0.0, HOUR, 5.0)
-    ]
+    changes = [(t, {"x_des": random.uniform((0.3, -0.2, 0.3), (0.6, 0.2, 0.6))}) for t in np.arange(0.0, HOUR, 5.0)]
     run = twodof.experiment(panda, stop_time=HOUR, changes=changes)
     twodof.simulate(run, twodof.Bag(folder / "hour", effort=True))
     plot = [sys.executable, "-m", "twodof", "plot", "hour", "-o", "hour.html"]
@@ -106,8 +105,10 @@ def measure(chromium: Browser, path: Path) -> None:
         with spent() as processor:
             page.goto(path.absolute().as_uri(), wait_until="commit")
             ready = page.evaluate(READY) / 1000
-        print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB, ready after {ready:.2f} s"
-              f" ({processor[0]:.2f} s of processor time)")  # fmt: skip
+        print(
+            f"{path.name}: {path.stat().st_size / 1e6:.2f} MB, ready after {ready:.2f} s"
+            f" ({processor[0]:.2f} s of processor time)"
+        )
         if page.locator("#arm-scene").count():
             frames(page)
             if page.evaluate("arm.groups.has('x_des')"):
@@ -143,9 +144,7 @@ def drag(page: Page) -> None:
     page.wait_for_timeout(200)
     assert page.evaluate("arm.held('x_des')") != before
     delays = page.evaluate("delays")
-    print(
-        f"  a drag is seen after {statistics.median(delays):.0f} ms, at most {max(delays):.0f} ms"
-    )
+    print(f"  a drag is seen after {statistics.median(delays):.0f} ms, at most {max(delays):.0f} ms")
 
 
 @contextmanager

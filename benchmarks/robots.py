@@ -44,17 +44,27 @@ from twodof.plant.urdf import read_urdf
 from twodof.plant.variables import CONTROLS
 
 REFUSED = (
-    "of type 'floating'", "of type 'planar'", "of type 'spherical'", "has no moving joint",
-    "no mass or no inertia about its axis", "which does not exist", "not physical",
+    "of type 'floating'",
+    "of type 'planar'",
+    "of type 'spherical'",
+    "has no moving joint",
+    "no mass or no inertia about its axis",
+    "which does not exist",
+    "not physical",
     "has no links",
-)  # fmt: skip
+)
 COMPARED = (
-    "ur_description/urdf/ur3_robot.urdf", "ur_description/urdf/ur5_robot.urdf",
-    "ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf",
-    "z1_description/urdf/z1.urdf", "kinova_description/robots/kinova.urdf",
-    "xarm_description/urdf/xarm7.urdf", "so_arm_description/urdf/so100.urdf",
-    "tiago_description/robots/tiago_no_hand.urdf", "baxter_description/urdf/baxter.urdf",
-)  # fmt: skip
+    "ur_description/urdf/ur3_robot.urdf",
+    "ur_description/urdf/ur5_robot.urdf",
+    "ur_description/urdf/ur10_robot.urdf",
+    "panda_description/urdf/panda.urdf",
+    "z1_description/urdf/z1.urdf",
+    "kinova_description/robots/kinova.urdf",
+    "xarm_description/urdf/xarm7.urdf",
+    "so_arm_description/urdf/so100.urdf",
+    "tiago_description/robots/tiago_no_hand.urdf",
+    "baxter_description/urdf/baxter.urdf",
+)
 FLIGHT = 0.1  # s
 GROUPS = ("q", "v", "x", "tau")
 STEP, STEPS, ROUNDS = 0.01, 100, 60
@@ -138,9 +148,14 @@ def simulated(path: Path) -> np.ndarray:
         names = [name for group in GROUPS for name in fmu.vector(group)]
         values = {n: v for g, all_ in starts.items() for n, v in zip(fmu.vector(g), all_)}
     rows = fmpy.simulate_fmu(
-        str(path), fmi_type="CoSimulation", stop_time=STEPS * STEP, step_size=STEP,
-        output_interval=STEP, start_values=values, output=names,
-    )  # fmt: skip
+        str(path),
+        fmi_type="CoSimulation",
+        stop_time=STEPS * STEP,
+        step_size=STEP,
+        output_interval=STEP,
+        start_values=values,
+        output=names,
+    )
     return np.array([np.hstack([np.ravel(row[name]) for name in names]) for row in rows])
 
 
@@ -167,9 +182,7 @@ def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
     frame = frame_of(urdf.read_text("utf-8"))
     paths = []
     for fmi in (2, 3):
-        options = twodof.FmuOptions(
-            urdf=urdf, frame=frame, control=control, native=True, fmi=fmi, meshes=False,
-        )  # fmt: skip
+        options = twodof.FmuOptions(urdf=urdf, frame=frame, control=control, native=True, fmi=fmi, meshes=False)
         paths.append(twodof.build_fmu(folder / f"fmi{fmi}.fmu", options))
     two, three = map(simulated, paths)
     size = library_size(paths[1]) / library_size(paths[0])

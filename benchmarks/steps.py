@@ -205,9 +205,7 @@ def bare_rosbags(stack: ExitStack, path: Path, storage: str) -> Callable[[int], 
         velocity=np.array([0.1, 0.2]),
         effort=np.array([]),
     )
-    writer = stack.enter_context(
-        Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()])
-    )
+    writer = stack.enter_context(Writer(path, version=8, storage_plugin=StoragePlugin[storage.upper()]))
     connection = writer.add_connection("/joint_states", kind, typestore=store)
     serialize, write = store.serialize_cdr, writer.write
     return lambda stamp: write(connection, stamp, serialize(message, kind))

@@ -48,9 +48,7 @@ def main() -> None:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
         samples = list(twodof.samples(fmu))
         draw_plot(fmu, ROOT / "docs" / "plot.png")
-        native = twodof.build_fmu(
-            Path(folder) / "TwoDof-native.fmu", twodof.FmuOptions(native=True)
-        )
+        native = twodof.build_fmu(Path(folder) / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
         gains = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
         draw_map(native, gains, {}, ROOT / "docs" / "map.png")
         loads = {"Kp": np.linspace(250, 5000, 20), "payload": np.linspace(0.024, 0.264, 11)}
@@ -150,9 +148,7 @@ def render(parts: list[tuple[np.ndarray, tuple[float, float, float]]], height: i
     for corners, colour in parts:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
-        pixels = np.stack(
-            [(corners[..., 0] - left) * scale, (top - corners[..., 1]) * scale], axis=-1
-        )
+        pixels = np.stack([(corners[..., 0] - left) * scale, (top - corners[..., 1]) * scale], axis=-1)
         for (a, b, c), z, normal in zip(pixels, corners[..., 2], normals, strict=True):
             if normal[2] > 1e-6:
                 fill(depth, image, (a, b, c), z, shade(colour, normal))
@@ -235,10 +231,9 @@ def draw_icon(path: Path) -> None:
     axes.axis("off")
     axes.add_patch(
         FancyBboxPatch(
-            (74, 8), 152, 184, boxstyle="round,pad=0,rounding_size=10",
-            facecolor="#f4f6f8", edgecolor=INK, lw=1.6,
+            (74, 8), 152, 184, boxstyle="round,pad=0,rounding_size=10", facecolor="#f4f6f8", edgecolor=INK, lw=1.6
         )
-    )  # fmt: skip
+    )
     arm = np.array([[116, 42], [116, 88], [158, 138], [198, 110]], dtype=float)
     axes.plot([94, 138], [30, 30], color=INK, lw=5, solid_capstyle="round")
     looks = ((INK, 15), ("#54657c", 12), (ORANGE, 9))
@@ -254,9 +249,7 @@ def draw_icon(path: Path) -> None:
     for text, y in (("$q$", 130), ("$v$", 70)):
         arrow(axes, 226, 258, y)
         axes.text(270, y, text, ha="left", **labels)
-    figure.savefig(
-        path, transparent=True, pil_kwargs={"optimize": True}, metadata={"Software": None}
-    )
+    figure.savefig(path, transparent=True, pil_kwargs={"optimize": True}, metadata={"Software": None})
     plt.close(figure)
 
 
@@ -264,10 +257,9 @@ def arrow(axes: plt.Axes, start: float, end: float, y: float) -> None:
     """Draw a signal from left to right."""
     axes.add_patch(
         FancyArrowPatch(
-            (start, y), (end, y), arrowstyle="-|>", mutation_scale=13, color=BLUE, lw=1.8,
-            shrinkA=0, shrinkB=0,
+            (start, y), (end, y), arrowstyle="-|>", mutation_scale=13, color=BLUE, lw=1.8, shrinkA=0, shrinkB=0
         )
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

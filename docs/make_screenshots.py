@@ -49,9 +49,12 @@ def page(chromium: Browser, folder: Path) -> None:
     """Make docs/page.png: a Panda in a page of its own."""
     options = twodof.FmuOptions(
         urdf=robots_folder() / "panda_description/urdf/panda.urdf",
-        mesh_dir=robots_folder().parent, frame="panda_hand_tcp", control="pose", native=True,
+        mesh_dir=robots_folder().parent,
+        frame="panda_hand_tcp",
+        control="pose",
+        native=True,
         name="Panda",
-    )  # fmt: skip
+    )
     file = twodof.page(twodof.build_fmu(folder / "Panda.fmu", options), folder / "panda.html")
     with browser.opened(chromium, file.as_uri(), scale=2) as shown:
         shown.locator("#arm-play").click()
@@ -74,10 +77,7 @@ def view(chromium: Browser, folder: Path) -> None:
 
 def live(chromium: Browser, folder: Path, fmu: Path) -> None:
     """Make the picture of the live arm, paused on its way to a target that was moved."""
-    with (
-        browser.served("live", fmu, cwd=folder) as command,
-        browser.opened(chromium, command.url, scale=2) as page,
-    ):
+    with browser.served("live", fmu, cwd=folder) as command, browser.opened(chromium, command.url, scale=2) as page:
         page.wait_for_function("() => arm.error() < 0.01")
         page.evaluate("arm.set('x_des', [0.14, 0.19])")
         page.wait_for_function("() => arm.error() > 0.08")
@@ -97,10 +97,7 @@ def panda(chromium: Browser, folder: Path) -> None:
     fmu = twodof.build_fmu(folder / "Panda.fmu", options)
     goal = {"x_des": (0.45, 0.2, 0.4), "quat_des": (0.9, 0.1, 0.3, 0.2)}
     twodof.simulate(fmu, twodof.Bag(folder / "panda"), stop_time=1, settings=goal)
-    with (
-        browser.served("view", "panda", cwd=folder) as command,
-        browser.opened(chromium, command.url) as page,
-    ):
+    with browser.served("view", "panda", cwd=folder) as command, browser.opened(chromium, command.url) as page:
         page.evaluate("arm.seek(1)")
         page.wait_for_timeout(3000)
         picture = Image.fromarray(browser.still(page).astype("uint8"))

@@ -72,9 +72,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         config = json.loads((resources / "plant.json").read_text("utf-8"))
         self._plant_module = import_plant(config["site_packages"])
         urdf = (resources / "robot.urdf").read_text("utf-8")
-        robot = importlib.import_module(f"{PACKAGE}.plant.robot").load_robot(
-            urdf, config["frame"], config["axes"]
-        )
+        robot = importlib.import_module(f"{PACKAGE}.plant.robot").load_robot(urdf, config["frame"], config["axes"])
         starts = {k: tuple(v) if isinstance(v, list) else v for k, v in config["starts"].items()}
         variables = importlib.import_module(f"{PACKAGE}.plant.variables")
         self._table = variables.variable_table(robot, starts, config["control"])
@@ -118,8 +116,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             return False
         if not abs(current_time - self._time) <= TIME_TOLERANCE * max(1.0, abs(self._time)):
             return self._discard(
-                f"fmi2DoStep: the communication point {current_time!r} s is not"
-                f" the time of the FMU, {self._time!r} s"
+                f"fmi2DoStep: the communication point {current_time!r} s is not the time of the FMU, {self._time!r} s"
             )
         if not (step_size > 0.0 and isfinite(step_size)):
             return self._discard(f"fmi2DoStep: the step {step_size!r} s must be finite and > 0")
@@ -200,10 +197,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             state = variable.name
             variable = replace(variable, group=f"{variable.group}_start", causality="parameter")
             if self._phase == INITIALIZATION:
-                self._refuse(
-                    f"fmi2Set{kind}: {state} follows from {variable.name} in"
-                    " initialization mode: set that"
-                )
+                self._refuse(f"fmi2Set{kind}: {state} follows from {variable.name} in initialization mode: set that")
                 return None
         if variable.causality in COMPUTED:
             self._refuse(f"fmi2Set{kind}: {variable.name} is computed and cannot be set")
@@ -235,9 +229,12 @@ class TwoDofSlave(fmi.Fmi2Slave):
         groups = {variable.group for variable in self._table if variable.causality not in COMPUTED}
         values = {group: getattr(self._plant, group) for group in sorted(groups | {"q", "v"})}
         return {
-            "identity": self._identity, "phase": self._phase, "time": self._time,
-            "refused": self._refused, "plant": deepcopy(values),
-        }  # fmt: skip
+            "identity": self._identity,
+            "phase": self._phase,
+            "time": self._time,
+            "refused": self._refused,
+            "plant": deepcopy(values),
+        }
 
     def _set_fmu_state(self, state):
         """Restore an untrusted state entirely, or leave the instance as it was."""

@@ -115,10 +115,7 @@ def unfinished(folder: Path, run: Experiment, storage: str, n: int, **options: A
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder"
-        for p in folder.rglob("*")
-    }
+    return {p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"folder" for p in folder.rglob("*")}
 
 
 class JointState(NamedTuple):
@@ -135,9 +132,7 @@ class JointState(NamedTuple):
 
 def sample(run: Experiment, k: int) -> Sample:
     """A sample that no simulation gave, told apart by its numbers."""
-    inputs = {
-        n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"
-    }
+    inputs = {n: v for n, v in run.start_values.items() if run.fmu.variables[n].causality == "input"}
     numbers = (k / 7, -k / 3), (k / 11, -k), (k, k), (k / 13, k / 17)
     return Sample(k, run.time(k), *numbers, inputs, 0.0, START * SECOND + k * PERIOD)
 
@@ -208,9 +203,7 @@ def header(stamp: int, frame: str = "") -> Any:
     return STORE.types["std_msgs/msg/Header"](time, frame)
 
 
-def joint_message(
-    stamp: int, names: Sequence[str], *numbers: Sequence[float] | np.ndarray, frame: str = ""
-) -> Any:
+def joint_message(stamp: int, names: Sequence[str], *numbers: Sequence[float] | np.ndarray, frame: str = "") -> Any:
     """A JointState with positions, velocities and efforts, as far as they are given."""
     parts = [np.array(part, float) for part in (*numbers, (), (), ())[:3]]
     return STORE.types["sensor_msgs/msg/JointState"](header(stamp, frame), [*names], *parts)

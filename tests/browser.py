@@ -34,10 +34,15 @@ LINKS = (
 PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
 VIEWPORT: ViewportSize = {"width": 900, "height": 560}
 ARGUMENTS = (
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
     "--disable-sync",
-)  # fmt: skip
+)
 HOSTILE = (
     "<img src=x onerror=\"document.title='ran'\"><script>document.title='ran'</script>"
     "<iframe srcdoc=\"<script>parent.document.title='ran'</script>\"></iframe>"
@@ -91,22 +96,15 @@ def chromium() -> Iterator[Browser]:
     """A headless browser that renders in software."""
     program = needs("chromium")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=program, args=ARGUMENTS, timeout=1e3 * PATIENCE
-        )
+        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS, timeout=1e3 * PATIENCE)
         yield browser
         browser.close()
 
 
 @contextmanager
 def opened(
-    browser: Browser,
-    url: str,
-    *,
-    ready: str = READY,
-    scale: int = 1,
-    begin: str = EVERY_OTHER_FRAME,
-) -> Iterator[Page]:  # fmt: skip
+    browser: Browser, url: str, *, ready: str = READY, scale: int = 1, begin: str = EVERY_OTHER_FRAME
+) -> Iterator[Page]:
     """A page that is shown, on a screen of so many pixels for one of the page's, and that begins
     with a script; at its end, no error is in its console but of a server that has ended."""
     with browser.new_context(viewport=VIEWPORT, device_scale_factor=scale) as context:
@@ -130,9 +128,12 @@ class Served:
     def __init__(self, *arguments: str | Path, cwd: Path, port: int = 0) -> None:
         self.process = subprocess.Popen(
             [*COMMAND, *map(str, arguments), "--port", str(port), "--no-browser"],
-            cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            cwd=cwd,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
             env={**os.environ, "XDG_STATE_HOME": str(cwd / "state")},
-        )  # fmt: skip
+        )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         found = re.match(r"open +(http://127\.0\.0\.1:\d+\S*)", line)
@@ -183,9 +184,11 @@ def connect(url: str) -> None:
 
 
 UPGRADE = (
-    ("Connection", "Upgrade"), ("Upgrade", "websocket"), ("Sec-WebSocket-Version", "13"),
+    ("Connection", "Upgrade"),
+    ("Upgrade", "websocket"),
+    ("Sec-WebSocket-Version", "13"),
     ("Sec-WebSocket-Key", "MDEyMzQ1Njc4OWFiY2RlZg=="),
-)  # fmt: skip
+)
 
 
 def answer(url: str, *headers: tuple[str, str], path: str = "/") -> int:

@@ -51,11 +51,30 @@ def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
 
 
 LONGEST = (
-    "native_platforms", "publish", "docs", "native_engine", "states", "live", "fmi3",
-    "sweep_workers", "listener", "view", "stiffness", "directional", "page", "control",
-    "bare_plant", "plot_files", "mutations", "ends", "slave", "pose", "sweep_table", "sweep",
+    "native_platforms",
+    "publish",
+    "docs",
+    "native_engine",
+    "states",
+    "live",
+    "fmi3",
+    "sweep_workers",
+    "listener",
+    "view",
+    "stiffness",
+    "directional",
+    "page",
+    "control",
+    "bare_plant",
+    "plot_files",
+    "mutations",
+    "ends",
+    "slave",
+    "pose",
+    "sweep_table",
+    "sweep",
     "hostile",
-)  # fmt: skip
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

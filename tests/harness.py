@@ -44,9 +44,7 @@ def shared(factory, name, make):
 
 
 FRESH = multiprocessing.get_context("forkserver")
-FRESH.set_forkserver_preload(
-    ["fmpy.fmi2", "hypothesis", "pinocchio", "pytest", "pythonfmu", "scipy.spatial.transform"]
-)
+FRESH.set_forkserver_preload(["fmpy.fmi2", "hypothesis", "pinocchio", "pytest", "pythonfmu", "scipy.spatial.transform"])
 """Forks of a process that has imported what takes long to import, and nothing of the package."""
 
 
@@ -165,9 +163,7 @@ class Recorded:
         """Of FMI 2.0."""
         self.messages = []
         return fmi2.fmi2CallbackFunctions(
-            logger=fmi2.fmi2CallbackLoggerTYPE(
-                lambda _, name, status, category, text: self.keep(status, text)
-            ),
+            logger=fmi2.fmi2CallbackLoggerTYPE(lambda _, name, status, category, text: self.keep(status, text)),
             allocateMemory=fmi2.fmi2CallbackAllocateMemoryTYPE(),
             freeMemory=fmi2.fmi2CallbackFreeMemoryTYPE(),
         )
@@ -207,9 +203,12 @@ def wine(folder):
     """Yield the command and the environment that run programs of Windows; its server ends too."""
     command, server = needs("wine"), needs("wineserver")
     environment = {
-        **os.environ, "TMPDIR": str(folder), "WINEPREFIX": str(folder / "wine"),
-        "WINEDEBUG": "-all", "WINEDLLOVERRIDES": "mscoree,mshtml=",
-    }  # fmt: skip
+        **os.environ,
+        "TMPDIR": str(folder),
+        "WINEPREFIX": str(folder / "wine"),
+        "WINEDEBUG": "-all",
+        "WINEDLLOVERRIDES": "mscoree,mshtml=",
+    }
     try:
         yield command, environment
     finally:

@@ -109,9 +109,7 @@ def urdf_path(name: str) -> Path:
 
 def last_link(name: str) -> str:
     """The link that the last joint of a URDF moves."""
-    joints = [
-        j for j in ET.parse(urdf_path(name)).iter("joint") if j.get("type", "fixed") != "fixed"
-    ]
+    joints = [j for j in ET.parse(urdf_path(name)).iter("joint") if j.get("type", "fixed") != "fixed"]
     return joints[-1].findall("child")[0].attrib["link"]
 
 
@@ -161,10 +159,7 @@ class Reduced:
 
 def from_urdf(urdf: str, frame: str, axes: str, control: str = "task") -> Model:
     robot = load_robot(urdf, frame, axes)
-    rest = tuple(
-        0.2 if low < 0.2 < high else 0.5 * (low + high)
-        for low, high in zip(robot.q_min, robot.q_max)
-    )
+    rest = tuple(0.2 if low < 0.2 < high else 0.5 * (low + high) for low, high in zip(robot.q_min, robot.q_max))
     starts = {"q_start": rest, "x_des": (0.0,) * len(axes)}
     plant = Plant(robot, variable_table(robot, starts))
     plant.initialise()
@@ -209,10 +204,7 @@ class Engine:
         self.n, self.m = len(of.robot.joints), len(of.robot.axes)
 
     def call(self, name: str, *arguments: float | np.ndarray) -> int:
-        values = (
-            ctypes.c_double(a) if isinstance(a, float) else a.ctypes.data_as(ctypes.c_void_p)
-            for a in arguments
-        )
+        values = (ctypes.c_double(a) if isinstance(a, float) else a.ctypes.data_as(ctypes.c_void_p) for a in arguments)
         return getattr(self.lib, f"probe_{name}")(*values)
 
     def task(self, q, v):
@@ -296,12 +288,29 @@ def executable(of: Model, *more: Path, flags: tuple[str, ...] = (), fmi: int = 2
             (begun / file).write_bytes(content)
         level = "-O1" if len(of.robot.joints) <= 2 else "-O0"  # seconds, where it is long
         subprocess.run(
-            [needs("gcc"), "-std=c99", level, "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic",
-             "-Werror", "-fcx-limited-range", "-fno-math-errno", "-fvisibility=hidden", *flags,
-             "-o", "program", "directional.c",
-             *(path.name for path in more if path.suffix == ".c"), "-lm"],
-            cwd=begun, check=True, env={**os.environ, "LC_ALL": "C"},
-        )  # fmt: skip
+            [
+                needs("gcc"),
+                "-std=c99",
+                level,
+                "-ffp-contract=off",
+                "-Wall",
+                "-Wextra",
+                "-pedantic",
+                "-Werror",
+                "-fcx-limited-range",
+                "-fno-math-errno",
+                "-fvisibility=hidden",
+                *flags,
+                "-o",
+                "program",
+                "directional.c",
+                *(path.name for path in more if path.suffix == ".c"),
+                "-lm",
+            ],
+            cwd=begun,
+            check=True,
+            env={**os.environ, "LC_ALL": "C"},
+        )
     return folder / "program"
 
 
@@ -317,9 +326,7 @@ def loaded(plant) -> pin.Model:
     reference.gravity.linear = np.array(plant.gravity)
     frame = reference.frames[robot.frame_id]
     placement = frame.placement * pin.SE3(np.eye(3), np.array(plant.payload_com))
-    reference.appendBodyToJoint(
-        frame.parentJoint, pin.Inertia(plant.payload, np.zeros(3), np.zeros((3, 3))), placement
-    )
+    reference.appendBodyToJoint(frame.parentJoint, pin.Inertia(plant.payload, np.zeros(3), np.zeros((3, 3))), placement)
     return reference
 
 

@@ -79,9 +79,8 @@ class Node:
     def __init__(self, program: Path, number: int, *topics: str, inside: tuple[str, ...] = ()):
         command = [*inside, str(program), str(number), *topics]
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            errors="surrogateescape",
-        )  # fmt: skip
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, errors="surrogateescape"
+        )
         self.told: list[list[Any]] = []
         self._thread = Thread(target=self._read)
         self._thread.start()
@@ -175,9 +174,11 @@ def published(
     """``twodof publish`` in a process of its own, when it has told that it is on the network."""
     process = Publisher(
         [*inside, *TWODOF, "publish", str(fmu), *options],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
         env=environment(number, **variables),
-    )  # fmt: skip
+    )
     try:
         assert process.stdout is not None
         process.told = []

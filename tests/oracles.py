@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 
 LINK = 0.15
-REST = {
-    "ur5": (0.1, -1.2, 1.4, -0.6, -1.3, 0.2),
-    "panda": (0.1, -0.5, 0.2, -1.8, 0.1, 1.6, 0.3),
-}
+REST = {"ur5": (0.1, -1.2, 1.4, -0.6, -1.3, 0.2), "panda": (0.1, -0.5, 0.2, -1.8, 0.1, 1.6, 0.3)}
 """Start positions away from singularities."""
 
 
@@ -23,9 +20,7 @@ def position(q: np.ndarray) -> np.ndarray:
 
 def jacobian(q: np.ndarray) -> np.ndarray:
     a, b = q[0], q[0] + q[1]
-    return LINK * np.array(
-        [[-np.sin(a) - np.sin(b), -np.sin(b)], [np.cos(a) + np.cos(b), np.cos(b)]]
-    )
+    return LINK * np.array([[-np.sin(a) - np.sin(b), -np.sin(b)], [np.cos(a) + np.cos(b), np.cos(b)]])
 
 
 def drift(q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -53,9 +48,7 @@ class TwoLinkArm:
 
     def __init__(self, urdf: Path, gravity: float) -> None:
         self.gravity = gravity
-        links = {
-            link.get("name"): link.findall("inertial/*") for link in ET.parse(urdf).iter("link")
-        }
+        links = {link.get("name"): link.findall("inertial/*") for link in ET.parse(urdf).iter("link")}
         self.links = []
         for name in ("link1", "link2"):
             inertial = {part.tag: part.attrib for part in links[name]}

@@ -22,7 +22,7 @@ LINK = 0.15  # m, of the default arm
 UR5_JOINTS = [
     "elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint", "wrist_2_joint",
     "wrist_3_joint",
-]  # fmt: skip  # fmt: skip
+]  # fmt: skip
 
 
 class Recording(NamedTuple):
@@ -51,8 +51,7 @@ def gains(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int,
 
     folder = shared(tmp_path_factory, "gains", make)
     return {
-        gain: Recording(folder / f"Kp{gain}", pickle.loads((folder / f"{gain}").read_bytes()))
-        for gain in (20, 50, 400)
+        gain: Recording(folder / f"Kp{gain}", pickle.loads((folder / f"{gain}").read_bytes())) for gain in (20, 50, 400)
     }
 
 
@@ -73,9 +72,7 @@ def changing(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Record
         "0.75,0.1,0.2,90,0.5\n1.2,0.05,0.2,90,0\n2,0.3,0.3,90,0\n"
         "9,0.3,0.3,90,0\n"
     )
-    run = twodof.experiment(
-        fmu_path, stop_time=2.0, input_file=folder / "in.csv", stamp_start=START
-    )
+    run = twodof.experiment(fmu_path, stop_time=2.0, input_file=folder / "in.csv", stamp_start=START)
     known: dict[str, Any] = {}
     changes = []
     for time, values in run.changes:
@@ -86,9 +83,7 @@ def changing(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Record
     return Recording(folder / "bag", samples)
 
 
-def elsewhere(
-    bag: Path, names: Sequence[str], t: np.ndarray, q: np.ndarray, v: np.ndarray | None
-) -> Path:
+def elsewhere(bag: Path, names: Sequence[str], t: np.ndarray, q: np.ndarray, v: np.ndarray | None) -> Path:
     """A bag as another recorder writes it, without provenance."""
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -96,11 +91,7 @@ def elsewhere(
     store = get_typestore(Stores.ROS2_HUMBLE)
     stamp_of, header_of, state_of = (
         store.types[f"{kind}"]
-        for kind in (
-            "builtin_interfaces/msg/Time",
-            "std_msgs/msg/Header",
-            "sensor_msgs/msg/JointState",
-        )
+        for kind in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", "sensor_msgs/msg/JointState")
     )
     with Writer(bag, version=9) as writer:
         topic = writer.add_connection("/joint_states", state_of.__msgtype__, typestore=store)
@@ -109,8 +100,9 @@ def elsewhere(
             numbers = [q[k], [] if v is None else v[k], []]
             message = state_of(
                 header_of(stamp_of(*divmod(stamp, 10**9)), ""),
-                list(names), *(np.asarray(part, dtype=np.float64) for part in numbers),
-            )  # fmt: skip
+                list(names),
+                *(np.asarray(part, dtype=np.float64) for part in numbers),
+            )
             writer.write(topic, stamp, store.serialize_cdr(message, topic.msgtype))
     return bag
 

@@ -50,18 +50,10 @@ KIB, MIB = 1024, 1024**2
 
 # As in the code that ROS 2 generates from the definitions: *__description.c of each message.
 TYPE_HASHES = {
-    "sensor_msgs/msg/JointState": (
-        "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
-    ),
-    "std_msgs/msg/String": (
-        "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-    ),
-    "tf2_msgs/msg/TFMessage": (
-        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
-    ),
-    "geometry_msgs/msg/PointStamped": (
-        "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"
-    ),
+    "sensor_msgs/msg/JointState": ("RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"),
+    "std_msgs/msg/String": ("RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
+    "tf2_msgs/msg/TFMessage": ("RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+    "geometry_msgs/msg/PointStamped": ("RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"),
 }
 
 
@@ -74,11 +66,7 @@ class Recording(NamedTuple):
         return self.folder / f"{storage}_{kind}"
 
 
-KINDS: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "effort": {"effort": True},
-    "scene": {"scene": True},
-}
+KINDS: dict[str, dict[str, Any]] = {"plain": {}, "effort": {"effort": True}, "scene": {"scene": True}}
 
 
 @pytest.fixture(scope="module")
@@ -215,9 +203,7 @@ def test_topics_have_the_type_hashes_that_ros_publishes(recording: Recording, st
 
 
 @both_storages
-def test_topics_have_the_quality_of_service_that_subscribers_expect(
-    recording: Recording, storage: str
-) -> None:
+def test_topics_have_the_quality_of_service_that_subscribers_expect(recording: Recording, storage: str) -> None:
     # numbers of rmw/types.h: keep last 1, reliable 1, transient local 1, volatile 2
     expected = {
         "/joint_states": {"history": 1, "depth": 10, "reliability": 1, "durability": 2},
@@ -275,30 +261,14 @@ def test_sqlite3_has_the_tables_that_rosbag2_expects(recording: Recording) -> No
     columns = {
         "schema": ["schema_version", "ros_distro"],
         "metadata": ["id", "metadata_version", "metadata"],
-        "topics": [
-            "id",
-            "name",
-            "type",
-            "serialization_format",
-            "offered_qos_profiles",
-            "type_description_hash",
-        ],
-        "message_definitions": [
-            "id",
-            "topic_type",
-            "encoding",
-            "encoded_message_definition",
-            "type_description_hash",
-        ],
+        "topics": ["id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash"],
+        "message_definitions": ["id", "topic_type", "encoding", "encoded_message_definition", "type_description_hash"],
         "messages": ["id", "topic_id", "timestamp", "data"],
     }
     with sqlite3.connect(recording.bag("sqlite3") / "sqlite3_plain.db3") as database:
         names = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
         tables = [name for (name,) in names if not name.startswith("sqlite_")]
-        found = {
-            table: [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
-            for table in tables
-        }
+        found = {table: [row[1] for row in database.execute(f"PRAGMA table_info({table})")] for table in tables}
         versions = database.execute("SELECT schema_version FROM schema").fetchall()
         ((version, embedded),) = database.execute("SELECT metadata_version, metadata FROM metadata")
     assert found == columns
@@ -336,9 +306,7 @@ def write_states(path: Path, states: Sequence[tuple[Sequence[str], Sequence[floa
     messages = [joint_message(t, *state, [0.0] * len(state[0])) for t, state in zip(times, states)]
     hello = STORE.types["std_msgs/msg/String"]("hello")
     given = [("/robot/joint_states", t, message) for t, message in zip(times, messages)]
-    return write_elsewhere(
-        path, [("/chatter", 1, hello), *given], storage_plugin=StoragePlugin.SQLITE3
-    )
+    return write_elsewhere(path, [("/chatter", 1, hello), *given], storage_plugin=StoragePlugin.SQLITE3)
 
 
 def test_bag_from_elsewhere_is_read_without_provenance(tmp_path: Path) -> None:
@@ -352,20 +320,14 @@ def test_bag_from_elsewhere_is_read_without_provenance(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("other", [["a", "b", "c"], ["b", "a"], ["c", "d"]])
-def test_bag_whose_joint_states_name_different_joints_is_refused(
-    tmp_path: Path, other: list[str]
-) -> None:
+def test_bag_whose_joint_states_name_different_joints_is_refused(tmp_path: Path, other: list[str]) -> None:
     states = [(["a", "b"], [0.0, 1.0]), (other, [2.0] * len(other))]
     with pytest.raises(BagError, match="joint states of different joints"):
         twodof.read_bag(write_states(tmp_path / "bag", states))
 
 
-@pytest.mark.parametrize(
-    ("frames", "known"), [("aaa", "a"), (["a", "a", "bb"], ""), (["a", "a", "b" * 9], "")]
-)
-def test_targets_are_known_where_they_are_in_one_frame(
-    tmp_path: Path, frames: Sequence[str], known: str
-) -> None:
+@pytest.mark.parametrize(("frames", "known"), [("aaa", "a"), (["a", "a", "bb"], ""), (["a", "a", "b" * 9], "")])
+def test_targets_are_known_where_they_are_in_one_frame(tmp_path: Path, frames: Sequence[str], known: str) -> None:
     point = STORE.types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0)
     targets = [STORE.types["geometry_msgs/msg/PointStamped"](header(0, f), point) for f in frames]
     states = [joint_message(0, "j", [0.0], [0.0]) for _ in frames]

@@ -52,9 +52,7 @@ def test_a_recorded_run_is_replayed_to_the_bit(native_path: Path, tmp_path: Path
     first, again = (twodof.read_bag(tmp_path / name) for name in ("first", "again"))
     np.testing.assert_array_equal(first.q, again.q)
     np.testing.assert_array_equal(first.v, again.v)
-    changes = [
-        json.loads((b.path / "run.json").read_text())["input_changes"] for b in (first, again)
-    ]
+    changes = [json.loads((b.path / "run.json").read_text())["input_changes"] for b in (first, again)]
     assert changes[0] == changes[1] and len(changes[0]) == 4
 
 
@@ -89,16 +87,13 @@ def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: Stora
     """Held from the first communication point at or after each, as a run on the network has it."""
     given = {0: (1.0, 0.5), 3: (-2.0, 0.25), 40: (0.5, -0.5)}
     states = [
-        ("/joint_states", BEGIN + k * STEP, joint_message(0, ("joint1", "joint2"), (0.0, 0.0)))
-        for k in range(100)
+        ("/joint_states", BEGIN + k * STEP, joint_message(0, ("joint1", "joint2"), (0.0, 0.0))) for k in range(100)
     ]
     commands = [
         ("/cmd", BEGIN + k * STEP - 7, joint_message(5, ("joint2", "joint1"), (), (), tau[::-1]))
         for k, tau in given.items()
     ]
-    bag = write_elsewhere(
-        tmp_path / "real", sorted(states + commands, key=lambda m: m[1]), storage_plugin=storage
-    )
+    bag = write_elsewhere(tmp_path / "real", sorted(states + commands, key=lambda m: m[1]), storage_plugin=storage)
     model = tmp_path / "model"
     options = ["--stop-time", "0.99", "-o", str(model)]
     assert main(["run", str(effort), "--input", f"{bag}:/cmd", *options]) == 0
@@ -128,19 +123,25 @@ def test_points(native_path: Path, tmp_path: Path) -> None:
         ([("/a", BEGIN, ONE)], "/b", "no commands on /b"),
         (
             [(name, BEGIN, ONE) for name in ("/a", "/b")],
-            None, "several topics that can be commands: /a, /b; choose one",
+            None,
+            "several topics that can be commands: /a, /b; choose one",
         ),
         (
             [("/a", BEGIN, joint_message(0, ("joint1",), (), (), (float("nan"),)))],
-            None, "the command at 0 s is not finite",
+            None,
+            "the command at 0 s is not finite",
         ),
         ([("/a", BEGIN, joint_message(0, ["elbow"], (), (), (1.0,)))], None, "of no joint of this"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_replayed(
-    effort: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
-    messages: list[tuple[str, int, Any]], topic: str | None, reason: str,
-) -> None:  # fmt: skip
+    effort: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    messages: list[tuple[str, int, Any]],
+    topic: str | None,
+    reason: str,
+) -> None:
     bag = write_elsewhere(tmp_path / "bag", messages)
     given = f"{bag}:{topic}" if topic else str(bag)
     assert main(["run", str(effort), "--input", given, "-o", str(tmp_path / "none")]) == 1
@@ -157,10 +158,15 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
     """Nor does NumPy say anything of it."""
 
     def bag(name: str, last: float) -> str:
-        return str(write_elsewhere(tmp_path / name, [
-            ("/joint_states", BEGIN + k * STEP, joint_message(0, "ab", (a, 0.1)))
-            for k, a in enumerate((0.1, 0.1, last, last))
-        ]))  # fmt: skip
+        return str(
+            write_elsewhere(
+                tmp_path / name,
+                [
+                    ("/joint_states", BEGIN + k * STEP, joint_message(0, "ab", (a, 0.1)))
+                    for k, a in enumerate((0.1, 0.1, last, last))
+                ],
+            )
+        )
 
     bags = [bag("real", last), bag("model", 0.1)]
     assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0
@@ -168,9 +174,7 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
     assert said in capfd.readouterr().out
 
 
-def test_a_plot_of_two_bags_tells_how_far_they_are_apart(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Sampled at other times, and one of them for longer."""
 
     def bag(name: str, count: int, step: int, off: float) -> str:
@@ -178,9 +182,12 @@ def test_a_plot_of_two_bags_tells_how_far_they_are_apart(
             t = k * step / 1e9
             return (0.5 * t, 0.1 + off * t)
 
-        return str(write_elsewhere(tmp_path / name, [
-            ("/joint_states", BEGIN + k * step, joint_message(0, "ab", q(k))) for k in range(count)
-        ]))  # fmt: skip
+        return str(
+            write_elsewhere(
+                tmp_path / name,
+                [("/joint_states", BEGIN + k * step, joint_message(0, "ab", q(k))) for k in range(count)],
+            )
+        )
 
     bags = [bag("real", 101, STEP, 0.0), bag("model", 80, 3 * STEP, 0.25)]
     assert main(["plot", *bags, "-o", str(tmp_path / "both.html")]) == 0

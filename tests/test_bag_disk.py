@@ -63,9 +63,7 @@ def test_a_foreign_lock_is_not_waited_for_without_end(
     monkeypatch.setattr("twodof.files.PATIENCE", 0.1)
     mkdir, held = Path.mkdir, []
 
-    def locked(
-        path: Path, mode: int = 0o777, *, parents: bool = False, exist_ok: bool = False
-    ) -> None:
+    def locked(path: Path, mode: int = 0o777, *, parents: bool = False, exist_ok: bool = False) -> None:
         mkdir(path, mode, parents, exist_ok)
         held.append(os.open(path, os.O_RDONLY))
         fcntl.flock(held[-1], fcntl.LOCK_EX)

@@ -16,9 +16,7 @@ SECRET = "a word that must not get out"
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
-def bag(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, native_path: Path
-) -> Path:
+def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, native_path: Path) -> Path:
     folder = tmp_path_factory.mktemp("links")
     sink = twodof.Bag(folder / "bag", storage=request.param)
     twodof.simulate(native_path, sink, stop_time=0.1)

@@ -33,11 +33,7 @@ def renamed(bag: Path, name: bytes) -> Path:
 
 @pytest.mark.parametrize(
     ("storage", "name"),
-    [
-        ("mcap", b"\xff"),
-        ("mcap", b"a?b"),
-        *[("sqlite3", name) for name in (b"\xff", b"a?b", b"a%41")],
-    ],
+    [("mcap", b"\xff"), ("mcap", b"a?b"), *[("sqlite3", name) for name in (b"\xff", b"a?b", b"a%41")]],
 )
 def test_bag_of_a_name_that_none_would_find_again_is_refused(
     run: Experiment, tmp_path: Path, storage: str, name: bytes

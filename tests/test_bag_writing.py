@@ -131,9 +131,7 @@ def test_what_is_no_bag_is_never_overwritten(tmp_path: Path, files: dict[str, st
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_folder_that_appears_before_the_first_sample_is_kept(
-    run: Experiment, tmp_path: Path, overwrite: bool
-) -> None:
+def test_folder_that_appears_before_the_first_sample_is_kept(run: Experiment, tmp_path: Path, overwrite: bool) -> None:
     path = tmp_path / "bag"
     bag = twodof.Bag(path, overwrite=overwrite).begin(run)
     path.mkdir()
@@ -169,10 +167,7 @@ def test_folder_that_cannot_be_written_is_refused(
     else:
         path = tmp_path / ("x" * 300)
     before = sorted(tmp_path.rglob("*"))
-    with (
-        pytest.raises(BagError, match=re.escape(str(path))),
-        twodof.Bag(path, storage=storage).begin(run),
-    ):
+    with pytest.raises(BagError, match=re.escape(str(path))), twodof.Bag(path, storage=storage).begin(run):
         pass
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -254,9 +249,7 @@ def test_reserve_is_room_to_close_a_run_that_was_never_flushed(
 
 
 @both_storages
-def test_messages_reach_the_disk_while_the_fmu_takes_its_time(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
+def test_messages_reach_the_disk_while_the_fmu_takes_its_time(run: Experiment, tmp_path: Path, storage: str) -> None:
     """Fewer than fill a buffer, and no more come."""
     with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:
         for k in range(50):
@@ -303,17 +296,13 @@ print(memory.growth)
 @both_storages
 def test_memory_does_not_grow_with_the_run(native_path: Path, tmp_path: Path, storage: str) -> None:
     command = [sys.executable, "-c", MEMORY, str(native_path), str(tmp_path / "bag"), storage]
-    done = subprocess.run(
-        command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-    )
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 5 * MIB
     assert assert_consistent(tmp_path / "bag", storage) == 20_000
 
 
 @both_storages
-def test_fsync_waits_for_the_disk_at_each_flush(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
+def test_fsync_waits_for_the_disk_at_each_flush(run: Experiment, tmp_path: Path, storage: str) -> None:
     """Seen in the system calls of the process."""
     script = """
 import sys

@@ -10,17 +10,7 @@ import xml.etree.ElementTree as ET
 import mujoco
 import numpy as np
 import pytest
-from native_models import (
-    ROBOTS,
-    Reduced,
-    coupling,
-    deviation,
-    engine,
-    loaded,
-    model,
-    random_plant,
-    urdf_path,
-)
+from native_models import ROBOTS, Reduced, coupling, deviation, engine, loaded, model, random_plant, urdf_path
 
 EVERY_ROBOT = ("twodof", *ROBOTS)
 
@@ -49,11 +39,19 @@ def test_bare_plant_is_pinocchios(name, length):
 
 # Robots whose inertias MuJoCo takes as they are.
 MUJOCO = (
-    "twodof", "ur5", "panda", "z1", "double_pendulum", "baxter",
-    "ur_description/urdf/ur10_robot.urdf", "kinova_description/robots/kinova.urdf",
-    "xarm_description/urdf/xarm7.urdf", "so_arm_description/urdf/so101.urdf",
-    "a1_description/urdf/a1.urdf", "talos_data/robots/talos_left_arm.urdf",
-)  # fmt: skip
+    "twodof",
+    "ur5",
+    "panda",
+    "z1",
+    "double_pendulum",
+    "baxter",
+    "ur_description/urdf/ur10_robot.urdf",
+    "kinova_description/robots/kinova.urdf",
+    "xarm_description/urdf/xarm7.urdf",
+    "so_arm_description/urdf/so101.urdf",
+    "a1_description/urdf/a1.urdf",
+    "talos_data/robots/talos_left_arm.urdf",
+)
 
 
 @pytest.mark.parametrize("name", MUJOCO)
@@ -183,9 +181,7 @@ def test_stops_are_the_same_in_both_flavours(name, rigid):
         stops.impact(y, kept.tolist())
         if any(0.0 < abs(speed) < 1e-12 for speed in y[n:]):
             continue  # rounding says whether it rests
-        rates = list(
-            plant.equations_of_motion().acceleration(np.array(y[:n]), np.array(y[n:]), None)[0]
-        )
+        rates = list(plant.equations_of_motion().acceleration(np.array(y[:n]), np.array(y[n:]), None)[0])
         pressed = list(rates)
         stops.hold(y, rates, kept.tolist())
         assert deviation(y[n:], native.group(values, "v")) <= 1e-9

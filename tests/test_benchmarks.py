@@ -123,8 +123,6 @@ def test_growth_is_the_largest_exponent(benchmarks: SimpleNamespace) -> None:
     assert growth([1, 2, 4], [1.0, 2.0, 16.0]) == pytest.approx(3.0)
 
 
-def test_tables_are_aligned(
-    benchmarks: SimpleNamespace, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tables_are_aligned(benchmarks: SimpleNamespace, capsys: pytest.CaptureFixture[str]) -> None:
     benchmarks.report.print_rows("of all", ("", "time"), ("a", "1 s"), ("bcd", "10 s"))
     assert capsys.readouterr().out == "\nof all\n\n       time\n  a     1 s\n  bcd  10 s\n"

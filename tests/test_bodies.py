@@ -43,9 +43,7 @@ def random_tree(rng):
             '<limit lower="-3" upper="3" effort="9" velocity="9"/></joint>'
         )
     parts.append('<link name="end"/><joint name="fix" type="fixed"><parent link="l5"/>')
-    return (
-        "".join(parts) + '<child link="end"/><origin xyz=".1 .2 .3" rpy="1 .5 2"/></joint></robot>'
-    )
+    return "".join(parts) + '<child link="end"/><origin xyz=".1 .2 .3" rpy="1 .5 2"/></joint></robot>'
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -55,10 +53,7 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
     constants, n = joint_tree(robot), len(robot.joints)
     q, v, a = rng.normal(size=(3, n))
     joint = np.array(
-        [
-            (x, 0.0) if slides else (np.cos(x), np.sin(x))
-            for x, slides in zip(q + constants.c, constants.prismatic)
-        ]
+        [(x, 0.0) if slides else (np.cos(x), np.sin(x)) for x, slides in zip(q + constants.c, constants.prismatic)]
     )
     reference, gravity = robot.model.copy(), rng.normal(0, 9, 3)
     reference.gravity.linear = gravity
@@ -78,10 +73,7 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
         np.testing.assert_allclose(expected @ a.astype(float), v, rtol=0, atol=1e-11)
     free = rng.integers(0, 2, n)
     split = free * v, free, (1 - free) * v  # effort of free joints, acceleration of the others
-    for a, reaction in (
-        hybrid_by_factors(M, *split),
-        hybrid_by_recursion(constants, constants.body, joint, *split),
-    ):
+    for a, reaction in (hybrid_by_factors(M, *split), hybrid_by_recursion(constants, constants.body, joint, *split)):
         np.testing.assert_array_equal(a[free == 0], v[free == 0])
         assert_close(reaction * free, np.zeros(n))
         balance = expected @ a.astype(float) - reaction.astype(float)

@@ -54,8 +54,12 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
         ("local", "rad/s"): {"der(q[1])": None, "der(q[2])": None},
         ("local", "rad/s2"): {"der(v[1])": None, "der(v[2])": None},
         ("parameter", "rad"): {
-            "q_start[1]": "0.5", "q_start[2]": "0.35",
-            "q_min[1]": f"-{pi}", "q_min[2]": f"-{pi}", "q_max[1]": pi, "q_max[2]": pi,
+            "q_start[1]": "0.5",
+            "q_start[2]": "0.35",
+            "q_min[1]": f"-{pi}",
+            "q_min[2]": f"-{pi}",
+            "q_max[1]": pi,
+            "q_max[2]": pi,
         },
         ("parameter", "rad/s"): {"v_start[1]": "0.0", "v_start[2]": "0.0"},
         ("parameter", "m/s2"): {"gravity[1]": "0.0", "gravity[2]": "-9.81", "gravity[3]": "0.0"},
@@ -63,10 +67,14 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
         ("parameter", "kg"): {"payload": "0.0"},
         ("parameter", "m"): {f"payload_com[{i}]": "0.0" for i in (1, 2, 3)},
         ("parameter", None): {
-            "rcond": "0.01", "rtol": "0.001", "atol": "1e-06", "limit_effort": "false",
-            "rigid_stops": "false", "payload_known": "false",
+            "rcond": "0.01",
+            "rtol": "0.001",
+            "atol": "1e-06",
+            "limit_effort": "false",
+            "rigid_stops": "false",
+            "payload_known": "false",
         },
-    }  # fmt: skip
+    }
     by_unit: dict = {}
     for v in variables.values():
         by_unit.setdefault((v.causality, v.unit), {})[v.name] = v.start
@@ -81,26 +89,38 @@ def test_units_are_given_in_si_base_units(description):
         for unit in description.iter("Unit")
     }
     assert dimensions == {
-        "m": {"m": 1}, "m/s": {"m": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad": {"rad": 1},
-        "rad/s": {"rad": 1, "s": -1}, "N.m": {"kg": 1, "m": 2, "s": -2}, "s": {"s": 1},
-        "1/s": {"s": -1}, "1/s2": {"s": -2}, "N": {"kg": 1, "m": 1, "s": -2}, "kg": {"kg": 1},
+        "m": {"m": 1},
+        "m/s": {"m": 1, "s": -1},
+        "m/s2": {"m": 1, "s": -2},
+        "rad": {"rad": 1},
+        "rad/s": {"rad": 1, "s": -1},
+        "N.m": {"kg": 1, "m": 2, "s": -2},
+        "s": {"s": 1},
+        "1/s": {"s": -1},
+        "1/s2": {"s": -2},
+        "N": {"kg": 1, "m": 1, "s": -2},
+        "kg": {"kg": 1},
         "rad/s2": {"rad": 1, "s": -2},
-    }  # fmt: skip
+    }
     assert {base.get("factor") for base in description.iter("BaseUnit")} == {"1"}
 
 
 def test_attributes_that_tools_rely_on(description):
     simulation = description.find("CoSimulation")
     for capability in (
-        "canHandleVariableCommunicationStepSize", "canGetAndSetFMUstate", "canSerializeFMUstate",
+        "canHandleVariableCommunicationStepSize",
+        "canGetAndSetFMUstate",
+        "canSerializeFMUstate",
         "needsExecutionTool",
-    ):  # fmt: skip
+    ):
         assert simulation.get(capability) == "true"
     assert description.get("generationDateAndTime") is None
     assert description.get("variableNamingConvention") == "structured"
     assert dict(description.find("DefaultExperiment").attrib) == {
-        "startTime": "0.0", "stopTime": "5.0", "stepSize": "0.01",
-    }  # fmt: skip
+        "startTime": "0.0",
+        "stopTime": "5.0",
+        "stepSize": "0.01",
+    }
     names = [j.get("name") for j in description.iterfind("VendorAnnotations/Tool/Robot/Joint")]
     assert names == ["joint1", "joint2"]
 
@@ -126,10 +146,12 @@ def test_the_zip_holds_what_tools_and_people_look_for(fmu_path):
             assert info.date_time == (1980, 1, 1, 0, 0, 0)
     assert names == sorted(names)
     assert {
-        "binaries/linux64/TwoDof.so", "documentation/externalDependencies.txt",
-        "documentation/licenses/license.txt", "documentation/licenses/pythonfmu.txt",
+        "binaries/linux64/TwoDof.so",
+        "documentation/externalDependencies.txt",
+        "documentation/licenses/license.txt",
+        "documentation/licenses/pythonfmu.txt",
         "resources/requirements.txt",
-    } < set(names)  # fmt: skip
+    } < set(names)
     meshes = set(re.findall(r"package://([^\"]+)", urdf))
     assert len(meshes) == 4
     assert {f"resources/{name}" for name in meshes} < set(names)
@@ -178,8 +200,7 @@ def test_an_fmu_of_other_settings_is_replaced_on_request_alone(fmu_path, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("file", "name"),
-    [("ur5.urdf", "ur5"), ("ur-5.urdf.xacro", "ur_5"), ("5.urdf", "robot_5"), (None, "TwoDof")],
+    ("file", "name"), [("ur5.urdf", "ur5"), ("ur-5.urdf.xacro", "ur_5"), ("5.urdf", "robot_5"), (None, "TwoDof")]
 )
 def test_a_model_is_named_after_its_robot(file, name):
     assert FmuOptions(urdf=file).name == name
@@ -203,9 +224,7 @@ def test_a_urdf_of_ones_own_gets_the_documented_defaults(panda, tmp_path):
     assert q == pytest.approx([0, 0, 0, middle, 0, 0, 0])
     assert float(start["Kn"]) == 10.0
     # the hand's position by the arm's published lengths, for this pose of the elbow
-    assert [float(start[f"x_des[{k}]"]) for k in (1, 2, 3)] == pytest.approx(
-        _panda_hand(middle), abs=1e-9
-    )
+    assert [float(start[f"x_des[{k}]"]) for k in (1, 2, 3)] == pytest.approx(_panda_hand(middle), abs=1e-9)
 
 
 def _panda_hand(elbow):
@@ -243,12 +262,8 @@ def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):
 def test_an_fmu_holds_no_file_that_is_none_of_the_robots(tmp_path):
     urdf, uri = tmp_path / "in/arm.urdf", "package://etc/passwd"
     urdf.parent.mkdir()
-    urdf.write_text(
-        SHAPES.sub(f"<mesh filename='{uri}'/>", data_file("urdf", "2dof.urdf").read_text())
-    )
-    with pytest.raises(
-        TwoDofError, match=f"mesh '{uri}' not found in '{urdf.parent}', .*`mesh_dir`"
-    ):
+    urdf.write_text(SHAPES.sub(f"<mesh filename='{uri}'/>", data_file("urdf", "2dof.urdf").read_text()))
+    with pytest.raises(TwoDofError, match=f"mesh '{uri}' not found in '{urdf.parent}', .*`mesh_dir`"):
         build_fmu(tmp_path / "A.fmu", FmuOptions(urdf=urdf, axes="xy"))
     assert list(tmp_path.iterdir()) == [urdf.parent]
 
@@ -329,19 +344,30 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 # --- dependencies, by moving one variable at a time ---
 
 PERTURBATION = {
-    "q_start": 0.05, "v_start": 0.3, "x_des": 0.01, "xd_des": 0.1, "xdd_des": 0.5, "Kp": 5.0,
-    "Kd": 5.0, "tau_ext": 0.3, "Kn": 1.0, "gravity": 1.0, "rtol": 1e-4, "atol": 1e-7,
-    "max_step": 1e-4, "f_ext": 0.3, "payload": 0.05, "payload_com": 0.02,
-}  # fmt: skip
+    "q_start": 0.05,
+    "v_start": 0.3,
+    "x_des": 0.01,
+    "xd_des": 0.1,
+    "xdd_des": 0.5,
+    "Kp": 5.0,
+    "Kd": 5.0,
+    "tau_ext": 0.3,
+    "Kn": 1.0,
+    "gravity": 1.0,
+    "rtol": 1e-4,
+    "atol": 1e-7,
+    "max_step": 1e-4,
+    "f_ext": 0.3,
+    "payload": 0.05,
+    "payload_com": 0.02,
+}
 
 
 def declared(description, element):
     """Names of the variables that each unknown depends on, by its name."""
     names = [v.get("name") for v in description.find("ModelVariables")]
     return {
-        names[int(unknown.get("index")) - 1]: {
-            names[int(i) - 1] for i in unknown.get("dependencies").split()
-        }
+        names[int(unknown.get("index")) - 1]: {names[int(i) - 1] for i in unknown.get("dependencies").split()}
         for unknown in description.find(f"ModelStructure/{element}")
     }
 
@@ -379,9 +405,11 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
     limits = {"q_max[1]": 0.5, "q_min[2]": 0.35}
     stopped = [{**generic, **limits}, {**back, **limits}]
     into = [
-        {**generic, "q_min[2]": 0.35}, {**back, "q_max[2]": 0.35},
-        {**generic, "q_max[1]": 0.5}, {**back, "q_min[1]": 0.5},
-    ]  # fmt: skip
+        {**generic, "q_min[2]": 0.35},
+        {**back, "q_max[2]": 0.35},
+        {**generic, "q_max[1]": 0.5},
+        {**back, "q_min[1]": 0.5},
+    ]
     rigid = [{**base, "rigid_stops": True} for base in into]
     for base in (generic, back, *stopped, *rigid):
         for saturated in (False, True):
@@ -496,7 +524,5 @@ def test_what_the_description_excludes_is_refused_and_nothing_else(flavour, fmu_
             driver.initialise(**{name: value})
             driver.call("reset")
             refusals = [message for status, message in driver.log if status == 3]
-            assert [message.startswith(f"{name} = ") for message in refusals] == (
-                [] if value == end else [True]
-            )
+            assert [message.startswith(f"{name} = ") for message in refusals] == ([] if value == end else [True])
     driver.free()

@@ -25,10 +25,7 @@ RUN = ["run", "arm.fmu", "-o", "out", "--stop-time", "0.02"]
 
 def twodof_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own."""
-    return subprocess.run(
-        [*COMMAND, *arguments], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True,
-        timeout=300,
-    )  # fmt: skip
+    return subprocess.run([*COMMAND, *arguments], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
 
 
 @pytest.fixture(scope="module")
@@ -86,22 +83,20 @@ def test_run_says_how_far_the_end_effector_is_from_its_target(session: dict[str,
 
 
 def test_run_says_how_fast_it_was_and_what_to_do_next(session: dict[str, str]) -> None:
-    timing = re.fullmatch(
-        r"1\.5 s simulated in ([\d.]+) s, ([\d.]+) × real time", rows(session["run"])["time"]
-    )
+    timing = re.fullmatch(r"1\.5 s simulated in ([\d.]+) s, ([\d.]+) × real time", rows(session["run"])["time"])
     assert timing is not None
     assert float(timing[2]) == pytest.approx(1.5 / float(timing[1]), rel=0.1)
     following = session["run"].partition("\nnext\n")[2]
     assert [line.strip() for line in following.splitlines()] == [
-        "twodof plot bag", "twodof view bag", "ros2 bag play bag",
-    ]  # fmt: skip
+        "twodof plot bag",
+        "twodof view bag",
+        "ros2 bag play bag",
+    ]
 
 
 @pytest.mark.parametrize("activated", [True, False])
 @pytest.mark.parametrize("missing", [[], ["matplotlib", "websockets"]])
-def test_what_is_suggested_can_be_typed(
-    activated: bool, missing: list[str], native_path: Path, tmp_path: Path
-) -> None:
+def test_what_is_suggested_can_be_typed(activated: bool, missing: list[str], native_path: Path, tmp_path: Path) -> None:
     """In a shell that finds the program or does not, with and without figures and pages."""
     here = str(Path(sys.executable).parent)
     path = [p for p in os.environ["PATH"].split(os.pathsep) if Path(p) != Path(here)]
@@ -110,9 +105,12 @@ def test_what_is_suggested_can_be_typed(
     code = f"{spec}import sys; from twodof.__main__ import main; sys.exit(main())"
     done = subprocess.run(
         [sys.executable, "-c", code, "run", str(native_path), "--stop-time", "0.1", "-o", "bag"],
-        cwd=tmp_path, capture_output=True, text=True, check=True,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
         env={**os.environ, "PATH": os.pathsep.join([here] * activated + path)},
-    )  # fmt: skip
+    )
     following = done.stdout.partition("\nnext\n")[2]
     program = "twodof" if activated else f"{here}/twodof"
     commands = [line.strip() for line in following.partition("\n\n")[0].splitlines()]
@@ -155,9 +153,7 @@ def test_info_of_an_fmu_shows_what_is_in_it(session: dict[str, str]) -> None:
         assert re.search(f"^{line}$", table, re.MULTILINE), line
 
 
-def test_default_run_builds_the_fmu_again_only_if_it_differs(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_default_run_builds_the_fmu_again_only_if_it_differs(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     fmu_file = folder / "TwoDof.fmu"
 
     def run(bag: str) -> int:
@@ -178,13 +174,9 @@ def test_default_run_builds_the_fmu_again_only_if_it_differs(
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_overwrite_replaces_a_bag(
-    storage: str, folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_overwrite_replaces_a_bag(storage: str, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "-o", "bag"]) == 0
-    assert (
-        main([*RUN, "-o", "bag", "--overwrite", "--stop-time", "0.04", "--storage", storage]) == 0
-    )
+    assert main([*RUN, "-o", "bag", "--overwrite", "--stop-time", "0.04", "--storage", storage]) == 0
     assert len(twodof.read_bag("bag").t) == 5
     assert capfd.readouterr().err == ""
 
@@ -222,9 +214,7 @@ def test_what_the_fmu_refuses_is_one_line_and_leaves_no_bag(folder: Path) -> Non
     assert [path.name for path in folder.iterdir()] == ["arm.fmu"]
 
 
-def test_controls_are_told_in_the_words_of_the_options(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_controls_are_told_in_the_words_of_the_options(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--set", "quat_des=1"]) == 1
     told = "it is of control 'task --orientation'; this FMU has control 'task'\n"
     assert capfd.readouterr().err.endswith(told)
@@ -242,9 +232,13 @@ def test_reader_that_leaves_early_gets_no_traceback(line: str, folder: Path) -> 
     reading, writing = os.pipe()
     os.close(reading)
     process = subprocess.Popen(
-        [*COMMAND, *line.split()], cwd=folder, env=ENVIRONMENT | {"PYTHONUNBUFFERED": ""},
-        stdout=writing, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [*COMMAND, *line.split()],
+        cwd=folder,
+        env=ENVIRONMENT | {"PYTHONUNBUFFERED": ""},
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     os.close(writing)
     _, err = process.communicate(timeout=120)
     assert err == ""
@@ -255,8 +249,12 @@ def test_output_that_cannot_be_written_gives_no_traceback(output: str | None, fo
     redirect = f">{output}" if output else ">&-"
     done = subprocess.run(
         ["sh", "-c", f'"$0" "$@" {redirect}', *COMMAND, "info", "arm.fmu"],
-        cwd=folder, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, timeout=120,
-    )  # fmt: skip
+        cwd=folder,
+        env=ENVIRONMENT,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=120,
+    )
     assert "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) <= 1
 
@@ -271,9 +269,7 @@ def test_help_is_told_in_two_ways(verb: str, capsys: pytest.CaptureFixture[str])
     assert out.startswith(f"usage: twodof {verb}")
 
 
-def test_facts_as_json(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_facts_as_json(native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def facts(*arguments: object) -> dict[str, object]:
         assert main([*map(str, arguments), "--json"]) == 0
         told: dict[str, object] = json.loads(capsys.readouterr().out)
@@ -319,9 +315,13 @@ def test_the_shell_completes_verbs_and_options(tmp_path: Path) -> None:
         subprocess.run(
             [sys.executable, "-m", "twodof"],
             env={
-                **os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)),
-                "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "COMP_TYPE": "9",
+                **os.environ,
+                "_ARGCOMPLETE": "1",
+                "COMP_LINE": line,
+                "COMP_POINT": str(len(line)),
+                "_ARGCOMPLETE_STDOUT_FILENAME": str(answer),
+                "COMP_TYPE": "9",
             },
             check=True,
-        )  # fmt: skip
+        )
         assert expected in answer.read_text()

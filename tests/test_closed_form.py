@@ -108,9 +108,7 @@ def held(x_des, xd_des=(0.0, 0.0), xdd_des=(0.0, 0.0), Kp=(50.0, 50.0), Kd=(40.0
 
 def test_held_inputs_from_rest_give_the_textbook_solution() -> None:
     step, steps = 0.01, 500
-    error = task_error(
-        (0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], step, np.arange(steps + 1)
-    )
+    error = task_error((0.23, 0.18), (0.0, 0.0), [(0, held((0.2, 0.05)))], step, np.arange(steps + 1))
     expected = oracles.task_error(np.array([0.03, 0.13]), 50.0, 40.0, step * np.arange(steps + 1))
     np.testing.assert_allclose(error, expected, rtol=0.0, atol=1e-15)
 
@@ -139,12 +137,8 @@ def test_inputs_that_change_give_what_an_integrator_gives() -> None:
             return np.r_[y[2:], xdd_des + Kd * (xd_des - y[2:]) + Kp * (x_des - y[:2])]
 
         t = step * np.arange(end - k + 1)
-        solution = solve_ivp(
-            motion, (0.0, t[-1]), np.r_[x, v], method="DOP853", t_eval=t, rtol=1e-13, atol=1e-15
-        )
-        np.testing.assert_allclose(
-            error[k + 1 : end + 1], solution.y[:2, 1:].T - x_des, rtol=0.0, atol=1e-12
-        )
+        solution = solve_ivp(motion, (0.0, t[-1]), np.r_[x, v], method="DOP853", t_eval=t, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(error[k + 1 : end + 1], solution.y[:2, 1:].T - x_des, rtol=0.0, atol=1e-12)
         x, v = solution.y[:2, -1], solution.y[2:, -1]
 
 
@@ -159,9 +153,7 @@ def test_at_a_change_the_error_is_still_that_from_the_target_before() -> None:
 def test_some_samples_have_the_error_that_they_have_among_all() -> None:
     """As of a bag that was recovered, or thinned out; also where none is between two changes."""
     steps = np.array([0, 1, 2, 69, 70, 72, 150, 151, 299])
-    some, every = (
-        task_error((0.23, 0.18), (0.4, -0.2), SCHEDULE, 0.01, k) for k in (steps, np.arange(300))
-    )
+    some, every = (task_error((0.23, 0.18), (0.4, -0.2), SCHEDULE, 0.01, k) for k in (steps, np.arange(300)))
     np.testing.assert_allclose(some, every[steps], rtol=0.0, atol=1e-15)
 
 

@@ -31,18 +31,17 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
 
 def joint_state(
-    names: tuple[str, ...] = (), q: tuple[float, ...] = (), v: tuple[float, ...] = (),
-    tau: tuple[float, ...] = (), stamp: tuple[int, int] = (0, 0),
-) -> bytes:  # fmt: skip
-    header = STORE.types["std_msgs/msg/Header"](
-        stamp=STORE.types["builtin_interfaces/msg/Time"](*stamp), frame_id=""
-    )
+    names: tuple[str, ...] = (),
+    q: tuple[float, ...] = (),
+    v: tuple[float, ...] = (),
+    tau: tuple[float, ...] = (),
+    stamp: tuple[int, int] = (0, 0),
+) -> bytes:
+    header = STORE.types["std_msgs/msg/Header"](stamp=STORE.types["builtin_interfaces/msg/Time"](*stamp), frame_id="")
     import numpy as np
 
     arrays = [np.array(part, float) for part in (q, v, tau)]
-    return bytes(
-        STORE.serialize_cdr(STORE.types[JOINT_STATE](header, [*names], *arrays), JOINT_STATE)
-    )
+    return bytes(STORE.serialize_cdr(STORE.types[JOINT_STATE](header, [*names], *arrays), JOINT_STATE))
 
 
 def test_joints_are_matched_by_name_in_any_order_and_number(arm: Build) -> None:
@@ -53,9 +52,7 @@ def test_joints_are_matched_by_name_in_any_order_and_number(arm: Build) -> None:
     assert inputs == {"q_des[1]": 0.1, "q_des[2]": 0.2, "v_des[1]": 1.0, "v_des[2]": 2.0}
     assert effort.read(JOINT_STATE, both).inputs == {"tau_cmd[1]": 10.0, "tau_cmd[2]": 20.0}
     some = joint_state(("finger", "joint2"), (0.7, 0.2), (), (7.0, 20.0))
-    assert joint.read(JOINT_STATE, some) == (
-        0, {"q_des[2]": 0.2, "v_des[2]": 0.0}, ("finger",),
-    )  # fmt: skip
+    assert joint.read(JOINT_STATE, some) == (0, {"q_des[2]": 0.2, "v_des[2]": 0.0}, ("finger",))
     assert effort.read(JOINT_STATE, some).inputs == {"tau_cmd[2]": 20.0}
 
 

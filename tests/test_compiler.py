@@ -126,8 +126,7 @@ def test_a_cache_that_cannot_be_is_named(monkeypatch):
 
 
 def test_universal_header():
-    thin = [struct.pack("<III", 0xFEEDFACF, cpu, 3) + b"x" * size
-            for cpu, size in ((0x1000007, 20000), (0x100000C, 5))]  # fmt: skip
+    thin = [struct.pack("<III", 0xFEEDFACF, cpu, 3) + b"x" * size for cpu, size in ((0x1000007, 20000), (0x100000C, 5))]
     fat = universal(thin)
     magic, count = struct.unpack_from(">II", fat)
     assert (magic, count) == (0xCAFEBABE, 2)

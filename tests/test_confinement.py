@@ -71,9 +71,12 @@ ATTEMPTS: dict[str, Callable[[Path], object]] = {
     "take memory": lambda folder: len(np.ones(MEMORY // 8)),
 }
 ANSWERS = {
-    "read in the folder": b"mesh", "read beside it": "EACCES", "read through a link": "EACCES",
-    "list beside it": "EACCES", "take memory": "MemoryError",
-}  # fmt: skip
+    "read in the folder": b"mesh",
+    "read beside it": "EACCES",
+    "read through a link": "EACCES",
+    "list beside it": "EACCES",
+    "take memory": "MemoryError",
+}
 """EPERM from all others."""
 
 

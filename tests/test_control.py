@@ -19,9 +19,7 @@ from twodof.export.package import build_fmu
 CONTROLS = ("task", "pose", "joint", "effort")
 
 
-DRIVEN = (
-    "q_des", "v_des", "a_des", "tau_cmd", "x_des", "xd_des", "quat_des", "omega_des", "alpha_des",
-)  # fmt: skip
+DRIVEN = ("q_des", "v_des", "a_des", "tau_cmd", "x_des", "xd_des", "quat_des", "omega_des", "alpha_des")
 
 
 @pytest.mark.parametrize("name", ["twodof", "ur5", "panda"])
@@ -49,10 +47,7 @@ def test_both_flavours_have_the_same_accelerations_and_efforts(name, control):
 def fmus(tmp_path_factory) -> dict[tuple[str, bool], Path]:
     folder = tmp_path_factory.mktemp("controls")
     return {
-        (control, native): build_fmu(
-            folder / f"{control}{native}.fmu",
-            FmuOptions(control=control, native=native),
-        )
+        (control, native): build_fmu(folder / f"{control}{native}.fmu", FmuOptions(control=control, native=native))
         for control in CONTROLS
         for native in (False, True)
     }
@@ -133,8 +128,7 @@ def test_energy_of_the_free_plant_is_kept(fmus, native):
     reference.gravity.linear = np.array(plant.gravity)
     data = reference.createData()
     energy = [
-        pin.computeKineticEnergy(reference, data, a, b)
-        + pin.computePotentialEnergy(reference, data, a)
+        pin.computeKineticEnergy(reference, data, a, b) + pin.computePotentialEnergy(reference, data, a)
         for a, b in zip(q, v)
     ]
     assert np.ptp(energy) <= 1e-9 * max(map(abs, energy))
@@ -160,9 +154,8 @@ def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
     for native, step in ((True, 0.01), (True, 0.002), (False, 0.01)):
         changes = dict(zip((0.0, 0.2, 0.4), values))
         run = twodof.samples(
-            fmus[control, native], step=step, stop_time=0.6,
-            settings={**settings, group: changes[0.0]},
-        )  # fmt: skip
+            fmus[control, native], step=step, stop_time=0.6, settings={**settings, group: changes[0.0]}
+        )
         states = []
         sample = next(run)
         while True:
@@ -174,9 +167,7 @@ def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
             except StopIteration:
                 break
         trajectories.append(np.array(states))
-    at_stops = (trajectories[0][:, :2] == [0.7, 0.5]).any() and (
-        trajectories[0][:, :2] == [0.2, 0.1]
-    ).any()
+    at_stops = (trajectories[0][:, :2] == [0.7, 0.5]).any() and (trajectories[0][:, :2] == [0.2, 0.1]).any()
     assert at_stops
     size = np.maximum(1.0, np.abs(trajectories[0]))  # joints are thrown at up to 200 rad/s
     assert (np.abs(trajectories[0] - trajectories[1]) / size).max() <= 1e-6
@@ -187,9 +178,15 @@ def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
 def test_flavours_are_equal_with_limits_of_all_kinds_and_a_force(fmus, control):
     """Joints stopped, efforts saturated, pushed, with an unknown payload; stops as by default."""
     settings = {
-        "q_min": (0.2, 0.1), "q_max": (0.7, 0.5), "limit_effort": True, "f_ext": (3.0, -2.0, 1.0),
-        "payload": 0.2, "payload_com": (0.01, 0.02, 0.0), "tau_ext": (0.1, -0.1), **TIGHT,
-    }  # fmt: skip
+        "q_min": (0.2, 0.1),
+        "q_max": (0.7, 0.5),
+        "limit_effort": True,
+        "f_ext": (3.0, -2.0, 1.0),
+        "payload": 0.2,
+        "payload_com": (0.01, 0.02, 0.0),
+        "tau_ext": (0.1, -0.1),
+        **TIGHT,
+    }
     moves: dict[str, Any] = {
         "task": ({"x_des": (0.1, 0.25), "Kp": 5000.0}, {"x_des": (0.28, 0.05)}),
         "pose": ({"x_des": (0.1, 0.25), "Kp": 5000.0, "Kp_rot": 9.0}, {"x_des": (0.28, 0.05)}),
@@ -210,16 +207,11 @@ def test_the_largest_step_has_no_say_in_a_short_hop(fmus):
     """Joint 2 is thrown off its stop for 11 µs, at 0.9481 s."""
     rng = np.random.default_rng(1)
     torque, limit = rng.uniform(0.2, 2.0), 0.3 * rng.uniform(0.2, 2.0)
-    changes = [
-        (0.2 * k, dict(zip(("tau_cmd[1]", "tau_cmd[2]"), rng.uniform(-torque, torque, 2))))
-        for k in range(5)
-    ]
+    changes = [(0.2 * k, dict(zip(("tau_cmd[1]", "tau_cmd[2]"), rng.uniform(-torque, torque, 2)))) for k in range(5)]
     ends = []
     for native, max_step in ((True, 1e-5), (True, 1e-3), (True, 1e-2), (False, 1e-3)):
         settings = {"q_start": 0.0, "q_min": -limit, "q_max": limit, "max_step": max_step, **TIGHT}
-        _, q, v = trajectory(
-            fmus["effort", native], stop_time=1.0, settings=settings, changes=changes
-        )
+        _, q, v = trajectory(fmus["effort", native], stop_time=1.0, settings=settings, changes=changes)
         ends.append([*q[-1], *v[-1]])
     np.testing.assert_allclose(ends, [ends[0]] * 4, atol=1e-9)
 
@@ -250,9 +242,8 @@ def test_a_pd_loop_outside_comes_near_the_one_inside(fmus):
     reference.gravity.linear = np.array(plant.gravity)
     data = reference.createData()
     _, inside, _ = trajectory(
-        fmus["joint", True], stop_time=1.0,
-        settings={"q_des": tuple(goal), "Kp": Kp, "Kd": Kd, **TIGHT},
-    )  # fmt: skip
+        fmus["joint", True], stop_time=1.0, settings={"q_des": tuple(goal), "Kp": Kp, "Kd": Kd, **TIGHT}
+    )
     distances = []
     for step in (0.002, 0.001):
         run = twodof.samples(fmus["effort", True], step=step, stop_time=1.0, settings=TIGHT)
@@ -291,12 +282,23 @@ def test_the_description_is_that_of_the_control(fmus, control):
     of = {
         "task": ["x_des", "xd_des", "xdd_des", "Kp", "Kd", "tau_ext", "f_ext", "Kn"],
         "pose": [
-            "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des",
-            "Kp", "Kd", "Kp_rot", "Kd_rot", "tau_ext", "f_ext", "Kn",
+            "x_des",
+            "xd_des",
+            "xdd_des",
+            "quat_des",
+            "omega_des",
+            "alpha_des",
+            "Kp",
+            "Kd",
+            "Kp_rot",
+            "Kd_rot",
+            "tau_ext",
+            "f_ext",
+            "Kn",
         ],
         "joint": ["q_des", "v_des", "a_des", "Kp", "Kd", "tau_ext", "f_ext"],
         "effort": ["tau_cmd", "tau_ext", "f_ext"],
-    }  # fmt: skip
+    }
     descriptions = []
     for native in (False, True):
         path = fmus[control, native]
@@ -344,9 +346,7 @@ def test_a_start_into_a_stop_is_an_impact(fmus, rigid):
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_target_on_a_limit_does_not_chatter(fmus, side):
     """The joint that is not pressed is driven off by the other's stop."""
-    settings = {
-        "q_min": -1.0, "q_max": 1.0, "q_start": (side, -side), "q_des": (4 * side, -side),
-    }  # fmt: skip
+    settings = {"q_min": -1.0, "q_max": 1.0, "q_start": (side, -side), "q_des": (4 * side, -side)}
     _, q, _ = trajectory(fmus["joint", True], settings={**settings, **TIGHT}, stop_time=0.3)
     assert (q[:, 0] == side).all() and side * q[-1, 1] > 0.5
     _, other, _ = trajectory(fmus["joint", False], settings={**settings, **TIGHT}, stop_time=0.3)
@@ -377,9 +377,14 @@ def test_every_verb_follows_the_control(fmus, control, tmp_path, monkeypatch, ca
     fmu, swept = str(fmus[control, True]), "tau_cmd" if control == "effort" else "Kp"
     for line in (
         f"run {fmu} -o bag --scene --effort --stop-time 0.3 --set payload=0.1 --set f_ext=0.2,0,0",
-        "plot bag -o p.html", "plot bag bag -o p2.svg", "view bag --export v.html", "info bag",
-        f"sweep {fmu} --grid {swept}=1:3:3 --stop-time 0.2 -o s", "info s", "plot s -o s.svg",
-    ):  # fmt: skip
+        "plot bag -o p.html",
+        "plot bag bag -o p2.svg",
+        "view bag --export v.html",
+        "info bag",
+        f"sweep {fmu} --grid {swept}=1:3:3 --stop-time 0.2 -o s",
+        "info s",
+        "plot s -o s.svg",
+    ):
         assert main(line.split()) == 0, capsys.readouterr().err
     best = capsys.readouterr().out.partition("best:")[2]
     follows = control in ("task", "pose")

@@ -99,9 +99,7 @@ def test_the_bare_plants_are_pinocchios(name):
         effort = engine.group(values, "tau_cmd") + engine.group(values, "tau_ext") - damping * v
         by_q, by_v, by_tau = derivatives(reduced, q, v, effort)
         ours = engine.jacobian(values)
-        for columns, theirs in (
-            (r"q\[\d+\]", by_q), (r"v\[\d+\]", by_v - by_tau * damping), (r"tau_cmd.*", by_tau),
-        ):  # fmt: skip
+        for columns, theirs in ((r"q\[\d+\]", by_q), (r"v\[\d+\]", by_v - by_tau * damping), (r"tau_cmd.*", by_tau)):
             part = engine.part(ours, r"der\(v.*", columns)
             assert np.abs(part - theirs).max() <= 1e-10 * max(1.0, np.abs(theirs).max())
         J = reduced.jacobian(q, robot.frame_id)[:3]

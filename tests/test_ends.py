@@ -39,9 +39,7 @@ def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
 def has_samples(bag: Path) -> bool:
     """Whether the first sample of a run is in its bag, beside which the reserve is then."""
     try:
-        return (bag / "reserve").exists() and any(
-            any(read_messages(file, Allowance())) for file in storage_files(bag)
-        )
+        return (bag / "reserve").exists() and any(any(read_messages(file, Allowance())) for file in storage_files(bag))
     except (OSError, DamageError):
         return False
 
@@ -65,12 +63,9 @@ SIGNALS = {
 
 
 @pytest.mark.parametrize(
-    ("name", "storage", "pace"),
-    [*zip(SIGNALS, STORAGES * 3, ("--realtime", "", "", "--realtime", "--realtime", ""))],
+    ("name", "storage", "pace"), [*zip(SIGNALS, STORAGES * 3, ("--realtime", "", "", "--realtime", "--realtime", ""))]
 )
-def test_signals_leave_a_complete_bag(
-    native_path: Path, tmp_path: Path, name: str, storage: str, pace: str
-) -> None:
+def test_signals_leave_a_complete_bag(native_path: Path, tmp_path: Path, name: str, storage: str, pace: str) -> None:
     signals, bag = SIGNALS[name], tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, *pace.split())
     for number in signals:
@@ -111,9 +106,7 @@ except KeyboardInterrupt:
 
 
 @both_storages
-def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(
-    native_path: Path, tmp_path: Path, storage: str
-) -> None:
+def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(native_path: Path, tmp_path: Path, storage: str) -> None:
     """Python raises KeyboardInterrupt anywhere, in the middle of a write too."""
     for i in range(3):
         bag = tmp_path / f"bag{i}"
@@ -130,17 +123,13 @@ def test_interrupt_in_a_loop_of_ones_own_never_cuts_a_message(
         assert (process.returncode, err) == (0, "")
         assert_consistent(bag, storage)
         states = read_with_rosbags(bag)
-        assert [float(*memoryview(s.position).cast("d")[1:]) for s in states] == [
-            *range(len(states))
-        ]
+        assert [float(*memoryview(s.position).cast("d")[1:]) for s in states] == [*range(len(states))]
         assert int(said) <= len(states) <= int(said) + 1
 
 
 @both_storages
 @pytest.mark.parametrize("how", ["removed", "moved"])
-def test_folder_that_goes_under_the_run_ends_it(
-    native_path: Path, tmp_path: Path, storage: str, how: str
-) -> None:
+def test_folder_that_goes_under_the_run_ends_it(native_path: Path, tmp_path: Path, storage: str, how: str) -> None:
     bag = tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, "--realtime")
     if how == "removed":
@@ -161,11 +150,7 @@ def test_folder_that_goes_under_the_run_ends_it(
 @pytest.mark.long
 @both_storages
 def test_full_disk_costs_a_second_at_most(
-    native_path: Path,
-    tmp_path: Path,
-    disk: Callable[..., Path],
-    storage: str,
-    length: Callable[[int, int], int],
+    native_path: Path, tmp_path: Path, disk: Callable[..., Path], storage: str, length: Callable[[int, int], int]
 ) -> None:
     """Somebody else fills the disk to the last byte under a run in real time."""
     expected = whole(native_path, tmp_path, 1000)
@@ -191,9 +176,7 @@ def test_full_disk_costs_a_second_at_most(
     assert max(lost) <= 1.0
 
 
-def test_reader_of_the_summary_that_leaves_costs_no_sample(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_reader_of_the_summary_that_leaves_costs_no_sample(native_path: Path, tmp_path: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     command = [*TWODOF, "run", str(native_path), "-o", str(tmp_path / "bag")]
@@ -253,9 +236,7 @@ sys.exit(main(["info", FMU]))
         ("fmpy", True, "twodof: error: interrupted\n"),
     ],
 )
-def test_an_interrupted_import_is_quiet(
-    native_path: Path, module: str, as_c_does: bool, said: str
-) -> None:
+def test_an_interrupted_import_is_quiet(native_path: Path, module: str, as_c_does: bool, said: str) -> None:
     given = f"MODULE, AS_C_DOES, FMU = {module!r}, {as_c_does}, {str(native_path)!r}"
     command = [sys.executable, "-c", given + INTERRUPTED_IMPORT]
     done = subprocess.run(command, capture_output=True, text=True)

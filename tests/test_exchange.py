@@ -55,9 +55,15 @@ def states(fmu):
 def run(fmu, kind, starts, stop_time=2.0, interval=0.01, **named):
     """States at each interval, as an array with a column each."""
     result = fmpy.simulate_fmu(
-        str(fmu), fmi_type=kind, stop_time=stop_time, start_values={**TIGHT, **starts},
-        output=states(fmu), output_interval=interval, record_events=False, **named,
-    )  # fmt: skip
+        str(fmu),
+        fmi_type=kind,
+        stop_time=stop_time,
+        start_values={**TIGHT, **starts},
+        output=states(fmu),
+        output_interval=interval,
+        record_events=False,
+        **named,
+    )
     return np.array([result[name] for name in states(fmu)]).T
 
 
@@ -68,9 +74,8 @@ class FMU2Exchange(Recorded, FMU2Model):
         self.n = self.description.numberOfContinuousStates
         identifier = self.description.modelExchange.modelIdentifier
         super().__init__(
-            guid=self.description.guid, modelIdentifier=identifier, instanceName="model",
-            unzipDirectory=unzipped(fmu),
-        )  # fmt: skip
+            guid=self.description.guid, modelIdentifier=identifier, instanceName="model", unzipDirectory=unzipped(fmu)
+        )
         self.instantiate(callbacks=self.functions())
         self.set(**starts)
         self.setupExperiment(startTime=0.0)
@@ -147,16 +152,26 @@ RUNS = {
     ("effort", "clamped"): {**NARROW, "v_start[1]": 2.0, "rigid_stops": False},
     ("joint", "stops"): {**NARROW, "q_max[1]": 0.6, "q_des[1]": 0.7, "q_des[2]": 0.9},
     ("joint", "saturated"): {"limit_effort": True, "q_des[1]": 1.0, "Kp[1]": 4e3, "payload": 1.0},
-    ("task", "stops"): {"q_min[1]": -0.2, "q_max[1]": 0.8, "q_min[2]": 0.8, "q_max[2]": 1.9,
-                        "q_start[1]": 0.3, "q_start[2]": 1.3, "Kp[1]": 400.0, "Kp[2]": 400.0,
-                        "x_des[1]": 0.14, "x_des[2]": -0.03},
+    ("task", "stops"): {
+        "q_min[1]": -0.2,
+        "q_max[1]": 0.8,
+        "q_min[2]": 0.8,
+        "q_max[2]": 1.9,
+        "q_start[1]": 0.3,
+        "q_start[2]": 1.3,
+        "Kp[1]": 400.0,
+        "Kp[2]": 400.0,
+        "x_des[1]": 0.14,
+        "x_des[2]": -0.03,
+    },
     ("task", "forces"): {"tau_ext[1]": 0.2, "f_ext[2]": -0.5, "limit_effort": True},
-    ("pose", "stops"): {"q_max[1]": 0.7, "x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5,
-                        "quat_des[4]": 0.8},
+    ("pose", "stops"): {"q_max[1]": 0.7, "x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5, "quat_des[4]": 0.8},
     ("ur5", "falls into its stops"): {
-        **{f"q_min[{i}]": -0.3 for i in (2, 3, 4)}, **{f"q_max[{i}]": 0.4 for i in (2, 3, 4)}},
+        **{f"q_min[{i}]": -0.3 for i in (2, 3, 4)},
+        **{f"q_max[{i}]": 0.4 for i in (2, 3, 4)},
+    },
     ("ur5 pose", "turns"): {"omega_des[3]": 0.3, "quat_des[1]": 0.1, "payload": 1.0},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name, what", RUNS, ids=map(" ".join, RUNS))
@@ -168,8 +183,7 @@ def test_cvode_gives_the_trajectories_of_co_simulation(fmus, name, what):
     assert ours.shape == theirs.shape
     assert np.abs(ours - theirs)[:, :n].max() <= 1e-7
     if "stop" in what:
-        limits = [RUNS[name, what].get(f"q_{side}[{i + 1}]", np.nan)
-                  for i in range(n) for side in ("min", "max")]  # fmt: skip
+        limits = [RUNS[name, what].get(f"q_{side}[{i + 1}]", np.nan) for i in range(n) for side in ("min", "max")]
         assert np.isin(ours[:, :n], limits).any()
 
 
@@ -178,9 +192,7 @@ def test_euler_converges_at_first_order_to_the_same_stops_included(fmus):
     exact = run(fmus["task"], "CoSimulation", starts)
     error = []
     for step in (1e-3, 5e-4, 2.5e-4):
-        rough = run(
-            fmus["task"], "ModelExchange", starts, 2.0, step, solver="Euler", step_size=step
-        )
+        rough = run(fmus["task"], "ModelExchange", starts, 2.0, step, solver="Euler", step_size=step)
         error.append(np.abs(rough[:: round(0.01 / step)] - exact)[:, :2].max())
     assert error[0] < 5e-3
     assert 1.7 < error[0] / error[1] < 2.4 and 1.7 < error[1] / error[2] < 2.4
@@ -195,8 +207,7 @@ def test_a_joint_that_rests_at_its_stop_for_ten_seconds_has_one_event(fmus, monk
         return enter(model)
 
     monkeypatch.setattr(FMU2Model, "enterEventMode", entered)
-    run(fmus["effort"], "ModelExchange", {"q_min[1]": 0.0, "q_min[2]": 0.0}, 10.0,
-        relative_tolerance=1e-10)  # fmt: skip
+    run(fmus["effort"], "ModelExchange", {"q_min[1]": 0.0, "q_min[2]": 0.0}, 10.0, relative_tolerance=1e-10)
     assert 2 <= len(events) <= 6  # two joints, and a bounce or two until both rest
     events.clear()
     starts = {"q_min[1]": 0.5, "q_min[2]": 0.35}  # both at rest from the start
@@ -211,9 +222,13 @@ def test_a_joint_that_rests_at_its_stop_for_ten_seconds_has_one_event(fmus, monk
 def falling(fmus):
     """The bare arm without gravity, its first joint on its way to a limit at 1 rad/s."""
     model = Model(
-        fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[0.5, 0.0], v_start=[0.0, 0.0],
-        q_max=[1.0, 2.0], rigid_stops=False,
-    )  # fmt: skip
+        fmus["effort"],
+        gravity=[0.0, 0.0, 0.0],
+        q_start=[0.5, 0.0],
+        v_start=[0.0, 0.0],
+        q_max=[1.0, 2.0],
+        rigid_stops=False,
+    )
     model.go()
     return model
 
@@ -252,8 +267,14 @@ def test_an_impact_beyond_all_numbers_is_refused_and_changes_nothing(fmus):
 
 @pytest.mark.parametrize("rigid", [False, True])
 def test_a_held_joint_is_let_go_where_it_is_pulled_off_and_no_sooner(fmus, rigid):
-    model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0],
-                  tau_cmd=[0.5, 0.0], rigid_stops=rigid)  # fmt: skip
+    model = Model(
+        fmus["effort"],
+        gravity=[0.0, 0.0, 0.0],
+        q_start=[1.0, 0.0],
+        q_max=[1.0, 2.0],
+        tau_cmd=[0.5, 0.0],
+        rigid_stops=rigid,
+    )
     model.go()
     assert model.rates()[2] == 0.0 and model.indicators()[0] > 0.0
     model.set(tau_cmd=[1e-12, 0.0])
@@ -265,8 +286,7 @@ def test_a_held_joint_is_let_go_where_it_is_pulled_off_and_no_sooner(fmus, rigid
 
 
 def test_a_solvers_rounding_does_not_let_a_held_joint_go(fmus):
-    model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0],
-                  tau_cmd=[0.5, 0.0])  # fmt: skip
+    model = Model(fmus["effort"], gravity=[0.0, 0.0, 0.0], q_start=[1.0, 0.0], q_max=[1.0, 2.0], tau_cmd=[0.5, 0.0])
     model.go()
     model.y = [1.0 - 1e-12, 0.0, -1e-17, 0.0]
     assert model.indicators()[0] > 0.0 and model.rates()[2] == 0.0
@@ -290,8 +310,15 @@ def events(monkeypatch):
 def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, events):
     """As the feet of a rocking block. Were each impact to free the other joint, there would be no
     end of events."""
-    starts = {"q_min[1]": 0.0, "q_max[2]": 0.5, "q_start[1]": 0.0, "q_start[2]": -0.457,
-              "tau_cmd[1]": -1.451, "tau_cmd[2]": 1.308, "gravity[2]": 0.0}  # fmt: skip
+    starts = {
+        "q_min[1]": 0.0,
+        "q_max[2]": 0.5,
+        "q_start[1]": 0.0,
+        "q_start[2]": -0.457,
+        "tau_cmd[1]": -1.451,
+        "tau_cmd[2]": 1.308,
+        "gravity[2]": 0.0,
+    }
     theirs = run(fmus["effort"], "ModelExchange", starts, 2.0, relative_tolerance=1e-10)
     assert events and theirs[-1].tolist() == [0.0, 0.5, 0.0, 0.0]
 
@@ -299,8 +326,9 @@ def test_two_joints_that_drive_each_other_off_come_to_rest(fmus, events):
 @pytest.mark.parametrize("torques", [(0.0236, 0.9009), (0.8861, 0.0227), (0.2502, 0.7944)])
 def test_a_joint_that_is_thrown_off_its_stop_has_no_event_by_a_solvers_error(fmus, events, torques):
     """CVode's own tolerance is far beyond what is past a limit."""
-    starts = {f"{group}[{i}]": value for i in (1, 2)
-              for group, value in (("q_start", 0.0), ("q_min", -0.3), ("q_max", 0.3))}  # fmt: skip
+    starts = {
+        f"{group}[{i}]": value for i in (1, 2) for group, value in (("q_start", 0.0), ("q_min", -0.3), ("q_max", 0.3))
+    }
     starts |= {"tau_cmd[1]": torques[0], "tau_cmd[2]": torques[1]}
     for tolerance, near in ((1e-5, 1e-2), (1e-10, 1e-7)):
         events.clear()
@@ -326,10 +354,18 @@ def test_events_are_at_the_times_of_the_closed_form(fmus, monkeypatch):
     monkeypatch.setattr(FMU2Model, "setTime", timed)
     monkeypatch.setattr(FMU2Model, "enterEventMode", entered)
     for side in (1.0, -1.0):  # both ends of both joints
-        starts = {"q_start[1]": 0.0, "q_start[2]": 0.0, "q_des[1]": 2.0 * side,
-                  "q_des[2]": -2.0 * side, "Kp[1]": 25.0, "Kp[2]": 49.0, "Kd[1]": 0.0, "Kd[2]": 0.0,
-                  **{f"q_{end}[{i}]": x for i in (1, 2) for end, x in (("min", -1.), ("max", 1.))},
-                  "rigid_stops": False}  # fmt: skip
+        starts = {
+            "q_start[1]": 0.0,
+            "q_start[2]": 0.0,
+            "q_des[1]": 2.0 * side,
+            "q_des[2]": -2.0 * side,
+            "Kp[1]": 25.0,
+            "Kp[2]": 49.0,
+            "Kd[1]": 0.0,
+            "Kd[2]": 0.0,
+            **{f"q_{end}[{i}]": x for i in (1, 2) for end, x in (("min", -1.0), ("max", 1.0))},
+            "rigid_stops": False,
+        }
         events.clear()
         last = run(fmus["joint"], "ModelExchange", starts, 0.5, relative_tolerance=1e-10)[-1]
         assert last.tolist() == [side, -side, 0.0, 0.0]
@@ -388,9 +424,7 @@ def test_what_is_out_of_turn_or_wrong_is_refused_and_changes_nothing(fmus):
     assert model.dll["fmi2DoStep"](ctypes.c_void_p(step[0]), *step[1:]) == ERROR
     assert "fmi2DoStep is a call of co-simulation" in model.messages.pop()[1]
     model.refused("wrong number of values, 4 are wanted", "getDerivatives", four, 3)
-    model.refused(
-        r"der\(q\[1\]\) is computed and cannot be set", "setReal", [model.vr["der(q[1])"]], [0]
-    )
+    model.refused(r"der\(q\[1\]\) is computed and cannot be set", "setReal", [model.vr["der(q[1])"]], [0])
     model.go()
     model.refused("is not allowed in the state 'continuous-time mode'", "newDiscreteStates")
     model.refused(r"v\[1\] is not finite", "setContinuousStates", four, 4)
@@ -443,6 +477,4 @@ def test_a_derivative_of_what_has_none_is_refused(fmus):
         ("limit_effort is of type Boolean", ["x[1]"], ["limit_effort"], [1.0]),
     ]
     for message, unknown, known, seed in refused:
-        model.refused(
-            re.escape(message), call, [vr[n] for n in unknown], [vr[n] for n in known], seed
-        )
+        model.refused(re.escape(message), call, [vr[n] for n in unknown], [vr[n] for n in known], seed)

@@ -82,18 +82,28 @@ def test_a_users_program_is_checked_by_its_types(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda fmu: twodof.simulate(fmu, stop_tim=2), "simulate.. has no argument 'stop_tim'; did"
-         r" you mean 'stop_time'\?"),
-        (lambda fmu: next(twodof.samples(fmu, stepp=2)), "samples.. has no argument 'stepp'; did"
-         r" you mean 'step'\?"),
-        (lambda fmu: twodof.publish(fmu, setting={}), "publish.. has no argument 'setting'; did you"
-         r" mean 'settings'\?"),
-        (lambda fmu: twodof.publish_together({}, lock_step=True),
-         r"publish_together.. .*'lockstep'\?"),
-        (lambda fmu: twodof.view("bag", export="a.html"), "view.. has no argument 'export'; .*It"
-         " takes bag, fmu, frame, host, mesh_dir, opened, port, stop, urdf$"),
+        (
+            lambda fmu: twodof.simulate(fmu, stop_tim=2),
+            "simulate.. has no argument 'stop_tim'; did"
+            r" you mean 'stop_time'\?",
+        ),
+        (
+            lambda fmu: next(twodof.samples(fmu, stepp=2)),
+            "samples.. has no argument 'stepp'; did"
+            r" you mean 'step'\?",
+        ),
+        (
+            lambda fmu: twodof.publish(fmu, setting={}),
+            "publish.. has no argument 'setting'; did you"
+            r" mean 'settings'\?",
+        ),
+        (lambda fmu: twodof.publish_together({}, lock_step=True), r"publish_together.. .*'lockstep'\?"),
+        (
+            lambda fmu: twodof.view("bag", export="a.html"),
+            "view.. has no argument 'export'; .*It takes bag, fmu, frame, host, mesh_dir, opened, port, stop, urdf$",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_keyword_that_is_none_is_told_of_the_function_that_was_called(
     call: Callable[[Path], object], told: str, native_path: Path
 ) -> None:
@@ -132,9 +142,7 @@ def test_recording_has_what_the_samples_had(native_path: Path, tmp_path: Path) -
     np.testing.assert_array_equal(bag.tau, [s.tau for s in samples])
     table = bag.to_pandas()
     assert isinstance(table, pandas.DataFrame) and table.index.name == "t"
-    assert [*table.columns] == [
-        f"{group}[{i}]" for group in ("q", "v", "tau", "x", "x_des") for i in (1, 2)
-    ]
+    assert [*table.columns] == [f"{group}[{i}]" for group in ("q", "v", "tau", "x", "x_des") for i in (1, 2)]
     np.testing.assert_array_equal(table[["q[1]", "q[2]"]], bag.q)
     np.testing.assert_allclose(table.index, [s.t for s in samples], atol=1e-12)
 
@@ -143,8 +151,11 @@ def program(names: list[str], code: str, folder: Path, *arguments: object) -> st
     """Run code where these modules cannot be imported; what it says."""
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT.format(names=names) + code, *map(str, arguments)],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -209,6 +220,4 @@ def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path:
 
 def test_versions_are_of_what_is_installed() -> None:
     """Where there is no Pinocchio, a run still says what made it."""
-    assert versions("numpy", "no-such-package") == {
-        "twodof": twodof.__version__, "numpy": np.__version__,
-    }  # fmt: skip
+    assert versions("numpy", "no-such-package") == {"twodof": twodof.__version__, "numpy": np.__version__}

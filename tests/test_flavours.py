@@ -16,13 +16,15 @@ from twodof.export.compiler import UNITS
 def test_trajectories_of_both_flavours_agree(fmu_path, native_path):
     """At their own tolerance; `test_control.py` has the rest at a tight one."""
     settings = {
-        "q_min": (-0.2, 0.8), "q_max": (0.8, 1.9), "q_start": (0.3, 1.3), "Kp": 400.0,
-        "x_des": (0.14, -0.03), "tau_ext": (0.2, -0.1), "limit_effort": True,
-    }  # fmt: skip
-    runs = [
-        list(twodof.samples(fmu, stop_time=2.0, settings=settings))
-        for fmu in (fmu_path, native_path)
-    ]
+        "q_min": (-0.2, 0.8),
+        "q_max": (0.8, 1.9),
+        "q_start": (0.3, 1.3),
+        "Kp": 400.0,
+        "x_des": (0.14, -0.03),
+        "tau_ext": (0.2, -0.1),
+        "limit_effort": True,
+    }
+    runs = [list(twodof.samples(fmu, stop_time=2.0, settings=settings)) for fmu in (fmu_path, native_path)]
     for group in ("q", "v", "x", "tau"):
         python, native = (np.array([getattr(s, group) for s in run]) for run in runs)
         scale = np.maximum(1.0, np.abs(python))
@@ -37,9 +39,7 @@ def test_sources_compiled_without_any_flag_show_the_standard_functions_alone(nat
     files = [tmp_path / "sources" / name for name in UNITS]
     library = tmp_path / "library.so"
     subprocess.run([needs("gcc"), "-shared", "-fPIC", "-o", library, *files, "-lm"], check=True)
-    symbols = subprocess.check_output(
-        [needs("nm"), "-D", "--defined-only", library], text=True
-    ).split()
+    symbols = subprocess.check_output([needs("nm"), "-D", "--defined-only", library], text=True).split()
     names = [name for name in symbols[2::3] if not name.startswith("_")]
     assert len(names) == 44
     assert all(name.startswith("fmi2") for name in names)
@@ -61,14 +61,10 @@ def test_run_native_beside_an_fmu_is_refused(native_path, capsys):
     assert "--native builds the default arm's FMU" in capsys.readouterr().err
 
 
-def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_host_without_the_python_flavour_takes_the_native_one_and_says_so(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("twodof.export.compiler.host_platform", lambda fmi=2: "darwin64")
-    monkeypatch.setattr(
-        "twodof.export.composition.host_platform", lambda fmi=2: "linux64"
-    )  # what can run here
+    monkeypatch.setattr("twodof.export.composition.host_platform", lambda fmi=2: "linux64")  # what can run here
     assert main(["run", "--stop-time", "0.1", "-o", "bag"]) == 0
     captured = capsys.readouterr()
     assert "the Python flavour is for Linux x86-64: building the native one" in captured.err

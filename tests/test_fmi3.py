@@ -40,8 +40,7 @@ def options(robot, control):
     if robot == "twodof":
         return {"control": control}
     path, frame, axes = ROBOTS[robot]
-    return {"control": control, "urdf": robots_folder() / path, "frame": frame, "axes": axes,
-            "meshes": False}  # fmt: skip
+    return {"control": control, "urdf": robots_folder() / path, "frame": frame, "axes": axes, "meshes": False}
 
 
 @pytest.fixture(scope="session")
@@ -52,11 +51,11 @@ def pair(tmp_path_factory):
     def build(robot="twodof", control="task"):
         if (robot, control) not in pairs:
             pairs[robot, control] = [
-                build_fmu(folder / f"{robot}-{control}-{fmi}.fmu",
-                          FmuOptions(native=True, fmi=fmi,
-                                     **options(robot, control)))
+                build_fmu(
+                    folder / f"{robot}-{control}-{fmi}.fmu", FmuOptions(native=True, fmi=fmi, **options(robot, control))
+                )
                 for fmi in (2, 3)
-            ]  # fmt: skip
+            ]
         return pairs[robot, control]
 
     return build
@@ -66,16 +65,13 @@ class Calls(Recorded):
     def open(self, fmu, start=True, **named):
         self.description = fmpy.read_model_description(str(fmu))
         self.vr = {v.name: v.valueReference for v in self.description.modelVariables}
-        self.size = {v.valueReference: int(np.prod(v.shape or ()))
-                     for v in self.description.modelVariables}  # fmt: skip
+        self.size = {v.valueReference: int(np.prod(v.shape or ())) for v in self.description.modelVariables}
         super().__init__(
-            guid=self.description.guid, modelIdentifier="TwoDof", instanceName="arm",
-            unzipDirectory=unzipped(fmu),
-        )  # fmt: skip
+            guid=self.description.guid, modelIdentifier="TwoDof", instanceName="arm", unzipDirectory=unzipped(fmu)
+        )
         self.messages = []
         self.instantiate(
-            logMessage=lambda _, status, category, text: self.keep(status, text),
-            **{"loggingOn": True, **named},
+            logMessage=lambda _, status, category, text: self.keep(status, text), **{"loggingOn": True, **named}
         )
         if start:
             self.enterInitializationMode(startTime=0.0)
@@ -121,18 +117,20 @@ def simulated(fmu, kind, starts=(), stop_time=2.0, parts=PARTS, **named):
         whole = names == [name]  # an array, or a scalar
         start_values |= {name: values} if whole else dict(zip(names, np.atleast_1d(values)))
     result = fmpy.simulate_fmu(
-        str(fmu), fmi_type=kind, stop_time=stop_time, step_size=0.01, output_interval=0.01,
-        start_values=start_values, output=output, record_events=False, **named,
-    )  # fmt: skip
+        str(fmu),
+        fmi_type=kind,
+        stop_time=stop_time,
+        step_size=0.01,
+        output_interval=0.01,
+        start_values=start_values,
+        output=output,
+        record_events=False,
+        **named,
+    )
     return np.array([np.hstack([np.ravel(row[name]) for name in output]) for row in result])
 
 
-COMBINATIONS = [
-    ("twodof", "task"),
-    ("twodof", "pose"),
-    ("twodof", "effort"),
-    ("panda_finger", "task"),
-]
+COMBINATIONS = [("twodof", "task"), ("twodof", "pose"), ("twodof", "effort"), ("panda_finger", "task")]
 
 
 @pytest.mark.parametrize("robot, control", COMBINATIONS)
@@ -182,12 +180,13 @@ def test_scalars_have_no_dimension_and_nothing_is_wrong_with_them(pair, scalars)
 
 def test_derivatives_of_scalars_are_elements_of_those_of_arrays(pair, scalars):
     one, all_of_them = arm(scalars), arm(pair(control="pose")[1])
-    matrix = np.reshape([
-        all_of_them.getDirectionalDerivative(
-            [all_of_them.vr["tau"]], [all_of_them.vr["x_des"]], seed, 2
-        )
-        for seed in np.eye(2)
-    ], (2, 2)).T  # fmt: skip
+    matrix = np.reshape(
+        [
+            all_of_them.getDirectionalDerivative([all_of_them.vr["tau"]], [all_of_them.vr["x_des"]], seed, 2)
+            for seed in np.eye(2)
+        ],
+        (2, 2),
+    ).T
     for i, k in np.ndindex(2, 2):
         tau, x_des = [one.vr[f"tau[{i + 1}]"]], [one.vr[f"x_des[{k + 1}]"]]
         assert list(one.getDirectionalDerivative(tau, x_des, [1.0], 1)) == [matrix[i, k]]
@@ -246,9 +245,7 @@ def test_model_exchange_equals_co_simulation_with_stops(pair):
     starts = {**NARROW, "rtol": 1e-10, "atol": 1e-10}
     three = pair()[1]
     stepped = simulated(three, "CoSimulation", starts, parts=("q", "v"))
-    solved = simulated(
-        three, "ModelExchange", starts, parts=("q", "v"), solver="CVode", relative_tolerance=1e-10
-    )
+    solved = simulated(three, "ModelExchange", starts, parts=("q", "v"), solver="CVode", relative_tolerance=1e-10)
     assert stepped[:, :2].min() == -0.5 and stepped[:, :2].max() == 1.0
     assert np.abs(solved - stepped)[:, :2].max() <= 1e-7
 
@@ -283,8 +280,7 @@ def test_adjoint_derivatives_are_the_transpose(pair, control):
 
 def test_a_sweep_is_that_of_fmi_2(pair):
     two, three = (
-        twodof.sweep(fmu, grid={"Kp": [20.0, 60.0], "x_des[2]": [0.1]}, stop_time=0.5, workers=1)
-        for fmu in pair()
+        twodof.sweep(fmu, grid={"Kp": [20.0, 60.0], "x_des[2]": [0.1]}, stop_time=0.5, workers=1) for fmu in pair()
     )
     assert two.equals(three) and len(set(two["peak_velocity"])) == 2
 
@@ -305,12 +301,16 @@ def test_wrong_arrays_are_refused(pair):
     a.refused("q\\[1\\] is of type Float64", "getInt64", [q], 2)
     a.refused("is computed and cannot be set", "setFloat64", [a.vr["time"]], [0.0])
     a.refused("parameter .* is not allowed", "setFloat64", [a.vr["rtol"]], [0.1])
-    a.refused("event_indicators.*has no derivative", "getDirectionalDerivative",
-              [a.vr["event_indicators"]], [q], [1.0, 0.0], 5)  # fmt: skip
-    a.refused("2 values for variables of 1", "getAdjointDerivative",
-              [a.vr["x"]], [a.vr["Kn"]], [1.0, 0.0], 2)  # fmt: skip
-    a.refused("weight of x\\[1\\] is not finite", "getAdjointDerivative",
-              [a.vr["x"]], [q], [np.nan, 0.0], 2)  # fmt: skip
+    a.refused(
+        "event_indicators.*has no derivative",
+        "getDirectionalDerivative",
+        [a.vr["event_indicators"]],
+        [q],
+        [1.0, 0.0],
+        5,
+    )
+    a.refused("2 values for variables of 1", "getAdjointDerivative", [a.vr["x"]], [a.vr["Kn"]], [1.0, 0.0], 2)
+    a.refused("weight of x\\[1\\] is not finite", "getAdjointDerivative", [a.vr["x"]], [q], [np.nan, 0.0], 2)
 
 
 def test_what_the_description_does_not_have_is_refused(pair):
@@ -319,13 +319,22 @@ def test_what_the_description_does_not_have_is_refused(pair):
     for kind in ("CoSimulation", "ModelExchange"):
         with zipfile.ZipFile(fmu) as archive:
             (element,) = ET.fromstring(archive.read("modelDescription.xml")).findall(kind)
-        for name in ("hasEventMode", "providesIntermediateUpdate", "providesEvaluateDiscreteStates",
-                     "canReturnEarlyAfterIntermediateUpdate"):  # fmt: skip
+        for name in (
+            "hasEventMode",
+            "providesIntermediateUpdate",
+            "providesEvaluateDiscreteStates",
+            "canReturnEarlyAfterIntermediateUpdate",
+        ):
             assert element.get(name) in (None, "false")
     a.refused("fmi3EnterEventMode is a call of Model Exchange", "enterEventMode")
     a.refused("fmi3EnterStepMode is not supported", "enterStepMode")
-    for name in ("EvaluateDiscreteStates", "EnterConfigurationMode", "GetIntervalDecimal",
-                 "ActivateModelPartition", "GetOutputDerivatives"):  # fmt: skip
+    for name in (
+        "EvaluateDiscreteStates",
+        "EnterConfigurationMode",
+        "GetIntervalDecimal",
+        "ActivateModelPartition",
+        "GetOutputDerivatives",
+    ):
         a.messages.clear()
         null = [ctypes.c_void_p()] * 5
         assert a.dll[f"fmi3{name}"](ctypes.c_void_p(a.component), *null) == ERROR
@@ -357,8 +366,7 @@ def test_instances_that_cannot_be_are_not_made(pair, named, message):
 
 def test_call_order(pair):
     a = arm(pair()[1], start=False)
-    a.refused("fmi3ExitInitializationMode is not allowed in the state 'instantiated'",
-              "exitInitializationMode")  # fmt: skip
+    a.refused("fmi3ExitInitializationMode is not allowed in the state 'instantiated'", "exitInitializationMode")
     a.refused("stop time 1 < start time 2", "enterInitializationMode", None, 2.0, 1.0)
     a.enterInitializationMode(startTime=0.0, stopTime=0.02)
     a.refused("fmi3DoStep is not allowed", "doStep", 0.0, 0.01)
@@ -372,8 +380,12 @@ def test_call_order(pair):
     a.refused("is not allowed in the state 'terminated'", "doStep", 0.01, 0.01)
     a.reset()
     b = exchange(pair()[1])
-    b.refused("fmi3SetContinuousStates is not allowed in the state 'event mode'",
-              "setContinuousStates", (ctypes.c_double * 4)(), 4)  # fmt: skip
+    b.refused(
+        "fmi3SetContinuousStates is not allowed in the state 'event mode'",
+        "setContinuousStates",
+        (ctypes.c_double * 4)(),
+        4,
+    )
     b.enterContinuousTimeMode()
     indicators = (ctypes.c_double * 5)()
     b.getEventIndicators(indicators, 5)
@@ -400,9 +412,12 @@ def test_random_calls_under_sanitizers(length):
     """Legal and illegal calls; in full, 100,000 sequences."""
     count = length(100_000, 3_000)
     program = executable(
-        model("twodof"), HERE / "fuzz.c", HERE / "fuzz3.h", fmi=3,
+        model("twodof"),
+        HERE / "fuzz.c",
+        HERE / "fuzz3.h",
+        fmi=3,
         flags=("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
-    )  # fmt: skip
+    )
     done = subprocess.run([program, str(count), "1"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"{count} sequences")
@@ -427,9 +442,7 @@ def embedded(pair, folder, *target, suffix=""):
         for unit in UNITS:
             output = folder / f"{prefix}{unit}.o"
             define = f"-DFMI{fmi}_FUNCTION_PREFIX={prefix}"
-            subprocess.run(
-                [*compiler, "-c", define, "-o", output, home / "sources" / unit], check=True
-            )
+            subprocess.run([*compiler, "-c", define, "-o", output, home / "sources" / unit], check=True)
             objects.append(output)
     program = folder / f"embedded{suffix}"
     command = [*compiler, "-o", program, HERE / "embedded.c", *objects]
@@ -526,9 +539,8 @@ def test_fmpy_rebuilds_the_library_from_the_sources(pair, tmp_path):
     assert library.read_bytes() != shipped
     first = simulated(fmu, "CoSimulation")
     again = fmpy.simulate_fmu(
-        str(tmp_path), fmi_type="CoSimulation", stop_time=2.0, step_size=0.01, output_interval=0.01,
-        output=["q"],
-    )  # fmt: skip
+        str(tmp_path), fmi_type="CoSimulation", stop_time=2.0, step_size=0.01, output_interval=0.01, output=["q"]
+    )
     assert np.abs(np.array([row["q"] for row in again]) - first[:, :2]).max() <= 1e-12
 
 

@@ -50,9 +50,7 @@ def waiting_run(fmu, folder):
         process.kill()
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(
-    native_path, tmp_path, monkeypatch
-):
+def test_what_a_killed_run_left_is_removed_by_the_next_and_nothing_else(native_path, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     others = tmp_path / "others"
     others.mkdir()
@@ -113,9 +111,7 @@ def test_no_place_for_temporary_folders_is_told(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["é", "100%41"])
-def test_a_temporary_folder_that_the_wrapper_cannot_read_is_refused(
-    name, fmu_path, tmp_path, monkeypatch
-):
+def test_a_temporary_folder_that_the_wrapper_cannot_read_is_refused(name, fmu_path, tmp_path, monkeypatch):
     (tmp_path / name).mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
     with pytest.raises(FmuError, match="set TMPDIR to a folder with a plain name"):

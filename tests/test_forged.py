@@ -46,9 +46,8 @@ def forged(fmu: Path, folder: Path, pattern: str, text: str) -> Path:
     ],
 )
 def test_a_forged_fmu_is_refused_in_a_line(
-    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    pattern: str, text: str, culprit: str,
-) -> None:  # fmt: skip
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], pattern: str, text: str, culprit: str
+) -> None:
     """By one of the commands at least; by the others too, or they do without what is wrong."""
     fmu = forged(native_path, tmp_path, pattern, text)
     lines = []
@@ -88,9 +87,7 @@ def test_a_list_of_start_values_that_is_none_is_refused(
         twodof.load_fmu(forged(of_fmi3, tmp_path, pattern, text))
 
 
-def test_a_page_of_a_frame_that_its_robot_has_not_is_refused(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_a_page_of_a_frame_that_its_robot_has_not_is_refused(native_path: Path, tmp_path: Path) -> None:
     fmu = forged(native_path, tmp_path, 'frame="EndEffector"', 'frame="Nope"')
     with pytest.raises(PageError, match="its robot cannot be shown: it has no link 'Nope'"):
         twodof.page(fmu, tmp_path / "arm.html")

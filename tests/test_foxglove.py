@@ -25,9 +25,7 @@ from twodof.errors import PublishError
 from twodof.pages.foxglove import Foxglove
 
 
-def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path: Path, tmp_path: Path) -> None:
     """The one of its viewer, in JavaScript; a gain is in the FMU within two steps."""
     client = Path(__file__).with_name("foxglove_client.js")
     node = needs("node")
@@ -42,9 +40,14 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(
     bag = tmp_path / "bag"
     viewer = Foxglove(0, scene=True, effort=True, set_gains=True, opened=opened)
     twodof.simulate(
-        native_path, viewer, twodof.Bag(bag, scene=True, effort=True), stop_time=4, step=step,
-        pace=twodof.RealTime(), steer=viewer.command,
-    )  # fmt: skip
+        native_path,
+        viewer,
+        twodof.Bag(bag, scene=True, effort=True),
+        stop_time=4,
+        step=step,
+        pace=twodof.RealTime(),
+        steer=viewer.command,
+    )
     assert clients[0].wait(PATIENCE) == 0
     heard: dict[str, list[Any]] = {}
     for line in told.read_text().splitlines():
@@ -121,12 +124,8 @@ def ask(connection: Connection, asked: dict[str, Any]) -> list[Any]:
             return [it["value"] for it in answer["parameters"]]
 
 
-def test_gains_are_set_where_asked_for_alone(
-    native_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    for set_gains, held, taken in (
-        (False, [50.0, 50.0], {}), (True, [1.0, 1.0], {"Kp[1]": 1.0, "Kp[2]": 1.0}),
-    ):  # fmt: skip
+def test_gains_are_set_where_asked_for_alone(native_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for set_gains, held, taken in ((False, [50.0, 50.0], {}), (True, [1.0, 1.0], {"Kp[1]": 1.0, "Kp[2]": 1.0})):
         viewer = Foxglove(0, set_gains=set_gains).begin(twodof.experiment(native_path))
         with viewer, joined(viewer.url) as connection:
             assert ask(connection, {"name": "Kp", "value": 1.0}) == [held]
@@ -148,18 +147,20 @@ def test_websites_but_foxgloves_own_are_refused(native_path: Path) -> None:
         for origin in ("https://app.foxglove.dev", "https://embed.foxglove.dev", "file://"):
             assert status(own, ("Origin", origin)) == 101
         for origin in (
-            "https://evil.example", "null", "http://localhost:3000", "http://app.foxglove.dev",
-            "https://app.foxglove.dev.evil.example", "https://evil.example/app.foxglove.dev",
-        ):  # fmt: skip
+            "https://evil.example",
+            "null",
+            "http://localhost:3000",
+            "http://app.foxglove.dev",
+            "https://app.foxglove.dev.evil.example",
+            "https://evil.example/app.foxglove.dev",
+        ):
             assert status(own, ("Origin", origin)) == 403
         for host in ("evil.example", "app.foxglove.dev"):
             assert status(("Host", host), ("Origin", f"https://{host}")) == 403
             assert status(("Host", host)) == 403
 
 
-def test_a_client_of_junk_prints_nothing(
-    native_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_client_of_junk_prints_nothing(native_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with Foxglove(0).begin(twodof.experiment(native_path)) as viewer:
         address = viewer.url.removeprefix("ws://").split(":")
         for _ in range(20):

@@ -35,8 +35,7 @@ def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) 
     tree = ET.fromstring(content)
     diffuse = {
         str(effect.get("id")): tuple(
-            round(float(value), 3)
-            for value in effect.findtext(f".//{DAE}diffuse/{DAE}color", "").split()[:3]
+            round(float(value), 3) for value in effect.findtext(f".//{DAE}diffuse/{DAE}color", "").split()[:3]
         )
         for effect in tree.iter(f"{DAE}effect")
     }
@@ -44,10 +43,7 @@ def test_triangles_have_the_colours_of_their_materials(robots: Path, name: str) 
         str(material.get("id")): material.findall(f"{DAE}instance_effect")[0].attrib["url"][1:]
         for material in tree.iter(f"{DAE}material")
     }
-    symbols = {
-        str(bound.get("symbol")): bound.attrib["target"][1:]
-        for bound in tree.iter(f"{DAE}instance_material")
-    }
+    symbols = {str(bound.get("symbol")): bound.attrib["target"][1:] for bound in tree.iter(f"{DAE}instance_material")}
     expected: Counter[tuple[float, ...]] = Counter()
     for kind in ("triangles", "polylist"):
         for listed in tree.iter(f"{DAE}{kind}"):
@@ -95,8 +91,9 @@ def test_an_obj_has_the_colours_of_its_library() -> None:
     files = {"meshes/cube.obj": CUBE.encode(), "meshes/cube.obj.mtl": COLOURS.encode()}
     parts = surfaces("meshes/cube.obj", files.get, np.array([1.0, 2.0, 3.0]))
     assert {tuple(np.round(part.colour or (), 2)): len(part.triangles) for part in parts} == {
-        (0.9, 0.05, 0.05): 6, (0.05, 0.8, 0.05): 6,
-    }  # fmt: skip
+        (0.9, 0.05, 0.05): 6,
+        (0.05, 0.8, 0.05): 6,
+    }
     assert np.abs(parts[0].vertices).max(axis=0).tolist() == [1.0, 2.0, 3.0]
     del files["meshes/cube.obj.mtl"]
     plain = surfaces("meshes/cube.obj", files.get, ONE)
@@ -105,9 +102,7 @@ def test_an_obj_has_the_colours_of_its_library() -> None:
 
 
 def test_what_has_no_colours_or_cannot_be_read() -> None:
-    triangle = (
-        b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
-    )
+    triangle = b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
     files = {"a.stl": triangle + b"endloop\nendfacet\nendsolid a\n", "b.dae": b"<a", "c.obj": b"v"}
     (part,) = surfaces("a.stl", files.get, ONE)
     assert part.colour is None and part.triangles.tolist() == [[0, 1, 2]]
@@ -124,9 +119,7 @@ URDF = """<robot name="cube"><material name="blue"><color rgba="0.1 0.1 0.9 1"/>
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_mesh_that_is_not_finite_is_not_drawn(
-    number: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mesh_that_is_not_finite_is_not_drawn(number: float, caplog: pytest.LogCaptureFixture) -> None:
     """A page whose numbers are not JSON shows nothing at all."""
     facet = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
     robot = read_urdf(URDF.replace("cube.obj", "cube.stl"))

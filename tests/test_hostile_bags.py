@@ -16,19 +16,7 @@ import mutations
 import numpy as np
 import pytest
 import zstandard
-from bags import (
-    CHANNEL,
-    FOOTER,
-    HEADER,
-    SCHEMA,
-    channel,
-    chunk,
-    joint_message,
-    message,
-    record,
-    sample,
-    serialised,
-)
+from bags import CHANNEL, FOOTER, HEADER, SCHEMA, channel, chunk, joint_message, message, record, sample, serialised
 from jail import MIB, SPECIAL, Jail, check_reading, without_slow
 from jail import jail as jail
 from jail import the_jail as the_jail
@@ -105,9 +93,7 @@ def many_files(bag: Path) -> None:
 
 def circle(bag: Path) -> None:
     """Rows enough for pages of pages, whose children then are all the same full one."""
-    with_sql(
-        f"{ENDLESS} INSERT INTO messages SELECT i + 99, 1, i, zeroblob(300) FROM r LIMIT 200000"
-    )(bag)
+    with_sql(f"{ENDLESS} INSERT INTO messages SELECT i + 99, 1, i, zeroblob(300) FROM r LIMIT 200000")(bag)
     file = bag / "bag.db3"
     pages = bytearray(file.read_bytes())
     interior = [start for start in range(4096, len(pages), 4096) if pages[start] == 5]
@@ -143,11 +129,7 @@ def hollow(size: int, content: bytes) -> Callable[[Path], None]:
     def make() -> bytes:
         chunks = content * (32 * MIB // len(content))
         packed = chunk(zipped(chunks), len(chunks), "zstd")
-        return mcap_of(
-            SCHEMA,
-            *(channel(i, f"/t{i}") for i in range(1, 1000)),
-            *[packed] * (size // len(packed)),
-        )
+        return mcap_of(SCHEMA, *(channel(i, f"/t{i}") for i in range(1, 1000)), *[packed] * (size // len(packed)))
 
     return with_mcap(make)
 
@@ -160,19 +142,12 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
         for what in ("a pipe", "3 GB of zeros")
     },
     "5000 files": many_files,
-    "10 GB in a chunk of 1 kB": with_mcap(
-        lambda: mcap_of(chunk(zipped(bytes(MIB), 10_000), 1000, "zstd"))
-    ),
-    "250 MB of zeros in a chunk": with_mcap(
-        lambda: mcap_of(chunk(zipped(bytes(MIB), 250), 250 * MIB, "zstd"))
-    ),
+    "10 GB in a chunk of 1 kB": with_mcap(lambda: mcap_of(chunk(zipped(bytes(MIB), 10_000), 1000, "zstd"))),
+    "250 MB of zeros in a chunk": with_mcap(lambda: mcap_of(chunk(zipped(bytes(MIB), 250), 250 * MIB, "zstd"))),
     "250 MB of messages in a chunk": with_mcap(
-        lambda: mcap_of(SCHEMA, CHANNEL, chunk(
-            zipped(message(bytes(44)) * 1000, 3500), 75 * 3_500_000, "zstd"))
+        lambda: mcap_of(SCHEMA, CHANNEL, chunk(zipped(message(bytes(44)) * 1000, 3500), 75 * 3_500_000, "zstd"))
     ),
-    "2.5 GB in a chunk of lz4": with_mcap(
-        lambda: mcap_of(chunk(lz4_zeros(2500 * MIB), 1000, "lz4"))
-    ),
+    "2.5 GB in a chunk of lz4": with_mcap(lambda: mcap_of(chunk(lz4_zeros(2500 * MIB), 1000, "lz4"))),
     "100 kB of joint states of nothing": hollow(100_000, message(nothing(0, 0))),
     "32 MB of joint states of 40,000 joints": hollow(0, message(nothing(40_000, 0))),
     "32 MB of joint states of 80,000 names": hollow(0, message(nothing(0, 80_000))),
@@ -184,37 +159,31 @@ HOSTILE_BAGS: dict[str, Callable[[Path], None]] = {
             *(message(bytes(4), number=i) for i in range(1, 1000)),
         )
     ),
-    "a message of 700 MB": with_mcap(
-        lambda: mcap_of(SCHEMA, CHANNEL, message(bytes(700 * MIB)))
-    ),
+    "a message of 700 MB": with_mcap(lambda: mcap_of(SCHEMA, CHANNEL, message(bytes(700 * MIB)))),
     "60 MB of small records": with_mcap(lambda: mcap_of(record(8) * (7 * MIB))),
-    "no topic in CDR": with_sql(
-        "UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"
-    ),
-    "stamps before 1970": with_sql(
-        "UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"
-    ),
+    "no topic in CDR": with_sql("UPDATE topics SET serialization_format = 'json'; DELETE FROM messages WHERE id = 3"),
+    "stamps before 1970": with_sql("UPDATE messages SET timestamp = -1; DELETE FROM messages WHERE id = 3"),
     "pages in a circle": circle,
     "100,000 topics": with_sql(
-        f"{ENDLESS} INSERT INTO topics SELECT i + 9, 't' || i, 'x', 'cdr', '', '' FROM r"
-        " LIMIT 100000"
+        f"{ENDLESS} INSERT INTO topics SELECT i + 9, 't' || i, 'x', 'cdr', '', '' FROM r LIMIT 100000"
     ),
-    "a message of 300 MB in a database": with_sql(
-        "UPDATE messages SET data = zeroblob(300000000) WHERE id = 1"
+    "a message of 300 MB in a database": with_sql("UPDATE messages SET data = zeroblob(300000000) WHERE id = 1"),
+    "laughing metadata": instead(
+        "metadata.yaml",
+        written(
+            lambda: (
+                "l0: &l0 [x]\n"
+                + "".join(f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 9))
+                + "rosbag2_bagfile_information: {compression_format: *l8}"
+            ).encode()
+        ),
     ),
-    "laughing metadata": instead("metadata.yaml", written(lambda: (
-        "l0: &l0 [x]\n" + "".join(
-            f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 9)
-        ) + "rosbag2_bagfile_information: {compression_format: *l8}"
-    ).encode())),
     "60 MB of metadata": instead("metadata.yaml", written(lambda: b"[" * (60 * MIB))),
-    "30 MB of provenance": instead("run.json", written(
-        lambda: b'{"format":1,"fmu":{},"x":[' + b'{"a":10},' * (3 * MIB) + b"0]}"
-    )),
-    "60 MB of provenance": instead("run.json", written(
-        lambda: b'{"format":1,"fmu":[' + b"{}," * (20 * MIB) + b"0]}"
-    )),
-}  # fmt: skip
+    "30 MB of provenance": instead(
+        "run.json", written(lambda: b'{"format":1,"fmu":{},"x":[' + b'{"a":10},' * (3 * MIB) + b"0]}")
+    ),
+    "60 MB of provenance": instead("run.json", written(lambda: b'{"format":1,"fmu":[' + b"{}," * (20 * MIB) + b"0]}")),
+}
 
 
 def test_hostile_bag(hostile_bag: Callable[[Path], None], jail: Jail, bags: Path) -> None:
@@ -226,8 +195,17 @@ def test_hostile_bag(hostile_bag: Callable[[Path], None], jail: Jail, bags: Path
 
 
 SLOW = {
-    "5000 files", "pages in a circle", "10 GB in a chunk of 1 kB", "2.5 GB in a chunk of lz4",
-    "250 MB of zeros in a chunk", "250 MB of messages in a chunk", "a message of 700 MB",
-    "a message of 300 MB in a database", "60 MB of small records", "60 MB of metadata",
-    "30 MB of provenance", "60 MB of provenance", "a thousand topics with profiles of their own",
-}  # fmt: skip
+    "5000 files",
+    "pages in a circle",
+    "10 GB in a chunk of 1 kB",
+    "2.5 GB in a chunk of lz4",
+    "250 MB of zeros in a chunk",
+    "250 MB of messages in a chunk",
+    "a message of 700 MB",
+    "a message of 300 MB in a database",
+    "60 MB of small records",
+    "60 MB of metadata",
+    "30 MB of provenance",
+    "60 MB of provenance",
+    "a thousand topics with profiles of their own",
+}

@@ -43,9 +43,14 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
         options = FmuOptions(control=control, native=True, fmi=fmi, arrays=fmi == 2)
         fmu = twodof.build_fmu(tmp_path_factory.mktemp("built") / "Arm.fmu", options)
         result = fmpy.simulate_fmu(
-            str(fmu), stop_time=END, step_size=0.01, output_interval=0.01, output=Q,
-            start_values={**COMMANDS[control], **TIGHT}, fmi_type="CoSimulation",
-        )  # fmt: skip
+            str(fmu),
+            stop_time=END,
+            step_size=0.01,
+            output_interval=0.01,
+            output=Q,
+            start_values={**COMMANDS[control], **TIGHT},
+            fmi_type="CoSimulation",
+        )
         end = [float(result[name][-1]) for name in Q]
         assert np.abs(np.subtract(end, (0.5, 0.35))).max() > 0.1  # it has moved
         plant = model("twodof", control).plant()

@@ -69,14 +69,16 @@ RESOLVED = {
     "one element": ({"x_des[2]": 0.1}, {"x_des[2]": 0.1}),
     "a scalar": ({"Kn": 5}, {"Kn": 5.0}),
     "a scalar as a vector of one": ({"Kn": [5]}, {"Kn": 5.0}),
-    "a vector of three": ({"gravity": [0, 0, -9.81]}, {f"gravity[{i}]": g for i, g in
-                          ((1, 0.0), (2, 0.0), (3, -9.81))}),
+    "a vector of three": (
+        {"gravity": [0, 0, -9.81]},
+        {f"gravity[{i}]": g for i, g in ((1, 0.0), (2, 0.0), (3, -9.81))},
+    ),
     "a Boolean": ({"limit_effort": True}, {"limit_effort": True}),
     "an element after its vector": ({"Kp": 80, "Kp[2]": 90}, {"Kp[1]": 80.0, "Kp[2]": 90.0}),
     "an array": ({"x_des": np.array([0.25, 0.1])}, {"x_des[1]": 0.25, "x_des[2]": 0.1}),
     "a number of numpy": ({"Kn": np.float64(5)}, {"Kn": 5.0}),
     "a Boolean of numpy": ({"limit_effort": np.bool_(True)}, {"limit_effort": True}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("settings", "values"), RESOLVED.values(), ids=RESOLVED)
@@ -114,9 +116,7 @@ UNRESOLVED = {
 
 
 @pytest.mark.parametrize(("settings", "culprit"), UNRESOLVED.values(), ids=UNRESOLVED)
-def test_setting_that_does_not_fit_the_fmu_is_refused(
-    fmu: Fmu, settings: dict[str, Setting], culprit: str
-) -> None:
+def test_setting_that_does_not_fit_the_fmu_is_refused(fmu: Fmu, settings: dict[str, Setting], culprit: str) -> None:
     with pytest.raises(InputError, match=culprit):
         resolve(fmu, settings)
 
@@ -148,9 +148,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize(("text", "changes"), TABLES.values(), ids=TABLES)
-def test_table_is_read(
-    fmu: Fmu, tmp_path: Path, text: str, changes: list[tuple[float, dict[str, float]]]
-) -> None:
+def test_table_is_read(fmu: Fmu, tmp_path: Path, text: str, changes: list[tuple[float, dict[str, float]]]) -> None:
     (tmp_path / "inputs.csv").write_text(text, "utf-8", newline="")
     assert read_changes(fmu, tmp_path / "inputs.csv") == changes
 
@@ -179,9 +177,7 @@ BAD_TABLES = {
 
 
 @pytest.mark.parametrize(("text", "culprit"), BAD_TABLES.values(), ids=BAD_TABLES)
-def test_refused_table_is_named_with_its_culprit(
-    fmu: Fmu, tmp_path: Path, text: str, culprit: str
-) -> None:
+def test_refused_table_is_named_with_its_culprit(fmu: Fmu, tmp_path: Path, text: str, culprit: str) -> None:
     path = tmp_path / "inputs.csv"
     path.write_text(text, "utf-8")
     with pytest.raises(InputError, match=culprit) as refusal:
@@ -284,9 +280,7 @@ def test_a_parameter_cannot_be_sent(fmu: Fmu) -> None:
 
 
 def test_a_setting_holds_throughout(fmu: Fmu) -> None:
-    run = twodof.samples(
-        fmu, stop_time=N * STEP, settings={"Kp": 80, "q_start": (0.4, 0.6)}, stamp_start=0
-    )
+    run = twodof.samples(fmu, stop_time=N * STEP, settings={"Kp": 80, "q_start": (0.4, 0.6)}, stamp_start=0)
     found = list(run)
     assert found[0].q == (0.4, 0.6)
     assert {(sample.inputs["Kp[1]"], sample.inputs["Kp[2]"]) for sample in found} == {(80.0, 80.0)}
@@ -314,9 +308,7 @@ def test_times_that_make_no_run_are_refused(fmu: Fmu, times: dict[str, Any], cul
         twodof.experiment(fmu, **times)
 
 
-@pytest.mark.parametrize(
-    ("stop", "step", "n"), [(5.0, 0.01, 500), (0.3, 0.1, 3), (1e4, 1e-3, 10**7)]
-)
+@pytest.mark.parametrize(("stop", "step", "n"), [(5.0, 0.01, 500), (0.3, 0.1, 3), (1e4, 1e-3, 10**7)])
 def test_number_of_steps_is_right_though_the_step_has_no_binary_form(
     fmu: Fmu, stop: float, step: float, n: int
 ) -> None:
@@ -329,9 +321,7 @@ def test_number_of_steps_is_right_though_the_step_has_no_binary_form(
 
 def test_changes_are_named_as_settings_are(fmu: Fmu) -> None:
     run = twodof.experiment(fmu, changes=[(0.1, {"x_des": (0.1, 0.2)}), (0.1, {"Kp": 9})])
-    assert run.changes == [
-        (0.1, {"x_des[1]": 0.1, "x_des[2]": 0.2}), (0.1, {"Kp[1]": 9.0, "Kp[2]": 9.0}),
-    ]  # fmt: skip
+    assert run.changes == [(0.1, {"x_des[1]": 0.1, "x_des[2]": 0.2}), (0.1, {"Kp[1]": 9.0, "Kp[2]": 9.0})]
 
 
 @pytest.mark.parametrize(

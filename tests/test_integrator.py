@@ -67,8 +67,14 @@ def test_steps_and_states_are_those_of_scipy(rtol, atol):
     q, v = advance(smooth(counted), [1.2], [0.0], h, FREE, rtol, atol, max_step)
     scipy = RK45(
         lambda t, y: np.concatenate((y[1:], acceleration(y[:1], y[1:]))),
-        0.0, [1.2, 0.0], h, max_step=max_step, rtol=rtol, atol=atol, first_step=max_step,
-    )  # fmt: skip
+        0.0,
+        [1.2, 0.0],
+        h,
+        max_step=max_step,
+        rtol=rtol,
+        atol=atol,
+        first_step=max_step,
+    )
     while scipy.status == "running":
         scipy.step()
     assert calls == scipy.nfev
@@ -139,9 +145,15 @@ def test_an_excursion_within_one_step_is_found():
 def test_joints_stop_each_at_its_own_limit_and_leave_the_others_alone():
     """Two within one step; one between them that turns in its range; one that has no room."""
     q, v = advance(
-        smooth(lambda q, v: [1.0, -2.0, 1.0, -7.0]), [0.0, 0.0, 0.0, 0.5], [1.0, 1.0, 1.0, 0.0],
-        0.5, [(-1, 0.02), (-9, 9), (-1, 0.04), (0.5, 0.5)], 1, 1, 0.5,
-    )  # fmt: skip
+        smooth(lambda q, v: [1.0, -2.0, 1.0, -7.0]),
+        [0.0, 0.0, 0.0, 0.5],
+        [1.0, 1.0, 1.0, 0.0],
+        0.5,
+        [(-1, 0.02), (-9, 9), (-1, 0.04), (0.5, 0.5)],
+        1,
+        1,
+        0.5,
+    )
     assert (q[0], q[2:], v[0], v[2:]) == (0.02, [0.04, 0.5], 0.0, [0.0, 0.0])
     assert (q[1], v[1]) == pytest.approx((0.5 - 0.25, 0.0), abs=1e-12)
 
@@ -163,8 +175,7 @@ def test_a_change_of_rank_is_located(h):
 def test_a_zone_of_lower_rank_is_not_missed_within_a_step(width):
     """q̈ = −100 in a zone around q = 0.05, which is crossed in a part of a step; else 0."""
     equations = jumping(
-        lambda q, v, rank: [0.0 if rank == 2 else -100.0],
-        lambda q: 0.01 + abs(q[0] - 0.05) - width / 2,
+        lambda q, v, rank: [0.0 if rank == 2 else -100.0], lambda q: 0.01 + abs(q[0] - 0.05) - width / 2
     )
     q, v = advance(equations, [0.0], [10.0], 0.01, FREE, 1e-3, 1e-6, 0.01)
     speed = np.sqrt(100.0 - 2 * 100.0 * width)
@@ -239,9 +250,8 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_rate(budget):
 def test_a_joint_that_answers_to_its_position_is_named_by_the_root_of_it(budget):
     with pytest.raises(StepError) as refused:
         advance(
-            smooth(lambda q, v: [-1e18 * q[0], -1e8 * v[1]]), [1.0, 0.0], [0.0, 1.0], 0.01,
-            FREE * 2, 1e-3, 1e-6, 1e-3,
-        )  # fmt: skip
+            smooth(lambda q, v: [-1e18 * q[0], -1e8 * v[1]]), [1.0, 0.0], [0.0, 1.0], 0.01, FREE * 2, 1e-3, 1e-6, 1e-3
+        )
     assert refused.value.joint == 0 and refused.value.rate == pytest.approx(1e9, rel=1e-6)
 
 

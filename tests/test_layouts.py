@@ -44,8 +44,7 @@ def test_rviz_shows_the_topics_of_the_bag_as_they_are_offered(bag: Path) -> None
     manager = config["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] == "world"
     metadata = YAML(typ="safe").load(bag / "metadata.yaml")["rosbag2_bagfile_information"]
-    topics = {it["topic_metadata"]["name"]: it["topic_metadata"]
-              for it in metadata["topics_with_message_count"]}  # fmt: skip
+    topics = {it["topic_metadata"]["name"]: it["topic_metadata"] for it in metadata["topics_with_message_count"]}
     shown = {}
     for display in manager["Displays"]:
         for topic in dictionaries(display):
@@ -100,9 +99,7 @@ def test_names_are_text_and_topics_are_in_the_namespace(
 ) -> None:
     urdf = (Path(__file__).parents[1] / "urdf" / "2dof.urdf").read_text("utf-8")
     (tmp_path / "odd.urdf").write_text(urdf.replace("joint1", "a&quot;&lt;b>"), "utf-8")
-    fmu = twodof.build_fmu(
-        tmp_path / "Odd.fmu", twodof.FmuOptions(urdf=tmp_path / "odd.urdf", meshes=False)
-    )
+    fmu = twodof.build_fmu(tmp_path / "Odd.fmu", twodof.FmuOptions(urdf=tmp_path / "odd.urdf", meshes=False))
     rviz, juggler, foxglove = twodof.layouts(fmu, tmp_path, namespace="left")
     curves = [curve.get("name") for curve in ET.parse(juggler).getroot().iter("curve")]
     assert curves[0] == '/left/joint_states/a"<b>/position'
@@ -120,9 +117,7 @@ def test_names_are_text_and_topics_are_in_the_namespace(
     assert len([*(tmp_path / "none" / "yet").iterdir()]) == 3
 
 
-def test_layouts_that_were_changed_stay(
-    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_layouts_that_were_changed_stay(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["layouts", str(bag.parent / "Arm 1.fmu"), "-o", str(tmp_path)]
     assert main(command) == main(command) == 0
     rviz, juggler = tmp_path / "Arm 1.rviz", tmp_path / "Arm 1.plotjuggler.xml"

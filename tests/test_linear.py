@@ -23,9 +23,7 @@ UPRIGHT = [np.pi / 2, 0.0]
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory):
-    return build_fmu(
-        tmp_path_factory.mktemp("bare") / "Bare.fmu", FmuOptions(native=True, control="effort")
-    )
+    return build_fmu(tmp_path_factory.mktemp("bare") / "Bare.fmu", FmuOptions(native=True, control="effort"))
 
 
 def test_a_target_reached_has_the_poles_of_its_gains(native_path):
@@ -112,17 +110,18 @@ def test_a_pole_of_rounding_is_zero(native_path):
     assert (still.eigenvalue, still.frequency) == (0.0, 0.0) and np.isnan(still.damping)
     expected = [-10.0, *np.roots([1.0, 20.0, 50.0])]
     found = [mode.eigenvalue for mode in others]
-    assert np.sort_complex(np.array(found)) == pytest.approx(
-        np.sort_complex(np.array(expected)), abs=1e-9
-    )
+    assert np.sort_complex(np.array(found)) == pytest.approx(np.sort_complex(np.array(expected)), abs=1e-9)
 
 
 @pytest.fixture(scope="module")
 def ur10(tmp_path_factory):
     options = FmuOptions(
-        urdf=robots_folder() / "ur_description/urdf/ur10_joint_limited_robot.urdf", frame="tool0",
-        control="pose", native=True, meshes=False,
-    )  # fmt: skip
+        urdf=robots_folder() / "ur_description/urdf/ur10_joint_limited_robot.urdf",
+        frame="tool0",
+        control="pose",
+        native=True,
+        meshes=False,
+    )
     return build_fmu(tmp_path_factory.mktemp("ur10") / "UR10.fmu", options)
 
 

@@ -89,9 +89,8 @@ def closed(fmu: Path, n: int, steps: int, delay: Callable[[int], int]) -> Iterat
 
 
 def test_lockstep_is_the_loop_closed_in_python_to_the_bit(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
-    length: Callable[[int, int], int],
-) -> None:  # fmt: skip
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
+) -> None:
     fmu, steps = bare(7), length(6000, 1000)
     node = listen(*control(7))
     bag = tmp_path / "bag"
@@ -101,9 +100,7 @@ def test_lockstep_is_the_loop_closed_in_python_to_the_bit(
     assert err == ""
     print(re.search("time .*", out))
     states = recorded(bag)["/joint_states"]
-    assert [stamp_of(state[0]) for state in states] == [
-        1000 * SECOND + k * SECOND // 100 for k in range(steps + 1)
-    ]
+    assert [stamp_of(state[0]) for state in states] == [1000 * SECOND + k * SECOND // 100 for k in range(steps + 1)]
     truth = [[[*s.q], [*s.v]] for s in closed(fmu, 7, steps, lambda k: 0)]
     assert [state[2:4] for state in states] == truth
     node.leave()
@@ -111,9 +108,8 @@ def test_lockstep_is_the_loop_closed_in_python_to_the_bit(
 
 
 def test_lockstep_gives_the_same_bytes_each_time(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
-    length: Callable[[int, int], int],
-) -> None:  # fmt: skip
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
+) -> None:
     fmu, contents = bare(2), []
     options = ["--lockstep", "--stamp-start", "1000", "--stop-time", "2", "--scene"]
     bag = tmp_path / "bag"
@@ -131,9 +127,8 @@ def test_lockstep_gives_the_same_bytes_each_time(
 
 
 def test_a_controller_in_real_time_misses_nothing(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
-    length: Callable[[int, int], int],
-) -> None:  # fmt: skip
+    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
+) -> None:
     """Each step has the answer to a sample of just before; with those delays, the same bits."""
     fmu, steps = bare(7), 100 * length(60, 4)
     node = listen("/joint_states", *control(7))
@@ -172,21 +167,24 @@ def test_a_controller_in_real_time_misses_nothing(
     [
         ((), "", "nobody publishes on /joint_commands"),
         (("/joint_commands=command",), "", "nobody hears /joint_states"),
+        (("/joint_commands=command", "/joint_states"), "", "who publishes on /joint_commands is silent"),
         (
-            ("/joint_commands=command", "/joint_states"), "",
-            "who publishes on /joint_commands is silent",
-        ),
-        (
-            ("/joint_commands=command", "/joint_states"), "1 5000000007 joint1 - - 0.1",
+            ("/joint_commands=command", "/joint_states"),
+            "1 5000000007 joint1 - - 0.1",
             "the latest on /joint_commands is stamped 5.000000007 s, not 9.000000000 s;"
             " a command has the stamp of the state that it answers",
         ),
     ],
-)  # fmt: skip
+)
 def test_lockstep_says_who_is_missing(
-    bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen,
-    topics: tuple[str, ...], command: str, missing: str,
-) -> None:  # fmt: skip
+    bare: Callable[[int], Path],
+    tmp_path: Path,
+    number: int,
+    listen: Listen,
+    topics: tuple[str, ...],
+    command: str,
+    missing: str,
+) -> None:
     node = listen(*topics) if topics else None
 
     def opened(wire: twodof.Publisher) -> None:
@@ -269,23 +267,23 @@ def test_commands_that_mean_nothing_or_are_absurd_end_no_run(
     for ramp in values:  # to 0, where no command comes in time
         assert ramp.keys() == {"tau_cmd[1]"} and 0.0 <= ramp["tau_cmd[1]"] <= 0.25
     assert np.isfinite([state[2:4] for state in recorded(bag)["/joint_states"]]).all()
-    found = sorted(
-        line.removeprefix("WARNING: a command on /joint_commands ") for line in err.splitlines()
-    )
+    found = sorted(line.removeprefix("WARNING: a command on /joint_commands ") for line in err.splitlines())
     expected = [
-        "WARNING: no command for 0.5 s", "WARNING: step ", "cannot be read",
-        "has 1 efforts for 2 joints", "is not finite", "is of joints that this",
+        "WARNING: no command for 0.5 s",
+        "WARNING: step ",
+        "cannot be read",
+        "has 1 efforts for 2 joints",
+        "is not finite",
+        "is of joints that this",
         "is of no joint of this robot: 'elbow'",
         "is stamped 8.64e+04 s before the sample",
-    ]  # fmt: skip
+    ]
     assert len(found) == len(expected)
     for line, text in zip(found, expected):
         assert line.startswith(text)
 
 
-def test_a_flood_of_commands_holds_nothing_up(
-    jointed: Path, tmp_path: Path, number: int, listen: Listen
-) -> None:
+def test_a_flood_of_commands_holds_nothing_up(jointed: Path, tmp_path: Path, number: int, listen: Listen) -> None:
     """Some 10,000 a second; the newest wins."""
     bag = tmp_path / "bag"
     node = listen("/joint_states", "/joint_commands=command")
@@ -293,9 +291,7 @@ def test_a_flood_of_commands_holds_nothing_up(
         node.hears()
         node.say("/joint_commands 5000 0 joint2,joint1 0.1,0.2 - -")
         node.say("/joint_commands 1 0 joint2,joint1 0.3,0.4 - -")
-        node.until(
-            lambda: np.allclose(node.messages("/joint_states")[-1][2], (0.4, 0.3), atol=1e-2)
-        )
+        node.until(lambda: np.allclose(node.messages("/joint_states")[-1][2], (0.4, 0.3), atol=1e-2))
         process.send_signal(signal.SIGINT)
         ended(process, 130)
     changes = json.loads((bag / "run.json").read_text())["input_changes"]
@@ -313,9 +309,13 @@ def test_names_of_topics(jointed: Path, number: int, listen: Listen) -> None:
         node.until(lambda: ["matched", "/left/arm/command", 1] in node.told)
         topics = process.told[0].split(maxsplit=1)[1].strip().split(", ")
     assert {*topics} == {
-        "/robot_joint_states", "/clock", "/left/tf", "/left/tf_static", "/left/robot_description",
+        "/robot_joint_states",
+        "/clock",
+        "/left/tf",
+        "/left/tf_static",
+        "/left/robot_description",
         "/left/end_effector",
-    }  # fmt: skip
+    }
 
 
 def test_several_robots_are_in_step_and_apart(
@@ -350,9 +350,7 @@ def test_several_robots_are_in_step_and_apart(
 
 
 @pytest.mark.parametrize("speed", [0.1, 10.0])
-def test_the_clock_is_that_of_the_simulation(
-    native_path: Path, number: int, listen: Listen, speed: float
-) -> None:
+def test_the_clock_is_that_of_the_simulation(native_path: Path, number: int, listen: Listen, speed: float) -> None:
     node = listen("/clock=clock", "/joint_states")
     end = 4 * speed
     options = ["--clock", "--speed", str(speed), "--stamp-start", "100"]

@@ -127,9 +127,13 @@ def play(page: Page, until_time: float) -> list[dict[str, str]]:
 
 
 def assert_follows(
-    seen: list[dict[str, str]], target: Sequence[float] | np.ndarray, *,
-    kp: float = KP, kd: float = KD, rounded: float = ROUNDED,
-) -> None:  # fmt: skip
+    seen: list[dict[str, str]],
+    target: Sequence[float] | np.ndarray,
+    *,
+    kp: float = KP,
+    kd: float = KD,
+    rounded: float = ROUNDED,
+) -> None:
     """The arm goes from its start to the target as the closed form says."""
     t = np.array([time_of(found) for found in seen])
     x = np.array([numbers(found["end effector"])[:2] for found in seen])
@@ -220,10 +224,7 @@ def test_a_parameter_begins_the_run_anew(page: Page) -> None:
     until(page, lambda value: value == 0, lambda page: page.evaluate("arm.values.get('payload')"))
 
 
-ORDERS = (
-    ["no order"], ["[]"], ['["leave", 1]'], ['["change", 3]'], ['["change"]'], ["{}"],
-    [b"\xff"], ["x" * 100_000],
-)  # fmt: skip
+ORDERS = (["no order"], ["[]"], ['["leave", 1]'], ['["change", 3]'], ['["change"]'], ["{}"], [b"\xff"], ["x" * 100_000])
 
 
 def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> None:
@@ -288,9 +289,7 @@ def test_a_setting_that_is_none_is_told_as_text(command: Served, page: Page) -> 
     until(page, lambda value: value == 60.0, lambda page: page.evaluate("arm.held('Kp')[0]"))
 
 
-def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(
-    shown: Browser, fmu_path: Path, tmp_path: Path
-) -> None:
+def test_neither_who_never_reads_nor_ctrl_c_harms_a_recording(shown: Browser, fmu_path: Path, tmp_path: Path) -> None:
     """In the Python flavour; what is beyond the page's own pace is not waited for."""
     with served("live", fmu_path, cwd=tmp_path) as command:
         place = urlsplit(socket_of(command))
@@ -321,9 +320,7 @@ def test_closing_the_last_page_pauses(native_path: Path, tmp_path: Path) -> None
         assert end(command, tmp_path, signal.SIGTERM) >= seen - 1e-6
 
 
-def latest(
-    command: Served, condition: Callable[[dict[str, Any]], bool], *orders: list[Any]
-) -> dict[str, Any]:
+def latest(command: Served, condition: Callable[[dict[str, Any]], bool], *orders: list[Any]) -> dict[str, Any]:
     """News that fulfil a condition, as told to a page that gives orders, and then leaves."""
     with open_socket(socket_of(command)) as connection:
         for order in orders:
@@ -379,11 +376,11 @@ def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> 
         page.goto(command.url)
         page.wait_for_selector(browser.READY)
         for code in (
-            f"new WebSocket('ws://127.0.0.1:{port}')", f"fetch('http://127.0.0.1:{port}')",
+            f"new WebSocket('ws://127.0.0.1:{port}')",
+            f"fetch('http://127.0.0.1:{port}')",
             f"new Image().src = 'http://127.0.0.1:{port}'",
-            "document.body.append(Object.assign(document.createElement('script'),"
-            " {text: 'document.title = 1'}))",
-        ):  # fmt: skip
+            "document.body.append(Object.assign(document.createElement('script'), {text: 'document.title = 1'}))",
+        ):
             page.evaluate(f"() => {{ try {{ {code}; }} catch {{}} }}")
         page.wait_for_timeout(500)
         assert page.title() == "2dof - twodof"
@@ -427,10 +424,7 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
     given = made["start_values"]
     ((moment_of_change, values),) = made["input_changes"]
     assert values == {"x_des[1]": 0.15}
-    run = twodof.experiment(
-        native_path,
-        start_time=first, stop_time=first + (len(states) - 1) * 0.01, settings=given,
-    )  # fmt: skip
+    run = twodof.experiment(native_path, start_time=first, stop_time=first + (len(states) - 1) * 0.01, settings=given)
     again = twodof.samples(run)
     sample = next(again)
     for k, state in enumerate(states):
@@ -482,9 +476,7 @@ def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_p
             link.remove(part)
     urdf = tmp_path / "panda.urdf"
     urdf.write_text(ET.tostring(tree, encoding="unicode"))
-    options = twodof.FmuOptions(
-        urdf=urdf, frame="panda_hand", control="pose", q_start=oracles.REST["panda"]
-    )
+    options = twodof.FmuOptions(urdf=urdf, frame="panda_hand", control="pose", q_start=oracles.REST["panda"])
     fmu = twodof.build_fmu(tmp_path / "Panda.fmu", options)
     with served("live", fmu, cwd=tmp_path) as command, opened(shown, command.url) as page:
         pause(page)
@@ -518,9 +510,7 @@ def test_a_page_whose_server_ends_goes_on_with_the_next(
     """
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # the server that is killed leaves a folder
     (tmp_path / "slider.urdf").write_text(SLIDER)
-    options = twodof.FmuOptions(
-        urdf=tmp_path / "slider.urdf", frame="tip", axes="xy", q_start=(0.1, 0.6)
-    )
+    options = twodof.FmuOptions(urdf=tmp_path / "slider.urdf", frame="tip", axes="xy", q_start=(0.1, 0.6))
     slider = twodof.build_fmu(tmp_path / "Slider.fmu", options)
     with served("live", native_path, cwd=tmp_path) as command:
         port = urlsplit(command.url).port or 0

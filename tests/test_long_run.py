@@ -39,16 +39,10 @@ def test_a_day_has_flat_memory_and_exact_stamps(
     steps = length(DAY, 60_000)
     bag = tmp_path / "bag"
     command = [sys.executable, "-c", RUN, str(native_path), str(bag), storage, str(steps)]
-    done = subprocess.run(
-        [*command, str(START)], cwd=Path(__file__).parent, capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
+    done = subprocess.run([*command, str(START)], cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     growth, wall_time = map(float, done.stdout.split())
     size = sum(file.stat().st_size for file in bag.iterdir())
-    print(
-        f"{steps} steps, {storage}: memory grew by {growth / MIB:.1f} MiB,"
-        f" {wall_time:.0f} s, {size / 1e9:.2f} GB"
-    )
+    print(f"{steps} steps, {storage}: memory grew by {growth / MIB:.1f} MiB, {wall_time:.0f} s, {size / 1e9:.2f} GB")
     assert growth <= 10e6
     last = START * SECOND + steps * PERIOD
     told = metadata(bag)

@@ -36,9 +36,14 @@ def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> 
     """What is set before a step holds for it, and what is set after a reset is not reset."""
     loop = loop_of(native_path)
     for order, value in (
-        ("change", {"x_des[1]": 0.11}), ("step", None), ("change", {"x_des[1]": 0.12}),
-        ("step", None), ("reset", everything), ("change", {"x_des[2]": 0.07}), ("step", None),
-    ):  # fmt: skip
+        ("change", {"x_des[1]": 0.11}),
+        ("step", None),
+        ("change", {"x_des[1]": 0.12}),
+        ("step", None),
+        ("reset", everything),
+        ("change", {"x_des[2]": 0.07}),
+        ("step", None),
+    ):
         loop.tell(order, value)
     loop.play(lambda: loop.news()["run"] > 1 and loop.news()["t"] == 0.01)
     news = loop.news()
@@ -122,10 +127,7 @@ def test_full_disk_ends_the_recording_alone(native_path: Path, disk: Callable[..
     try:
         loop.tell("record", True)
         wait_until(lambda: loop.news()["recorded"] > 20)
-        with (
-            pytest.raises(OSError, match="No space left"),
-            (bag.parent / "other").open("wb") as other,
-        ):
+        with pytest.raises(OSError, match="No space left"), (bag.parent / "other").open("wb") as other:
             while True:
                 other.write(bytes(256))
                 other.flush()

@@ -99,9 +99,7 @@ def test_a_sink_is_left_with_the_error_that_ends_the_run(native_path):
 
 def test_a_run_that_is_asked_to_stop_ends_between_steps(native_path):
     recorder = Recorder()
-    summary = twodof.simulate(
-        native_path, recorder, stop_time=1.0, stop=lambda: len(recorder.samples) > 5
-    )
+    summary = twodof.simulate(native_path, recorder, stop_time=1.0, stop=lambda: len(recorder.samples) > 5)
     assert summary.stopped
     assert summary.last.k == len(recorder.samples) - 1 < 10
 
@@ -167,9 +165,8 @@ def test_steering_holds_from_the_sample_on_that_it_answers(native_path):
     answers: dict[int, Any] = {3: {"x_des": (0.1, 0.2)}, 7: {"Kp[2]": 80.0}, 20: {"Kp": 1.0}}
     recorder = Recorder()
     twodof.simulate(
-        native_path, recorder, stop_time=0.2, stamp_start=0.0,
-        steer=lambda: answers.get(recorder.samples[-1].k),
-    )  # fmt: skip
+        native_path, recorder, stop_time=0.2, stamp_start=0.0, steer=lambda: answers.get(recorder.samples[-1].k)
+    )
     run = twodof.samples(native_path, stop_time=0.2, stamp_start=0.0)
     expected = [next(run)]
     expected += [run.send(answers.get(k)) for k in range(20)]
@@ -187,9 +184,13 @@ def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
         return at_rest(fmu, sample)
 
     twodof.simulate(
-        fmu, recorder, stop_time=0.2, step=0.01, resume=resume,
+        fmu,
+        recorder,
+        stop_time=0.2,
+        step=0.01,
+        resume=resume,
         steer=lambda: {"x_des": (1e308, 1e308)} if recorder.samples[-1].k == 5 else None,
-    )  # fmt: skip
+    )
     assert reasons == [(5, "discarded")]
     before, *after = recorder.samples[5:]
     assert max(map(abs, before.v)) > 0.1
@@ -217,9 +218,8 @@ def test_what_a_run_goes_on_with_holds_since_then(native_path, monkeypatch):
 
         monkeypatch.setattr(instance, "step", breaks)
         run = twodof.samples(
-            fmu, stop_time=0.1, step=0.01, instance=instance,
-            resume=lambda sample, error: at_rest(fmu, sample),
-        )  # fmt: skip
+            fmu, stop_time=0.1, step=0.01, instance=instance, resume=lambda sample, error: at_rest(fmu, sample)
+        )
         since = [sample.since for sample in run]
     assert since == [0.0] * 7 + [0.06] * 4
 
@@ -235,10 +235,11 @@ def test_what_cannot_run_together_opens_no_sink(native_path, monkeypatch):
     options: dict[str, Any] = {"stop_time": 0.1, "stamp_start": 0.0}
     first = Member(twodof.experiment(native_path, **options), [recorder])
     for other, error in (
-        ({**options, "stop_time": 0.2}, InputError), ({**options, "start_time": 0.05}, InputError),
+        ({**options, "stop_time": 0.2}, InputError),
+        ({**options, "start_time": 0.05}, InputError),
         ({**options, "stamp_start": 1.0}, InputError),
         ({**options, "settings": {"rtol": -1.0}}, SimulationError),
-    ):  # fmt: skip
+    ):
         with pytest.raises(error, match=r"what runs together|rtol = -1 must be"):
             simulate_together([first, Member(twodof.experiment(native_path, **other), [])])
     unstamped = Member(twodof.experiment(native_path, stop_time=0.1), [])
@@ -268,9 +269,7 @@ def test_a_refusal_of_the_fmu_comes_with_its_own_words(native_path):
     ],
 )
 @in_child_process
-def test_an_fmu_that_misbehaves_ends_the_run_with_what_was_good(
-    fmu_path, tmp_path, inside, message
-):
+def test_an_fmu_that_misbehaves_ends_the_run_with_what_was_good(fmu_path, tmp_path, inside, message):
     recorder = Recorder()
     with pytest.raises(SimulationError, match=message):
         twodof.simulate(changed_step(fmu_path, tmp_path, inside), recorder, stop_time=1.0)
@@ -377,9 +376,7 @@ def test_options_beside_an_experiment_are_refused(native_path, how):
         list(how(run, settings={"Kp": 10.0}, step=0.1))
 
 
-def test_threads_stay_in_the_working_directory_while_an_fmu_is_loaded(
-    tmp_path, native_path, fmu_path, monkeypatch
-):
+def test_threads_stay_in_the_working_directory_while_an_fmu_is_loaded(tmp_path, native_path, fmu_path, monkeypatch):
     """It is one for the whole process: files of others would be elsewhere."""
     monkeypatch.chdir(tmp_path)
     there, ended = [], threading.Event()

@@ -146,10 +146,7 @@ FORGED = {
     "no JSON": ([b"\x80\x04cos\nsystem\n"], "answer is none"),
     "other JSON": ([b'{"a": 1}'], "answer is none"),
     "other numbers": ([head((3, 1, 1, 1))], "answer is none"),
-    "a small negative size": (
-        [head((-1, 0, 1, 1, 1), (4, 1, 1, 1, 1)), POINTS, TRIANGLE],
-        "answer is none",
-    ),
+    "a small negative size": ([head((-1, 0, 1, 1, 1), (4, 1, 1, 1, 1)), POINTS, TRIANGLE], "answer is none"),
     "nothing drawn": ([b"[]", b"", b""], "no triangles"),
     "a negative size": ([head((-8, 1, 1, 1, 1), (11, 0, 1, 1, 1))], "answer is none"),
     "too many": ([head((10**12, 1, 1, 1, 1))], "answer is too long"),
@@ -165,9 +162,8 @@ FORGED = {
 
 @pytest.mark.parametrize(("answers", "reason"), FORGED.values(), ids=FORGED)
 def test_answers_of_a_reader_in_the_power_of_its_file(
-    answers: list[bytes], reason: str, monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+    answers: list[bytes], reason: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """Injected code may send what it likes; a pickle would be a program."""
     monkeypatch.setattr(meshes_module, "serve", forging(answers))
     with Meshes({"a.stl": STL}.get) as meshes:
@@ -202,9 +198,7 @@ def test_all_that_draws_goes_on(
     monkeypatch.chdir(tmp_path)
     for name, content in {"r.urdf": ROBOT.encode(), "bad.dae": ITSELF, "good.stl": STL}.items():
         Path(name).write_bytes(content)
-    assert (
-        main(["build", "--native", "r.urdf", "--axes", "x", "-o", "R.fmu", "--frame", "arm"]) == 0
-    )
+    assert main(["build", "--native", "r.urdf", "--axes", "x", "-o", "R.fmu", "--frame", "arm"]) == 0
     run, view = "run R.fmu --scene --stop-time 0.1 -o bag", "view bag --export bag.html"
     for command in (run, view, "page R.fmu -o page.html"):
         caplog.clear()

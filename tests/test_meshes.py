@@ -58,9 +58,7 @@ def numbers(element: ElementTree.Element, path: str, attribute: str) -> list[flo
 def test_mesh_is_closed_and_oriented_outwards(name: str) -> None:
     corners = facets(name)
     edges = Counter(
-        (tuple(triangle[i]), tuple(triangle[(i + 1) % 3]))
-        for triangle in corners.tolist()
-        for i in range(3)
+        (tuple(triangle[i]), tuple(triangle[(i + 1) % 3])) for triangle in corners.tolist() for i in range(3)
     )
     # each edge belongs to two triangles, which run along it in opposite directions
     assert set(edges.values()) == {1}
@@ -124,14 +122,10 @@ def test_inertial_is_that_of_the_mesh(name: str) -> None:
     assert inertial is not None
 
     assert numbers(inertial, "mass", "value") == pytest.approx([surface.mass], rel=1e-9)
-    np.testing.assert_allclose(
-        numbers(inertial, "origin", "xyz"), surface.center_mass, rtol=1e-9, atol=1e-12
-    )
+    np.testing.assert_allclose(numbers(inertial, "origin", "xyz"), surface.center_mass, rtol=1e-9, atol=1e-12)
     assert numbers(inertial, "origin", "rpy") == [0.0, 0.0, 0.0]
     axes = "xyz"
-    inertia = [
-        [numbers(inertial, "inertia", f"i{''.join(sorted(a + b))}")[0] for b in axes] for a in axes
-    ]
+    inertia = [[numbers(inertial, "inertia", f"i{''.join(sorted(a + b))}")[0] for b in axes] for a in axes]
     np.testing.assert_allclose(inertia, surface.moment_inertia, rtol=1e-9, atol=1e-15)
 
 

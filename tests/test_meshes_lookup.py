@@ -60,32 +60,24 @@ FOUND = {
     "mesh_dir is the package": (PACKAGE, "ws/arm_description", b"base"),
     "mesh_dir is the mesh folder": (PACKAGE, "ws/arm_description/meshes", b"base"),
     "mesh_dir above a subfolder": (
-        "package://arm_description/meshes/visual/link.stl", "ws/arm_description/meshes", b"visual",
+        "package://arm_description/meshes/visual/link.stl",
+        "ws/arm_description/meshes",
+        b"visual",
     ),
     "model://": ("model://arm_description/meshes/base.stl", "ws", b"base"),
     "the URDF's package": (PACKAGE, None, b"base"),
-    "another package, mesh_dir holds both": (
-        "package://tool_description/meshes/tool.stl", "ws", b"tool",
-    ),
-    "the URDF's package in a folder of another name": (
-        "package://renamed/meshes/base.stl", None, b"base",
-    ),
+    "another package, mesh_dir holds both": ("package://tool_description/meshes/tool.stl", "ws", b"tool"),
+    "the URDF's package in a folder of another name": ("package://renamed/meshes/base.stl", None, b"base"),
     "relative to the URDF": ("beside.stl", None, b"beside"),
     "relative to the URDF with ./": ("./beside.stl", None, b"beside"),
     "relative to the URDF though mesh_dir is given": ("beside.stl", "ws", b"beside"),
     "a link to inside the places": ("link.stl", None, b"base"),
     "relative, in the URDF's package": ("../meshes/base.stl", None, b"base"),
     "relative to mesh_dir": ("visual/link.stl", "ws/arm_description/meshes", b"visual"),
-    "relative, out of the URDF's folder but inside mesh_dir": (
-        "../meshes/base.stl", "ws/arm_description", b"base",
-    ),
-    "percent and entity": (
-        "package://arm_description/meshes/with%20space%20&amp;%20more.stl", "ws", b"space",
-    ),
-    "entity in a relative name": (
-        "with space &amp; more.stl", "ws/arm_description/meshes", b"space",
-    ),
-}  # fmt: skip
+    "relative, out of the URDF's folder but inside mesh_dir": ("../meshes/base.stl", "ws/arm_description", b"base"),
+    "percent and entity": ("package://arm_description/meshes/with%20space%20&amp;%20more.stl", "ws", b"space"),
+    "entity in a relative name": ("with space &amp; more.stl", "ws/arm_description/meshes", b"space"),
+}
 
 
 @pytest.mark.parametrize(("uri", "mesh_dir", "content"), FOUND.values(), ids=FOUND)
@@ -97,13 +89,14 @@ def test_mesh_is_found(disk: Path, uri: str, mesh_dir: str | None, content: byte
 @pytest.mark.parametrize("scheme", ["file://", ""])
 @pytest.mark.parametrize(
     ("name", "mesh_dir"),
-    [("arm_description/urdf/beside.stl", None), ("arm_description/meshes/base.stl", None),
-     ("tool_description/meshes/tool.stl", "ws")],
+    [
+        ("arm_description/urdf/beside.stl", None),
+        ("arm_description/meshes/base.stl", None),
+        ("tool_description/meshes/tool.stl", "ws"),
+    ],
     ids=["URDF's folder", "URDF's package", "mesh_dir"],
-)  # fmt: skip
-def test_absolute_name_is_found_where_meshes_may_be(
-    disk: Path, scheme: str, name: str, mesh_dir: str | None
-) -> None:
+)
+def test_absolute_name_is_found_where_meshes_may_be(disk: Path, scheme: str, name: str, mesh_dir: str | None) -> None:
     content = FILES[f"ws/{name}"]
     assert collect(disk, f"{scheme}{disk}/ws/{name}", mesh_dir) == content
 
@@ -121,7 +114,7 @@ ABSENT = {
     "absolute, not there": ("/nowhere/none.stl", None),
     "another scheme": ("http://example.com/a.stl", "ws"),
     "not a URI": ("package://[arm/a.stl", "ws"),
-}  # fmt: skip
+}
 ELSEWHERE = {
     "a folder": ("package://arm_description/meshes", "ws"),
     "no name": ("", "ws"),
@@ -143,7 +136,7 @@ ELSEWHERE = {
     "relative, out of the URDF's package": ("../../../secret.stl", None),
     "relative, out of mesh_dir": ("../secret.stl", "ws"),
     "relative, beside mesh_dir": ("../ws2/secret.stl", "ws"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("uri", "mesh_dir"), ABSENT.values(), ids=ABSENT)
@@ -157,9 +150,7 @@ def test_warning_names_the_mesh_that_is_left_out(
 
 
 @pytest.mark.parametrize(("uri", "mesh_dir"), ELSEWHERE.values(), ids=ELSEWHERE)
-def test_refusal_names_the_mesh_and_where_it_may_be(
-    disk: Path, uri: str, mesh_dir: str | None
-) -> None:
+def test_refusal_names_the_mesh_and_where_it_may_be(disk: Path, uri: str, mesh_dir: str | None) -> None:
     uri = uri.format(disk=disk)
     (disk / "ws2").mkdir()
     (disk / "ws2/secret.stl").write_bytes(b"secret")
@@ -186,9 +177,7 @@ def test_folder_of_the_urdf_alone_where_there_is_no_package(disk: Path, uri: str
 
 @pytest.mark.parametrize("mesh_dir", ["ws", None])
 @pytest.mark.parametrize("link", ["meshes/link.stl", "urdf/link.stl", "more", "meshes/more"])
-def test_symbolic_link_out_of_the_places_is_refused(
-    disk: Path, link: str, mesh_dir: str | None
-) -> None:
+def test_symbolic_link_out_of_the_places_is_refused(disk: Path, link: str, mesh_dir: str | None) -> None:
     folder = disk / "ws/arm_description"
     folder.joinpath(link).symlink_to(disk if "more" in link else disk / "secret.stl")
     name = f"{link}/secret.stl" if "more" in link else link
@@ -220,20 +209,14 @@ def test_a_mesh_used_twice_is_taken_along_once(disk: Path) -> None:
 
 
 def test_nothing_but_the_names_of_meshes_changes(disk: Path) -> None:
-    before = urdf(PACKAGE).replace(
-        "<link", '<!-- <mesh filename="package://old/gone.stl"/> -->\n<link\n  '
-    )
+    before = urdf(PACKAGE).replace("<link", '<!-- <mesh filename="package://old/gone.stl"/> -->\n<link\n  ')
     after, _ = collect_meshes(before, disk, disk / "ws")
     expected = before.replace(PACKAGE, "package://meshes/base.stl")
-    assert ET.canonicalize(after, with_comments=True) == ET.canonicalize(
-        expected, with_comments=True
-    )
+    assert ET.canonicalize(after, with_comments=True) == ET.canonicalize(expected, with_comments=True)
 
 
 def test_characters_that_trouble_file_systems_are_replaced(disk: Path) -> None:
-    _, files = collect_meshes(
-        urdf("package://arm_description/meshes/with%20space%20%26%20more.stl"), disk, disk / "ws"
-    )
+    _, files = collect_meshes(urdf("package://arm_description/meshes/with%20space%20%26%20more.stl"), disk, disk / "ws")
     assert list(files) == ["meshes/with_space___more.stl"]
 
 
@@ -272,9 +255,7 @@ LIBRARY = {
 
 
 @pytest.mark.parametrize(("name", "content"), LIBRARY.values(), ids=LIBRARY)
-def test_an_obj_brings_the_library_of_its_colours(
-    disk: Path, name: str, content: bytes | None
-) -> None:
+def test_an_obj_brings_the_library_of_its_colours(disk: Path, name: str, content: bytes | None) -> None:
     folder = disk / "ws/arm_description/meshes"
     (folder / "box.obj").write_text(f"# a box\r\nmtllib {name}\r\nv 0 0 0\r\n")
     if content:

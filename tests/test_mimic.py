@@ -129,9 +129,7 @@ def test_the_bag_of_either_flavour_moves_all_joints(tmp_path: Path, native: bool
 
 
 @pytest.mark.parametrize("control", ["task", "effort"])
-def test_flavours_are_equal_under_limits_damping_and_a_payload(
-    tmp_path: Path, control: str
-) -> None:
+def test_flavours_are_equal_under_limits_damping_and_a_payload(tmp_path: Path, control: str) -> None:
     rows = []
     (tmp_path / "hand.urdf").write_text(HAND)
     settings = {"tau_ext": 4.0, "limit_effort": True, "payload": 1.0, "q_start": 0.25}
@@ -160,9 +158,7 @@ def test_geometry_of_many_samples_is_that_of_the_plant(robots: Path) -> None:
 
 
 @pytest.mark.parametrize("known", ["leader", "both"])
-def test_pictures_of_a_bag_follow_the_leader_unless_the_bag_says_otherwise(
-    robots: Path, known: str
-) -> None:
+def test_pictures_of_a_bag_follow_the_leader_unless_the_bag_says_otherwise(robots: Path, known: str) -> None:
     from twodof.plots.linkage import load_linkage
 
     text, frame = (robots / PANDA).read_text(), "panda_rightfinger"

@@ -55,8 +55,7 @@ def test_cosine_and_sine_are_right_where_arithmetic_is_not_the_standards():
 
 
 @pytest.mark.parametrize(
-    ("name", "control"),
-    [*((name, "task") for name in EVERY_ROBOT), ("twodof", "pose"), ("panda", "pose")],
+    ("name", "control"), [*((name, "task") for name in EVERY_ROBOT), ("twodof", "pose"), ("panda", "pose")]
 )
 def test_kinematics_equal_pinocchio(name, control):
     native, robot, (G, c) = engine(name, control), model(name).robot, coupling(name)
@@ -67,9 +66,7 @@ def test_kinematics_equal_pinocchio(name, control):
         Q = G @ q + c
         pin.forwardKinematics(robot.model, data, Q, G @ v, np.zeros(robot.model.nv))
         J = pin.computeFrameJacobian(robot.model, data, Q, frame, pin.LOCAL_WORLD_ALIGNED) @ G
-        drift = pin.getFrameClassicalAcceleration(
-            robot.model, data, frame, pin.LOCAL_WORLD_ALIGNED
-        ).vector
+        drift = pin.getFrameClassicalAcceleration(robot.model, data, frame, pin.LOCAL_WORLD_ALIGNED).vector
         expected = (data.oMf[frame].translation[axes], J[rows], drift[rows])
         for ours, theirs in zip(native.task(q, v), expected, strict=True):
             assert deviation(ours, theirs) <= 1e-11
@@ -117,9 +114,7 @@ def test_effort_bound_is_what_holds_a_stretched_arm():
     reference.gravity.linear = gravity
     data = reference.createData()
     angles = np.linspace(-np.pi, np.pi, 361)
-    largest = max(
-        abs(pin.rnea(reference, data, np.array([q, 0.0]), still, still)[0]) for q in angles
-    )
+    largest = max(abs(pin.rnea(reference, data, np.array([q, 0.0]), still, still)[0]) for q in angles)
     bound = effort_bounds(constants, constants.body, np.eye(2), still, still, gravity)
     assert largest <= bound[0] <= 1.02 * largest  # centres of mass lie a little off the line
 
@@ -212,9 +207,7 @@ def follow(name, changes=None, targets=(), seconds=3.0, h=0.01, of=None):
 
 
 NARROW = {"q_min": [-0.2, 0.6], "q_max": [0.6, 1.9], "q_start": [0.2, 1.2]}
-TARGETS = [
-    (0.17, 0.01), (-0.04, -0.09), (0.23, 0.27), (0.16, 0.19), (0.14, 0.27), (0.24, -0.1),
-]  # fmt: skip
+TARGETS = [(0.17, 0.01), (-0.04, -0.09), (0.23, 0.27), (0.16, 0.19), (0.14, 0.27), (0.24, -0.1)]
 
 
 def test_default_run():

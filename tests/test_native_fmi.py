@@ -99,13 +99,12 @@ def test_limit_effort_is_boolean():
 # --- the state machine ---
 
 LEGAL = {
-    "instantiated": {"setupExperiment", "enterInitializationMode", "reset", "set input",
-                     "set parameter"},
+    "instantiated": {"setupExperiment", "enterInitializationMode", "reset", "set input", "set parameter"},
     "initialization": {"exitInitializationMode", "reset", "get", "set input", "set parameter"},
     "step": {"doStep", "terminate", "reset", "get", "set input", "getStatus"},
     "failed": {"terminate", "reset", "get", "getStatus"},
     "terminated": {"reset", "get", "getStatus"},
-}  # fmt: skip
+}
 CALLS = {
     "setupExperiment": ("setupExperiment", None, 0.0),
     "enterInitializationMode": ("enterInitializationMode",),
@@ -153,11 +152,19 @@ def test_calls_that_are_not_supported_or_of_model_exchange_are_refused():
     refusals = dict.fromkeys(
         ("SetRealInputDerivatives", "GetRealOutputDerivatives"), "is not supported by this FMU"
     ) | dict.fromkeys(
-        ("EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode",
-         "CompletedIntegratorStep", "SetContinuousStates", "GetDerivatives", "GetEventIndicators",
-         "GetContinuousStates", "GetNominalsOfContinuousStates"),
+        (
+            "EnterEventMode",
+            "NewDiscreteStates",
+            "EnterContinuousTimeMode",
+            "CompletedIntegratorStep",
+            "SetContinuousStates",
+            "GetDerivatives",
+            "GetEventIndicators",
+            "GetContinuousStates",
+            "GetNominalsOfContinuousStates",
+        ),
         "is a call of Model Exchange, and the instance is one of co-simulation",
-    )  # fmt: skip
+    )
     for function, text in refusals.items():
         arm.messages.clear()
         assert arm.dll[f"fmi2{function}"](ctypes.c_void_p(arm.component), *[null] * 6) == ERROR
@@ -242,10 +249,7 @@ def test_tolerance_is_ignored_with_a_message():
 def test_start_outside_the_limits_is_clamped_with_a_warning():
     arm = Arm(start=False)
     arm.start(q_start=[4.0, 0.35], v_start=[1.0, 0.0])
-    text = (
-        "q_start[1] = 4 of joint 'joint1' is outside its limits [-3.14159, 3.14159]"
-        " and was clamped to 3.14159"
-    )
+    text = "q_start[1] = 4 of joint 'joint1' is outside its limits [-3.14159, 3.14159] and was clamped to 3.14159"
     assert arm.messages == [(WARNING, text)]
     assert arm.get("q") == [np.pi, 0.35] and arm.get("v") == [0.0, 0.0]
 
@@ -368,12 +372,8 @@ def test_a_state_with_a_right_checksum_and_a_wrong_field_is_refused(field):
 
 
 @pytest.mark.parametrize(
-    "field",
-    [
-        "initialised", "has_x", "has_tau", "has_stops", "has_rates", "any_held", "x[1]", "tau[1]",
-        "der(v[1])",
-    ],
-)  # fmt: skip
+    "field", ["initialised", "has_x", "has_tau", "has_stops", "has_rates", "any_held", "x[1]", "tau[1]", "der(v[1])"]
+)
 def test_what_a_state_computes_on_demand_is_not_taken_from_its_bytes(field):
     arm, other = Arm(), Arm(start=False)
     arm.step()
@@ -411,19 +411,14 @@ def test_interleaved_instances_equal_one_alone():
 
 def test_library_exports_the_standard_needs_libc_alone_and_is_small():
     path = library("twodof")
-    symbols = subprocess.check_output(
-        [needs("nm"), "-D", "--defined-only", path], text=True
-    ).split()[2::3]
+    symbols = subprocess.check_output([needs("nm"), "-D", "--defined-only", path], text=True).split()[2::3]
     header = "\n".join(
-        content.decode() for file, content in model("twodof").sources().items()
-        if file == "fmi2Functions.h"
-    )  # fmt: skip
+        content.decode() for file, content in model("twodof").sources().items() if file == "fmi2Functions.h"
+    )
     assert sorted(symbols) == sorted(re.findall(r"FMI2_Export \w+TYPE +(\w+);", header))
     needed = subprocess.check_output(["readelf", "-d", path], text=True)
     assert set(re.findall(r"NEEDED.*\[(.*)\]", needed)) <= {"libc.so.6", "libm.so.6"}
-    versions = re.findall(
-        r"GLIBC_2\.(\d+)", subprocess.check_output([needs("nm"), "-D", path], text=True)
-    )
+    versions = re.findall(r"GLIBC_2\.(\d+)", subprocess.check_output([needs("nm"), "-D", path], text=True))
     assert max(map(int, versions)) <= 17
     assert path.stat().st_size <= 200_000
 
@@ -443,9 +438,11 @@ def test_random_calls_under_sanitizers(length):
     """Legal and illegal calls, with NaN, infinities and more."""
     count = length(100_000, 6_000)
     program = executable(
-        model("twodof"), HERE / "fuzz.c", HERE / "fuzz2.h",
+        model("twodof"),
+        HERE / "fuzz.c",
+        HERE / "fuzz2.h",
         flags=("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
-    )  # fmt: skip
+    )
     done = subprocess.run([program, str(count), "0"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"{count} sequences")

@@ -33,10 +33,7 @@ BINARIES = {
     "win64": "binaries/win64/TwoDof.dll",
     "darwin64": "binaries/darwin64/TwoDof.dylib",
 }
-LIMITED = {
-    "q_min[1]": 0.3, "q_max[2]": 1.2, "x_des[1]": 0.1, "x_des[2]": 0.2,
-    "tau_ext[1]": 0.02, "tau_ext[2]": 0.02,
-}  # fmt: skip
+LIMITED = {"q_min[1]": 0.3, "q_max[2]": 1.2, "x_des[1]": 0.1, "x_des[2]": 0.2, "tau_ext[1]": 0.02, "tau_ext[2]": 0.02}
 """A run in which joints stop at their limits, away from the singularity at q[2] = 0."""
 
 
@@ -62,9 +59,7 @@ def unzipped(shipped):
 @pytest.fixture
 def without_zig(monkeypatch):
     find_spec = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "ziglang" else find_spec(name)
-    )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ziglang" else find_spec(name))
 
 
 def test_files_and_description(shipped, fmu_path):
@@ -192,11 +187,7 @@ def variables(fmu: Path) -> tuple[str, dict[str, int]]:
 
 
 def drive(
-    unzipped: Path,
-    platform: str,
-    folder: Path,
-    settings: dict[str, float],
-    wine: tuple[str, dict[str, str]],
+    unzipped: Path, platform: str, folder: Path, settings: dict[str, float], wine: tuple[str, dict[str, str]]
 ) -> subprocess.CompletedProcess[str]:
     """What an importer compiled for the platform prints of 5 s; Windows' runs in wine."""
     windows = platform == "win64"
@@ -215,9 +206,13 @@ def drive(
     name = Path(library).name if windows else str(library)
     command, environment = wine if windows else ("env", dict(os.environ))
     return subprocess.run(
-        [command, str(importer), name, *arguments], cwd=folder, env=environment,
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+        [command, str(importer), name, *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 TURNED = {"quat_des[3]": 0.5, "quat_des[4]": 0.8, "omega_des[3]": 0.1}
@@ -232,7 +227,7 @@ RUNS = {
         {"tau_cmd[1]": 0.4, "tau_cmd[2]": 0.1, "q_max[2]": 0.5},
         {"q_min[1]": 0.3, "q_max[2]": 1.2, "tau_cmd[2]": 0.5},
     ),
-}  # fmt: skip
+}
 """By control, the last one with stops."""
 
 
@@ -253,16 +248,13 @@ def test_windows_library_runs_as_linux_library(control, machines, tmp_path):
     for settings in RUNS[control]:
         runs = [drive(unzipped, kind, folder, settings, wine) for kind in ("linux64", "win64")]
         assert not any(run.returncode for run in runs), [run.stderr for run in runs]
-        linux, windows = (np.array([line.split() for line in run.stdout.splitlines()], float)
-                          for run in runs)  # fmt: skip
+        linux, windows = (np.array([line.split() for line in run.stdout.splitlines()], float) for run in runs)
         assert linux.shape == windows.shape and len(linux) == 51
         assert np.abs(windows - linux).max() <= 1e-12
         assert np.ptp(linux[:, :2], axis=0).min() > 0.0
     limits = [value for name, value in settings.items() if name[:5] in ("q_min", "q_max")]
     assert np.isin(limits, linux[:, :2]).all()  # they were met
-    refused = [
-        drive(unzipped, kind, folder, {"payload": -1e18}, wine) for kind in ("linux64", "win64")
-    ]
+    refused = [drive(unzipped, kind, folder, {"payload": -1e18}, wine) for kind in ("linux64", "win64")]
     for run in refused:
         assert run.returncode == 4 and "payload = -1e+18 must be >= 0\n" in run.stderr
     assert refused[1].stderr.replace("\r", "") == refused[0].stderr
@@ -271,9 +263,7 @@ def test_windows_library_runs_as_linux_library(control, machines, tmp_path):
 def outputs(fmu: Path, **named) -> np.ndarray:
     names = [f"{group}[{i}]" for group in ("q", "v", "x", "tau") for i in (1, 2)]
     start = {name: value for name, value in LIMITED.items() if "tau" not in name}
-    result = fmpy.simulate_fmu(
-        str(fmu), stop_time=5.0, output_interval=0.01, output=names, start_values=start, **named
-    )
+    result = fmpy.simulate_fmu(str(fmu), stop_time=5.0, output_interval=0.01, output=names, start_values=start, **named)
     assert len(result) == 501
     return np.array([result[name] for name in names])
 
@@ -315,11 +305,7 @@ def test_own_compiler_serves_without_zig(shipped, tmp_path, without_zig):
 
 def test_equal_bytes_from_an_empty_cache_without_a_home(unzipped, monkeypatch):
     """zig's cache is a temporary one where there is no home to keep it in."""
-    for name, value in (
-        ("HOME", "/dev/null"),
-        ("XDG_CACHE_HOME", ""),
-        ("ZIG_GLOBAL_CACHE_DIR", ""),
-    ):
+    for name, value in (("HOME", "/dev/null"), ("XDG_CACHE_HOME", ""), ("ZIG_GLOBAL_CACHE_DIR", "")):
         monkeypatch.setenv(name, value)
     sources = {path.name: path.read_bytes() for path in (unzipped / "sources").iterdir()}
     library = compile_library(sources, "linux64", "TwoDof")
@@ -369,17 +355,15 @@ def test_a_raspberry_builds_fmi_3_for_itself(raspberry, tmp_path, monkeypatch, c
 @pytest.mark.parametrize(
     "options, expected",
     [
-        (("--fmi", "2"), "FMI 2.0 has no name for this machine; choose one with --platform,"
-         " or --fmi 3, which has one"),
-        (("--platform", "aarch64-linux"), "FMI 2.0 has no platform 'aarch64-linux'; there are"
-         " linux64, win64, darwin64; --fmi 3 has it"),
-        (("--platform", "solaris"), "FMI 2.0 has no platform 'solaris'; there are"
-         " linux64, win64, darwin64\n"),
+        (("--fmi", "2"), "FMI 2.0 has no name for this machine; choose one with --platform, or --fmi 3, which has one"),
+        (
+            ("--platform", "aarch64-linux"),
+            "FMI 2.0 has no platform 'aarch64-linux'; there are linux64, win64, darwin64; --fmi 3 has it",
+        ),
+        (("--platform", "solaris"), "FMI 2.0 has no platform 'solaris'; there are linux64, win64, darwin64\n"),
     ],
-)  # fmt: skip
-def test_fmi_2_on_a_raspberry_is_refused_at_the_build(
-    raspberry, tmp_path, monkeypatch, capsys, options, expected
-):
+)
+def test_fmi_2_on_a_raspberry_is_refused_at_the_build(raspberry, tmp_path, monkeypatch, capsys, options, expected):
     monkeypatch.chdir(tmp_path)
     assert main(["build", "--native", *options]) == 1
     captured = capsys.readouterr()
@@ -410,9 +394,7 @@ print(len(list(samples("A.fmu", stop_time=0.1))))
 """
     options = FmuOptions(native=True, fmi=3)
     build_fmu(tmp_path / "A.fmu", options)
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "11\n"), done.stderr
 
 
@@ -429,14 +411,9 @@ def refused(folder: Path, *platforms: str) -> str:
 @needs_linux
 @pytest.mark.parametrize(
     "platform, reason",
-    [
-        ("win64", "this machine's own compiler builds for linux64"),
-        ("linux64", "this machine has no C compiler"),
-    ],
+    [("win64", "this machine's own compiler builds for linux64"), ("linux64", "this machine has no C compiler")],
 )
-def test_what_is_not_there_to_compile_with_is_named(
-    platform, reason, tmp_path, without_zig, monkeypatch
-):
+def test_what_is_not_there_to_compile_with_is_named(platform, reason, tmp_path, without_zig, monkeypatch):
     if platform == "linux64":
         monkeypatch.setenv("PATH", str(tmp_path))
     message = refused(tmp_path, platform)

@@ -28,10 +28,8 @@ def bag(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     table.write_text("\n".join(['time,"x_des[1]","x_des[2]"', *rows]))
     path = folder / "bag"
     twodof.simulate(
-        native_path,
-        twodof.Bag(path, storage="sqlite3", scene=True),
-        stop_time=200.0, step=0.01, input_file=table,
-    )  # fmt: skip
+        native_path, twodof.Bag(path, storage="sqlite3", scene=True), stop_time=200.0, step=0.01, input_file=table
+    )
     return path
 
 

@@ -70,10 +70,13 @@ def test_modes_are_those_of_the_umask(
     shutil.copyfile(native_path, tmp_path / "a.fmu")
     twodof.simulate(tmp_path / "a.fmu", twodof.Bag(tmp_path / "bag"), stop_time=0.05)
     for command in (
-        ["build", "-o", "b.fmu"], ["page", "a.fmu", "-o", "c.html"], ["plot", "bag", "-o", "d.png"],
-        ["plot", "bag", "-o", "e.html"], ["view", "bag", "--export", "f.html"],
+        ["build", "-o", "b.fmu"],
+        ["page", "a.fmu", "-o", "c.html"],
+        ["plot", "bag", "-o", "d.png"],
+        ["plot", "bag", "-o", "e.html"],
+        ["view", "bag", "--export", "f.html"],
         ["layouts", "a.fmu", "-o", "g"],
-    ):  # fmt: skip
+    ):
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(tmp_path)
             assert main(command) == 0
@@ -83,9 +86,7 @@ def test_modes_are_those_of_the_umask(
     assert modes == {p: (0o777 if p.is_dir() else 0o666) & ~mask for p in modes}
 
 
-def test_a_file_that_is_replaced_keeps_its_mode(
-    umask: Callable[[int], int], tmp_path: Path
-) -> None:
+def test_a_file_that_is_replaced_keeps_its_mode(umask: Callable[[int], int], tmp_path: Path) -> None:
     """A private file must not become one that all may read."""
     umask(0o022)
     path = tmp_path / "file"
@@ -159,9 +160,7 @@ def test_a_page_goes_to_the_standard_output(name: str, bag: Path, tmp_path: Path
     assert os.readlink("/dev/stdout") == before
 
 
-def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(
-    bag: Path, native_path: Path, tmp_path: Path
-) -> None:
+def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(bag: Path, native_path: Path, tmp_path: Path) -> None:
     assert twodof_to(subprocess.PIPE, "plot", bag, "-o", "-").startswith(b"\x89PNG")
     page = twodof_to(subprocess.PIPE, "page", native_path, "-o", "-")
     assert page.startswith(b"<!DOCTYPE html>") and page.endswith(b"</html>\n")

@@ -63,9 +63,7 @@ def browser() -> Iterator[Browser]:
 @contextmanager
 def shown(browser: Browser, path: Path, **context: Any) -> Iterator[Page]:
     """A page from its file, without a network; it asks for nothing and complains of nothing."""
-    with browser.new_context(
-        viewport=VIEWPORT, offline=True, accept_downloads=True, **context
-    ) as opened:
+    with browser.new_context(viewport=VIEWPORT, offline=True, accept_downloads=True, **context) as opened:
         opened.set_default_timeout(1e3 * PATIENCE)
         page = opened.new_page()
         page.add_init_script(EVERY_OTHER_FRAME)
@@ -102,9 +100,7 @@ def page(alive: Page) -> Page:
 def built(folder: Path, name: str, **options: Any) -> Path:
     """A native FMU of a robot of the package example-robot-data."""
     urdf = next(robots_folder().rglob(f"{name}.urdf"))
-    chosen = twodof.FmuOptions(
-        urdf=urdf, mesh_dir=robots_folder().parent, native=True, **options
-    )  # fmt: skip
+    chosen = twodof.FmuOptions(urdf=urdf, mesh_dir=robots_folder().parent, native=True, **options)
     return twodof.build_fmu(folder / f"{name}.fmu", chosen)
 
 
@@ -188,11 +184,7 @@ def test_a_panda_to_a_pose_has_its_numbers(browser, panda, tmp_path) -> None:
         joints, cut = page.evaluate(READOUT)
         error = page.locator("[data-value=error]")
         shown_error = f"{last.error:.3g}"[:4]  # the readout follows the last step by some frames
-        until(
-            page,
-            lambda found: found.startswith(shown_error),
-            lambda page: str(error.text_content()),
-        )
+        until(page, lambda found: found.startswith(shown_error), lambda page: str(error.text_content()))
         curves = page.locator("#arm-curves canvas").evaluate_all("all => all.map(c => c.ariaLabel)")
         said = str(error.text_content())
         before = page.evaluate("arm.held('quat_des')")
@@ -249,9 +241,7 @@ def test_all_is_seen_of_a_robot_and_its_names(browser, tmp_path) -> None:
         for size in (VIEWPORT, PHONE):
             page.set_viewport_size(size)
             until(page, lambda found: found == [], lambda page: page.evaluate(CUT))
-            scene, bar = (
-                page.locator(f".view > {part}").bounding_box() for part in ("canvas", ".bar")
-            )
+            scene, bar = (page.locator(f".view > {part}").bounding_box() for part in ("canvas", ".bar"))
             assert scene is not None and bar is not None
             assert scene["y"] + scene["height"] <= bar["y"] + 0.5
             assert bar["y"] + bar["height"] <= size["height"] and scene["height"] > 300
@@ -426,9 +416,7 @@ def test_hostile_names_are_shown_as_text(browser, tmp_path) -> None:
     robot.findall("joint")[0].set("name", "1 " + HOSTILE + "j" * (998 - len(HOSTILE)))
     (tmp_path / "hostile.urdf").write_text(ET.tostring(robot, encoding="unicode"))
     frame = robot.findall("link")[-1].get("name")
-    options = twodof.FmuOptions(
-        urdf=tmp_path / "hostile.urdf", frame=frame, control="joint", native=True
-    )
+    options = twodof.FmuOptions(urdf=tmp_path / "hostile.urdf", frame=frame, control="joint", native=True)
     fmu = twodof.build_fmu(tmp_path / "hostile.fmu", options)
     with shown(browser, twodof.page(fmu, tmp_path / "hostile.html")) as page:
         assert_shown_as_text(page, "joint2")
@@ -514,7 +502,5 @@ def test_the_scripts_are_typed_and_short() -> None:
                 begin, indent = i, len(line) - len(line.lstrip())
             if begin and re.match(rf" {{{indent}}}}}$", line):
                 assert i - begin < 60, f"{name}:{begin + 1}"
-    done = subprocess.run(
-        [needs("tsc"), "-p", str(ROOT / "tests/tsconfig.json")], capture_output=True, text=True
-    )
+    done = subprocess.run([needs("tsc"), "-p", str(ROOT / "tests/tsconfig.json")], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout

@@ -36,8 +36,7 @@ def fmus(tmp_path_factory):
 
     def build(fmi=2, control="effort"):
         if (fmi, control) not in built:
-            options = FmuOptions(native=True, fmi=fmi, control=control, arrays=fmi == 2,
-                                 meshes=False)  # fmt: skip
+            options = FmuOptions(native=True, fmi=fmi, control=control, arrays=fmi == 2, meshes=False)
             built[fmi, control] = build_fmu(folder / f"{control}{fmi}.fmu", options)
         return built[fmi, control]
 
@@ -46,9 +45,15 @@ def fmus(tmp_path_factory):
 
 def simulated(fmu, kind, starts, stop_time, interval=0.05, **named):
     result = fmpy.simulate_fmu(
-        str(fmu), fmi_type=kind, stop_time=stop_time, start_values={**TIGHT, **starts},
-        output=STATES, output_interval=interval, record_events=False, **named,
-    )  # fmt: skip
+        str(fmu),
+        fmi_type=kind,
+        stop_time=stop_time,
+        start_values={**TIGHT, **starts},
+        output=STATES,
+        output_interval=interval,
+        record_events=False,
+        **named,
+    )
     return np.array([result[name] for name in STATES]).T
 
 
@@ -63,14 +68,14 @@ class Importer(Recorded):
         self.nz = description.numberOfEventIndicators
         self.folder = tempfile.mkdtemp()
         super().__init__(
-            guid=description.guid, modelIdentifier="TwoDof", instanceName="arm",
+            guid=description.guid,
+            modelIdentifier="TwoDof",
+            instanceName="arm",
             unzipDirectory=fmpy.extract(str(fmu), self.folder),
-        )  # fmt: skip
+        )
         self.messages, self.asked, self.events = [], [], []
         if self.three:
-            self.instantiate(
-                loggingOn=True, logMessage=lambda _, status, kind, text: self.keep(status, text)
-            )
+            self.instantiate(loggingOn=True, logMessage=lambda _, status, kind, text: self.keep(status, text))
         else:
             self.instantiate(callbacks=self.functions(), loggingOn=True)
             self.setupExperiment(startTime=0.0)
@@ -229,9 +234,17 @@ def test_a_short_stop_of_a_closed_form(importer):
     """q = q_des (1 - cos wt) turns at 2 q_des; a stop 1e-6 before that ends the motion there, and
     it sets out anew without speed."""
     depth, omega = 1e-6, 5.0
-    starts = {"q_start[1]": 0.0, "q_start[2]": 0.0, "q_des[1]": 1.0, "q_des[2]": 0.0,
-              "q_max[1]": 2.0 - depth, "Kp[1]": omega**2, "Kd[1]": 0.0, "Kd[2]": 0.0,
-              "rigid_stops": False}  # fmt: skip
+    starts = {
+        "q_start[1]": 0.0,
+        "q_start[2]": 0.0,
+        "q_des[1]": 1.0,
+        "q_des[2]": 0.0,
+        "q_max[1]": 2.0 - depth,
+        "Kp[1]": omega**2,
+        "Kd[1]": 0.0,
+        "Kd[2]": 0.0,
+        "rigid_stops": False,
+    }
     solver = importer(starts, control="joint")
     rows = solver.run(1.0, 0.01, parts=20)
     stop = math.acos(depth - 1.0) / omega
@@ -261,8 +274,7 @@ def test_a_step_that_the_engine_cannot_integrate_is_warned_of(importer):
 
 def test_what_passes_no_stop_is_the_same_as_without_the_call(importer):
     """Bit for bit, with located stops."""
-    starts = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0,
-              "v_start[1]": 2.0}  # fmt: skip
+    starts = {"q_min[1]": -0.5, "q_max[1]": 1.5, "q_min[2]": -1.0, "q_max[2]": 1.0, "v_start[1]": 2.0}
     told, silent = importer(starts), importer(starts)
     rows = told.run(1.0, 2e-3)
     assert np.array_equal(rows, silent.run(1.0, 2e-3, tells=False))
@@ -294,14 +306,23 @@ def short_stop(solver, joint, depth):
 
 def test_after_a_passed_stop_all_is_as_at_a_start_there(importer):
     """Joints that rest and the rates follow from the state, as at any event."""
-    starts = {"q_start[1]": 0.0, "q_start[2]": 0.0, "q_des[1]": 1.0, "q_des[2]": 1.0,
-              "q_max[1]": 2.0 - 1e-6, "q_max[2]": 0.0, "Kp[1]": 25.0, "Kp[2]": 25.0, "Kd[1]": 0.0,
-              "Kd[2]": 0.0, "rigid_stops": False}  # fmt: skip
+    starts = {
+        "q_start[1]": 0.0,
+        "q_start[2]": 0.0,
+        "q_des[1]": 1.0,
+        "q_des[2]": 1.0,
+        "q_max[1]": 2.0 - 1e-6,
+        "q_max[2]": 0.0,
+        "Kp[1]": 25.0,
+        "Kp[2]": 25.0,
+        "Kd[1]": 0.0,
+        "Kd[2]": 0.0,
+        "rigid_stops": False,
+    }
     solver = importer(starts, control="joint")
     rows = solver.run(0.63, 0.01, 0.63)
     assert solver.asked == [0.63] and rows[-1, 1] == 0.0 and rows[-1, 3] == 0.0
-    reached = {f"{s}_start[{i + 1}]": rows[-1, 2 * k + i] for k, s in enumerate("qv")
-               for i in (0, 1)}  # fmt: skip
+    reached = {f"{s}_start[{i + 1}]": rows[-1, 2 * k + i] for k, s in enumerate("qv") for i in (0, 1)}
     fresh = importer({**starts, **reached}, control="joint")
     assert np.array_equal(fresh.rates(0.0, rows[-1]), solver.rates(0.63, rows[-1]))
     assert np.array_equal(fresh.indicators, solver.indicators)
@@ -367,8 +388,12 @@ def test_an_event_at_another_state_takes_no_passed_stop(importer):
 @pytest.mark.parametrize("seed", range(8))
 def test_every_short_stop_of_random_falls_is_seen_at_steps_of_20_ms(importer, fmus, seed):
     random = np.random.default_rng(seed)
-    starts = {"v_start[1]": random.uniform(-6, 6), "v_start[2]": random.uniform(-10, 10),
-              "q_start[1]": random.uniform(-1, 1), "q_start[2]": random.uniform(-1, 1)}  # fmt: skip
+    starts = {
+        "v_start[1]": random.uniform(-6, 6),
+        "v_start[2]": random.uniform(-10, 10),
+        "q_start[1]": random.uniform(-1, 1),
+        "q_start[2]": random.uniform(-1, 1),
+    }
     free, joint = {**FREE, **starts}, seed % 2
     turn, limit = short_stop(importer(free), joint, 10 ** random.uniform(-6, -4))
     solver = importer({**free, **limit})

@@ -286,9 +286,7 @@ def test_a_joint_that_grazes_its_limit_at_the_fold_does_not_chatter(monkeypatch)
         calls += 1
         return equations.acceleration(*state)
 
-    monkeypatch.setattr(
-        plant, "equations_of_motion", lambda: replace(equations, acceleration=counted)
-    )
+    monkeypatch.setattr(plant, "equations_of_motion", lambda: replace(equations, acceleration=counted))
     plant.step(0.01)
     assert calls < 10_000
     assert np.isfinite([*plant.q, *plant.v]).all()
@@ -382,6 +380,4 @@ def test_a_damped_robot_at_rest_on_its_target_does_not_move_at_all() -> None:
 def test_what_is_not_said_has_the_documented_start() -> None:
     task, bare = model("twodof").plant(), model("twodof", "effort").plant()
     assert (task.rtol, task.atol, task.max_step, task.rcond) == (1e-3, 1e-6, 1e-3, 0.01)
-    assert (
-        bare.tau_cmd == bare.tau_ext == [0.0, 0.0] and bare.f_ext == bare.payload_com == [0.0] * 3
-    )
+    assert bare.tau_cmd == bare.tau_ext == [0.0, 0.0] and bare.f_ext == bare.payload_com == [0.0] * 3

@@ -12,19 +12,7 @@ import matplotlib
 import numpy as np
 import oracles
 import pytest
-from figures import (
-    assert_legible,
-    heights,
-    key,
-    key_of,
-    legend_of,
-    lines,
-    notes,
-    only,
-    panels,
-    points,
-    texts,
-)
+from figures import assert_legible, heights, key, key_of, legend_of, lines, notes, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from recordings import LINK, Recording, build, chain_urdf, long_run, record
@@ -72,9 +60,7 @@ def test_units_and_settings_are_told(figure: Figure) -> None:
     assert "2dof" in told
     assert "joint1" in told
     (settings,) = [text for text in told if "Kp" in text]
-    assert settings == (
-        "x_des = (0.2, 0.05) m, Kp = 50 s⁻², Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu, bag Kp50"
-    )
+    assert settings == ("x_des = (0.2, 0.05) m, Kp = 50 s⁻², Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu, bag Kp50")
     assert key_of(figure) == []
 
 
@@ -109,17 +95,13 @@ def test_a_metre_is_as_long_up_as_across(default: Recording) -> None:
     assert left > -LINK  # of the circle of reach a part
 
 
-def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(
-    default: Recording, figure: Figure
-) -> None:
+def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(default: Recording, figure: Figure) -> None:
     error = panels(figure).error
     assert error is not None
     assert error.get_yscale() == "log"
     target = np.array([0.2, 0.05])
     run = only(error, default.bag.name)
-    np.testing.assert_allclose(
-        run[:, 1], np.linalg.norm(default.x - target, axis=1), rtol=1e-9, atol=1e-15
-    )
+    np.testing.assert_allclose(run[:, 1], np.linalg.norm(default.x - target, axis=1), rtol=1e-9, atol=1e-15)
     closed = only(error, "closed form")
     expected = oracles.task_error(default.x[0] - target, 50.0, 40.0, default.t)
     np.testing.assert_allclose(closed[:, 1], np.linalg.norm(expected, axis=1), rtol=1e-12)
@@ -131,9 +113,7 @@ def test_error_is_the_distance_that_the_fmu_tells_and_the_closed_form(
 def test_what_came_out_is_told(default: Recording, figure: Figure) -> None:
     left = np.linalg.norm(default.x[-1] - (0.2, 0.05))
     (told,) = [text for text in texts(figure) if "at the end;" in text]
-    found = re.fullmatch(
-        r"(\S+) m from its target at the end; at most (\S+) m off the closed form", told
-    )
+    found = re.fullmatch(r"(\S+) m from its target at the end; at most (\S+) m off the closed form", told)
     assert found is not None
     assert float(found[1]) == pytest.approx(left, rel=2e-3)
     assert float(found[2]) < 1e-12
@@ -142,13 +122,9 @@ def test_what_came_out_is_told(default: Recording, figure: Figure) -> None:
 # --- limits and targets ---
 
 
-def test_limits_are_lines_that_are_in_view_where_they_are_near(
-    fmu_path: Path, tmp_path: Path
-) -> None:
+def test_limits_are_lines_that_are_in_view_where_they_are_near(fmu_path: Path, tmp_path: Path) -> None:
     """The second joint stops at 1.2 rad, far from its lower limit."""
-    recording = record(
-        tmp_path / "bag", fmu_path, settings={"q_max": (0.9, 1.2), "x_des": (-0.1, 0.2)}
-    )
+    recording = record(tmp_path / "bag", fmu_path, settings={"q_max": (0.9, 1.2), "x_des": (-0.1, 0.2)})
     assert recording.q[-1, 1] == 1.2
     found = panels(plot(recording.bag))
     second = found.q[1]
@@ -189,9 +165,12 @@ def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path: Pa
     (tmp_path / "in.csv").write_text("time,tau_cmd[1]\n0,1\n0.02,12\n0.04,-2\n")
     for limited in (False, True):
         recording = record(
-            tmp_path / f"{limited}", fmu, stop_time=0.06, input_file=tmp_path / "in.csv",
+            tmp_path / f"{limited}",
+            fmu,
+            stop_time=0.06,
+            input_file=tmp_path / "in.csv",
             settings={"limit_effort": limited},
-        )  # fmt: skip
+        )
         (track,) = read_tracks([recording.bag])
         for j, joint in enumerate(track.joints):
             np.testing.assert_array_equal(joint.tau[1:], recording.tau[1:, j])
@@ -219,9 +198,7 @@ def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
             low, high = axes.get_ylim()
             assert low < np.min(drawn) <= np.max(drawn) < high
     over = over_time(read_tracks(bags))
-    assert "Position in rad; thin dashes: target" in [
-        a["text"] for a in over["layout"]["annotations"]
-    ]
+    assert "Position in rad; thin dashes: target" in [a["text"] for a in over["layout"]["annotations"]]
 
 
 def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
@@ -258,9 +235,7 @@ def test_changes_are_where_the_master_makes_them(changing: Recording) -> None:
     marked = only(found.views[0], "target")
     np.testing.assert_array_equal(marked, [(0.2, 0.05), (0.1, 0.2), (0.05, 0.2)])
     (told,) = [text for text in texts(figure) if "step" in text]
-    assert told == (
-        "x_des varied, xdd_des varied, Kp varied, Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu, bag bag"
-    )
+    assert told == ("x_des varied, xdd_des varied, Kp varied, Kd = 40 s⁻¹, step 10 ms, TwoDof.fmu, bag bag")
 
 
 def test_a_target_on_a_path_is_drawn_as_a_path(fmu_path: Path, tmp_path: Path) -> None:
@@ -282,15 +257,11 @@ DAMPED = chain_urdf("zz").replace("<limit", '<dynamics damping="0.3"/><limit')
 
 
 DISTURBED: dict[str, tuple[str, dict[str, Any], str]] = {
-    "external torque": (
-        chain_urdf("zz"), {"tau_ext": (0.0, 1.0)}, "closed form without external torque",
-    ),
+    "external torque": (chain_urdf("zz"), {"tau_ext": (0.0, 1.0)}, "closed form without external torque"),
     "singularities": (chain_urdf("zz"), {"x_des": (1.0, 0.2)}, "closed form without singularities"),
     "joint limits": (chain_urdf("zz"), {"q_max": (2.0, 0.6)}, "closed form without joint limits"),
-    "two of them": (
-        DAMPED, {"limit_effort": True}, "closed form without effort limits,\ndamping",
-    ),
-}  # fmt: skip
+    "two of them": (DAMPED, {"limit_effort": True}, "closed form without effort limits,\ndamping"),
+}
 
 
 @pytest.mark.parametrize(("urdf", "settings", "label"), DISTURBED.values(), ids=list(DISTURBED))
@@ -310,9 +281,7 @@ def test_the_closed_form_says_what_it_leaves_out(
 
 
 @pytest.mark.parametrize(("joints", "control"), [("z", "task"), ("zz", "pose")])
-def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(
-    joints: str, control: str, tmp_path: Path
-) -> None:
+def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(joints: str, control: str, tmp_path: Path) -> None:
     """One joint for two axes; two joints for these and an orientation."""
     start = (0.3, 0.5)[: len(joints)]
     fmu = build(tmp_path, chain_urdf(joints), axes="xy", q_start=start, control=control)
@@ -330,14 +299,14 @@ def test_a_task_that_the_joints_cannot_follow_has_no_closed_form(
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("gains", [(0.0, 40.0), (0.0, 0.0), (50.0, 0.0)])
-def test_a_controller_without_a_gain_is_drawn(
-    gains: tuple[float, float], fmu_path: Path, tmp_path: Path
-) -> None:
+def test_a_controller_without_a_gain_is_drawn(gains: tuple[float, float], fmu_path: Path, tmp_path: Path) -> None:
     Kp, Kd = gains
     recording = record(
-        tmp_path / "bag", fmu_path, stop_time=0.3,
+        tmp_path / "bag",
+        fmu_path,
+        stop_time=0.3,
         settings={"Kp": Kp, "Kd": Kd, "v_start": (0.1, 0.2), "xd_des": (0.01, 0.0)},
-    )  # fmt: skip
+    )
     error = panels(plot(recording.bag)).error
     assert error is not None
     distance = np.linalg.norm(recording.x - (0.2, 0.05), axis=1)
@@ -346,9 +315,7 @@ def test_a_controller_without_a_gain_is_drawn(
 
 def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: Path) -> None:
     at_rest = oracles.position(np.array([0.5, 0.35]))
-    recording = record(
-        tmp_path / "bag", fmu_path, stop_time=0.1, settings={"x_des": tuple(at_rest)}
-    )
+    recording = record(tmp_path / "bag", fmu_path, stop_time=0.1, settings={"x_des": tuple(at_rest)})
     figure = plot(recording.bag)
     FigureCanvasAgg(figure).draw()
     error = panels(figure).error
@@ -357,8 +324,9 @@ def test_an_arm_at_its_target_has_an_error_panel_too(fmu_path: Path, tmp_path: P
     assert 0.0 < low < high <= 1e-9
     assert error.get_legend() is None  # of curves that are not seen
     assert [text.get_text() for text in error.texts] == ["less than 1e-12 m throughout"]
-    (page,) = [a["text"] for a in over_time(read_tracks([recording.bag]))["layout"]["annotations"]
-               if "Distance" in a["text"]]  # fmt: skip
+    (page,) = [
+        a["text"] for a in over_time(read_tracks([recording.bag]))["layout"]["annotations"] if "Distance" in a["text"]
+    ]
     assert page == "Distance from the target in m: less than 1e-12 m throughout"
 
 
@@ -386,9 +354,7 @@ def test_bags_that_differ_in_a_gain_are_told_apart_by_it(gains: dict[int, Record
     found = panels(figure)
     assert found.error is not None
     paths = lines(found.views[0], "path")
-    for name, recording, handle, path in zip(
-        names, gains.values(), key(figure).get_lines(), paths, strict=True
-    ):
+    for name, recording, handle, path in zip(names, gains.values(), key(figure).get_lines(), paths, strict=True):
         np.testing.assert_array_equal(only(found.q[1], name)[:, 1], recording.q[:, 1])
         np.testing.assert_array_equal(only(found.v[0], name)[:, 1], recording.v[:, 0])
         distance = np.linalg.norm(recording.x - (0.2, 0.05), axis=1)
@@ -408,10 +374,7 @@ def test_looks_are_different_and_their_colours_those_of_okabe_and_ito() -> None:
     """Black, orange, sky blue, bluish green, blue, vermillion and reddish purple, as published."""
     found = [look[1:] for look in looks(map(str, range(28)))]
     assert len(set(found)) == 28
-    published = [
-        (0, 0, 0), (230, 159, 0), (86, 180, 233), (0, 158, 115), (0, 114, 178), (213, 94, 0),
-        (204, 121, 167),
-    ]  # fmt: skip
+    published = [(0, 0, 0), (230, 159, 0), (86, 180, 233), (0, 158, 115), (0, 114, 178), (213, 94, 0), (204, 121, 167)]
     colours = {matplotlib.colors.to_rgb(colour) for colour, _ in found}
     assert colours == {tuple(value / 255 for value in colour) for colour in published}
     assert len({dashes for _, dashes in found[:4]}) == 4  # on paper without colours
@@ -432,18 +395,14 @@ LABELS: dict[str, tuple[list[dict[str, Any]], list[str]]] = {
     "a flavour": ([{}, {"file": "B.fmu"}], ["TwoDof.fmu", "B.fmu"]),
     "nothing": ([BAG, OTHER], ["bag", "other"]),
     "not even their names": ([BAG, {"path": Path("two/bag")}], ["one/bag", "two/bag"]),
-    "too much": (
-        [BAG, {**OTHER, "Kp[1]": 9.0, "Kd[1]": 8.0, "Kn": 7.0, "rcond": 0.1}], ["bag", "other"],
-    ),
+    "too much": ([BAG, {**OTHER, "Kp[1]": 9.0, "Kd[1]": 8.0, "Kn": 7.0, "rcond": 0.1}], ["bag", "other"]),
     "not all of them": ([BAG, OTHER, {"path": Path("c"), "Kp[1]": 9.0}], ["bag", "other", "c"]),
     "a digit that is not told": ([BAG, {**OTHER, "Kp[1]": 50.0000001}], ["bag", "other"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("runs", "expected"), LABELS.values(), ids=list(LABELS))
-def test_labels_say_what_differs(
-    runs: list[dict[str, Any]], expected: list[str], default: Recording
-) -> None:
+def test_labels_say_what_differs(runs: list[dict[str, Any]], expected: list[str], default: Recording) -> None:
     bag = twodof.read_bag(default.bag)
     bags = []
     for run in runs:

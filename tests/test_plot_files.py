@@ -71,9 +71,7 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
 
 def test_settings_of_the_user_do_not_change_it(default: Recording, tmp_path: Path) -> None:
     expected = save(drawing(read_tracks([default.bag])), tmp_path / "a.svg").read_bytes()
-    with matplotlib.rc_context(
-        {"lines.linewidth": 9.0, "axes.grid": False, "font.size": 30, "svg.fonttype": "none"}
-    ):
+    with matplotlib.rc_context({"lines.linewidth": 9.0, "axes.grid": False, "font.size": 30, "svg.fonttype": "none"}):
         found = save(drawing(read_tracks([default.bag])), tmp_path / "b.svg").read_bytes()
         assert matplotlib.rcParams["lines.linewidth"] == 9.0
         figure = plot(default.bag)
@@ -141,9 +139,7 @@ def test_a_long_path_keeps_its_corners(default: Recording, tmp_path: Path) -> No
 
 def test_each_kind_of_file_opens(gains: dict[int, Recording], tmp_path: Path) -> None:
     tracks = read_tracks([recording.bag for recording in gains.values()])
-    png, svg, pdf, page = (
-        save(drawing(tracks), tmp_path / f"a.{k}") for k in ("PNG", "svg", "pdf", "html")
-    )
+    png, svg, pdf, page = (save(drawing(tracks), tmp_path / f"a.{k}") for k in ("PNG", "svg", "pdf", "html"))
     with Image.open(png) as image:
         image.load()
         assert image.format == "PNG"
@@ -188,10 +184,14 @@ def test_equal_bags_give_equal_files(gains: dict[int, Recording], tmp_path: Path
     That is: nothing is imported for it that takes long.
     """
     done = subprocess.run(
-        [sys.executable, "-c", PLOT, gains[20].bag], cwd=tmp_path, check=True,
-        env={**ENVIRONMENT, "PYTHONHASHSEED": "1", "SOURCE_DATE_EPOCH": "1"}, timeout=60,
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", PLOT, gains[20].bag],
+        cwd=tmp_path,
+        check=True,
+        env={**ENVIRONMENT, "PYTHONHASHSEED": "1", "SOURCE_DATE_EPOCH": "1"},
+        timeout=60,
+        capture_output=True,
+        text=True,
+    )
     assert done.stdout == "set()\n"
     drawn = drawing(read_tracks([gains[20].bag]))
     for kind in ("png", "svg", "pdf", "html"):
@@ -290,17 +290,18 @@ def test_a_window_opens_where_there_is_a_display(default: Recording, tmp_path: P
     environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
     done = subprocess.run(
         [sys.executable, "-c", SHOW, default.bag, json.dumps(given)],
-        capture_output=True, text=True, timeout=60, env=environment,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
+    )
     assert done.stdout == "".join(f"{said}\n" for *_, said in cases), done.stderr
 
 
 # --- what is wrong ---
 
 
-def test_what_else_is_wrong_is_named(
-    default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_else_is_wrong_is_named(default: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     drawn = drawing(read_tracks([default.bag]))
     Path("folder.png").mkdir()
@@ -328,9 +329,7 @@ def test_what_else_is_wrong_is_named(
 
 def test_without_matplotlib_it_says_what_to_install() -> None:
     code = "import sys; sys.modules['matplotlib'] = None; import twodof.plots.runs"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, timeout=60
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, timeout=60)
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith("twodof.errors.PlotError: cannot plot: ")
     assert last.endswith("install the package 'matplotlib' (the extra 'view')")
@@ -349,9 +348,8 @@ def test_joints_are_chosen(default: Recording, tmp_path: Path, capsys: Any) -> N
 
 
 def test_the_command_says_where_the_plot_is_and_what_came_out(
-    gains: dict[int, Recording], foreign: Path, ur5: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: Any,
-) -> None:  # fmt: skip
+    gains: dict[int, Recording], foreign: Path, ur5: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ur5.urdf").write_text(ur5)
     options = ["--urdf", "ur5.urdf", "--frame", "forearm_link"]
@@ -364,9 +362,7 @@ def test_the_command_says_where_the_plot_is_and_what_came_out(
     assert main(["plot", str(gains[20].bag), str(gains[50].bag), "-o", "both.html"]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in printed] == ["plot", "Kp = 20 s⁻²", "Kp = 50 s⁻²"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "Kp50.png", "a.svg", "both.html", "ur5.urdf"
-    ]  # fmt: skip
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["Kp50.png", "a.svg", "both.html", "ur5.urdf"]
 
 
 def test_the_command_fails_in_one_line(

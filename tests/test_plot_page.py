@@ -52,9 +52,7 @@ def test_a_page_has_the_curves_of_the_bags(gains: dict[int, Recording]) -> None:
         np.testing.assert_allclose(traces(time, "", "error")[i][:, 1], error, atol=1e-15)
 
 
-def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(
-    default: Recording, tmp_path: Path
-) -> None:
+def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(default: Recording, tmp_path: Path) -> None:
     """It keeps extremes, and jumps that are none, of one sample, in a curve that swings further."""
     n, jumps = 360_000, np.array([11_113, 130_077, 347_042])
     noise = np.random.default_rng(0).normal(scale=0.01, size=(n, 2))
@@ -74,9 +72,7 @@ def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(
     assert {*jumps, *jumps - 1} <= {*np.rint(jumping[:, 0] * 1000).astype(int)}
     page = save(drawing(tracks), tmp_path / "hour.html")
     assert page.stat().st_size <= 6e6
-    (told,) = re.findall(
-        r"'Kp50' is drawn through at most (\d+) of 360000 samples", page.read_text("utf-8")
-    )
+    (told,) = re.findall(r"'Kp50' is drawn through at most (\d+) of 360000 samples", page.read_text("utf-8"))
     assert max(len(line), len(jumping)) <= int(told) <= 30_000
 
 
@@ -163,9 +159,7 @@ def test_a_page_answers(gains: dict[int, Recording], chromium: Any, tmp_path: Pa
     assert said == []
 
 
-def test_buttons_of_a_page_cover_no_heading(
-    default: Recording, chromium: Any, tmp_path: Path
-) -> None:
+def test_buttons_of_a_page_cover_no_heading(default: Recording, chromium: Any, tmp_path: Path) -> None:
     """Nor on a phone, where they are always shown."""
     page = save(drawing(read_tracks([default.bag])), tmp_path / "a.html")
     phone = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}

@@ -17,17 +17,7 @@ import pytest
 from figures import heights, legend_of, lines, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from recordings import (
-    LINK,
-    UR5_JOINTS,
-    Recording,
-    bare,
-    build,
-    chain_urdf,
-    elsewhere,
-    record,
-    waves,
-)
+from recordings import LINK, UR5_JOINTS, Recording, bare, build, chain_urdf, elsewhere, record, waves
 
 import twodof
 from twodof.errors import PlotError, TwoDofError
@@ -38,9 +28,7 @@ from twodof.plots.track import read_tracks
 ARM = Path(__file__).parents[1] / "urdf/2dof.urdf"
 
 
-def seen(
-    folder: Path, urdf: str, names: Sequence[str], *motion: Any, frame: str | None = None
-) -> Figure:
+def seen(folder: Path, urdf: str, names: Sequence[str], *motion: Any, frame: str | None = None) -> Figure:
     """A bag from elsewhere, drawn with a robot."""
     (folder / "robot.urdf").write_text(urdf)
     bag = elsewhere(folder / "bag", names, *motion)
@@ -71,9 +59,7 @@ def test_a_robot_in_space_is_seen_from_above_and_from_the_side(ur5: str, tmp_pat
     data = model.createData()
     pin.forwardKinematics(model, data, recording.q[-1])
     places = np.array([*(place.translation for place in data.oMi), path[-1]])  # root, joints, end
-    assert [(v.get_xlabel(), v.get_ylabel()) for v in found.views] == [
-        ("x in m", "y in m"), ("x in m", "z in m"),
-    ]  # fmt: skip
+    assert [(v.get_xlabel(), v.get_ylabel()) for v in found.views] == [("x in m", "y in m"), ("x in m", "z in m")]
     for view, columns in zip(found.views, ([0, 1], [0, 2]), strict=True):
         np.testing.assert_allclose(only(view, "path"), path[:, columns], rtol=0.0, atol=1e-12)
         target = np.array([0.3, 0.35, 0.5])[columns]
@@ -106,9 +92,7 @@ def test_a_single_joint_has_its_position_above_its_velocity(tmp_path: Path) -> N
     np.testing.assert_allclose(np.hypot(*circle.T), 0.4)
     assert found.error is not None
     height = 0.4 * np.sin(recording.q[:, 0])
-    np.testing.assert_allclose(
-        only(found.error, "bag")[:, 1], np.abs(height - 0.2), rtol=1e-9, atol=1e-15
-    )
+    np.testing.assert_allclose(only(found.error, "bag")[:, 1], np.abs(height - 0.2), rtol=1e-9, atol=1e-15)
 
 
 def test_joints_that_slide_have_metres(tmp_path: Path) -> None:
@@ -121,15 +105,18 @@ def test_joints_that_slide_have_metres(tmp_path: Path) -> None:
 
 
 PLANES = {
-    "z": ("xy", 0.4), "y": ("xz", 0.4), "zz": ("xy", 0.8), "X": ("xz", None), "zX": ("xy", None),
-    "yZ": ("xz", None), "yy": ("xz", 0.8),
-}  # fmt: skip
+    "z": ("xy", 0.4),
+    "y": ("xz", 0.4),
+    "zz": ("xy", 0.8),
+    "X": ("xz", None),
+    "zX": ("xy", None),
+    "yZ": ("xz", None),
+    "yy": ("xz", 0.8),
+}
 
 
 @pytest.mark.parametrize(("axes", "expected"), PLANES.items(), ids=list(PLANES))
-def test_motion_in_a_plane_is_seen_in_that_plane(
-    axes: str, expected: tuple[str, float | None], tmp_path: Path
-) -> None:
+def test_motion_in_a_plane_is_seen_in_that_plane(axes: str, expected: tuple[str, float | None], tmp_path: Path) -> None:
     """With the circle that it cannot leave, if all of its joints turn."""
     names = [f"j{i + 1}" for i in range(len(axes))]
     (view,) = panels(seen(tmp_path, chain_urdf(axes), names, *waves(len(axes)))).views
@@ -200,9 +187,7 @@ def test_with_a_urdf_it_has_limits_path_and_arm(foreign: Path, ur5: str, tmp_pat
     assert found.q[0].get_title("left") == "Position in rad"
 
 
-def test_another_frame_needs_only_the_joints_that_move_it(
-    foreign: Path, ur5: str, tmp_path: Path
-) -> None:
+def test_another_frame_needs_only_the_joints_that_move_it(foreign: Path, ur5: str, tmp_path: Path) -> None:
     t, q, v = waves(6)
     names = UR5_JOINTS[:4]  # those up to the forearm and one more
     figure = seen(tmp_path, ur5, names, t, q[:, :4], v[:, :4], frame="forearm_link")
@@ -221,9 +206,7 @@ def test_a_urdf_that_cannot_be_simulated_can_be_drawn(robots: Path, tmp_path: Pa
     figure = seen(tmp_path, massless, names, t, q, v, frame="panda_rightfinger")
     alone = re.sub("<mimic[^>]*/>", "", urdf)
     path = kinematics(alone, "panda_rightfinger", names, q)
-    np.testing.assert_allclose(
-        only(panels(figure).views[0], "path"), path[:, :2], rtol=0.0, atol=1e-12
-    )
+    np.testing.assert_allclose(only(panels(figure).views[0], "path"), path[:, :2], rtol=0.0, atol=1e-12)
 
 
 def test_bags_without_velocities_or_with_gaps(tmp_path: Path) -> None:
@@ -313,7 +296,7 @@ BAD: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
         r"'.*bag' has no joint 'j3', which the robot 'chain' needs to move 'tip';"
         " its joints are: j1, j2$",
     ),
-}  # fmt: skip  # fmt: skip
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("urdf", "options", "message"), BAD.values(), ids=list(BAD))

@@ -45,14 +45,13 @@ def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, bool], two
             twodof.build_fmu(
                 folder / f"{name}{native:d}.fmu",
                 FmuOptions(
-                    urdf=robots_folder() / urdf, frame=frame, control="pose", native=native,
-                    meshes=False, q_start=start,
+                    urdf=robots_folder() / urdf, frame=frame, control="pose", native=native, meshes=False, q_start=start
                 ),
             )
         )
         for name, (urdf, frame, start) in of.items()
         for native in (False, True)
-    }  # fmt: skip
+    }
 
 
 def starts(fmu: twodof.Fmu, group: str) -> np.ndarray:
@@ -142,9 +141,7 @@ def test_almost_half_a_turn_is_finite_and_the_short_way(fmus, native: bool) -> N
     for degrees, way in ((179.999, 179.999), (180.0, None), (180.001, -179.999)):
         found = errors_after_a_turn(fmus["ur10", native], math.radians(degrees) * axis)
         short = np.sign(found[1] @ axis) * 180.0 if way is None else way
-        np.testing.assert_allclose(
-            found[1:], closed_form(math.radians(short) * axis)[1:], atol=1e-9
-        )
+        np.testing.assert_allclose(found[1:], closed_form(math.radians(short) * axis)[1:], atol=1e-9)
 
 
 @FLAVOURS
@@ -178,9 +175,7 @@ def test_outputs_are_the_frames_orientation_and_angular_velocity(fmus, native: b
             found = read()
             pin.forwardKinematics(robot.model, data, q, v)
             turned = pin.updateFramePlacement(robot.model, data, robot.frame_id).rotation
-            spin = pin.getFrameVelocity(
-                robot.model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
-            ).angular
+            spin = pin.getFrameVelocity(robot.model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED).angular
             np.testing.assert_allclose(
                 [*found], [*Rotation.from_matrix(turned).as_quat(canonical=True), *spin], atol=1e-12
             )
@@ -276,9 +271,7 @@ def test_without_provenance_the_target_is_that_of_the_poses(bag: Path, tmp_path:
     shutil.copytree(bag, tmp_path / "bag")
     (tmp_path / "bag" / "run.json").unlink()
     metadata = (tmp_path / "bag/metadata.yaml").read_text()
-    (tmp_path / "bag/metadata.yaml").write_text(
-        re.sub("custom_data:.*", "custom_data: {}", metadata, flags=re.S)
-    )
+    (tmp_path / "bag/metadata.yaml").write_text(re.sub("custom_data:.*", "custom_data: {}", metadata, flags=re.S))
     found = twodof.read_bag(tmp_path / "bag").target
     np.testing.assert_allclose(found, twodof.read_bag(bag).target, atol=1e-15)
 
@@ -336,20 +329,17 @@ def test_a_pose_on_the_network_is_the_target(
         (root, (9.0, 9.0, 9.0), (0.0, 0.0, math.inf, 0.0)),
         ("", (0.5, 0.2, 0.7), (0.0, 2.0, 0.0, 0.0)),
     ]
-    text = "".join(
-        f"({f!r}, {p!r}, {q!r})\n".replace("inf", "float('inf')") for f, p, q in messages
-    )
+    text = "".join(f"({f!r}, {p!r}, {q!r})\n".replace("inf", "float('inf')") for f, p, q in messages)
 
     def hears() -> Any:
         asked.append(wire.command())
         return asked[-1]
 
     with (
-        caplog.at_level(logging.WARNING, "twodof"), Publisher(scene=True).begin(run) as wire,
-        subprocess.Popen(
-            [sys.executable, "-c", TALKER], stdin=subprocess.PIPE, text=True
-        ) as talker,
-    ):  # fmt: skip
+        caplog.at_level(logging.WARNING, "twodof"),
+        Publisher(scene=True).begin(run) as wire,
+        subprocess.Popen([sys.executable, "-c", TALKER], stdin=subprocess.PIPE, text=True) as talker,
+    ):
         assert talker.stdin is not None
         talker.stdin.write(text)
         talker.stdin.close()
@@ -358,10 +348,15 @@ def test_a_pose_on_the_network_is_the_target(
         talker.kill()
     assert [command for command in asked if command] == [
         {
-            "x_des[1]": 0.5, "x_des[2]": 0.2, "x_des[3]": 0.7,
-            "quat_des[1]": 0.0, "quat_des[2]": 2.0, "quat_des[3]": 0.0, "quat_des[4]": 0.0,
+            "x_des[1]": 0.5,
+            "x_des[2]": 0.2,
+            "x_des[3]": 0.7,
+            "quat_des[1]": 0.0,
+            "quat_des[2]": 2.0,
+            "quat_des[3]": 0.0,
+            "quat_des[4]": 0.0,
         }
-    ]  # fmt: skip
+    ]
     told = [record.getMessage() for record in caplog.records]
     assert "a pose on /target_command is in frame 'elsewhere'" in told[0]
     assert "has the orientation 0, 0, 0, 0: ignored" in told[1] and "not finite" in told[2]

@@ -108,9 +108,8 @@ def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
     assert len(changes) == len(TARGETS)
     start = stored.provenance["start_time"]
     again = twodof.experiment(
-        fmu, start_time=start, stop_time=start + (len(stored.t) - 1) / 100,
-        settings=stored.provenance["start_values"],
-    )  # fmt: skip
+        fmu, start_time=start, stop_time=start + (len(stored.t) - 1) / 100, settings=stored.provenance["start_values"]
+    )
     due = iter(changes)
     change: tuple[float, dict[str, Any]] | None = next(due)
 
@@ -181,9 +180,7 @@ def test_so_it_is_after_a_kill_up_to_the_last_flush(native_path: Path, tmp_path:
     assert len(track.recording.provenance["input_changes"]) >= len(track.t) - 1
 
 
-def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(native_path: Path, tmp_path: Path) -> None:
     """In a bag whose run.json was lost, and where there were more changes than it has room for."""
     samples = Collector()
     run = twodof.experiment(native_path, stop_time=STEPS / 100)
@@ -215,9 +212,7 @@ def _renamed_root(urdf: Path) -> Path:
     other = urdf.with_name("other.urdf")
     root = ET.fromstring(urdf.read_text())
     children = {child.get("link") for child in root.iter("child")}
-    name = next(
-        str(link.get("name")) for link in root.iter("link") if link.get("name") not in children
-    )
+    name = next(str(link.get("name")) for link in root.iter("link") if link.get("name") not in children)
     other.write_text(urdf.read_text().replace(f'"{name}"', '"elsewhere"'))
     return other
 
@@ -240,9 +235,7 @@ def test_what_is_not_known_is_not_shown(native_path: Path, tmp_path: Path) -> No
 def test_provenance_is_complete(native_path: Path, tmp_path: Path, storage: str) -> None:
     inputs = tmp_path / "inputs.csv"
     inputs.write_text("time,x_des[1],x_des[2]\n0.02,0.25,0.1\n0.05,0.2,0.05\n")
-    run = twodof.experiment(
-        native_path, stop_time=0.1, step=0.005, settings={"Kp": 80.0}, input_file=inputs
-    )
+    run = twodof.experiment(native_path, stop_time=0.1, step=0.005, settings={"Kp": 80.0}, input_file=inputs)
     command_line = "twodof run --set Kp=80 --input inputs.csv"
     bag = twodof.Bag(tmp_path / "bag", storage=storage, command_line=command_line)
     twodof.simulate(run, bag)
@@ -254,9 +247,7 @@ def test_provenance_is_complete(native_path: Path, tmp_path: Path, storage: str)
     for variable in description.iter("ScalarVariable"):
         if variable.get("causality") in ("input", "parameter"):
             text = variable[0].get("start", "")
-            starts[variable.get("name", "")] = (
-                text == "true" if variable[0].tag == "Boolean" else float(text)
-            )
+            starts[variable.get("name", "")] = text == "true" if variable[0].tag == "Boolean" else float(text)
     assert {"x_des[1]", "Kd[2]", "tau_ext[1]", "Kn", "q_max[2]", "limit_effort"} <= set(starts)
 
     found = json.loads((tmp_path / "bag" / "run.json").read_text("utf-8"))
@@ -275,10 +266,7 @@ def test_provenance_is_complete(native_path: Path, tmp_path: Path, storage: str)
         "start_time": 0.0,
         "step": 0.005,
         "start_values": {**starts, "Kp[1]": 80.0, "Kp[2]": 80.0},
-        "input_changes": [
-            [0.02, {"x_des[1]": 0.25, "x_des[2]": 0.1}],
-            [0.05, {"x_des[1]": 0.2, "x_des[2]": 0.05}],
-        ],
+        "input_changes": [[0.02, {"x_des[1]": 0.25, "x_des[2]": 0.1}], [0.05, {"x_des[1]": 0.2, "x_des[2]": 0.05}]],
         "command_line": command_line,
         "urdf": urdf,
     }
@@ -306,9 +294,7 @@ def test_provenance_has_each_change_of_an_input_that_a_loop_sends(
     assert provenance["input_changes"] == CHANGES
 
 
-def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(native_path: Path, tmp_path: Path) -> None:
     """At each flush, so that they survive the death of the process."""
     run = twodof.experiment(native_path, stop_time=math.inf)
     steps = twodof.samples(run)
@@ -321,13 +307,13 @@ def test_changes_of_inputs_are_stored_with_the_messages_that_they_caused(
         there = bag.path / "run.json"
         wait_until(lambda: json.loads(there.read_text())["input_changes"] == CHANGES)
     assert json.loads((tmp_path / "early" / "run.json").read_text())["input_changes"] in (
-        CHANGES[:0], CHANGES[:1], CHANGES,
-    )  # fmt: skip
+        CHANGES[:0],
+        CHANGES[:1],
+        CHANGES,
+    )
 
 
-def test_provenance_says_where_it_was_full(
-    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_provenance_says_where_it_was_full(run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twodof.bag.provenance.MAX_PROVENANCE", MAX_TAIL + 20_000)
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(1000):
@@ -343,9 +329,7 @@ def test_provenance_says_where_it_was_full(
     assert provenance["inputs_known_until"] == round(changes[-1][0] * 100 + 1) / 100
 
 
-def test_custom_data_leaves_out_changes_that_take_yaml_minutes(
-    run: Experiment, tmp_path: Path
-) -> None:
+def test_custom_data_leaves_out_changes_that_take_yaml_minutes(run: Experiment, tmp_path: Path) -> None:
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(20_000):
             inputs = {"x_des[1]": k / 7}
@@ -355,9 +339,7 @@ def test_custom_data_leaves_out_changes_that_take_yaml_minutes(
     assert len(twodof.read_bag(tmp_path / "bag").provenance["input_changes"]) == 20_000
 
 
-def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(
-    run: Experiment, tmp_path: Path
-) -> None:
+def test_custom_data_is_the_provenance_wherever_yaml_breaks_its_lines(run: Experiment, tmp_path: Path) -> None:
     damaged = []
     for n in range(0, 80, 7):
         path = tmp_path / f"bag{n}"

@@ -20,19 +20,7 @@ import numpy as np
 import pytest
 from bags import SECOND, assert_consistent
 from harness import wait_until
-from nodes import (
-    CABLE,
-    COMMANDS,
-    LATCHED,
-    STREAMS,
-    Node,
-    ended,
-    environment,
-    isolated,
-    published,
-    recorded,
-    stamp_of,
-)
+from nodes import CABLE, COMMANDS, LATCHED, STREAMS, Node, ended, environment, isolated, published, recorded, stamp_of
 
 import twodof
 from twodof.cli.main import main
@@ -45,22 +33,22 @@ HASHES = {
     "sensor_msgs JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     "std_msgs String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "tf2_msgs TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-    "geometry_msgs PointStamped": (
-        "4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"
-    ),
+    "geometry_msgs PointStamped": ("4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"),
 }
 """Of types, as 'ros2 topic info --verbose' tells them."""
 TYPES = dict(
-    joint_states="sensor_msgs JointState", robot_description="std_msgs String",
-    tf="tf2_msgs TFMessage", tf_static="tf2_msgs TFMessage",
-    target="geometry_msgs PointStamped", end_effector="geometry_msgs PointStamped",
-)  # fmt: skip
+    joint_states="sensor_msgs JointState",
+    robot_description="std_msgs String",
+    tf="tf2_msgs TFMessage",
+    tf_static="tf2_msgs TFMessage",
+    target="geometry_msgs PointStamped",
+    end_effector="geometry_msgs PointStamped",
+)
 
 
 def test_another_makers_dds_hears_every_field_of_the_bag(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
-    length: Callable[[int, int], int],
-) -> None:  # fmt: skip
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
+) -> None:
     """Under the names, types and type hashes of ROS 2, stamped by the wall clock."""
     seconds, before = length(60, 2), 4  # in which a busy machine finds the node
     node = listen(*STREAMS, *LATCHED)
@@ -81,9 +69,7 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
         assert node.messages(topic) == truth[topic]
     state = truth["/joint_states"][0]
     assert state[1] == ["joint1", "joint2"] and len(state[4]) == 2  # names, efforts
-    assert re.search(
-        rf"deadlines +\d+ of {100 * (seconds + before) + 1} missed, worst [\d.]+ ms", out
-    )
+    assert re.search(rf"deadlines +\d+ of {100 * (seconds + before) + 1} missed, worst [\d.]+ ms", out)
     writers = {topic: rest for event, topic, *rest in node.told if event == "writer"}
     for topic, kind in TYPES.items():
         name = kind.replace(" ", "::msg::dds_::") + "_"
@@ -95,9 +81,8 @@ def test_another_makers_dds_hears_every_field_of_the_bag(
 
 
 def test_who_comes_late_gets_what_is_latched_and_the_last_sample_before_a_signal(
-    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node],
-    length: Callable[[int, int], int],
-) -> None:  # fmt: skip
+    native_path: Path, tmp_path: Path, number: int, listen: Callable[..., Node], length: Callable[[int, int], int]
+) -> None:
     bag = tmp_path / "bag"
     with published(number, native_path, "--scene", "-o", str(bag)) as process:
         time.sleep(length(45, 1))
@@ -148,9 +133,7 @@ def test_a_point_is_the_target_within_two_steps(
     # the FMU had it: its own trajectory with those targets from those steps on
     told = {round(t / step): values for t, values in changes}
     assert max(told) < len(states) - 1
-    run = twodof.samples(
-        native_path, step=step, stop_time=(len(states) - 1) * step, settings={"Kp": 80}
-    )
+    run = twodof.samples(native_path, step=step, stop_time=(len(states) - 1) * step, settings={"Kp": 80})
     sample = next(run)
     for state in states:
         assert state[2:4] == [list(sample.q), list(sample.v)]
@@ -194,9 +177,7 @@ def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
     assert len(lines) == len(warnings)
     for warning in warnings:
         assert [bool(re.fullmatch(warning, line)) for line in lines].count(True) == 1
-    states = np.array(
-        [state[2] + state[3] for state in recorded(tmp_path / "bag")["/joint_states"]]
-    )
+    states = np.array([state[2] + state[3] for state in recorded(tmp_path / "bag")["/joint_states"]])
     assert np.isfinite(states).all()
     bag = twodof.read_bag(tmp_path / "bag")
     np.testing.assert_allclose(bag.x[-1], (0.25, 0.0625), atol=1e-2)
@@ -255,9 +236,7 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
     with published(number, native_path, *options, inside=inside, ROS_LOCALHOST_ONLY="") as process:
         assert "end       after 0.5 s, or Ctrl-C\n" in process.told
         _, err = ended(process)
-    assert err.splitlines() == [
-        "WARNING: there is no network interface: nobody can hear what is published"
-    ]
+    assert err.splitlines() == ["WARNING: there is no network interface: nobody can hear what is published"]
     assert len(recorded(bag)["/joint_states"]) == 51
 
 
@@ -277,15 +256,24 @@ def packets(process: subprocess.Popen[str]) -> int:
         ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "cable0, range OFF (nobody)", False, False),
         (["--subnet"], {}, "cable0, range SUBNET (other hosts too)", True, True),
         (
-            [], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"},
-            "cable0, range SYSTEM_DEFAULT (other hosts too)", True, True,
+            [],
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"},
+            "cable0, range SYSTEM_DEFAULT (other hosts too)",
+            True,
+            True,
         ),
     ],
-)  # fmt: skip
+)
 def test_range(
-    native_path: Path, number: int, listen: Callable[..., Node],
-    options: list[str], variables: dict[str, str], reach: str, local: bool, outside: bool,
-) -> None:  # fmt: skip
+    native_path: Path,
+    number: int,
+    listen: Callable[..., Node],
+    options: list[str],
+    variables: dict[str, str],
+    reach: str,
+    local: bool,
+    outside: bool,
+) -> None:
     """A node of ROS 2's default range hears the run, and packets leave the host, or not."""
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     inside = isolated(CABLE)
@@ -296,9 +284,7 @@ def test_range(
         else:
             time.sleep(1.5)
             assert packets(process) == 0
-        node = listen(
-            "--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid))
-        )
+        node = listen("--any", "/joint_states", inside=("nsenter", "--net", "--target", str(process.pid)))
         if local:
             node.hears()
         else:
@@ -338,9 +324,7 @@ SHELLS = (  # of its ranges LOCALHOST and SUBNET
 
 
 @pytest.mark.parametrize("variables", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}])
-def test_cyclone_dds_as_jazzy_configures_it_hears(
-    native_path: Path, number: int, variables: dict[str, str]
-) -> None:
+def test_cyclone_dds_as_jazzy_configures_it_hears(native_path: Path, number: int, variables: dict[str, str]) -> None:
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     with published(number, native_path, inside=isolated(CABLE), **variables) as process:
         enter = ["nsenter", "--net", "--target", str(process.pid)]
@@ -408,9 +392,12 @@ def test_an_hour_has_flat_memory(
     command = [sys.executable, "-c", MEMORY, str(native_path), str(steps)]
     done = subprocess.run(
         [*command, "paced" if steps == 360_000 else ""],
-        cwd=Path(__file__).parent, env=environment(number),
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        cwd=Path(__file__).parent,
+        env=environment(number),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     print(f"{steps} samples: memory grew by {int(done.stdout) / 2**20:.1f} MiB")
     assert int(done.stdout) <= min(10e6, 250 * steps)
 
@@ -424,10 +411,7 @@ def test_an_hour_has_flat_memory(
         ({"ROS_STATIC_PEERS": "10.0.0.5;localhost;"}, Network(peers=("10.0.0.5", "localhost"))),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, Network(range="OFF")),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, Network(range="SUBNET")),
-        (
-            {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
-            Network(loopback=True),
-        ),
+        ({"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, Network(loopback=True)),
     ],
 )
 def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> None:
@@ -458,9 +442,12 @@ def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> 
     ],
 )
 def test_a_network_that_cannot_be(
-    native_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
-    variables: dict[str, str], culprit: str,
-) -> None:  # fmt: skip
+    native_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    variables: dict[str, str],
+    culprit: str,
+) -> None:
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert main(["publish", str(native_path), "--stop-time", "0.1"]) == 1
@@ -508,9 +495,7 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(
     shipped = data_file("urdf", "2dof.urdf").read_text()
     for maker, mass in (("one", "0.18"), ("other", "9.18")):
         Path(maker).mkdir()
-        Path(maker, "arm.urdf").write_text(
-            shipped.replace('mass value="0.18', f'mass value="{mass}')
-        )
+        Path(maker, "arm.urdf").write_text(shipped.replace('mass value="0.18', f'mass value="{mass}'))
     robots = ["a=one/arm.urdf", "b=other/arm.urdf"]
     assert main(["publish", *robots, "--stop-time", "0.01"]) == 1
     assert "'arm.fmu' is another FMU, and is not replaced" in capsys.readouterr().err
@@ -519,9 +504,7 @@ def test_robots_whose_fmus_would_be_one_file_are_refused(
     assert told in capsys.readouterr().err
 
 
-def test_a_robots_name_is_told_as_it_was_given(
-    native_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robots_name_is_told_as_it_was_given(native_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["publish", f"1={native_path}", "--stop-time", "0.01"]) == 1
     assert "NAME=FMU '1' is no name of ROS 2" in capsys.readouterr().err
     run = twodof.experiment(native_path, stop_time=0.1)

@@ -76,29 +76,30 @@ def other_host(process: subprocess.Popen[str]) -> Iterator[int]:
         ([], {}, "(this host alone; --subnet opens it)", False),
         ([], {"ROS_LOCALHOST_ONLY": "1"}, "loopback alone (ROS_LOCALHOST_ONLY)", False),
         ([], {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, "(nobody)", False),
+        ([], {"ROS_STATIC_PEERS": "10.200.0.3"}, "(this host and 10.200.0.3; --subnet opens it)", False),
         (
-            [], {"ROS_STATIC_PEERS": "10.200.0.3"},
-            "(this host and 10.200.0.3; --subnet opens it)", False,
-        ),
-        (
-            [], {"ROS_STATIC_PEERS": "10.200.0.3;10.200.0.2"},
-            "(this host and 10.200.0.3, 10.200.0.2; --subnet opens it)", True,
+            [],
+            {"ROS_STATIC_PEERS": "10.200.0.3;10.200.0.2"},
+            "(this host and 10.200.0.3, 10.200.0.2; --subnet opens it)",
+            True,
         ),
         (["--subnet"], {}, "range SUBNET (other hosts too)", True),
     ],
-)  # fmt: skip
+)
 def test_other_hosts_are_obeyed_where_it_says_so_alone(
-    native_path: Path, tmp_path: Path, number: int,
-    options: list[str], variables: dict[str, str], said: str, open_to: bool,
-) -> None:  # fmt: skip
+    native_path: Path,
+    tmp_path: Path,
+    number: int,
+    options: list[str],
+    variables: dict[str, str],
+    said: str,
+    open_to: bool,
+) -> None:
     """One that announces itself to each of the run's ports, listens and commands."""
     bag, inside = tmp_path / "bag", isolated(CABLE)
     variables = {"ROS_LOCALHOST_ONLY": "", **variables}
     options = [*options, "-o", str(bag)]
-    with (
-        published(number, native_path, *options, inside=inside, **variables) as process,
-        other_host(process) as host,
-    ):
+    with published(number, native_path, *options, inside=inside, **variables) as process, other_host(process) as host:
         assert said in process.told[1]
         command = [*ENTER, str(host), sys.executable, "-c", FOREIGN, str(number), "10.200.0.1"]
         seconds = "60" if open_to else "6"

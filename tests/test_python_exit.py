@@ -54,16 +54,25 @@ def in_fmpy(folder: Path, guid: str, _: Path) -> tuple[list[str], dict[str, str]
 
 def from_c(folder: Path, guid: str, scratch: Path) -> tuple[list[str], dict[str, str]]:
     """A C program with libpython preloaded, as docs/fmi-tools.md has it."""
-    libpython = Path(
-        sysconfig.get_config_var("LIBDIR"), sysconfig.get_config_var("INSTSONAME") or ""
-    )
+    libpython = Path(sysconfig.get_config_var("LIBDIR"), sysconfig.get_config_var("INSTSONAME") or "")
     if not libpython.is_file():
         missing("libpython")
     headers = Path(fmpy.__file__).parent / "c-code"
     subprocess.run(
-        ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", f"-I{headers}", "-o", scratch / "host",
-         HERE / "python_host.c", "-ldl"], check=True,
-    )  # fmt: skip
+        [
+            "gcc",
+            "-std=c99",
+            "-Wall",
+            "-Wextra",
+            "-Werror",
+            f"-I{headers}",
+            "-o",
+            scratch / "host",
+            HERE / "python_host.c",
+            "-ldl",
+        ],
+        check=True,
+    )
     packages = os.pathsep.join(filter(None, sys.path))
     command = [str(scratch / "host"), str(folder / LIBRARY), guid, (folder / "resources").as_uri()]
     return command, {"LD_PRELOAD": str(libpython), "PYTHONPATH": packages}
@@ -77,9 +86,7 @@ def test_the_process_ends_without_use_of_freed_memory(unzipped, tmp_path, host):
     reports = []
     for library in ((unzipped / LIBRARY).read_bytes(), original()):
         (unzipped / LIBRARY).write_bytes(library)
-        done = subprocess.run(
-            [*valgrind, *command], env={**os.environ, **variables}, capture_output=True, text=True
-        )
+        done = subprocess.run([*valgrind, *command], env={**os.environ, **variables}, capture_output=True, text=True)
         reports.append(done.stderr)
     assert done.returncode == 0, reports  # valgrind's heap is none that is damaged
     assert "TwoDof.so" not in reports[0] and "_dl_call_fini" not in reports[0], reports[0]

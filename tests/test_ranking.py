@@ -28,12 +28,16 @@ def ur5(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         control: twodof.build_fmu(
             folder / f"{control}.fmu",
             twodof.FmuOptions(
-                urdf=robots_folder() / UR5, frame="ee_link", control=control, native=True,
-                meshes=False, q_start=(0.1, -1.2, 1.4, 0.2, -1.0, 0.3),
+                urdf=robots_folder() / UR5,
+                frame="ee_link",
+                control=control,
+                native=True,
+                meshes=False,
+                q_start=(0.1, -1.2, 1.4, 0.2, -1.0, 0.3),
             ),
         )
         for control in ("pose", "joint")
-    }  # fmt: skip
+    }
 
 
 def limits(quantity: str) -> np.ndarray:
@@ -52,9 +56,7 @@ class Kept(twodof.Sink):
 
 
 @pytest.mark.parametrize("count", [3, 5000])
-def test_a_summary_has_the_errors_of_all_that_is_controlled(
-    ur5: dict[str, Path], count: int
-) -> None:
+def test_a_summary_has_the_errors_of_all_that_is_controlled(ur5: dict[str, Path], count: int) -> None:
     kept = Kept()
     settings = {"quat_des": GOAL, "Kp": 400.0, "Kp_rot": 400.0}
     run = twodof.simulate(ur5["pose"], kept, settings=settings, step=0.002, stop_time=0.002 * count)
@@ -77,9 +79,7 @@ def test_a_summary_has_the_errors_of_all_that_is_controlled(
     assert [tuple(excess) for excess in run.beyond_limits] == worst and worst
 
 
-def test_a_run_of_joints_has_the_largest_error_and_saturation_is_within_limits(
-    ur5: dict[str, Path],
-) -> None:
+def test_a_run_of_joints_has_the_largest_error_and_saturation_is_within_limits(ur5: dict[str, Path]) -> None:
     goal = (0.3, -1.0, 1.2, 0.9, -0.8, 0.3)
     settings = {"q_des": goal, "Kp": 60.0, "Kd": 10.0, "limit_effort": True}
     run = twodof.simulate(ur5["joint"], settings=settings, stop_time=0.1)
@@ -100,9 +100,7 @@ def test_a_run_prints_all_of_its_errors_and_limits(
     assert main(["plot", bag, "-o", str(tmp_path / "plot.png")]) == 0
     out = capsys.readouterr().out
     assert " rad from its target orientation; " in out and "beyond its limit 28" in out
-    summary = twodof.simulate(
-        ur5["pose"], settings={"quat_des": GOAL, "Kp_rot": 400.0}, stop_time=0.3
-    )
+    summary = twodof.simulate(ur5["pose"], settings={"quat_des": GOAL, "Kp_rot": 400.0}, stop_time=0.3)
     assert f" {summary.turn_error:.3g} rad from its target orientation" in out
     assert main(["run", str(ur5["joint"]), "-o", bag, "--overwrite", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -112,8 +110,13 @@ def test_a_run_prints_all_of_its_errors_and_limits(
 
 
 def test_metrics_of_a_pose_are_those_of_its_samples(ur5: dict[str, Path], tmp_path: Path) -> None:
-    settings = {"quat_des": tuple(2.0 * np.array(GOAL)), "x_des": (0.4, 0.2, 0.5), "Kp": 100.0,
-                "Kd": 20.0, "Kd_rot": 20.0}  # fmt: skip
+    settings = {
+        "quat_des": tuple(2.0 * np.array(GOAL)),
+        "x_des": (0.4, 0.2, 0.5),
+        "Kp": 100.0,
+        "Kd": 20.0,
+        "Kd_rot": 20.0,
+    }
     grid = {"Kp_rot": [1.0, 30.0, 100.0]}
     table = twodof.sweep(ur5["pose"], grid=grid, settings=settings, stop_time=4.0)
     for row in table.to_dict("records"):
@@ -150,9 +153,7 @@ def test_no_run_beyond_the_limits_is_best(
 ) -> None:
     arguments = ["--set", "q_des=0.3,-1.0,1.2,0.4,-0.8,0.5", "--set", "Kd=20", "--json"]
     folder = str(tmp_path / "some")
-    assert (
-        main(["sweep", str(ur5["joint"]), "--grid", "Kp=20:4000:5", "-o", folder, *arguments]) == 0
-    )
+    assert main(["sweep", str(ur5["joint"]), "--grid", "Kp=20:4000:5", "-o", folder, *arguments]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert 0 < facts["beyond_limits"] < 5
     assert len(facts["best"]) == 5 - facts["beyond_limits"]
@@ -162,10 +163,7 @@ def test_no_run_beyond_the_limits_is_best(
     said = f"note: {facts['beyond_limits']} of 5 finished runs exceed the URDF's effort or velocity"
     assert f"{said} limits and are not ranked\n" in out
     folder = str(tmp_path / "all")
-    assert (
-        main(["sweep", str(ur5["joint"]), "--grid", "Kp=4000:5000:2", "-o", folder, *arguments])
-        == 0
-    )
+    assert main(["sweep", str(ur5["joint"]), "--grid", "Kp=4000:5000:2", "-o", folder, *arguments]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["beyond_limits"] == len(facts["best"]) == 2
     assert main(["plot", folder, "-o", str(tmp_path / "map.png")]) == 0
@@ -195,9 +193,7 @@ def test_what_rounding_tells_apart_is_equal(
         ((0.0, 0.9e-12, 1.8e-12, 2.7e-12), (0, 0, 1, 1)),
     ],
 )
-def test_places_are_those_of_the_values(
-    values: tuple[float, ...], expected: tuple[int, ...]
-) -> None:
+def test_places_are_those_of_the_values(values: tuple[float, ...], expected: tuple[int, ...]) -> None:
     assert tuple(places(np.array(values))) == expected
     shuffled = np.random.default_rng(1).permutation(len(values))
     assert tuple(places(np.array(values)[shuffled])) == tuple(np.array(expected, int)[shuffled])

@@ -57,9 +57,7 @@ MCAPS = {
     "chunk that says it is huge": HEADER + chunk(b"", 2**62, "") + FOOTER,
     "chunk that says it is huge, packed": HEADER + chunk(b"x", 2**62, "zstd") + FOOTER,
     "unknown compression": HEADER + chunk(b"x", 1, "rot13") + FOOTER,
-    "text longer than its record": (
-        HEADER + record(3, struct.pack("<HI", 1, 2**31), b"x") + FOOTER
-    ),
+    "text longer than its record": (HEADER + record(3, struct.pack("<HI", 1, 2**31), b"x") + FOOTER),
     "text that is no UTF-8": HEADER + record(3, struct.pack("<H", 1) + texts(b"\xff")),
     "message of an unknown channel": HEADER + message(b"") + FOOTER,
     "message shorter than its head": TOPIC + chunk(record(5, b"\x01"), 10, "") + FOOTER,
@@ -89,16 +87,12 @@ def bag(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("content", MCAPS.values(), ids=MCAPS)
-def test_hostile_mcap_is_refused(
-    bag: Path, content: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_hostile_mcap_is_refused(bag: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
     (bag / "bag.mcap").write_bytes(content)
     refused(capsys, bag)
 
 
-def test_mcap_of_more_topics_than_are_read_is_refused(
-    bag: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mcap_of_more_topics_than_are_read_is_refused(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     topics = b"".join(channel(i, f"/t{i}") for i in range(2, 1002))
     (bag / "bag.mcap").write_bytes(TOPIC + topics + FOOTER)
     assert "has more than 1000 topics" in refused(capsys, bag)
@@ -121,8 +115,7 @@ DATABASES = {
         "has views, triggers or virtual tables",
     ),
     "a virtual table": (
-        "DROP TABLE messages;"
-        "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+        "DROP TABLE messages;CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
         "has views, triggers or virtual tables",
     ),
     "messages that are computed": (
@@ -147,10 +140,7 @@ DATABASES = {
         " junk BLOB, topic_id INTEGER, timestamp INTEGER, data BLOB)",
         "has messages that are not those of ROS 2",
     ),
-    "two hundred tables": (
-        "".join(f"CREATE TABLE t{n} (id);" for n in range(200)),
-        "interrupted",
-    ),
+    "two hundred tables": ("".join(f"CREATE TABLE t{n} (id);" for n in range(200)), "interrupted"),
     "more topics than are read": (
         f"INSERT INTO topics {COUNT} SELECT n + 9, 't' || n, 'x', 'cdr', '' FROM c LIMIT 1000",
         "has more than 1000 topics",
@@ -167,17 +157,12 @@ DATABASES = {
     "a stamp that is a text": ("INSERT INTO messages VALUES (1, 1, 'x', x'0001')", "is damaged"),
     "an unknown topic": ("INSERT INTO messages VALUES (1, 7, 1, x'00010000')", "is damaged"),
     "a topic that is a number": ("UPDATE topics SET name = x'07'", "is damaged"),
-    "a joint state that is none": (
-        "INSERT INTO messages VALUES (1, 1, 1, x'0001000001')",
-        "a joint state is damaged",
-    ),
+    "a joint state that is none": ("INSERT INTO messages VALUES (1, 1, 1, x'0001000001')", "a joint state is damaged"),
 }
 
 
 @pytest.mark.parametrize(("script", "reason"), DATABASES.values(), ids=DATABASES)
-def test_hostile_database_is_refused(
-    bag: Path, script: str, reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_hostile_database_is_refused(bag: Path, script: str, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A database as rosbag2 writes it, changed by some statements."""
     with sqlite3.connect(bag / "bag.db3") as database:
         database.executescript(
@@ -222,12 +207,8 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("what", "compression"), [("an arm", "lz4"), ("a humanoid", "zstd"), ("a heartbeat", "zstd")]
-)
-def test_mcap_of_what_is_at_rest_is_read_at_any_length(
-    tmp_path: Path, what: str, compression: str
-) -> None:
+@pytest.mark.parametrize(("what", "compression"), [("an arm", "lz4"), ("a humanoid", "zstd"), ("a heartbeat", "zstd")])
+def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path: Path, what: str, compression: str) -> None:
     """At the best level, in chunks of 4 MiB, without the index that tools write between them.
 
     That is as small as it gets; each of its chunks pays for itself, so a day of them does.
@@ -242,9 +223,7 @@ def test_mcap_of_what_is_at_rest_is_read_at_any_length(
 
 
 @pytest.mark.parametrize("read", [read_bag, read_ends])
-def test_memory_is_that_of_the_numbers(
-    bag: Path, read: Callable[[Path], Recording | tuple[Recording, int]]
-) -> None:
+def test_memory_is_that_of_the_numbers(bag: Path, read: Callable[[Path], Recording | tuple[Recording, int]]) -> None:
     n = 60_000
     (bag / "bag.mcap").write_bytes(TOPIC + message(joint_state(2, START)) * n + FOOTER)
     tracemalloc.start()

@@ -134,9 +134,7 @@ def test_mcap_cut_anywhere_keeps_what_came_before(run: Experiment, tmp_path: Pat
     assert max(counts) > 150 and len(counts) > 3
 
 
-def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(
-    run: Experiment, tmp_path: Path
-) -> None:
+def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run: Experiment, tmp_path: Path) -> None:
     bag = unfinished(tmp_path, run, "mcap", 200)
     file = bag / "bag.mcap"
     there = streamed(file)
@@ -147,9 +145,7 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(
 
 
 @pytest.mark.parametrize("part", [0.95, 0.5])
-def test_sqlite3_file_without_its_end_keeps_what_comes_before(
-    run: Experiment, tmp_path: Path, part: float
-) -> None:
+def test_sqlite3_file_without_its_end_keeps_what_comes_before(run: Experiment, tmp_path: Path, part: float) -> None:
     """What SQLite itself reads once its header has the number of pages that there are."""
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
@@ -163,9 +159,7 @@ def test_sqlite3_file_without_its_end_keeps_what_comes_before(
     (tmp_path / "mended.db3").write_bytes(mended)
     there = []
     with pytest.raises(sqlite3.DatabaseError):
-        for row in sqlite3.connect(tmp_path / "mended.db3").execute(
-            "SELECT timestamp, data FROM messages NOT INDEXED"
-        ):
+        for row in sqlite3.connect(tmp_path / "mended.db3").execute("SELECT timestamp, data FROM messages NOT INDEXED"):
             there.append(row)
     done = twodof.recover(bag)
     assert "malformed" in done.damage and len(there) > 1000
@@ -174,9 +168,7 @@ def test_sqlite3_file_without_its_end_keeps_what_comes_before(
 
 
 @pytest.mark.parametrize("table", ["messages", "topics", "message_definitions"])
-def test_a_table_whose_columns_are_damaged_is_not_an_empty_one(
-    run: Experiment, tmp_path: Path, table: str
-) -> None:
+def test_a_table_whose_columns_are_damaged_is_not_an_empty_one(run: Experiment, tmp_path: Path, table: str) -> None:
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
         sink.write(sample(run, 0))
@@ -206,9 +198,7 @@ def test_a_bag_of_which_nothing_can_be_read_stays(
 
 
 @pytest.mark.parametrize("named", ["", "a file", "nothing"])
-def test_sqlite3_transaction_that_was_cut_is_rolled_back(
-    run: Experiment, tmp_path: Path, named: str
-) -> None:
+def test_sqlite3_transaction_that_was_cut_is_rolled_back(run: Experiment, tmp_path: Path, named: str) -> None:
     """Also where its journal names that of several databases, which SQLite would delete."""
     bag = unfinished(tmp_path, run, "sqlite3", 200)
     file = bag / "bag.db3"
@@ -217,8 +207,7 @@ def test_sqlite3_transaction_that_was_cut_is_rolled_back(
     database.execute("PRAGMA cache_size = 2")  # so that pages are written before the commit
     database.execute("UPDATE messages SET data = zeroblob(length(data))")
     database.executemany(
-        "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, zeroblob(1000))",
-        [(k,) for k in range(1000)],
+        "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, zeroblob(1000))", [(k,) for k in range(1000)]
     )
     cut = tmp_path / "cut"
     shutil.copytree(bag, cut)
@@ -251,9 +240,7 @@ def super_journal(path: Path) -> bytes:
 
 
 @both_storages
-def test_recovered_bag_is_the_one_that_closing_makes(
-    run: Experiment, tmp_path: Path, storage: str
-) -> None:
+def test_recovered_bag_is_the_one_that_closing_makes(run: Experiment, tmp_path: Path, storage: str) -> None:
     bag = unfinished(tmp_path, run, storage, 2 * BATCH + 1, scene=True)
     with twodof.Bag(tmp_path / "closed" / "bag", storage=storage, scene=True).begin(run) as closed:
         for k in range(2 * BATCH + 1):
@@ -273,18 +260,14 @@ def test_recovered_bag_is_the_one_that_closing_makes(
 
 def messages(bag: Path) -> list[tuple[object, ...]]:
     with Reader(bag) as reader:
-        return sorted(
-            (c.topic, c.msgtype, c.ext, stamp, bytes(data)) for c, stamp, data in reader.messages()
-        )
+        return sorted((c.topic, c.msgtype, c.ext, stamp, bytes(data)) for c, stamp, data in reader.messages())
 
 
 DEFINITION = "# a comment\nfloat64[] readings\nstring unit\n"
 
 
 @pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.STORAGE])
-def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
-    tmp_path: Path, compression: CompressionMode
-) -> None:
+def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path: Path, compression: CompressionMode) -> None:
     """Two files, as of a recorder that splits; the last lacks its end."""
     from twodof.ros.messages import LATCHED
 
@@ -323,9 +306,7 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(
     assert connections["/talk"].digest == STORE.hash_rihs01("std_msgs/msg/String")
 
 
-def test_no_more_profiles_are_read_than_take_no_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_more_profiles_are_read_than_take_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of topics that have each its own; YAML is slow."""
     (tmp_path / "bag").mkdir()
     profiles = ["- {depth: [" + "1," * 300 + f"]}}#{i:02}" for i in range(50)]
@@ -348,9 +329,7 @@ def test_no_more_profiles_are_read_than_take_no_time(
 def test_messages_in_another_form_are_left_out_and_named(tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     other = record(4, struct.pack("<HH", 2, 1), texts("/text", "json", ""))
-    content = b"".join(
-        [HEADER, SCHEMA, CHANNEL, other, message(bytes(4)), message(b"{}", number=2)]
-    )
+    content = b"".join([HEADER, SCHEMA, CHANNEL, other, message(bytes(4)), message(b"{}", number=2)])
     (tmp_path / "bag/bag.mcap").write_bytes(content + FOOTER)
     done = twodof.recover(tmp_path / "bag")
     assert done.counts == {"/joint_states": 1}
@@ -384,9 +363,7 @@ def test_bag_that_is_being_written_is_left_alone(run: Experiment, tmp_path: Path
     assert assert_consistent(bag.path, "sqlite3") == 1
 
 
-def test_complete_bag_is_left_as_it_is(
-    run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_complete_bag_is_left_as_it_is(run: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with twodof.Bag(tmp_path / "bag", storage="sqlite3").begin(run) as bag:
         bag.write(sample(run, 0))
     before = content(tmp_path)
@@ -420,9 +397,7 @@ def test_damaged_provenance_does_not_keep_the_messages(run: Experiment, tmp_path
 
 
 @pytest.mark.parametrize("place", ["nowhere", "file", "empty", "no bag", "both", "taken"])
-def test_what_cannot_be_recovered_is_refused_and_left_alone(
-    run: Experiment, tmp_path: Path, place: str
-) -> None:
+def test_what_cannot_be_recovered_is_refused_and_left_alone(run: Experiment, tmp_path: Path, place: str) -> None:
     bag = unfinished(tmp_path, run, "mcap", 10)
     if place == "taken":
         (tmp_path / "bag.unfinished").mkdir()
@@ -482,9 +457,7 @@ for last, bag in enumerate(bags):
 """
 
 
-def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(
-    run: Experiment, tmp_path: Path
-) -> None:
+def test_recovery_killed_before_any_of_its_changes_is_finished_by_the_next(run: Experiment, tmp_path: Path) -> None:
     """Its changes to folders, one after the other; the last of these have not so many."""
     living = unfinished(tmp_path, run, "mcap", 200)
     before = content(living)
@@ -549,9 +522,7 @@ def test_bag_that_is_being_recovered_is_left_alone(
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "bag.unfinished"}
 
 
-def test_bag_is_recovered_from_within(
-    run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bag_is_recovered_from_within(run: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag = unfinished(tmp_path, run, "mcap", 10)
     monkeypatch.chdir(bag)
     assert twodof.recover(".").original == tmp_path / "bag.unfinished"

@@ -124,9 +124,8 @@ def text(name: str, content: str | bytes) -> Callable[[Path], None]:
 
 
 def fmu(
-    xml: str, *more: str, binary: str = "linux64/m.so", link: str = "",
-    change: Callable[..., bytes] = bytes,
-) -> Callable[[Path], None]:  # fmt: skip
+    xml: str, *more: str, binary: str = "linux64/m.so", link: str = "", change: Callable[..., bytes] = bytes
+) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         with zipfile.ZipFile(folder / "bad.fmu", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("modelDescription.xml", xml)
@@ -169,32 +168,25 @@ BAD: dict[str, Case] = {
     "URDF a folder": (nothing, [*BUILD[:-1], "."], "'.': Is a directory"),
     "URDF no XML": (text("arm.urdf", "a: 1"), BUILD, "arm.urdf: the URDF is not XML"),
     "URDF no text": (text("arm.urdf", b"\xff\x00"), BUILD, "'arm.urdf' is not UTF-8"),
-    "URDF with NUL": (
-        text("arm.urdf", urdf(mesh="a\0b.stl")), BUILD, "mesh 'a.*b.stl'|the URDF is not XML",
-    ),
-    "URDF with entities": (
-        text("arm.urdf", '<!DOCTYPE robot [<!ENTITY a "b">]>' + urdf()), BUILD, "document type",
-    ),
-    "no such frame": (
-        text("arm.urdf", urdf()), [*BUILD, "--frame", "hand"], "no frame 'hand'.*: base, a$",
-    ),
+    "URDF with NUL": (text("arm.urdf", urdf(mesh="a\0b.stl")), BUILD, "mesh 'a.*b.stl'|the URDF is not XML"),
+    "URDF with entities": (text("arm.urdf", '<!DOCTYPE robot [<!ENTITY a "b">]>' + urdf()), BUILD, "document type"),
+    "no such frame": (text("arm.urdf", urdf()), [*BUILD, "--frame", "hand"], "no frame 'hand'.*: base, a$"),
     "joint type": (text("arm.urdf", urdf(kind="planar")), BUILD, "'j' is of type 'planar'"),
     "no mass": (text("arm.urdf", urdf(link='<link name="a"/>')), BUILD, "'j': .*no mass .*--lock"),
     "negative mass": (
         text("arm.urdf", urdf(link=GOOD_LINK.replace('value="1"', 'value="-1"'))),
-        BUILD, "'a': negative mass -1",
+        BUILD,
+        "'a': negative mass -1",
     ),
     "inertia not physical": (
-        text("arm.urdf", urdf(link=GOOD_LINK.replace('ixx="1"', 'ixx="-9"'))), BUILD, "'a': its in",
+        text("arm.urdf", urdf(link=GOOD_LINK.replace('ixx="1"', 'ixx="-9"'))),
+        BUILD,
+        "'a': its in",
     ),
-    "inertia missing": (
-        text("arm.urdf", urdf(link=re.sub("<inertia .*?/>", "", GOOD_LINK))), BUILD, "link 'a'",
-    ),
+    "inertia missing": (text("arm.urdf", urdf(link=re.sub("<inertia .*?/>", "", GOOD_LINK))), BUILD, "link 'a'"),
     "q-start NaN": (nothing, ["build", "--q-start", "nan", "0"], "q_start .*nan.* finite"),
     "name that leaves the folder": (nothing, ["build", "--name", "../x"], "name '../x'"),
-    "output below a file": (
-        text("file", "x"), ["build", "-o", "file/x.fmu"], "cannot write 'file/x.fmu': Not a direc",
-    ),
+    "output below a file": (text("file", "x"), ["build", "-o", "file/x.fmu"], "cannot write 'file/x.fmu': Not a direc"),
     "output a folder": (nothing, ["build", "-o", "."], "cannot write '.'"),
     # an FMU
     "FMU missing": (nothing, RUN_BAD, "no FMU 'bad.fmu'; build one with 'twodof build'"),
@@ -205,41 +197,42 @@ BAD: dict[str, Case] = {
     "FMI 1.0": (fmu(FMI1), RUN_BAD, "'bad.fmu' is FMI 1.0 .*FMI 2.0"),
     "FMI 3.0": (fmu(FMI3), RUN_BAD, "'bad.fmu' is FMI 3.0 .*FMI 2.0 or 3.0 co-simulation"),
     "FMU encrypted": (fmu(description(), change=encrypted), RUN_BAD, "'bad.fmu'.*encrypted"),
-    "model exchange": (
-        fmu(description(kind="ModelExchange")), RUN_BAD, "'bad.fmu' is FMI 2.0 model exchange",
-    ),
+    "model exchange": (fmu(description(kind="ModelExchange")), RUN_BAD, "'bad.fmu' is FMI 2.0 model exchange"),
     "description no XML": (fmu("<fmiModel"), RUN_BAD, "'bad.fmu': modelDescription.xml is not val"),
     "description not of the schema": (
-        fmu(description().replace("modelName", "title")), RUN_BAD, "'bad.fmu'.*(title|modelName)",
+        fmu(description().replace("modelName", "title")),
+        RUN_BAD,
+        "'bad.fmu'.*(title|modelName)",
     ),
     "description with a DTD, info": (
-        fmu(description(head='<!DOCTYPE x SYSTEM "/etc/passwd">')), INFO, "declares entities",
+        fmu(description(head='<!DOCTYPE x SYSTEM "/etc/passwd">')),
+        INFO,
+        "declares entities",
     ),
     "no binary for this platform": (
-        fmu(description(), binary="win64/m.dll"), RUN_BAD,
+        fmu(description(), binary="win64/m.dll"),
+        RUN_BAD,
         r"no binary for this platform \(linux64\), only for: win64",
     ),
     "binary that is none": (fmu(description()), RUN_BAD, "'bad.fmu' cannot be loaded"),
     "no outputs q": (fmu(description(outputs=("y",))), RUN_BAD, r"no outputs q\[1\]"),
-    "fewer v than q": (
-        fmu(description(outputs=("q[1]", "q[2]", "v[1]"))), RUN_BAD, r"no outputs q\[1\]",
-    ),
+    "fewer v than q": (fmu(description(outputs=("q[1]", "q[2]", "v[1]"))), RUN_BAD, r"no outputs q\[1\]"),
     "q and v not outputs": (fmu(description(causality="local")), INFO, r"no outputs q\[1\]"),
     "q and v not Real": (
         fmu(description().replace("<Real/>", "<Integer/>").replace("continuous", "discrete")),
-        INFO, r"no outputs q\[1\]",
+        INFO,
+        r"no outputs q\[1\]",
     ),
     "joints of another number": (
         fmu(description().replace("<ModelVariables>", VENDOR_JOINTS + "<ModelVariables>")),
-        INFO, "'bad.fmu' names 2 joints but has 1 outputs",
+        INFO,
+        "'bad.fmu' names 2 joints but has 1 outputs",
     ),
     "zip slip": (fmu(description(), "../evil"), RUN_BAD, "unsafe: its member '../evil' leaves"),
     "zip slip below": (fmu(description(), "resources/../../evil"), RUN_BAD, "unsafe: .*evil"),
     "zip slip of Windows": (fmu(description(), "..\\evil"), RUN_BAD, "unsafe: .*evil"),
     "absolute member": (fmu(description(), "/tmp/twodof_evil"), RUN_BAD, "unsafe: .*'/tmp/twodof_"),
-    "symbolic link": (
-        fmu(description(), link="resources/link"), RUN_BAD, "unsafe: its member 'resources/link'",
-    ),
+    "symbolic link": (fmu(description(), link="resources/link"), RUN_BAD, "unsafe: its member 'resources/link'"),
     "zip bomb": (fmu(description(), change=swollen), RUN_BAD, "unsafe: unzipped it exceeds"),
     # settings
     "--set of an unknown name": (nothing, [*RUN, "--set", "Kpp=1"], "'Kpp'; did you mean 'Kp'"),
@@ -254,35 +247,25 @@ BAD: dict[str, Case] = {
     "bag exists": (a_bag, [*RUN, "-o", "bag"], "'bag' exists already.*--overwrite"),
     "bag is a file": (text("bag", "x"), [*RUN, "-o", "bag"], "'bag' exists already"),
     "folder that is no bag, --overwrite": (
-        lambda folder: (folder / "bag").mkdir(), [*RUN, "-o", "bag", "--overwrite"],
+        lambda folder: (folder / "bag").mkdir(),
+        [*RUN, "-o", "bag", "--overwrite"],
         "'bag' is not a bag",
     ),
-    "file, --overwrite": (
-        text("bag", "x"), [*RUN, "-o", "bag", "--overwrite"], "'bag' is not a bag",
-    ),
+    "file, --overwrite": (text("bag", "x"), [*RUN, "-o", "bag", "--overwrite"], "'bag' is not a bag"),
     "bag below a file": (text("file", "x"), [*RUN, "-o", "file/bag"], "'file/bag'.*Not a dir"),
     "bag with too long a name": (nothing, [*RUN, "-o", LONG], f"'{LONG}'.*too long"),
-    "symbolic link to a bag, --overwrite": (
-        a_linked_bag,
-        [*RUN, "-o", "link", "--overwrite"], "'link'",
-    ),
+    "symbolic link to a bag, --overwrite": (a_linked_bag, [*RUN, "-o", "link", "--overwrite"], "'link'"),
     "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "stamp_start = -1 s"),
     "info of a folder": (nothing, ["info", "."], r"cannot read the bag '\.'"),
     "info of a bag's file": (text("a.db3", "x"), ["info", "a.db3"], "give the bag's folder"),
-    "info of a file that is no bag": (
-        text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"
-    ),
+    "info of a file that is no bag": (text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"),
     "info of too long a name": (nothing, ["info", LONG], f"'{LONG}'.*too long"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("make", "arguments", "culprit"), BAD.values(), ids=BAD)
 def test_bad_input_gets_one_line_and_leaves_nothing(
-    make: Callable[[Path], None],
-    arguments: list[str],
-    culprit: str,
-    folder: Path,
-    capfd: pytest.CaptureFixture[str],
+    make: Callable[[Path], None], arguments: list[str], culprit: str, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     make(folder)
     before = listing(folder.parent)
@@ -318,8 +301,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
         (["build", "--orientation", "--control", "joint"], "--orientation goes with"),
         (["build", "a.urdf", "--urdf", "b"], "given twice"),
         (["build", "--mesh-dir", "."], "without a URDF"),
-        (["build", "arm.urdf", "--mesh-dir", ".", "--no-meshes"],
-         "--no-meshes does nothing beside --mesh-dir"),
+        (["build", "arm.urdf", "--mesh-dir", ".", "--no-meshes"], "--no-meshes does nothing beside --mesh-dir"),
         (["publish", "--rate", "0"], "--rate 0"),
         (["publish", "arm.fmu", "--storage", "mcap"], "--storage does nothing without -o"),
         (["publish", "arm.fmu", "--fsync"], "--fsync does nothing without -o"),
@@ -330,20 +312,25 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
         (["sweep", "--resume"], "--resume does nothing without -o"),
         (["sweep", "arm.fmu", "--grid", "Kp=1"], "expected NAME=LOW:HIGH:COUNT"),
         (["sweep", "arm.fmu", "--grid", "Kp=1:2:2", "--seed", "0"], "without --random"),
-        (["sweep", "arm.fmu", "--workers", "1", "--scheduler", "tcp://a"],
-         "--workers does nothing beside --scheduler"),
+        (["sweep", "arm.fmu", "--workers", "1", "--scheduler", "tcp://a"], "--workers does nothing beside --scheduler"),
         (["plot"], "BAG"),
         (["view", "bag", "--export", "a.html", "--port", "0"], "beside --export"),
         *(
             ([verb, option, ""], f"argument {option}: it is empty")
             for verb, option in (
-                ("run", "-o"), ("publish", "-o"), ("sweep", "-o"), ("page", "-o"), ("live", "-o"),
-                ("view", "--export"), *product(("run", "publish", "layouts", "page"), ["--frame"]),
-                *product(("plot", "view"), ("--frame", "--urdf")), ("build", "--frame"),
+                ("run", "-o"),
+                ("publish", "-o"),
+                ("sweep", "-o"),
+                ("page", "-o"),
+                ("live", "-o"),
+                ("view", "--export"),
+                *product(("run", "publish", "layouts", "page"), ["--frame"]),
+                *product(("plot", "view"), ("--frame", "--urdf")),
+                ("build", "--frame"),
             )
         ),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_command_line_is_status_2(
     arguments: list[str], culprit: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -357,9 +344,7 @@ def test_a_wrong_command_line_is_status_2(
     assert listing(folder) == before
 
 
-def test_refused_build_keeps_the_file_that_was_there(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_refused_build_keeps_the_file_that_was_there(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (folder / "arm.urdf").write_text(urdf(kind="planar"))
     (folder / "new.fmu").write_bytes(b"before")
     assert main(BUILD) == 1
@@ -410,9 +395,7 @@ def test_info_of_a_truncated_bag_is_refused(
     assert re.fullmatch("twodof: error: .*'bag'.*\n", capfd.readouterr().err)
 
 
-def test_damaged_default_fmu_is_built_again(
-    folder: Path, fmu_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_default_fmu_is_built_again(folder: Path, fmu_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (folder / "TwoDof.fmu").write_bytes(damaged(fmu_path.read_bytes()))
     assert main(["run", "--stop-time", "0.01", "-o", "bag"]) == 0
     assert (folder / "TwoDof.fmu").read_bytes() == fmu_path.read_bytes()
@@ -434,9 +417,7 @@ def test_an_fmu_in_the_place_of_the_default_arms_is_asked_for_by_name(
     assert (folder / "TwoDof.fmu").read_bytes() == before and not (folder / "bag").exists()
 
 
-def test_a_run_replaces_no_file_that_is_not_its_own(
-    folder: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_replaces_no_file_that_is_not_its_own(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Neither notes nor an FMU of another state of the URDF, unless it is told to."""
     (folder / "robot.urdf").write_text(urdf())
     (folder / "robot.fmu").write_text("notes")
@@ -457,10 +438,7 @@ def test_a_run_replaces_no_file_that_is_not_its_own(
 
 @pytest.mark.parametrize("verb", ["run", "page", "sweep --grid Kp=1:2:2"])
 def test_the_only_fmu_of_a_folder_is_asked_for_by_name(
-    verb: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Another robot's is neither run without its name nor replaced by the default arm's."""
     folder = tmp_path

@@ -65,9 +65,9 @@ class Oracle:
             return np.linalg.solve(M, np.array(self.plant.tau_cmd) - self.damping * v - h)
         plant, frame = self.plant, self.plant.robot.frame_id
         pin.forwardKinematics(self.model, self.data, q, v, np.zeros(self.n))
-        drift = pin.getFrameClassicalAcceleration(
-            self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED
-        ).linear[self.axes]
+        drift = pin.getFrameClassicalAcceleration(self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED).linear[
+            self.axes
+        ]
         J = self.jacobian(q)
         x = self.data.oMf[frame].translation[self.axes]
         wanted = np.array(plant.Kp) * (plant.x_des - x) - np.array(plant.Kd) * (J @ v) - drift
@@ -82,9 +82,15 @@ class Oracle:
         for _ in range(400):
             events = self.events(regime)
             solved = solve_ivp(
-                lambda _, y, regime=regime: self.rates(y, regime), (t, seconds), y, self.method,
-                rtol=1e-10, atol=1e-13, max_step=self.max_step, events=list(events.values()),
-            )  # fmt: skip
+                lambda _, y, regime=regime: self.rates(y, regime),
+                (t, seconds),
+                y,
+                self.method,
+                rtol=1e-10,
+                atol=1e-13,
+                max_step=self.max_step,
+                events=list(events.values()),
+            )
             t, y = solved.t[-1], solved.y[:, -1].copy()
             if t >= seconds:
                 return y
@@ -123,9 +129,7 @@ class Oracle:
             if i in regime.held:
                 found["free", i] = lambda _, y, i=i: self.press(y, i, regime)
             else:
-                found["limit", i] = lambda _, y, i=i: (
-                    EDGE + min(self.high[i] - y[i], y[i] - self.low[i])
-                )
+                found["limit", i] = lambda _, y, i=i: EDGE + min(self.high[i] - y[i], y[i] - self.low[i])
         if self.plant.control == "task":
             rcond, rank = self.rcond, regime.rank
             if rank:
@@ -154,24 +158,37 @@ CASES: dict[str, Any] = {
     # damping, changes, communication step, steps, implicit, error
     "across the fold": (
         0.0,
-        {"x_des": [-0.49722099942765074, -0.31582739208468036],
-         "Kp": [200.0] * 2, "Kd": [28.0] * 2},
-        0.01, 15, False, 1e-5,
+        {"x_des": [-0.49722099942765074, -0.31582739208468036], "Kp": [200.0] * 2, "Kd": [28.0] * 2},
+        0.01,
+        15,
+        False,
+        1e-5,
     ),
     "damping 10000": (
         10000.0,
-        {"q_start": [-1.648928452962053, 1.1692017583875287],
-         "v_start": [-0.7871927421571577, 0.5802844167243075],
-         "x_des": [0.10636684709554894, 0.16612958404470635]},
-        0.01, 1, True, 1e-9,
+        {
+            "q_start": [-1.648928452962053, 1.1692017583875287],
+            "v_start": [-0.7871927421571577, 0.5802844167243075],
+            "x_des": [0.10636684709554894, 0.16612958404470635],
+        },
+        0.01,
+        1,
+        True,
+        1e-9,
     ),
     "damping 300, long steps": (
         300.0,
-        {"q_start": [0.5478467488258172, -0.8935307702805146],
-         "x_des": [0.16510223091108872, 0.042654310306871945], "max_step": 0.1},
-        0.1, 1, True, 1e-9,
+        {
+            "q_start": [0.5478467488258172, -0.8935307702805146],
+            "x_des": [0.16510223091108872, 0.042654310306871945],
+            "max_step": 0.1,
+        },
+        0.1,
+        1,
+        True,
+        1e-9,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -243,11 +260,16 @@ def test_falls_between_narrow_stops_miss_none(max_step, length):
         width = np.exp(rng.uniform(np.log(0.003), np.log(0.6), 2))
         middle = rng.uniform(-1.0, 1.0, 2)
         plant = shipped(
-            of, q_min=(middle - width).tolist(), q_max=(middle + width).tolist(),
+            of,
+            q_min=(middle - width).tolist(),
+            q_max=(middle + width).tolist(),
             q_start=(middle + width * rng.uniform(-1.0, 1.0, 2)).tolist(),
-            v_start=rng.uniform(-3.0, 3.0, 2).tolist(), rigid_stops=False,
-            rtol=1e-8, atol=1e-11, max_step=max_step,
-        )  # fmt: skip
+            v_start=rng.uniform(-3.0, 3.0, 2).tolist(),
+            rigid_stops=False,
+            rtol=1e-8,
+            atol=1e-11,
+            max_step=max_step,
+        )
         oracle, values = Oracle(plant), of.values(plant)
         for _ in range(8):
             assert of.call("advance", values, 0.05) == 1
@@ -264,9 +286,7 @@ def test_a_limit_that_is_touched_between_two_ends_of_a_step_stops_the_joint(max_
     rng, of = np.random.default_rng(8), engine("twodof", "effort")
     for _ in range(8):
         start = {"q_start": rng.uniform(-1.0, 1.0, 2).tolist()}
-        a = Oracle(shipped(of, **start)).free_acceleration(
-            np.array(start["q_start"]), np.zeros(2), 0
-        )
+        a = Oracle(shipped(of, **start)).free_acceleration(np.array(start["q_start"]), np.zeros(2), 0)
         start["v_start"] = [-a[0] * max_step * rng.uniform(0.1, 0.4), 0.02 / max_step]
         q = [Oracle(shipped(of, **start)).after(part * max_step)[:2] for part in np.arange(20) / 20]
         first, second = np.transpose(q)
@@ -275,9 +295,7 @@ def test_a_limit_that_is_touched_between_two_ends_of_a_step_stops_the_joint(max_
         (low if a[0] > 0.0 else high)[0] = first[0] + rng.uniform(0.1, 0.9) * (turn - first[0])
         plant = shipped(of, **start, q_min=low, q_max=high, rigid_stops=False, max_step=max_step)
         expected = Oracle(plant, max_step=max_step / 50).after(max_step)
-        np.testing.assert_allclose(
-            both(of, plant, 1, max_step), [expected] * 2, atol=1e-4, rtol=1e-4
-        )
+        np.testing.assert_allclose(both(of, plant, 1, max_step), [expected] * 2, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["tiago", "tiago_dual"])

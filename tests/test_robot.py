@@ -90,10 +90,7 @@ REFUSED = {
     "two links of one name": (arm(link("tip")), "two links named 'tip'"),
     "two joints of one name": (arm(link("x"), joint("elbow", "tip", "x")), "two joints .*'elbow'"),
     "no links": (robot(), "no links"),
-    "no moving joint": (
-        robot(link("base"), link("a"), joint("weld", "base", "a", kind="fixed")),
-        "no moving joint",
-    ),
+    "no moving joint": (robot(link("base"), link("a"), joint("weld", "base", "a", kind="fixed")), "no moving joint"),
     "one link only": (robot(link("base")), "no moving joint"),
     "missing parent": (arm(elbow=joint("elbow", "ghost", "tip")), "'elbow'.* parent .*'ghost'"),
     "missing child": (arm(joint("wrist", "tip", "ghost")), "'wrist'.* child .*'ghost'"),
@@ -105,20 +102,16 @@ REFUSED = {
     "no type": (arm(elbow=elbow().replace(' type="revolute"', "")), "'elbow'.* type"),
     "mimic of none": (arm(elbow=elbow(LIMIT + '<mimic joint="e"/>')), "'elbow' mimics 'e'.* exist"),
     "mimic of no name": (arm(elbow=elbow(LIMIT + "<mimic/>")), "'elbow' mimics ''.* not exist"),
-    "mimic of itself": (
-        arm(elbow=elbow(LIMIT + '<mimic joint="elbow"/>')), "'elbow' mimics itself",
-    ),
+    "mimic of itself": (arm(elbow=elbow(LIMIT + '<mimic joint="elbow"/>')), "'elbow' mimics itself"),
     "mimics in a circle": (
-        arm(
-            elbow=elbow(LIMIT + '<mimic joint="shoulder"/>'),
-            shoulder=shoulder(LIMIT + '<mimic joint="elbow"/>'),
-        ),
+        arm(elbow=elbow(LIMIT + '<mimic joint="shoulder"/>'), shoulder=shoulder(LIMIT + '<mimic joint="elbow"/>')),
         "mimics 'shoulder', which follows it",
     ),
     "mimic of a fixed joint": (
         arm(
             elbow=elbow(LIMIT + '<mimic joint="weld"/>'),
-            hand=link("hand"), weld=joint("weld", "tip", "hand", kind="fixed"),
+            hand=link("hand"),
+            weld=joint("weld", "tip", "hand", kind="fixed"),
         ),
         "'elbow' mimics 'weld', which is fixed: make 'elbow' fixed too",
     ),
@@ -173,13 +166,10 @@ REFUSED = {
         "'elbow'.* no inertia about its axis",
     ),
     "broken inertial in a body that has mass": (
-        arm(
-            joint("fixed", "tip", "tool", kind="fixed"),
-            link("tool", inertial(5).replace('ixy="0"', "")),
-        ),
+        arm(joint("fixed", "tip", "tool", kind="fixed"), link("tool", inertial(5).replace('ixy="0"', ""))),
         "link 'tool'",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("urdf", "culprit"), REFUSED.values(), ids=REFUSED)
@@ -222,9 +212,8 @@ def test_any_number_of_joints_that_is_not_refused_loads_in_two_gigabytes() -> No
         """
     environment = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ":".join(sys.path)}
     child = subprocess.run(
-        [sys.executable], input=textwrap.dedent(code), env=environment,
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+        [sys.executable], input=textwrap.dedent(code), env=environment, capture_output=True, text=True, timeout=300
+    )
     assert child.stdout == f"{MAX_JOINTS}\n", child.stderr[-300:]
 
 
@@ -253,18 +242,14 @@ def assert_same_mechanism(loaded: Robot, urdf: str) -> None:
             i = loaded.model.getFrameId(frame.name, frame.type)
             np.testing.assert_allclose(data.oMf[i], placement, atol=1e-12)
         M = np.triu(pin.crba(loaded.model, data, q))
-        np.testing.assert_allclose(
-            M, np.triu(pin.crba(own, own_data, angles(own, q))), rtol=1e-9, atol=1e-12
-        )
+        np.testing.assert_allclose(M, np.triu(pin.crba(own, own_data, angles(own, q))), rtol=1e-9, atol=1e-12)
 
 
 def test_continuous_joint_has_the_angle_as_state_and_no_limits() -> None:
     urdf = arm(elbow=elbow('<limit effort="5" velocity="1"/>', kind="continuous"))
     loaded = load_robot(urdf, "tip", "xyz")
     assert loaded.model.nq == loaded.model.nv == len(loaded.joints) == 2
-    assert (UNBOUNDED, loaded.q_min[1], loaded.q_max[1]) == (
-        1.7976931348623157e308, -UNBOUNDED, UNBOUNDED,
-    )  # fmt: skip
+    assert (UNBOUNDED, loaded.q_min[1], loaded.q_max[1]) == (1.7976931348623157e308, -UNBOUNDED, UNBOUNDED)
     assert (loaded.q_min[0], loaded.q_max[0]) == (-1.0, 2.0)
     assert loaded.effort == (3.0, 5.0)
     assert_same_mechanism(loaded, urdf)
@@ -315,9 +300,7 @@ def test_tree_is_read_with_its_branches() -> None:
 
 def test_attributes_belong_to_their_joint_in_whatever_order() -> None:
     other = '<limit lower="-5" upper="6" effort="7" velocity="1"/><dynamics damping="0.25"/>'
-    loaded = load_robot(
-        robot(elbow(other), link("tip"), shoulder(), link("upper"), link("base", "")), "tip", "xyz"
-    )
+    loaded = load_robot(robot(elbow(other), link("tip"), shoulder(), link("upper"), link("base", "")), "tip", "xyz")
     assert loaded.joints == ("shoulder", "elbow")
     assert loaded.q_min == (-1.0, -5.0)
     assert loaded.q_max == (2.0, 6.0)
@@ -367,10 +350,7 @@ def test_what_is_not_the_mechanism_is_ignored(extra: str) -> None:
     assert_same_mechanism(loaded, arm())
 
 
-UNUSED = {
-    "safety controller": "<safety_controller/>",
-    "unknown": "<note>x</note>",
-}
+UNUSED = {"safety controller": "<safety_controller/>", "unknown": "<note>x</note>"}
 
 
 @pytest.mark.parametrize("unused", UNUSED.values(), ids=UNUSED)
@@ -379,9 +359,7 @@ def test_what_a_joint_has_beside_the_mechanism_is_ignored(unused: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["", "<geometry/>", "<geometry><mesh/></geometry>"])
-def test_shapes_have_no_effect_on_the_mechanism(
-    shape: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_shapes_have_no_effect_on_the_mechanism(shape: str, capfd: pytest.CaptureFixture[str]) -> None:
     visual = f"<visual>{shape}</visual>"
     for inside in (visual + inertial(), inertial() + visual):
         loaded = load_robot(arm(tip=link("tip", inside)), "tip", "xyz")
@@ -401,9 +379,7 @@ def test_numbers_may_have_spaces_around_them(capfd: pytest.CaptureFixture[str]) 
     """urdfdom would take them for 0."""
     spaced = re.sub(r'(value|i..|xyz)="([^"]*)"', r'\1=" \2\n"', inertial(2.0, 0.3, 0.4, 0.5))
     plain = load_robot(arm(tip=link("tip", inertial(2.0, 0.3, 0.4, 0.5))), "tip", "xyz").model
-    found = load_robot(
-        arm(tip=link("tip", spaced), elbow=elbow(axis=" 0 0  1 ")), "tip", "xyz"
-    ).model
+    found = load_robot(arm(tip=link("tip", spaced), elbow=elbow(axis=" 0 0  1 ")), "tip", "xyz").model
     assert found == plain
     assert capfd.readouterr().err == ""
 
@@ -457,9 +433,7 @@ EXAMPLES = {
 
 
 @pytest.mark.parametrize(("name", "n"), EXAMPLES.items(), ids=[Path(e).stem for e in EXAMPLES])
-def test_example_robot_is_the_one_that_pinocchio_loads(
-    robots: Path, name: str, n: int | None
-) -> None:
+def test_example_robot_is_the_one_that_pinocchio_loads(robots: Path, name: str, n: int | None) -> None:
     urdf = (robots / name).read_text("utf-8")
     joints = ET.fromstring(urdf).findall("joint")
     (moved,) = next(j for j in joints if j.get("type") != "fixed").findall("child")

@@ -36,12 +36,19 @@ def ran(folder: Path, text: str, *options: str, ci: str = "") -> subprocess.Comp
     (folder / "tmp").mkdir(exist_ok=True)
     environment = {
         **{name: value for name, value in os.environ.items() if not name.startswith("PYTEST")},
-        "TMPDIR": str(folder / "tmp"), "PYTHONPATH": str(HERE), "CI": ci,
-    }  # fmt: skip
+        "TMPDIR": str(folder / "tmp"),
+        "PYTHONPATH": str(HERE),
+        "CI": ci,
+    }
     return subprocess.run(
-        [sys.executable, "-m", "pytest", *options, str(folder)], cwd=folder, env=environment,
-        capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
+        [sys.executable, "-m", "pytest", *options, str(folder)],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
 
 
 def test_a_file_left_in_the_temporary_folder_fails_the_run(tmp_path: Path) -> None:

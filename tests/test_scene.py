@@ -167,9 +167,7 @@ def test_quaternion_is_x_y_z_w_also_near_half_turns(axis: str, angle: float) -> 
     ((found,),) = transforms_of(scene, scene.moving, np.array([[angle]]))
     direction = np.array(axis.split(), dtype=float)
     expected = Rotation.from_rotvec(angle * direction / np.linalg.norm(direction))
-    np.testing.assert_allclose(
-        Rotation.from_quat(found.rotation).as_matrix(), expected.as_matrix(), atol=1e-14
-    )
+    np.testing.assert_allclose(Rotation.from_quat(found.rotation).as_matrix(), expected.as_matrix(), atol=1e-14)
 
 
 # --- topics of a bag ---
@@ -230,9 +228,7 @@ def test_scene_has_one_message_a_sample_and_one_on_latched_topics(messages: Mess
             assert {nanoseconds(part.header.stamp) for part in parts} <= {log_time}
 
 
-def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(
-    messages: Messages, fmu_urdf: str
-) -> None:
+def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(messages: Messages, fmu_urdf: str) -> None:
     ((_, static),) = messages["/tf_static"]
     for (_, state), (_, tf) in zip(messages["/joint_states"], messages["/tf"], strict=True):
         expected = placements(fmu_urdf, list(state.name), np.array(state.position))
@@ -241,9 +237,7 @@ def test_tf_of_the_bag_shows_the_arm_where_its_joint_states_put_it(
 
 
 def test_end_effector_and_target_are_in_the_root_frame(messages: Messages) -> None:
-    states, points, targets = (
-        messages[f"/{it}"] for it in ("joint_states", "end_effector", "target")
-    )
+    states, points, targets = (messages[f"/{it}"] for it in ("joint_states", "end_effector", "target"))
     for (_, state), (_, point), (_, target) in zip(states, points, targets, strict=True):
         assert point.header.frame_id == target.header.frame_id == "world"
         expected = [*oracles.position(np.array(state.position)), 0.0]
@@ -256,9 +250,7 @@ def test_end_effector_and_target_are_in_the_root_frame(messages: Messages) -> No
 def test_target_follows_the_end_effector_along_axes_that_are_not_controlled(
     robots: Path, ur5: str, tmp_path: Path
 ) -> None:
-    options = twodof.FmuOptions(
-        urdf=robots / ROBOTS["ur5"], mesh_dir=robots.parents[1], frame="tool0", axes="zx"
-    )
+    options = twodof.FmuOptions(urdf=robots / ROBOTS["ur5"], mesh_dir=robots.parents[1], frame="tool0", axes="zx")
     fmu = twodof.build_fmu(tmp_path / "ur5.fmu", options)
     run = twodof.experiment(fmu)
     q = (0.1, -0.9, 1.2, 0.4, 0.5, 0.6)
@@ -285,8 +277,7 @@ def geometries(urdf: str) -> list[tuple[ET.Element, np.ndarray]]:
             origin = part.find("origin")
             attributes = {} if origin is None else origin.attrib
             position, angles = (
-                [float(word) for word in attributes.get(key, "0 0 0").split()]
-                for key in ("xyz", "rpy")
+                [float(word) for word in attributes.get(key, "0 0 0").split()] for key in ("xyz", "rpy")
             )
             shape = part.findall("geometry/*")[0]
             found.append((shape, pose(position, Rotation.from_euler("xyz", angles))))
@@ -314,9 +305,7 @@ def volume(shape: ET.Element) -> float:
     return math.pi * float(shape.get("radius", "")) ** 2 * float(shape.get("length", ""))
 
 
-def assert_shapes_hold_the_meshes(
-    description: str, urdf: str, vertices: Callable[[str], np.ndarray]
-) -> None:
+def assert_shapes_hold_the_meshes(description: str, urdf: str, vertices: Callable[[str], np.ndarray]) -> None:
     assert "<mesh" not in description
     before, after = geometries(urdf), geometries(description)
     meshes = 0
@@ -340,9 +329,7 @@ def assert_same_robot(description: str, urdf: str) -> None:
     assert found == expected
 
 
-def test_description_of_the_default_arm_holds_its_meshes(
-    messages: Messages, fmu_path: Path, fmu_urdf: str
-) -> None:
+def test_description_of_the_default_arm_holds_its_meshes(messages: Messages, fmu_path: Path, fmu_urdf: str) -> None:
     ((_, message),) = messages["/robot_description"]
     assert_same_robot(message.data, fmu_urdf)
     model = pin.buildModelFromXML(message.data)
@@ -398,10 +385,14 @@ def placed(seed: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("kind", "size"),
     [
-        ("box", (0.05, 0.1, 0.3)), ("box", (0.02, 0.1, 0.2)), ("box", (0.8, 0.9, 1.0)),
-        ("cylinder", (0.04, 0.3)), ("cylinder", (0.2, 0.02)), ("cylinder", (0.1, 0.25)),
+        ("box", (0.05, 0.1, 0.3)),
+        ("box", (0.02, 0.1, 0.2)),
+        ("box", (0.8, 0.9, 1.0)),
+        ("cylinder", (0.04, 0.3)),
+        ("cylinder", (0.2, 0.02)),
+        ("cylinder", (0.1, 0.25)),
     ],
-)  # fmt: skip
+)
 def test_fit_recovers_a_box_or_a_cylinder(seed: int, kind: str, size: tuple[float, ...]) -> None:
     if kind == "box":
         mesh = trimesh.creation.box(extents=size, transform=placed(seed))
@@ -439,9 +430,7 @@ def single(vertices: np.ndarray) -> np.ndarray:
     return np.asarray(vertices, dtype=np.float32).astype(float)
 
 
-@pytest.mark.parametrize(
-    "angles", ["0 0 0", "0.3 -0.4 2.5", "0 1.5707963267948966 0", "1 -1.5707963267948966 2"]
-)
+@pytest.mark.parametrize("angles", ["0 0 0", "0.3 -0.4 2.5", "0 1.5707963267948966 0", "1 -1.5707963267948966 2"])
 def test_fit_keeps_the_origin_and_the_scale_of_the_mesh(angles: str) -> None:
     mesh = trimesh.creation.box(extents=(300.0, 100.0, 50.0))
     mesh.apply_translation([10.0, 20.0, 30.0])
@@ -482,18 +471,19 @@ def test_mesh_that_cannot_be_read_is_left_out_and_named(
 UP = "../" * 40  # from a temporary folder to the root
 
 
-def test_mesh_whose_geometry_is_in_another_file_is_left_out(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What a page shows, and a file made of it, would have the secret's bytes as vertices."""
     (tmp_path / "secret").write_bytes(struct.pack("<9f", *range(9)))
     content = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
         "buffers": [{"uri": f"{UP}{tmp_path}/secret", "byteLength": 36}],
         "bufferViews": [{"buffer": 0, "byteLength": 36}],
         "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-    }  # fmt: skip
+    }
     urdf = with_mesh().replace("thing.stl", "thing.gltf")
     description = Scene(urdf, [], "thing", lambda _: json.dumps(content).encode()).description
     assert "its format '.gltf' is none of .stl" in caplog.text

@@ -20,13 +20,7 @@ def names_of(*names: str) -> list[str]:
 
 
 LOOPBACK = ("127.0.0.1", "localhost", "LocalHost", "[::1]")
-STRANGERS = (
-    "evil.example",
-    "127.0.0.1.evil.example",
-    "localhost.evil.example",
-    "[::1].example",
-    "",
-)
+STRANGERS = ("evil.example", "127.0.0.1.evil.example", "localhost.evil.example", "[::1].example", "")
 ASKED = {
     "127.0.0.1": (LOOPBACK, (*STRANGERS, "192.0.2.1", "[2001:db8::1]")),
     "localhost": (LOOPBACK, (*STRANGERS, "192.0.2.1")),

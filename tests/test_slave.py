@@ -133,9 +133,19 @@ def test_importing_the_slave_is_cheap_and_free_of_effects(fmu_path, tmp_path):
 
 
 FOREIGN = (
-    b"not a state", b"[1, 2]", b"{}", b'{"identity": "x"}', b"", b"\xff\xfe", b"null", b"NaN",
-    b"[" * 60_000, b'{"a":' * 10_000, b"1" * 60_000, b"[" + b"1," * 10**7 + b"1]",
-)  # fmt: skip
+    b"not a state",
+    b"[1, 2]",
+    b"{}",
+    b'{"identity": "x"}',
+    b"",
+    b"\xff\xfe",
+    b"null",
+    b"NaN",
+    b"[" * 60_000,
+    b'{"a":' * 10_000,
+    b"1" * 60_000,
+    b"[" + b"1," * 10**7 + b"1]",
+)
 
 
 @in_child_process
@@ -221,24 +231,16 @@ REFUSALS = {
     "fmi2SetReal: q[1] is computed and cannot be set": (
         lambda driver: driver.call("setReal", driver.references("q")[:1], [0.1])
     ),
-    "fmi2Set of a parameter (rtol) is not allowed in the state 'step mode'": (
-        lambda driver: driver.set(rtol=1e-6)
-    ),
-    "fmi2SetReal: there is no variable with value reference 999": (
-        lambda driver: driver.call("setReal", [999], [0.1])
-    ),
+    "fmi2Set of a parameter (rtol) is not allowed in the state 'step mode'": (lambda driver: driver.set(rtol=1e-6)),
+    "fmi2SetReal: there is no variable with value reference 999": (lambda driver: driver.call("setReal", [999], [0.1])),
     "fmi2SetReal: there is no variable with value reference -1": (
         lambda driver: driver.call("setReal", [2**32 - 1], [0.1])
     ),
     "fmi2SetReal: limit_effort is of type Boolean": (
         lambda driver: driver.call("setReal", driver.references("limit_effort"), [1.0])
     ),
-    "fmi2SetInteger: Kn is of type Real": (
-        lambda driver: driver.call("setInteger", driver.references("Kn"), [1])
-    ),
-    "fmi2GetReal: there is no variable with value reference 999": (
-        lambda driver: driver.call("getReal", [999])
-    ),
+    "fmi2SetInteger: Kn is of type Real": (lambda driver: driver.call("setInteger", driver.references("Kn"), [1])),
+    "fmi2GetReal: there is no variable with value reference 999": (lambda driver: driver.call("getReal", [999])),
     "fmi2EnterInitializationMode is not allowed in the state 'step mode'": (
         lambda driver: driver.call("enterInitializationMode")
     ),
@@ -314,9 +316,7 @@ def test_calls_before_their_time_are_refused(fmu_path):
     assert np.isnan(driver.get("q")).all()
     assert driver.log[-1][1] == "fmi2GetReal is not allowed in the state 'instantiated'"
     driver.call("exitInitializationMode")
-    assert (
-        driver.log[-1][1] == "fmi2ExitInitializationMode is not allowed in the state 'instantiated'"
-    )
+    assert driver.log[-1][1] == "fmi2ExitInitializationMode is not allowed in the state 'instantiated'"
     driver.call("reset")
     driver.initialise()
     driver.call("terminate")
@@ -430,9 +430,13 @@ def answer_getstatus(fmu):
 
 
 CANNOT = (
-    refuse_a_call, discard_a_step_without_ending_the_run, tell_its_guid_from_another,
-    refuse_a_null_pointer, keep_to_the_stop_time, answer_getstatus,
-)  # fmt: skip
+    refuse_a_call,
+    discard_a_step_without_ending_the_run,
+    tell_its_guid_from_another,
+    refuse_a_null_pointer,
+    keep_to_the_stop_time,
+    answer_getstatus,
+)
 
 
 @in_child_process
@@ -452,9 +456,7 @@ def test_what_this_flavour_cannot_do_is_told_row_by_row(fmu_path, native_path):
         rows.append(re.findall("<tr><td>(.*?)</td>", section, re.DOTALL))
     python, native = rows
     assert native == []
-    assert [re.sub(r"\W", "_", row.replace("fmi2", "")).lower() for row in python] == [
-        row.__name__ for row in CANNOT
-    ]
+    assert [re.sub(r"\W", "_", row.replace("fmi2", "")).lower() for row in python] == [row.__name__ for row in CANNOT]
 
 
 # --- packages ---

@@ -31,9 +31,11 @@ class Kept(Recorded):
         description = fmpy.read_model_description(str(fmu))
         self.vr = {v.name: v.valueReference for v in description.modelVariables}
         super().__init__(
-            guid=description.guid, modelIdentifier="TwoDof", instanceName="arm",
+            guid=description.guid,
+            modelIdentifier="TwoDof",
+            instanceName="arm",
             unzipDirectory=fmpy.extract(str(fmu), str(folder)),
-        )  # fmt: skip
+        )
         self.messages = []
         if description.fmiVersion == "2.0":
             self.callbacks = self.functions()
@@ -71,9 +73,11 @@ class FMU3Exchange(Kept, FMU3Model): ...
 
 
 KINDS = {
-    (2, "CoSimulation"): FMU2Co, (2, "ModelExchange"): FMU2Exchange,
-    (3, "CoSimulation"): FMU3Co, (3, "ModelExchange"): FMU3Exchange,
-}  # fmt: skip
+    (2, "CoSimulation"): FMU2Co,
+    (2, "ModelExchange"): FMU2Exchange,
+    (3, "CoSimulation"): FMU3Co,
+    (3, "ModelExchange"): FMU3Exchange,
+}
 
 
 @pytest.fixture(scope="module")
@@ -95,17 +99,19 @@ def made(fmus: dict[int, Path], kind: tuple[int, str], folder: Path, **named: bo
 @in_child_process
 def first_row(fmu: str, kind: str, starts: dict[str, Any]) -> None:
     rows = fmpy.simulate_fmu(
-        fmu, fmi_type=kind, start_values=starts, stop_time=0.01, output_interval=0.01,
+        fmu,
+        fmi_type=kind,
+        start_values=starts,
+        stop_time=0.01,
+        output_interval=0.01,
         output=list(dict.fromkeys(re.sub("start", "", name) for name in starts)),
-    )  # fmt: skip
+    )
     for name, value in starts.items():
         assert np.array_equal(rows[0][name], value), (name, rows[0][name])
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_fmpys_start_values_of_the_state_are_its_start(
-    fmus: dict[int, Path], kind: tuple[int, str]
-) -> None:
+def test_fmpys_start_values_of_the_state_are_its_start(fmus: dict[int, Path], kind: tuple[int, str]) -> None:
     fmi, interface = kind
     starts = {"q[1]": 1.0, "v[2]": 0.25} if fmi == 2 else {"q": [1.0, 0.35], "v": [0.0, 0.25]}
     first_row(str(fmus[fmi]), interface, starts)
@@ -144,9 +150,7 @@ def test_the_python_flavour_asks_for_it_too(fmu_path: Path) -> None:
 # --- FMI 3.0.2: after a discarded step, before initialisation, logging ---
 
 
-def test_a_discarded_step_of_fmi_3_is_done_with_other_inputs(
-    fmus: dict[int, Path], tmp_path: Path
-) -> None:
+def test_a_discarded_step_of_fmi_3_is_done_with_other_inputs(fmus: dict[int, Path], tmp_path: Path) -> None:
     arm = made(fmus, (3, "CoSimulation"), tmp_path)
     arm.begin()
     arm.exitInitializationMode()
@@ -161,9 +165,7 @@ def test_a_discarded_step_of_fmi_3_is_done_with_other_inputs(
     arm.freeInstance()
 
 
-def test_variables_are_read_before_initialisation_in_fmi_3(
-    fmus: dict[int, Path], tmp_path: Path
-) -> None:
+def test_variables_are_read_before_initialisation_in_fmi_3(fmus: dict[int, Path], tmp_path: Path) -> None:
     for number, kind in enumerate([(3, "CoSimulation"), (3, "ModelExchange")]):
         arm = made(fmus, kind, tmp_path / str(number))
         description = fmpy.read_model_description(str(fmus[3]))
@@ -180,22 +182,22 @@ def test_logging_that_is_off_calls_nobody(fmus: dict[int, Path], tmp_path: Path)
     refused = "getFloat64", [0], 1
     assert arm.status(*refused) == ERROR and not arm.messages
     for on, categories, count in (
-        (True, [], 1), (True, ["logStatusError"], 1), (True, ["logStatusWarning"], 0),
-        (True, ["logStatusWarning", "logAll"], 1), (False, [], 0), (False, ["logStatusError"], 0),
-    ):  # fmt: skip
+        (True, [], 1),
+        (True, ["logStatusError"], 1),
+        (True, ["logStatusWarning"], 0),
+        (True, ["logStatusWarning", "logAll"], 1),
+        (False, [], 0),
+        (False, ["logStatusError"], 0),
+    ):
         arm.messages.clear()
         arm.setDebugLogging(on, categories)
         assert arm.status(*refused) == ERROR and len(arm.messages) == count, categories
     arm.freeInstance()
 
 
-def test_categories_of_fmi_2_choose_too_and_errors_are_no_debug_logging(
-    fmus: dict[int, Path], tmp_path: Path
-) -> None:
+def test_categories_of_fmi_2_choose_too_and_errors_are_no_debug_logging(fmus: dict[int, Path], tmp_path: Path) -> None:
     arm = made(fmus, (2, "CoSimulation"), tmp_path, logging=False)
-    for on, categories, count in (
-        (False, [], 1), (True, ["logStatusError"], 1), (True, ["logStatusWarning"], 0),
-    ):  # fmt: skip
+    for on, categories, count in ((False, [], 1), (True, ["logStatusError"], 1), (True, ["logStatusWarning"], 0)):
         arm.messages.clear()
         arm.setDebugLogging(on, categories)
         assert arm.status("getReal", [0]) == ERROR and len(arm.messages) == count, categories
@@ -206,9 +208,7 @@ def test_categories_of_fmi_2_choose_too_and_errors_are_no_debug_logging(
 
 
 @pytest.fixture(scope="module")
-def texts(
-    fmus: dict[int, Path], fmu_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, bytes]:
+def texts(fmus: dict[int, Path], fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """Descriptions by the kind of FMU."""
     folder = tmp_path_factory.mktemp("texts")
     options = twodof.FmuOptions(native=True, fmi=3, arrays=False, control="pose")
@@ -257,10 +257,7 @@ def test_headers_of_fmi_3_are_the_importers(fmus: dict[int, Path]) -> None:
 
 def written(folder: Path, control: str, fmi: int) -> Path:
     folder.mkdir()
-    for name, content in {
-        **standard_headers(),
-        **model("twodof", control).sources(fmi=fmi),
-    }.items():
+    for name, content in {**standard_headers(), **model("twodof", control).sources(fmi=fmi)}.items():
         (folder / name).write_bytes(content)
     return folder
 
@@ -285,10 +282,12 @@ def test_sources_refuse_to_lose_their_checks(flag: str, tmp_path: Path) -> None:
 
 
 PREFIXES = {
-    (): "", ("{}_FUNCTION_PREFIX=A_",): "A_", ("{}_OVERRIDE_FUNCTION_PREFIX",): "",
+    (): "",
+    ("{}_FUNCTION_PREFIX=A_",): "A_",
+    ("{}_OVERRIDE_FUNCTION_PREFIX",): "",
     ("{}_FUNCTION_PREFIX=A_", "{}_OVERRIDE_FUNCTION_PREFIX"): "",
     ("{}_FUNCTION_PREFIX=A_", "{}_OVERRIDE_FUNCTION_PREFIX", "{}_ACTUAL_FUNCTION_PREFIX=B_"): "B_",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fmi", [2, 3])

@@ -33,14 +33,39 @@ OK, DISCARD, ERROR = 0, 2, 3
 ESCAPED = "gave a value that is not finite"
 OUTPUTS = ("q", "v", "x", "xd", "quat", "omega", "tau")
 INPUTS = (
-    "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des", "q_des", "v_des", "a_des",
-    "tau_cmd", "Kp", "Kd", "Kp_rot", "Kd_rot", "Kn", "tau_ext", "f_ext",
-)  # fmt: skip
+    "x_des",
+    "xd_des",
+    "xdd_des",
+    "quat_des",
+    "omega_des",
+    "alpha_des",
+    "q_des",
+    "v_des",
+    "a_des",
+    "tau_cmd",
+    "Kp",
+    "Kd",
+    "Kp_rot",
+    "Kd_rot",
+    "Kn",
+    "tau_ext",
+    "f_ext",
+)
 BOOLEANS = ("limit_effort", "rigid_stops", "payload_known")
 PARAMETERS = (
-    "q_start", "v_start", "q_min", "q_max", "gravity", "payload", "payload_com",
-    "rcond", "rtol", "atol", "max_step", *BOOLEANS,
-)  # fmt: skip
+    "q_start",
+    "v_start",
+    "q_min",
+    "q_max",
+    "gravity",
+    "payload",
+    "payload_com",
+    "rcond",
+    "rtol",
+    "atol",
+    "max_step",
+    *BOOLEANS,
+)
 """Of all controls; an FMU has those of its own."""
 TARGETS = {"task": "x_des", "pose": "x_des", "joint": "q_des", "effort": "tau_cmd"}
 
@@ -376,9 +401,12 @@ class Arm(NamedTuple):
 
 
 ARMS = {
-    "twodof task": (50, 2000), "panda task": (5, 300), "panda pose": (5, 300),
-    "twodof joint": (10, 500), "twodof effort": (10, 500),
-}  # fmt: skip
+    "twodof task": (50, 2000),
+    "panda task": (5, 300),
+    "panda pose": (5, 300),
+    "twodof joint": (10, 500),
+    "twodof effort": (10, 500),
+}
 """A robot and a control, and how many programs are run, without --full and with it."""
 
 
@@ -461,10 +489,7 @@ def inputs_of_law(arm):
 
     def gains(size, of=""):
         proportional = st.sampled_from([50.0, 400.0, 8000.0])
-        return {
-            f"Kp{of}": proportional.map(lambda gain: (gain,) * size),
-            f"Kd{of}": near((30.0,) * size, 25.0),
-        }
+        return {f"Kp{of}": proportional.map(lambda gain: (gain,) * size), f"Kd{of}": near((30.0,) * size, 25.0)}
 
     if arm.control == "effort":
         return {"tau_cmd": near((0.0,) * n, 0.3), "tau_cmd[1]": number(-0.3, 0.3)}
@@ -500,29 +525,29 @@ def programs(arm):
     """Programs that begin with an initialisation and end by reading all."""
     n, target = len(arm.rest), TARGETS[arm.control]
     size = len(arm.x) if target == "x_des" else n
-    inputs = setting({
-        **inputs_of_law(arm),
-        "tau_ext": near((0.0,) * n, 0.1),
-        "f_ext": near((0.0,) * 3, 0.5),
-    })  # fmt: skip
-    parameters = setting({
-        "q_start": near(arm.rest, 0.3),
-        "v_start": near((0.0,) * n, 1.0),
-        "gravity": near((0.0, -9.81, 0.0), 5.0),
-        "payload": number(0.0, 1.0),
-        "payload_com": near((0.0,) * 3, 0.1),
-        **({"payload_known": st.booleans()} if arm.control != "effort" else {}),
-        **({"rcond": st.sampled_from([0.005, 0.02])} if target == "x_des" else {}),
-        "rtol": st.sampled_from([1e-6, 1e-2]),
-        "atol": st.sampled_from([1e-9, 1e-3]),
-        "max_step": st.sampled_from([5e-4, 5e-3, 0.1]),
-    })  # fmt: skip
-    limits = setting({
-        "q_min": near([q - 0.1 for q in arm.rest], 0.09),
-        "q_max": near([q + 0.1 for q in arm.rest], 0.09),
-        "limit_effort": st.just(True),
-        "rigid_stops": st.booleans(),
-    })  # fmt: skip
+    inputs = setting({**inputs_of_law(arm), "tau_ext": near((0.0,) * n, 0.1), "f_ext": near((0.0,) * 3, 0.5)})
+    parameters = setting(
+        {
+            "q_start": near(arm.rest, 0.3),
+            "v_start": near((0.0,) * n, 1.0),
+            "gravity": near((0.0, -9.81, 0.0), 5.0),
+            "payload": number(0.0, 1.0),
+            "payload_com": near((0.0,) * 3, 0.1),
+            **({"payload_known": st.booleans()} if arm.control != "effort" else {}),
+            **({"rcond": st.sampled_from([0.005, 0.02])} if target == "x_des" else {}),
+            "rtol": st.sampled_from([1e-6, 1e-2]),
+            "atol": st.sampled_from([1e-9, 1e-3]),
+            "max_step": st.sampled_from([5e-4, 5e-3, 0.1]),
+        }
+    )
+    limits = setting(
+        {
+            "q_min": near([q - 0.1 for q in arm.rest], 0.09),
+            "q_max": near([q + 0.1 for q in arm.rest], 0.09),
+            "limit_effort": st.just(True),
+            "rigid_stops": st.booleans(),
+        }
+    )
     value = choice(inputs, parameters, limits)
     slot = st.sampled_from("abc")
     save, restore, reset = one("save", slot), one("restore", slot), one("reset")
@@ -556,8 +581,7 @@ def programs(arm):
     def with_a_state(slot):
         """Save, and do with that state what there is to do."""
         save, restore, serialise, damage, wreck, free = (
-            one(name, st.just(slot))
-            for name in ("save", "restore", "serialise", "damage", "wreck", "free")
+            one(name, st.just(slot)) for name in ("save", "restore", "serialise", "damage", "wreck", "free")
         )
         return choice(
             phrase(save, go, some(serialise, 0, 1), restore),
@@ -604,11 +628,24 @@ def without_empty_slots(program):
 # --- the test, and what its programs are to contain ---
 
 CONTAINED = (
-    "parameter after a reset", "set tau_ext", "set limit_effort", "two states alive",
-    "save at a limit", "save before a discard", "restore after set", "restore after step",
-    "restore after reset", "restore after serialise", "move", "wreck", "terminate", "refused set",
-    "refused step", "refused damage", "refused fail_to_start",
-)  # fmt: skip
+    "parameter after a reset",
+    "set tau_ext",
+    "set limit_effort",
+    "two states alive",
+    "save at a limit",
+    "save before a discard",
+    "restore after set",
+    "restore after step",
+    "restore after reset",
+    "restore after serialise",
+    "move",
+    "wreck",
+    "terminate",
+    "refused set",
+    "refused step",
+    "refused damage",
+    "refused fail_to_start",
+)
 """What one program in fifty contains at least; most are in every second to fourth."""
 
 
@@ -676,8 +713,7 @@ def test_every_state_is_that_of_its_history_alone(arm, worker, request):
         note(program)
         try:
             python, native = (
-                states(partial(worker, carry_out, *fmu), flavour, program)
-                for flavour, fmu in arm.fmus.items()
+                states(partial(worker, carry_out, *fmu), flavour, program) for flavour, fmu in arm.fmus.items()
             )
         except EscapeError:
             seen.update(["programs", "escapes"])

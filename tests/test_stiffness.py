@@ -35,9 +35,7 @@ def radau(plant: Plant, seconds: float) -> np.ndarray:
         q, v = y[:n], y[n:]
         pin.forwardKinematics(model, data, q, v, np.zeros(n))
         J = pin.computeFrameJacobian(model, data, q, robot.frame_id, pin.LOCAL_WORLD_ALIGNED)[axes]
-        drift = pin.getFrameClassicalAcceleration(
-            model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED
-        ).linear[axes]
+        drift = pin.getFrameClassicalAcceleration(model, data, robot.frame_id, pin.LOCAL_WORLD_ALIGNED).linear[axes]
         command = Kp * (x_des - data.oMf[robot.frame_id].translation[axes]) - Kd * (J @ v)
         commanded = np.linalg.pinv(J, plant.rcond) @ (command - drift + plant.Kn * J @ v)
         M = pin.crba(model, data, q)
@@ -111,9 +109,7 @@ def test_a_largest_step_beyond_the_budget_is_refused_at_once(max_step):
     assert of.call("advance", values, STEP) == 0
     assert (values == before).all()
     assert of.obstacle()[0] == MANY_STEPS
-    with pytest.raises(
-        DiscardError, match=f"max_step = {max_step:g} s divides .*; enlarge max_step"
-    ):
+    with pytest.raises(DiscardError, match=f"max_step = {max_step:g} s divides .*; enlarge max_step"):
         plant.step(STEP)
     assert plant.q == [0.5, 0.35]
 

@@ -26,8 +26,7 @@ def listed(part: str) -> set[str]:
 
 
 def test_every_stock_robot_is_refused_or_becomes_c_that_compiles(tmp_path: Path) -> None:
-    command = [needs("gcc"), "-std=c99", "-fsyntax-only", "-Wall", "-Wextra",
-               "-pedantic", "-Werror", *UNITS]  # fmt: skip
+    command = [needs("gcc"), "-std=c99", "-fsyntax-only", "-Wall", "-Wextra", "-pedantic", "-Werror", *UNITS]
     refused, compiled = set(), []
 
     def compile_one(name: str, sources: dict[str, bytes]) -> tuple[str, str]:

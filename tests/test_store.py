@@ -36,18 +36,13 @@ NAMES = {"left": "effort", "fleet/right": "task", "fleet_right": "pose"}
 def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("robots")
     return {
-        name: twodof.build_fmu(
-            folder / f"{control}.fmu", twodof.FmuOptions(control=control, native=True)
-        )
+        name: twodof.build_fmu(folder / f"{control}.fmu", twodof.FmuOptions(control=control, native=True))
         for name, control in NAMES.items()
     }
 
 
 def runs(fmus: dict[str, Path], stop_time: float = 0.5) -> dict[str, Experiment]:
-    return {
-        name: experiment(fmu, stop_time=stop_time, step=0.01, stamp_start=START)
-        for name, fmu in fmus.items()
-    }
+    return {name: experiment(fmu, stop_time=stop_time, step=0.01, stamp_start=START) for name, fmu in fmus.items()}
 
 
 def messages_of(bag: Path) -> dict[str, list[tuple[int, bytes]]]:
@@ -67,10 +62,7 @@ def logged(fmus: dict[str, Path], path: Path, **options: Any) -> Path:
     """A bag of three robots, of which one is steered."""
     steer = {"fleet/right": partial(steered, iter(range(10**6)))}
     bag = twodof.Bag(path, **options)
-    simulate_together([
-        Member(run, [bag.of(name)], steer.get(name, lambda: None))
-        for name, run in runs(fmus).items()
-    ])  # fmt: skip
+    simulate_together([Member(run, [bag.of(name)], steer.get(name, lambda: None)) for name, run in runs(fmus).items()])
     return path
 
 
@@ -81,9 +73,7 @@ def three(fmus: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_each_robot_has_its_topics_as_if_it_were_alone(
-    fmus: dict[str, Path], tmp_path: Path, storage: str
-) -> None:
+def test_each_robot_has_its_topics_as_if_it_were_alone(fmus: dict[str, Path], tmp_path: Path, storage: str) -> None:
     """By rosbags, bit for bit those of a bag of its own."""
     together = messages_of(logged(fmus, tmp_path / "bag", storage=storage, scene=True, effort=True))
     topics = set()
@@ -159,9 +149,7 @@ def test_a_robot_in_anothers_namespace_has_its_own_topics(
     for name in ("a", "a/b"):
         topics = read_bag(f"{bag.path}:{name}").topics
         assert [topic.name for topic in topics] == [f"/{name}/joint_states"]
-        assert [topic.name for topic in read_ends(f"{bag.path}:{name}").topics] == [
-            f"/{name}/joint_states"
-        ]
+        assert [topic.name for topic in read_ends(f"{bag.path}:{name}").topics] == [f"/{name}/joint_states"]
     assert not caplog.records
     (file,) = bag.path.glob("*.mcap")
     alone = file.rename(tmp_path / "alone.mcap")  # without what says whose topics are whose
@@ -173,9 +161,7 @@ def test_a_robot_in_anothers_namespace_has_its_own_topics(
 
 
 @pytest.mark.parametrize("names", [("a", "/a"), ("", "a"), ("a", "")])
-def test_robots_need_names_that_differ(
-    fmus: dict[str, Path], tmp_path: Path, names: tuple[str, str]
-) -> None:
+def test_robots_need_names_that_differ(fmus: dict[str, Path], tmp_path: Path, names: tuple[str, str]) -> None:
     run = runs(fmus)["left"]
     bag = twodof.Bag(tmp_path / "bag")
     members = [Member(run, [bag.of(name) if name else bag]) for name in names]
@@ -213,9 +199,7 @@ def test_a_sink_is_of_a_robot_that_there_is(fmus: dict[str, Path]) -> None:
         twodof.publish_together(runs(fmus, 0.02), sinks={"lift": []})
 
 
-def test_a_robot_that_comes_after_the_others_replaces_none(
-    fmus: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_robot_that_comes_after_the_others_replaces_none(fmus: dict[str, Path], tmp_path: Path) -> None:
     run = runs(fmus)["left"]
     bag = twodof.Bag(tmp_path / "bag", overwrite=True)
     for _ in range(2):  # the same run again may replace itself
@@ -242,9 +226,7 @@ simulate_together(
 """
 
 
-def test_a_killed_bag_is_recovered_with_all_its_robots(
-    fmus: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_killed_bag_is_recovered_with_all_its_robots(fmus: dict[str, Path], tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     command = [sys.executable, "-c", LOGGER, str(bag), *map(str, fmus.values())]
     with subprocess.Popen(command) as process:
@@ -296,9 +278,7 @@ def test_a_copy_of_a_robots_provenance_is_no_robot(tmp_path: Path) -> None:
     assert robots_of(tmp_path) == ["a/b", "left"]
 
 
-def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_a_robot_of_which_there_is_nothing_is_told_by_its_file(native_path: Path, tmp_path: Path) -> None:
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
     (tmp_path / "bag/run.json").rename(tmp_path / "bag/run.old.json")
     for read in (read_bag, read_ends):

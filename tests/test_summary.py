@@ -72,9 +72,7 @@ def test_summary_is_that_of_the_mcap_project(bag: Path) -> None:
     assert ours is not None and theirs is not None and theirs.statistics is not None
     assert ours.counts == theirs.statistics.channel_message_counts
     assert sum(ours.counts.values()) == read == 4 * 3001 + 2
-    assert {n: c.topic for n, c in ours.channels.items()} == {
-        n: c.topic for n, c in theirs.channels.items()
-    }
+    assert {n: c.topic for n, c in ours.channels.items()} == {n: c.topic for n, c in theirs.channels.items()}
     assert [c.place for c in ours.chunks] == [c.chunk_start_offset for c in theirs.chunk_indexes]
     assert len(ours.chunks) > 2
 

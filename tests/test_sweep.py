@@ -158,9 +158,7 @@ def test_a_trace_has_the_numbers_of_the_samples(
 
 
 def test_design_is_the_product_of_grids_with_the_same_draws(native_path: Path) -> None:
-    options: dict[str, Any] = {
-        "grid": SMALL, "ranges": {"tau_ext[2]": (-0.01, 0.02)}, "random": 4, "seed": 5,
-    }  # fmt: skip
+    options: dict[str, Any] = {"grid": SMALL, "ranges": {"tau_ext[2]": (-0.01, 0.02)}, "random": 4, "seed": 5}
     table = sweep(native_path, stop_time=0.05, **options)
     assert list(table["run"]) == list(range(24))
     draws = np.random.default_rng(5).uniform(-0.01, 0.02, 4)
@@ -187,10 +185,11 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kp=1:2"], "--grid Kp=1:2: expected NAME=LOW:HIGH:COUNT"),
         (["--grid", "Kp=1:nan:3"], "its numbers must be finite"),
         (["--grid", "Kp=1:2:3", "--grid", "Kp=1:2:3"], "--grid Kp is given twice"),
-        (["--grid", "Kp=1:2:3", "--range", "Kp[2]=1:2", "--random", "2"],
-         "Kp[2] gets values from the design of Kp and from Kp[2]"),
-        (["--grid", "Kp=1:2:3", "--set", "Kp[1]=4"],
-         "Kp[1] gets values from the settings and from Kp"),
+        (
+            ["--grid", "Kp=1:2:3", "--range", "Kp[2]=1:2", "--random", "2"],
+            "Kp[2] gets values from the design of Kp and from Kp[2]",
+        ),
+        (["--grid", "Kp=1:2:3", "--set", "Kp[1]=4"], "Kp[1] gets values from the settings and from Kp"),
         (["--range", "Kp=1:2"], "0 random draws of Kp; at least 1 is needed"),
         (["--range", "Kp=2:1", "--random", "3"], "LOW 2 must be below HIGH 1"),
         (["--random", "3"], "there is nothing to vary"),
@@ -203,15 +202,21 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
         (["--grid", "Kp=1:2:3", "--resume", "-o", "none"], "there is no sweep 'none' to resume"),
         (["--grid", "Kp=1:2:3", "-o", "taken"], "'taken' exists and is no sweep; choose another"),
         (["--grid", "Kp=1:2:3", "--workers", "0"], "0 workers; at least 1 is needed"),
-        (["--grid", "Kp=1:2:3", "--scheduler", "tcp://127.0.0.1:9"],
-         "the scheduler 'tcp://127.0.0.1:9' does not answer"),
+        (
+            ["--grid", "Kp=1:2:3", "--scheduler", "tcp://127.0.0.1:9"],
+            "the scheduler 'tcp://127.0.0.1:9' does not answer",
+        ),
         (["--grid", "Kp=1:2:3", "--scheduler", "nonsense://x"], "does not answer"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_gets_one_line(
-    arguments: list[str], said: str, native_path: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    arguments: list[str],
+    said: str,
+    native_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     monkeypatch.chdir(tmp_path)
     if "--scheduler" in arguments:
         monkeypatch.setattr("twodof.sweeps.cluster.PATIENCE", 0.5)
@@ -235,8 +240,11 @@ def test_a_missing_extra_is_named(
     code = missing + "from twodof.__main__ import main; sys.exit(main())"
     done = subprocess.run(
         [sys.executable, "-c", code, "sweep", str(native_path), "--grid", "Kp=1:2:2", *options],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert package in line and f"install the extra '{extra}': {sys.executable} -m pip" in line
@@ -248,9 +256,7 @@ def test_a_missing_extra_is_named(
 # --- one instance, any outcome ---
 
 
-def test_a_runner_instantiates_once_and_repeats_to_the_bit(
-    native_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runner_instantiates_once_and_repeats_to_the_bit(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In any order, what a run gives is what a fresh instance gives."""
     made = []
     instantiate = runner_module.instantiate
@@ -309,14 +315,10 @@ def test_each_run_has_its_outcome_and_harms_no_other(fmu_path: Path, tmp_path: P
     assert list(table["end_time"][finished]) == [0.05] * finished.sum()
     expected = sweep(fmu_path, grid={"Kp": [1.0, 6.0, 7.0]}, stop_time=0.05)
     columns = list(METRICS)
-    assert table[columns][finished].to_numpy() == pytest.approx(
-        expected[columns].to_numpy(), nan_ok=True, abs=0
-    )
+    assert table[columns][finished].to_numpy() == pytest.approx(expected[columns].to_numpy(), nan_ok=True, abs=0)
 
 
-def test_a_run_that_kills_is_given_up_alone(
-    fmu_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_kills_is_given_up_alone(fmu_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is begun three times; what was in its batch, twice at most; all else once.
 
     Those that kill are further apart than a batch is long: in one, the second would not begin.

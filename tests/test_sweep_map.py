@@ -78,9 +78,7 @@ def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Pat
         values = mesh.get_array()
         assert values is not None
         cells = np.ma.filled(values, np.nan).reshape(16, 20)
-        assert np.asarray(cells).T.ravel() == pytest.approx(
-            table[metric].to_numpy(), nan_ok=True, abs=0
-        )
+        assert np.asarray(cells).T.ravel() == pytest.approx(table[metric].to_numpy(), nan_ok=True, abs=0)
         (below,) = (text.get_text() for text in axes.texts)
         ascending = np.sort(table[metric].dropna())
         if ascending[1] - ascending[0] > 1e-12:
@@ -110,9 +108,7 @@ def test_map_of_one_variable_is_curves(native_path: Path, tmp_path: Path) -> Non
         assert np.array(y) == pytest.approx(table[metric].to_numpy(), nan_ok=True, abs=0)
 
 
-def test_map_of_three_variables_is_the_best_over_the_third(
-    native_path: Path, tmp_path: Path
-) -> None:
+def test_map_of_three_variables_is_the_best_over_the_third(native_path: Path, tmp_path: Path) -> None:
     grid = {**SMALL, "tau_ext[1]": [-0.05, 0.0, 0.05]}
     table = sweep(native_path, grid=grid, stop_time=2.0, output=tmp_path / "s")
     found = panels(tmp_path / "s")
@@ -137,9 +133,8 @@ def test_map_of_random_values_is_dots(native_path: Path, tmp_path: Path) -> None
 
 
 def test_plot_of_a_sweep_prints_the_best_runs(
-    grid_sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    grid_sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["plot", str(grid_sweep)]) == 0
     out = capsys.readouterr().out

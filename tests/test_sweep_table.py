@@ -30,9 +30,7 @@ from twodof.sweeps.results import read_sweep
 
 
 def test_table_is_parquet_with_units_and_provenance(native_path: Path, tmp_path: Path) -> None:
-    table = sweep(
-        native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", command_line="by hand"
-    )
+    table = sweep(native_path, grid=SMALL, stop_time=0.5, output=tmp_path / "s", command_line="by hand")
     (file,) = (tmp_path / "s").iterdir()
     assert file.name == "runs.parquet"
     same(table_of(tmp_path / "s"), table)
@@ -57,9 +55,7 @@ GRIDS = ["--grid", "Kp=10:200:20", "--grid", "Kd=5:80:16", "--stop-time", "20"]
 
 def begin(fmu: Path, output: Path, *options: str) -> subprocess.Popen[str]:
     command = [*COMMAND, "sweep", str(fmu), *GRIDS, "-o", str(output), *options]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
 @pytest.fixture(scope="module")
@@ -118,16 +114,12 @@ def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
         if count >= 3:
             stop.set()
 
-    options: dict[str, Any] = {
-        "grid": {"Kp": np.linspace(10, 90, 40)}, "stop_time": 20.0, "output": path,
-    }  # fmt: skip
+    options: dict[str, Any] = {"grid": {"Kp": np.linspace(10, 90, 40)}, "stop_time": 20.0, "output": path}
     table = sweep(native_path, workers=1, progress=progress, stop=stop.is_set, **options)
     assert 3 <= len(table) < 40
     parts = {file: file.read_bytes() for file in path.iterdir()}
     counts: list[int] = []
-    resumed = sweep(
-        native_path, resume=True, progress=lambda count, runs: counts.append(count), **options
-    )
+    resumed = sweep(native_path, resume=True, progress=lambda count, runs: counts.append(count), **options)
     assert counts[0] == len(table) and len(parts) > 1
     same(resumed, sweep(native_path, **{**options, "output": None}))
     made = {file.name: file.read_bytes() for file in path.iterdir()}
@@ -135,21 +127,14 @@ def test_resuming_repeats_nothing(native_path: Path, tmp_path: Path) -> None:
     assert {file.name: file.read_bytes() for file in path.iterdir()} == made
 
 
-def test_what_is_another_sweep_is_not_resumed(
-    native_path: Path, tmp_path: Path, fmu_path: Path
-) -> None:
+def test_what_is_another_sweep_is_not_resumed(native_path: Path, tmp_path: Path, fmu_path: Path) -> None:
     path = tmp_path / "s"
-    options: dict[str, Any] = {
-        "grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True,
-    }  # fmt: skip
+    options: dict[str, Any] = {"grid": {"Kp": [1.0, 2.0]}, "stop_time": 0.05, "output": path, "resume": True}
     sweep(native_path, **{**options, "resume": False})
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     for change, said in (
         ({"grid": {"Kp": [1.0, 3.0]}}, r'was begun with grids {"Kp": \[1.0, 2.0\]};'),
-        (
-            {"stop_time": 0.06},
-            "was begun with stop time 0.05; begin this sweep in another `output`",
-        ),
+        ({"stop_time": 0.06}, "was begun with stop time 0.05; begin this sweep in another `output`"),
         ({"bags": True}, "was begun with `bags=False`;"),
         ({"resume": False}, "exists; resume it with `resume=True`, or choose another `output`"),
     ):
@@ -221,9 +206,7 @@ HOSTILE_TABLES: dict[str, Callable[[pa.Table], pa.Table]] = {
     "not finite": lambda table: changed(table, "Kp", pa.array([1.0, np.inf])),
     "no design": lambda table: described(table, "design", []),
     "no FMU": lambda table: described(table, "fmu", {}),
-    "a long number": lambda table: described(
-        table, "options", {"stop_time": 10**400, "step": 1, "settings": {}}
-    ),
+    "a long number": lambda table: described(table, "options", {"stop_time": 10**400, "step": 1, "settings": {}}),
     "endless": endless,
     "one text for all": of_one_text,
 }
@@ -278,8 +261,12 @@ if __name__ == "__main__":
     runs = length(10_000, 5_000)
     done = subprocess.run(
         [sys.executable, "-c", code, str(native_path), str(tmp_path / "s"), str(runs)],
-        cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=500,
-    )  # fmt: skip
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=500,
+    )
     first, growth, all_growth = map(float, done.stdout.split())
     print(f"coordinator: {growth:.1f} MiB from run {first:.0f} to {runs}; {all_growth:.1f} in all")
     assert first < 0.9 * runs

@@ -52,9 +52,7 @@ def started() -> Callable[[], list[int]]:
     return lambda: [child for child in children_of(os.getpid()) if child not in others]
 
 
-def test_nobody_else_can_talk_to_workers(
-    native_path: Path, started: Callable[[], list[int]]
-) -> None:
+def test_nobody_else_can_talk_to_workers(native_path: Path, started: Callable[[], list[int]]) -> None:
     """No socket has a port or a name, no other user can write where they read; one thread each."""
     before, seen = doors(os.getpid()), {}
 
@@ -90,18 +88,25 @@ assert not {"dask", "distributed"} & {*sys.modules}
 @pytest.mark.parametrize(
     ("way", "variables"),
     [  # what a way puts on the path and what a variable does are independent of each other
-        (["-c", PROGRAM], {"PYTHONPATH": ":."}), (["program.py"], {}), (["-m", "program"], {}),
+        (["-c", PROGRAM], {"PYTHONPATH": ":."}),
+        (["program.py"], {}),
+        (["-m", "program"], {}),
     ],
-)  # fmt: skip
+)
 def test_workers_import_nothing_from_the_working_directory(
     way: list[str], variables: dict[str, str], native_path: Path, tmp_path: Path
 ) -> None:
     """Nor the program itself, which shields nothing by ``if __name__ == "__main__"``."""
     (tmp_path / "program.py").write_text(PROGRAM)
     done = subprocess.run(
-        [sys.executable, *way, str(Path(__file__).parent), str(native_path)], cwd=tmp_path,
-        env={**os.environ, **variables}, capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
+        [sys.executable, *way, str(Path(__file__).parent), str(native_path)],
+        cwd=tmp_path,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "numpy.py").exists() and not list(tmp_path.glob("*.sprung"))
 
@@ -114,8 +119,12 @@ def test_workers_run_the_package_that_the_program_runs(native_path: Path, tmp_pa
     code = "import sys, twodof; print(*twodof.sweep(sys.argv[1], grid={'Kp': [9.0]})['overshoot'])"
     done = subprocess.run(
         [sys.executable, "-c", code, str(native_path)],
-        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
     assert (done.stdout, done.stderr) == ("17.0\n", "")
 
 
@@ -196,9 +205,11 @@ def asleep(fmu_path: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str]
     grid = ["--grid", "Kp=2:6:5", "--stop-time", "0.05", "--workers", "1"]
     process = subprocess.Popen(
         [*COMMAND, "sweep", str(fmu), *grid, "-o", str(folder / "s")],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
         env={**os.environ, "ASLEEP": str(folder / "asleep")},
-    )  # fmt: skip
+    )
     try:
         wait_until(lambda: (folder / "asleep").exists())
         yield process, children_of(process.pid)
@@ -228,10 +239,7 @@ def test_workers_end_with_the_sweep_whatever_they_are_at(fmu_path: Path, tmp_pat
 
 
 def test_a_sweep_can_be_stopped_while_its_workers_start(
-    native_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    started: Callable[[], list[int]],
+    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callable[[], list[int]]
 ) -> None:
     (tmp_path / "numpy.py").write_text("import time; time.sleep(1e6)")
     monkeypatch.syspath_prepend(tmp_path)
@@ -251,9 +259,7 @@ def test_a_sweep_can_be_stopped_while_a_scheduler_does_not_answer(native_path: P
 
 
 @contextmanager
-def cluster(
-    folder: Path, workers: int, options: Sequence[str] = (), **environment: str
-) -> Iterator[tuple[str, int]]:
+def cluster(folder: Path, workers: int, options: Sequence[str] = (), **environment: str) -> Iterator[tuple[str, int]]:
     """Address and process of a scheduler, with workers that have joined it."""
     file, log = folder / "scheduler.json", folder / "cluster.log"
     programs = [["scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1"]]
@@ -263,17 +269,15 @@ def cluster(
         processes = [
             subprocess.Popen(
                 [sys.executable, "-m", "dask", *program, "--scheduler-file", str(file), *options],
-                stdout=told, stderr=told, start_new_session=True,
+                stdout=told,
+                stderr=told,
+                start_new_session=True,
                 env={**os.environ, "TMPDIR": str(folder), **environment},
             )
             for program in programs
-        ]  # fmt: skip
+        ]
     try:
-        while (
-            not file.exists()
-            or not file.read_text()
-            or log.read_text().count("Registered to:") < workers
-        ):
+        while not file.exists() or not file.read_text() or log.read_text().count("Registered to:") < workers:
             assert all(process.poll() is None for process in processes), log.read_text()
             time.sleep(0.05)
         yield json.loads(file.read_text())["address"], processes[0].pid
@@ -283,16 +287,29 @@ def cluster(
             process.wait()
 
 
-def test_a_cluster_that_asks_for_keys(
-    native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_that_asks_for_keys(native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By Dask's own configuration; who has none is not let in."""
     key, certificate = str(tmp_path / "key.pem"), str(tmp_path / "certificate.pem")
     subprocess.run(
-        [needs("openssl"), "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=cluster",
-         "-days", "2", "-keyout", key, "-out", certificate],
-        check=True, capture_output=True,
-    )  # fmt: skip
+        [
+            needs("openssl"),
+            "req",
+            "-x509",
+            "-newkey",
+            "rsa:2048",
+            "-nodes",
+            "-subj",
+            "/CN=cluster",
+            "-days",
+            "2",
+            "-keyout",
+            key,
+            "-out",
+            certificate,
+        ],
+        check=True,
+        capture_output=True,
+    )
     monkeypatch.setattr("twodof.sweeps.cluster.PATIENCE", 2.0)
     names = (("--tls-ca-file", certificate), ("--tls-cert", certificate), ("--tls-key", key))
     options = ["--protocol", "tls", *(word for pair in names for word in pair)]
@@ -304,8 +321,11 @@ def test_a_cluster_that_asks_for_keys(
         command = ["sweep", str(native_path), "--grid", "Kp=20:60:2", "--scheduler", address]
         done = subprocess.run(
             [*COMMAND, *command, "-o", str(tmp_path / "s")],
-            env={**os.environ, **keys}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            env={**os.environ, **keys},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert (done.returncode, done.stderr) == (0, "")
         same(table_of(tmp_path / "s"), sweep(native_path, grid=grid))
         for stranger in (address, address.replace("tls", "tcp")):
@@ -317,16 +337,12 @@ def test_a_cluster_that_asks_for_keys(
 def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int, Path]]:
     """Address and process of a scheduler, and a file in which runs are told that are begun."""
     folder = tmp_path_factory.mktemp("cluster")
-    variables = {
-        "BEGUN": str(folder / "begun"), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"
-    }  # fmt: skip
+    variables = {"BEGUN": str(folder / "begun"), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
     with cluster(folder, 2, **variables) as (address, scheduler):
         yield address, scheduler, folder / "begun"
 
 
-def test_a_cluster_gives_the_table_of_local_workers(
-    native_path: Path, two_workers: tuple[str, int, Path]
-) -> None:
+def test_a_cluster_gives_the_table_of_local_workers(native_path: Path, two_workers: tuple[str, int, Path]) -> None:
     grid: dict[str, Iterable[float]] = {"Kp": np.linspace(10.0, 200.0, 30), "Kd": [10.0, 40.0]}
     expected = sweep(native_path, grid=grid)
     for _ in range(2):  # the workers stay, and nothing of a sweep stays with them
@@ -359,9 +375,12 @@ def test_a_sweep_can_be_stopped_when_its_scheduler_is_suspended(
 
     try:
         table = sweep(
-            native_path, grid={"Kp": np.linspace(10.0, 200.0, 2000)}, scheduler=address,
-            progress=suspend, stop=lambda: bool(suspended) and looks(),
-        )  # fmt: skip
+            native_path,
+            grid={"Kp": np.linspace(10.0, 200.0, 2000)},
+            scheduler=address,
+            progress=suspend,
+            stop=lambda: bool(suspended) and looks(),
+        )
     finally:
         os.kill(scheduler, signal.SIGCONT)
     assert suspended[0] <= len(table) < 2000

@@ -15,19 +15,20 @@ TWODOF = [sys.executable, "-m", "twodof"]
 ESCAPES = "\x1b[31mred\x1b[0m‮reversed⁦"
 
 
-def run(
-    *arguments: str | bytes, cwd: Path, shell: str = '"$@"', **variables: str
-) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str | bytes, cwd: Path, shell: str = '"$@"', **variables: str) -> subprocess.CompletedProcess[str]:
     """A command behind a shell, which may close its streams."""
     return subprocess.run(
-        ["sh", "-c", shell, "sh", *TWODOF, *arguments], cwd=cwd, capture_output=True, text=True,
-        errors="surrogateescape", env={**os.environ, **variables}, check=False,
-    )  # fmt: skip
+        ["sh", "-c", shell, "sh", *TWODOF, *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        errors="surrogateescape",
+        env={**os.environ, **variables},
+        check=False,
+    )
 
 
-@pytest.mark.parametrize(
-    "arguments", [["build", "-o--"], ["plot", "bag", "-o--"], ["run", "--set=--"]]
-)
+@pytest.mark.parametrize("arguments", [["build", "-o--"], ["plot", "bag", "-o--"], ["run", "--set=--"]])
 def test_a_value_that_argparse_loses_is_refused(arguments: list[str], tmp_path: Path) -> None:
     done = run(*arguments, cwd=tmp_path)
     usage, line = done.stderr.splitlines()
@@ -37,9 +38,7 @@ def test_a_value_that_argparse_loses_is_refused(arguments: list[str], tmp_path: 
 
 
 @pytest.mark.parametrize("verb", ["sweep", "info", "plot"])
-def test_a_sweep_whose_name_is_no_text_is_refused(
-    verb: str, native_path: Path, tmp_path: Path
-) -> None:
+def test_a_sweep_whose_name_is_no_text_is_refused(verb: str, native_path: Path, tmp_path: Path) -> None:
     name = b"\xff\xfe"
     if verb == "sweep":
         arguments: list[str | bytes] = [verb, str(native_path), "--grid", "Kp=10:20:2", "-o", name]

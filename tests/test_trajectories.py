@@ -42,19 +42,16 @@ def trajectory(points: Sequence[Point], names: Sequence[str] = NAMES, stamp: int
 
     make, empty = types["trajectory_msgs/msg/JointTrajectoryPoint"], ((),) * 4
     stored = [
-        make(*(np.array(part, float) for part in (*parts, *empty)[:4]),
-             time("Duration", round(after * SECOND)))
+        make(*(np.array(part, float) for part in (*parts, *empty)[:4]), time("Duration", round(after * SECOND)))
         for after, *parts in points
-    ]  # fmt: skip
+    ]
     header = types["std_msgs/msg/Header"](time("Time", stamp), "")
     return types[TRAJECTORY](header, [*names], stored)
 
 
 def write(path: Path, *commands: tuple[float, Any], topic: str = "/go") -> Path:
     """A bag whose first joint state is at BEGIN, and messages so many seconds after."""
-    header = HUMBLE.types["std_msgs/msg/Header"](
-        HUMBLE.types["builtin_interfaces/msg/Time"](0, 0), ""
-    )
+    header = HUMBLE.types["std_msgs/msg/Header"](HUMBLE.types["builtin_interfaces/msg/Time"](0, 0), "")
     none = np.zeros(0)
     state = HUMBLE.types[JOINT_STATE](header, [], none, none, none)
     with Writer(path, version=8) as writer:
@@ -84,9 +81,7 @@ def held(fmu: Path, bag: Path, step: float, count: int, **options: Any) -> np.nd
         while k < len(changes) and changes[k][0] <= (i + 1e-9) * step:
             now |= changes[k][1]
             k += 1
-        table.append(
-            [[now[f"{group}[{j}]"] for j in (1, 2)] for group in ("q_des", "v_des", "a_des")]
-        )
+        table.append([[now[f"{group}[{j}]"] for j in (1, 2)] for group in ("q_des", "v_des", "a_des")])
     return np.array(table)
 
 
@@ -166,9 +161,7 @@ def test_the_robot_stays_on_the_trajectory(arm: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(
-    arm: Path, tmp_path: Path, parts: int
-) -> None:
+def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(arm: Path, tmp_path: Path, parts: int) -> None:
     """In its joints alone; between two points by what both have."""
     stops = [(START, (0.0, 0.0), (0.0, 0.0)), THERE, BACK, THERE, BACK, THERE, BACK]
     first = trajectory([(t, *stop) for t, stop in zip((1.0, 1.6, 1.7, 1.8, 1.9, 2.0), stops[1:])])
@@ -201,9 +194,7 @@ def test_a_new_one_replaces_the_old_from_the_state_that_was_wanted(
         (0.5, 0.0, [(0.0, (0.8,))], None),
     ],
 )
-def test_when_it_starts(
-    arm: Path, tmp_path: Path, came: float, stamp: float, points: Any, path: BPoly | None
-) -> None:
+def test_when_it_starts(arm: Path, tmp_path: Path, came: float, stamp: float, points: Any, path: BPoly | None) -> None:
     begin = BEGIN + round(stamp * SECOND) if stamp else 0
     bag = write(tmp_path / "bag", (came, trajectory(points, ["joint1"], begin)))
     table = held(arm, bag, 0.01, 250)
@@ -223,9 +214,7 @@ def test_it_begins_where_the_run_does(arm: Path, tmp_path: Path) -> None:
         assert table[150, 0] == pytest.approx([0.1 + 0.505 * 0.7, 0.2], abs=1e-12)
 
 
-def test_joints_of_another_robot_are_left_out(
-    arm: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_joints_of_another_robot_are_left_out(arm: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Of a trajectory, and of a joint state."""
     names, none = ["finger", "joint2", "elbow"], np.zeros(0)
     message = trajectory([(1.0, (0.1, 0.2, 0.3), (0.0, 0.5, 1.0))], names)
@@ -259,7 +248,7 @@ NAN = float("nan")
         (trajectory([(-1.0, *THERE)], NAMES, BEGIN + SECOND // 2), "ends 1 s before it starts"),
         (trajectory([(1.0, *THERE)], NAMES, SECOND), "s before it starts; its stamp is 0"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_followed(
     arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], message: Any, reason: str
 ) -> None:
@@ -279,9 +268,8 @@ def test_what_cannot_be_followed(
     ],
 )
 def test_what_would_have_no_end(
-    arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
-    after: float, there: Any, step: str, reason: str,
-) -> None:  # fmt: skip
+    arm: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], after: float, there: Any, step: str, reason: str
+) -> None:
     bag = write(tmp_path / "bag", (0.0, trajectory([(after, *there)])))
     given = ["--input", str(bag), "--step", step, "-o", str(tmp_path / "none")]
     assert main(["run", str(arm), *given]) == 1
@@ -290,9 +278,7 @@ def test_what_would_have_no_end(
 
 
 @pytest.mark.parametrize("control", ["effort", "task"])
-def test_another_control_follows_none(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], control: str
-) -> None:
+def test_another_control_follows_none(tmp_path: Path, capfd: pytest.CaptureFixture[str], control: str) -> None:
     bag = write(tmp_path / "bag", (0.0, trajectory([(1.0, *THERE)])))
     fmu = twodof.build_fmu(tmp_path / "Arm.fmu", twodof.FmuOptions(control=control))
     for given in (f"{bag}:/go", str(bag)):
@@ -302,9 +288,7 @@ def test_another_control_follows_none(
 
 
 def test_a_topic_of_two_types_is_refused(arm: Path, tmp_path: Path) -> None:
-    state = HUMBLE.types[JOINT_STATE](
-        trajectory([]).header, ["joint1"], np.zeros(1), np.zeros(0), np.zeros(0)
-    )
+    state = HUMBLE.types[JOINT_STATE](trajectory([]).header, ["joint1"], np.zeros(1), np.zeros(0), np.zeros(0))
     both = [(0.0, trajectory([(1.0, *THERE)])), (0.5, state)]
     for name, commands in (("a", both), ("b", [(0.0, state), (0.5, both[0][1])])):
         bag = write(tmp_path / name, *commands)

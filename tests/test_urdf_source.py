@@ -27,13 +27,8 @@ def panda_file(robots: Path) -> Path:
     return robots / "panda_description/urdf/panda.urdf"
 
 
-@pytest.mark.parametrize(
-    "locks",
-    [{"panda_joint7": 0.7}, {"panda_joint[24]": -0.5}, {"*": 0.0, "panda_joint4": -1.0}],
-)
-def test_locked_joints_are_pinocchios_reduced_model(
-    panda_file: Path, locks: dict[str, float]
-) -> None:
+@pytest.mark.parametrize("locks", [{"panda_joint7": 0.7}, {"panda_joint[24]": -0.5}, {"*": 0.0, "panda_joint4": -1.0}])
+def test_locked_joints_are_pinocchios_reduced_model(panda_file: Path, locks: dict[str, float]) -> None:
     """M, h and the frame's place; the fingers, one of which mimics the other, are always locked."""
     text = panda_file.read_text()
     full = pin.buildModelFromXML(text)
@@ -81,10 +76,11 @@ def test_who_mimics_a_locked_joint_is_locked_where_that_puts_it() -> None:
     ("factor", "lock", "message"),
     [
         ("abc", "j", "'k': its <mimic> has a factor or offset that is no number"),
-        ("nan", "j", "'k': its <mimic> has"), ("1_0", "j", "'k': its <mimic> has"),
+        ("nan", "j", "'k': its <mimic> has"),
+        ("1_0", "j", "'k': its <mimic> has"),
         ("2", "k", "'k' mimics 'j', which moves: lock that"),
     ],
-)  # fmt: skip
+)
 def test_a_mimic_that_cannot_be_followed_is_refused(factor: str, lock: str, message: str) -> None:
     with pytest.raises(RobotError, match=message):
         lock_joints(MIMIC.format(factor=factor), {lock: 0.3})
@@ -107,9 +103,7 @@ def test_of_several_last_links_one_must_be_named(panda_file: Path) -> None:
         end_effector(read_urdf(panda_file.read_text()))
 
 
-def test_a_mesh_that_is_not_there_is_left_out(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mesh_that_is_not_there_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shipped = data_file("urdf", "2dof.urdf")
     text = shipped.read_text().replace("link1.stl", "gone.stl")
     (tmp_path / "arm.urdf").write_text(text.replace("link2.stl", "lost.stl"))
@@ -156,9 +150,7 @@ def test_a_urdf_of_several_ends_is_run_by_one_command_too(
     monkeypatch.chdir(tmp_path)
     arm = without_meshes(data_file("urdf", "2dof.urdf").read_text()).replace("EndEffector", "tip")
     side = '<link name="side"/><joint name="fork" type="fixed"><parent link="link1"/>'
-    Path("fork.urdf").write_text(
-        arm.replace("</robot>", f'{side}<child link="side"/></joint></robot>')
-    )
+    Path("fork.urdf").write_text(arm.replace("</robot>", f'{side}<child link="side"/></joint></robot>'))
     command = ["run", "fork.urdf", "--native", "-o", "bag", "--stop-time", "0.1"]
     assert main(command) == 1
     assert "name the controlled link with --frame" in capsys.readouterr().err
@@ -178,16 +170,16 @@ BALL = """<robot name="top"><link name="base"/><link name="a"/><link name="b"/><
         f'<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>'
         f'<axis xyz="{axis}"/></joint>'
         for name, parent, child, axis in (
-            ("z", "base", "a", "0 0 1"), ("y", "a", "b", "0 1 0"), ("x", "b", "top", "1 0 0"),
+            ("z", "base", "a", "0 0 1"),
+            ("y", "a", "b", "0 1 0"),
+            ("x", "b", "top", "1 0 0"),
         )
     )
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("native", [False, True], ids=["python", "native"])
-def test_links_without_mass_make_a_ball_joint(
-    native: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_links_without_mass_make_a_ball_joint(native: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A body that turns about its centre without torque keeps its angular momentum."""
     (tmp_path / "top.urdf").write_text(BALL)
     options = FmuOptions(urdf=tmp_path / "top.urdf", control="effort", native=native)

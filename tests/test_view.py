@@ -144,9 +144,7 @@ def test_page_plays_and_scrubbing_lands_on_the_right_sample(page: Page, truth: n
     paused = pytest.approx(numbers(at_rest(page)["time"])[0], abs=0.006)
     assert float(slider.input_value()) == paused
     press(page, "Step")
-    assert until(
-        page, lambda found: numbers(found["time"])[0] == pytest.approx(paused.expected + 0.01)
-    )
+    assert until(page, lambda found: numbers(found["time"])[0] == pytest.approx(paused.expected + 0.01))
 
 
 def test_the_end_is_the_end_or_the_beginning(page: Page) -> None:
@@ -248,9 +246,7 @@ def test_twenty_visits_leak_nothing(command: Served, page: Page) -> None:
     assert command.status("VmRSS") <= memory + 10_000  # KiB
 
 
-def test_exported_file_replays_offline(
-    shown: Browser, folder: Path, truth: np.ndarray, run_view: View
-) -> None:
+def test_exported_file_replays_offline(shown: Browser, folder: Path, truth: np.ndarray, run_view: View) -> None:
     """Each picture is the arm at that moment of the bag; and it is all of the page."""
     done = run_view("bag", "--export", "replay.html", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
@@ -300,9 +296,7 @@ def assert_on_one_arm(system: np.ndarray, middles: np.ndarray) -> None:
     assert min(fitted[2:]) > 0.0 and np.abs(system @ fitted - middles).max() < 1.5  # pixels
 
 
-def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(
-    shown: Browser, folder: Path, tmp_path: Path
-) -> None:
+def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(shown: Browser, folder: Path, tmp_path: Path) -> None:
     bag = tmp_path / "foreign"
     bag.mkdir()
     for file in (folder / "bag").iterdir():
@@ -376,16 +370,14 @@ def test_without_its_meshes_a_robot_is_drawn_as_sticks(painted: Path, run_view: 
     done = run_view("bag", "--export", "sticks.html", cwd=painted)
     assert done.returncode == 0
     assert re.fullmatch(
-        "WARNING: without the meshes meshes/link1.stl, .*; give them with --fmu or --urdf\n",
-        done.stderr,
+        "WARNING: without the meshes meshes/link1.stl, .*; give them with --fmu or --urdf\n", done.stderr
     )
     shutil.copy(data_file("urdf", "2dof.urdf"), painted / "far.urdf")
     far = "--urdf", "far.urdf", "--mesh-dir", "bag", "--export", "far.html"
     done = run_view("bag", *far, cwd=painted)
     assert done.returncode == 0
     assert re.fullmatch(
-        "WARNING: meshes are left out, .* with --mesh-dir: package://meshes/link1.stl, .*\n",
-        done.stderr,
+        "WARNING: meshes are left out, .* with --mesh-dir: package://meshes/link1.stl, .*\n", done.stderr
     )
 
 
@@ -439,9 +431,7 @@ def test_bag_whose_name_is_no_text_is_shown(folder: Path, tmp_path: Path, run_vi
         '<geometry><box/></geometry><material name="red"><color rgba="1"/></material>',
     ],
 )
-def test_shape_without_numbers_gets_one_line(
-    shape: str, folder: Path, tmp_path: Path, run_view: View
-) -> None:
+def test_shape_without_numbers_gets_one_line(shape: str, folder: Path, tmp_path: Path, run_view: View) -> None:
     shutil.copytree(folder / "bag", tmp_path / "bag")
     made = json.loads((tmp_path / "bag/run.json").read_text())
     made["urdf"] = made["urdf"].replace("<visual>", f"<visual>{shape}</visual><visual>", 1)
@@ -474,9 +464,7 @@ def test_port_in_use(folder: Path, run_view: View) -> None:
         (["bag", "--export", "no/where.html"], "cannot write 'no/where.html'"),
     ],
 )
-def test_bad_input_gets_one_line(
-    arguments: list[str], said: str, folder: Path, run_view: View
-) -> None:
+def test_bad_input_gets_one_line(arguments: list[str], said: str, folder: Path, run_view: View) -> None:
     urdf = (Path(__file__).parents[1] / "urdf/2dof.urdf").read_text()
     (folder / "other.urdf").write_text(urdf.replace('"joint1"', '"shoulder"'))
     port = () if "--export" in arguments else ("--port", "0")

@@ -53,9 +53,12 @@ def package(tmp_path: Path) -> Path:
     folder = tmp_path / "checkout"
     for name, text in {
         "package.xml": "<package><name>my_robot</name></package>",
-        "urdf/arm.urdf.xacro": ROBOT, "urdf/macros.xacro": MACROS, "config/sizes.yaml": SIZES,
-        "../secret.xacro": "<robot secret='hidden'/>", "../secret.yaml": "hidden: 1",
-    }.items():  # fmt: skip
+        "urdf/arm.urdf.xacro": ROBOT,
+        "urdf/macros.xacro": MACROS,
+        "config/sizes.yaml": SIZES,
+        "../secret.xacro": "<robot secret='hidden'/>",
+        "../secret.yaml": "hidden: 1",
+    }.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, "utf-8")
     return folder
@@ -120,26 +123,26 @@ HOSTILE = {
     "eval of arithmetic": (VALUE.format("$(eval 1 + 1)"), "write"),
     "import": (VALUE.format('${__import__("os")}'), "not defined"),
     "document": (
-        "<xacro:include filename='block.xacro' ns='b'/>"
-        + VALUE.format('${b.get("**block").ownerDocument}'), "not allowed",
+        "<xacro:include filename='block.xacro' ns='b'/>" + VALUE.format('${b.get("**block").ownerDocument}'),
+        "not allowed",
     ),
     "an argument without a default": (VALUE.format("$(arg size)"), "'size' has no default"),
     "a huge power": (VALUE.format("${9**9**9**9}"), "don't want to evaluate"),
     "a long text": (VALUE.format('${"a" * 10**9}'), "something that long"),
     "a long list": (VALUE.format("${list(python.range(10**10))}"), "MemoryError"),
     "ever more elements": (
-        "<xacro:macro name='m' params='i'>" + "<xacro:if value='${i}'>"
-        + "<xacro:m i='${i - 1}'/>" * 9 + "</xacro:if></xacro:macro><xacro:m i='20'/>",
+        "<xacro:macro name='m' params='i'>"
+        + "<xacro:if value='${i}'>"
+        + "<xacro:m i='${i - 1}'/>" * 9
+        + "</xacro:if></xacro:macro><xacro:m i='20'/>",
         "it takes more than|exit status|MemoryError",
     ),
     "no XML": ("<", "not well-formed"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("body", "message"), HOSTILE.values(), ids=HOSTILE)
-def test_hostile_files_are_refused(
-    package: Path, body: str, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hostile_files_are_refused(package: Path, body: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if "more than" in message:
         monkeypatch.setattr(xacro_file, "MAX_XACRO_SECONDS", 3)
     path = package / "urdf/robot.xacro"
@@ -155,7 +158,5 @@ def test_hostile_files_are_refused(
 
 def test_a_missing_extra_is_named(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "simpleeval", None)
-    with pytest.raises(
-        BuildError, match=r"no simpleeval; install the extra 'xacro': .* pip install "
-    ):
+    with pytest.raises(BuildError, match=r"no simpleeval; install the extra 'xacro': .* pip install "):
         twodof.build_fmu(None, FmuOptions(urdf=package / "urdf/arm.urdf.xacro"))

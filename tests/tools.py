@@ -31,48 +31,28 @@ class Tool(NamedTuple):
 
 TOOLS = {
     "binutils": Tool("the symbols of libraries", "binutils", ("readelf",)),
-    "chromium": Tool(
-        "pages in a browser", "chromium", ("chromium", "chromium-browser", "google-chrome")
-    ),
+    "chromium": Tool("pages in a browser", "chromium", ("chromium", "chromium-browser", "google-chrome")),
     "clang": Tool("warnings of another compiler", "clang"),
     "cmake": Tool("libraries that FMPy rebuilds from the sources", "cmake"),
-    "cyclonedds": Tool(
-        "ROS 2 networks", remedy="use Python 3.13 or older, or build Cyclone DDS",
-        module="cyclonedds",
-    ),
+    "cyclonedds": Tool("ROS 2 networks", remedy="use Python 3.13 or older, or build Cyclone DDS", module="cyclonedds"),
     "disks": Tool("full disks", names=("mount",), remedy="run as root, where tmpfs can be mounted"),
-    "fastdds": Tool(
-        "ROS 2 networks with Fast DDS", "libfastrtps-dev", ("/usr/include/fastdds/dds",)
-    ),
+    "fastdds": Tool("ROS 2 networks with Fast DDS", "libfastrtps-dev", ("/usr/include/fastdds/dds",)),
     "fastddsgen": Tool("ROS 2 networks with Fast DDS", "fastddsgen"),
     "foxglove": Tool(
-        "Foxglove's own client", names=(str(PACKAGES),),
-        remedy="npm install --no-package-lock --prefix tests",
+        "Foxglove's own client", names=(str(PACKAGES),), remedy="npm install --no-package-lock --prefix tests"
     ),
     "g++": Tool("ROS 2 networks with Fast DDS", "g++", ("g++", "c++")),
     "gcc": Tool("the engine's inner functions in C", "gcc", ("gcc", "cc", "clang")),
     "ip": Tool("separate networks", "iproute2"),
-    "libc-arm64": Tool(
-        "libraries for ARM", "libc6-arm64-cross",
-        ("/usr/aarch64-linux-gnu/lib/ld-linux-aarch64.so.1",),
-    ),
+    "libc-arm64": Tool("libraries for ARM", "libc6-arm64-cross", ("/usr/aarch64-linux-gnu/lib/ld-linux-aarch64.so.1",)),
     "libatomic": Tool(
-        "FMUs in libcosim", "libatomic1",
-        ("/usr/lib/x86_64-linux-gnu/libatomic.so.1", "/usr/lib64/libatomic.so.1"),
+        "FMUs in libcosim", "libatomic1", ("/usr/lib/x86_64-linux-gnu/libatomic.so.1", "/usr/lib64/libatomic.so.1")
     ),
-    "libcosimpy": Tool(
-        "FMUs in libcosim", remedy="use Python 3.11 or newer", module="libcosimpy"
-    ),
-    "libpython": Tool(
-        "C programs that embed Python", remedy="use a Python built with --enable-shared"
-    ),
+    "libcosimpy": Tool("FMUs in libcosim", remedy="use Python 3.11 or newer", module="libcosimpy"),
+    "libpython": Tool("C programs that embed Python", remedy="use a Python built with --enable-shared"),
     "make": Tool("libraries that FMPy rebuilds from the sources", "make"),
-    "mingw": Tool(
-        "libraries for Windows", "gcc-mingw-w64-x86-64-win32", ("x86_64-w64-mingw32-gcc",)
-    ),
-    "networks": Tool(
-        "separate networks", names=("unshare",), remedy="run as root, where namespaces are allowed"
-    ),
+    "mingw": Tool("libraries for Windows", "gcc-mingw-w64-x86-64-win32", ("x86_64-w64-mingw32-gcc",)),
+    "networks": Tool("separate networks", names=("unshare",), remedy="run as root, where namespaces are allowed"),
     "node": Tool("Foxglove's own client", "nodejs"),
     "nm": Tool("the symbols of libraries", "binutils"),
     "npm": Tool("Foxglove's own client", "npm"),
@@ -84,10 +64,8 @@ TOOLS = {
     "valgrind": Tool("memory errors", "valgrind"),
     "wine": Tool("libraries for Windows", "wine64", ("wine64", "wine", "/usr/lib/wine/wine64")),
     "wineserver": Tool("libraries for Windows", "wine64"),
-    "ziglang": Tool(
-        "libraries for other platforms", remedy="pip install '.[native]'", module="ziglang"
-    ),
-}  # fmt: skip
+    "ziglang": Tool("libraries for other platforms", remedy="pip install '.[native]'", module="ziglang"),
+}
 
 
 def found(name: str) -> str | None:
@@ -126,12 +104,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in reports)
     for reason, count in sorted(reasons.items()):
         known = reason.startswith("of ")
-        terminalreporter.write_line(
-            f"{count} tests {reason}" if known else f"{count} tests were not run: {reason}"
-        )
+        terminalreporter.write_line(f"{count} tests {reason}" if known else f"{count} tests were not run: {reason}")
 
 
 if __name__ == "__main__":
-    print(
-        *sorted({tool.package for name, tool in TOOLS.items() if tool.package and not found(name)})
-    )
+    print(*sorted({tool.package for name, tool in TOOLS.items() if tool.package and not found(name)}))

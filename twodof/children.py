@@ -51,12 +51,51 @@ SECCOMP, FILTER, ALL_THREADS = 317, 1, 1
 X86_64 = 0xC000003E
 READ_ONLY = ~(os.O_CLOEXEC | os.O_NONBLOCK | os.O_DIRECTORY | os.O_NOFOLLOW | 0o100000)
 ALLOWED = (
-    0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12,  # read, write, close, *stat, poll, lseek, mmap … brk
-    13, 14, 15, 17, 19, 20, 21, 24, 25, 28,  # rt_sig*, pread64, readv, writev, access … madvise
-    35, 39, 60, 79, 89, 96, 98,  # nanosleep, getpid, exit, getcwd … getrusage; not fcntl: SIGIO
-    131, 186, 202, 217, 228, 230, 231,  # sigaltstack, gettid, futex, getdents64 … exit_group
-    262, 267, 271, 273, 318, 324, 332, 334,  # fstatat, readlinkat, ppoll, getrandom, statx, rseq
-)  # fmt: skip
+    0,
+    1,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+    10,
+    11,
+    12,  # read, write, close, *stat, poll, lseek, mmap … brk
+    13,
+    14,
+    15,
+    17,
+    19,
+    20,
+    21,
+    24,
+    25,
+    28,  # rt_sig*, pread64, readv, writev, access … madvise
+    35,
+    39,
+    60,
+    79,
+    89,
+    96,
+    98,  # nanosleep, getpid, exit, getcwd … getrusage; not fcntl: SIGIO
+    131,
+    186,
+    202,
+    217,
+    228,
+    230,
+    231,  # sigaltstack, gettid, futex, getdents64 … exit_group
+    262,
+    267,
+    271,
+    273,
+    318,
+    324,
+    332,
+    334,  # fstatat, readlinkat, ppoll, getrandom, statx, rseq
+)
 OPEN, LIMIT = 257, 302  # openat for reading, prlimit64 of the process itself
 
 
@@ -75,17 +114,24 @@ class Child(Connection):
     """
 
     def __init__(
-        self, function: Callable[..., None], *arguments: object,
-        environment: Mapping[str, str] | None = None, output: int | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        function: Callable[..., None],
+        *arguments: object,
+        environment: Mapping[str, str] | None = None,
+        output: int | None = None,
+    ) -> None:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             handle = theirs.fileno()
             self._process = Popen(
                 [sys.executable, "-I", "-c", BOOT, str(handle)],  # -I: from Python's own path alone
-                pass_fds=[handle], env={**os.environ, **(environment or {})},
-                stdin=DEVNULL, stdout=output, stderr=output, start_new_session=True,
-            )  # fmt: skip
+                pass_fds=[handle],
+                env={**os.environ, **(environment or {})},
+                stdin=DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
             super().__init__(ours.detach())
         self.send(_path())
         self.send(partial(_call, function, arguments))
@@ -177,9 +223,12 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
         folders: the only ones whose files it may read, where the kernel has Landlock.
     """
     limits = {
-        resource.RLIMIT_AS: memory, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0,
-        resource.RLIMIT_FSIZE: 0, resource.RLIMIT_NOFILE: DESCRIPTORS,
-    }  # fmt: skip
+        resource.RLIMIT_AS: memory,
+        resource.RLIMIT_CPU: seconds,
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_FSIZE: 0,
+        resource.RLIMIT_NOFILE: DESCRIPTORS,
+    }
     for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
@@ -225,11 +274,18 @@ def _allow_calls(libc: ctypes.CDLL) -> None:
     for call in ALLOWED:
         program += [(equal, 0, 1, call), allow]
     program += [
-        (equal, 0, 4, OPEN), (load, 0, 0, third), (mask, 0, 0, READ_ONLY & 0xFFFFFFFF),
-        (equal, 0, 1, 0), allow,
-        (load, 0, 0, number), (equal, 0, 3, LIMIT), (load, 0, 0, first), (equal, 0, 1, 0), allow,
+        (equal, 0, 4, OPEN),
+        (load, 0, 0, third),
+        (mask, 0, 0, READ_ONLY & 0xFFFFFFFF),
+        (equal, 0, 1, 0),
+        allow,
+        (load, 0, 0, number),
+        (equal, 0, 3, LIMIT),
+        (load, 0, 0, first),
+        (equal, 0, 1, 0),
+        allow,
         refuse,
-    ]  # fmt: skip
+    ]
     code = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in program))
     head = struct.pack("HP", len(program), ctypes.addressof(code))
     libc.syscall(SECCOMP, FILTER, ALL_THREADS, head)

@@ -63,9 +63,7 @@ class PublishError(TwoDofError):
     """A run cannot be published because of Cyclone DDS, the network or a ROS 2 variable."""
 
 
-def check_keywords(
-    given: Iterable[str], called: Callable[..., object], *more: Callable[..., object]
-) -> None:
+def check_keywords(given: Iterable[str], called: Callable[..., object], *more: Callable[..., object]) -> None:
     """Refuse keywords that neither the called function nor its delegates accept.
 
     Raises:
@@ -80,9 +78,7 @@ def check_keywords(
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean '{near[0]}'? " if near else ""
-            raise TypeError(
-                f"{called.__name__}() has no argument '{name}'; {remedy}It takes {', '.join(known)}"
-            )
+            raise TypeError(f"{called.__name__}() has no argument '{name}'; {remedy}It takes {', '.join(known)}")
 
 
 def diverged(k: int, t: float) -> SimulationError:

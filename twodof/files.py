@@ -22,13 +22,7 @@ from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from .bounds import (
-    MAX_ARCHIVE,
-    MAX_DIRECTORY,
-    MAX_FOLDERS_DEEP,
-    MAX_MEMBERS,
-    MAX_UNZIPPED,
-)
+from .bounds import MAX_ARCHIVE, MAX_DIRECTORY, MAX_FOLDERS_DEEP, MAX_MEMBERS, MAX_UNZIPPED
 from .errors import TwoDofError
 
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
@@ -125,13 +119,10 @@ def _check_member(member: zipfile.ZipInfo) -> None:
     if link or outside or not member.filename:
         raise UnsafeArchiveError(f"it is unsafe: its member '{name}' leaves its folder")
     if len(name.parts) > MAX_FOLDERS_DEEP:
-        raise UnsafeArchiveError(
-            f"it is unsafe: its folders are nested deeper than {MAX_FOLDERS_DEEP}"
-        )
+        raise UnsafeArchiveError(f"it is unsafe: its folders are nested deeper than {MAX_FOLDERS_DEEP}")
     if member.compress_type not in METHODS:
         raise UnsafeArchiveError(
-            f"its member '{name}' is compressed by method {member.compress_type};"
-            " FMI allows to store and to deflate"
+            f"its member '{name}' is compressed by method {member.compress_type}; FMI allows to store and to deflate"
         )
 
 
@@ -257,9 +248,7 @@ def lock(path: Path, *, wait: bool = False) -> int:
     folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place would be waited for
     try:
         end = time.monotonic() + (PATIENCE if wait else 0.0)
-        while (
-            not (own := _locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) and time.monotonic() < end
-        ):
+        while not (own := _locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) and time.monotonic() < end:
             time.sleep(0.01)
         if not own or not os.path.samestat(os.fstat(folder), os.stat(path)):
             raise BlockingIOError(errno.EWOULDBLOCK, "another process writes it", str(path))
@@ -288,9 +277,7 @@ def _locked(folder: int, how: int) -> bool:
     return True
 
 
-def free_name(
-    name: str, ending: str = "", replaceable: Callable[[Path], bool] = lambda path: False
-) -> Path:
+def free_name(name: str, ending: str = "", replaceable: Callable[[Path], bool] = lambda path: False) -> Path:
     """Return the name, or the name with the first number from 2 on, that no file has."""
     names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
     return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
@@ -341,9 +328,7 @@ def fits(content: Any, shape: Any) -> bool:
         return same and all(map(fits, content, shape))
     if isinstance(shape, dict):
         keys = content if str in shape else shape
-        return isinstance(content, dict) and all(
-            fits(content.get(key), shape.get(key, shape.get(str))) for key in keys
-        )
+        return isinstance(content, dict) and all(fits(content.get(key), shape.get(key, shape.get(str))) for key in keys)
     if shape == NUMBER:
         return isinstance(content, shape) and abs(content) <= sys.float_info.max
     return isinstance(content, shape)

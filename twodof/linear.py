@@ -102,12 +102,8 @@ def linearise(
         SimulationError: there is no equilibrium near, or the model is not linear at the point.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
-    if not fmu.description.coSimulation.providesDirectionalDerivative or "der(q[1])" not in (
-        fmu.variables
-    ):
-        raise InputError(
-            f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`"
-        )
+    if not fmu.description.coSimulation.providesDirectionalDerivative or "der(q[1])" not in (fmu.variables):
+        raise InputError(f"'{fmu.path}' gives no derivatives; a native FMU does: build one with `native=True`")
     groups = ("der(q[{}])", "der(v[{}])", "q_start[{}]", "v_start[{}]", "q_min[{}]", "q_max[{}]")
     for name in (g.format(i + 1) for i in range(len(fmu.vector("q"))) for g in groups):
         if name not in fmu.variables:
@@ -120,9 +116,7 @@ def linearise(
         point = _Point(fmu, instance, values)
         if not fixed:
             point.settle()
-        return point.model(
-            _chosen(fmu, "input", inputs, "inputs"), _chosen(fmu, "output", outputs, "outputs")
-        )
+        return point.model(_chosen(fmu, "input", inputs, "inputs"), _chosen(fmu, "output", outputs, "outputs"))
 
 
 def _values(fmu: Fmu, given: Mapping[str, Setting]) -> dict[str, Value]:
@@ -234,9 +228,7 @@ class _Point:
         sigma, (rcond,) = np.linalg.svd(jacobian)[1], self._read(["rcond"])
         ratio = sigma / sigma[0] if sigma[0] else 0.0 * sigma
         if np.abs(ratio[1:] - rcond).min(initial=1.0) < NEAR_JUMP:
-            raise SimulationError(
-                f"J⁺ jumps here: σ_min/σ_max = {ratio[-1]:.6g} is rcond; choose another q or rcond"
-            )
+            raise SimulationError(f"J⁺ jumps here: σ_min/σ_max = {ratio[-1]:.6g} is rcond; choose another q or rcond")
         if ratio[-1] <= rcond:
             remarks.append(
                 f"a singular pose: σ_min/σ_max = {ratio[-1]:.3g} is below rcond = {rcond:g}, so"
@@ -262,7 +254,6 @@ class _Point:
                 )
             if abs(tau) > limit:
                 remarks.append(
-                    f"joint '{joint}' is saturated: its effort stays at {limit:g}, the controller"
-                    f" asks for {tau:.4g}"
+                    f"joint '{joint}' is saturated: its effort stays at {limit:g}, the controller asks for {tau:.4g}"
                 )
         return remarks

@@ -63,9 +63,13 @@ class Worker:
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         }
         self._process = subprocess.Popen(
-            [sys.executable, __file__], cwd=folder, env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
+            [sys.executable, __file__],
+            cwd=folder,
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
 
     def run(self, *arguments: object) -> Outcome:
         """Run a command; one that takes too long ends with the traceback of where it was."""
@@ -224,9 +228,7 @@ SPECIAL: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-def without_slow(
-    metafunc: pytest.Metafunc, tables: Mapping[str, Mapping[str, object]], slow: Collection[str]
-) -> None:
+def without_slow(metafunc: pytest.Metafunc, tables: Mapping[str, Mapping[str, object]], slow: Collection[str]) -> None:
     """Parameters of a test from the table of its name: without --full none that takes a second."""
     full = metafunc.config.getoption("full")
     for name in tables.keys() & set(metafunc.fixturenames):

@@ -25,21 +25,85 @@ from typing import Any, Literal
 Mutation = Callable[[Random, bytes], bytes]
 
 NUMBERS = (
-    "", "0", "-0.0", "-1", "3", "nan", "inf", "-inf", "INF", "1e308", "-1e308", "1e999", "1e-320",
-    "1e9", "1e15", "99999999999999999999", "18446744073709551615", "-9223372036854775809",
-    "0x10", "1,5", "1_0", "1 2", "1 2 3", "1e308 1e308 1e308", "true", "None", "٣", "1" * 5000,
-)  # fmt: skip
+    "",
+    "0",
+    "-0.0",
+    "-1",
+    "3",
+    "nan",
+    "inf",
+    "-inf",
+    "INF",
+    "1e308",
+    "-1e308",
+    "1e999",
+    "1e-320",
+    "1e9",
+    "1e15",
+    "99999999999999999999",
+    "18446744073709551615",
+    "-9223372036854775809",
+    "0x10",
+    "1,5",
+    "1_0",
+    "1 2",
+    "1 2 3",
+    "1e308 1e308 1e308",
+    "true",
+    "None",
+    "٣",
+    "1" * 5000,
+)
 PATHS = (
-    "package://../../secret", "package://meshes/../../../secret", "package://%2e%2e/%2e%2e/secret",
-    "../../secret", "/etc/passwd", "file:///etc/passwd", "file:///dev/zero", "/dev/zero",
-    "file:///proc/self/mem", "package://meshes/", "package://", "http://[", "C:\\x", "\x7f",
-    "package://meshes/" + "a" * 5000, "package://" + "a/" * 3000, "package://meshes/%00",
-)  # fmt: skip
+    "package://../../secret",
+    "package://meshes/../../../secret",
+    "package://%2e%2e/%2e%2e/secret",
+    "../../secret",
+    "/etc/passwd",
+    "file:///etc/passwd",
+    "file:///dev/zero",
+    "/dev/zero",
+    "file:///proc/self/mem",
+    "package://meshes/",
+    "package://",
+    "http://[",
+    "C:\\x",
+    "\x7f",
+    "package://meshes/" + "a" * 5000,
+    "package://" + "a/" * 3000,
+    "package://meshes/%00",
+)
 WORDS = (
-    " ", "x", "x" * 100_000, "ö→𝄞", "\u202eabc", "a\nb", "a\tb", "%s%n%d", "${x}", "'\"<>&",
-    "__init__", "..", "/", "\\", "2.0", "3.0", "1.0", "input", "output", "parameter", "local",
-    "Real", "Integer", "revolute", "prismatic", "continuous", "fixed", "floating", "planar",
-)  # fmt: skip
+    " ",
+    "x",
+    "x" * 100_000,
+    "ö→𝄞",
+    "\u202eabc",
+    "a\nb",
+    "a\tb",
+    "%s%n%d",
+    "${x}",
+    "'\"<>&",
+    "__init__",
+    "..",
+    "/",
+    "\\",
+    "2.0",
+    "3.0",
+    "1.0",
+    "input",
+    "output",
+    "parameter",
+    "local",
+    "Real",
+    "Integer",
+    "revolute",
+    "prismatic",
+    "continuous",
+    "fixed",
+    "floating",
+    "planar",
+)
 
 
 def value(rng: Random) -> str:
@@ -67,16 +131,47 @@ def flip(rng: Random, data: bytes) -> bytes:
     return bytes(changed)
 
 
-def put(
-    rng: Random, data: bytes, at: int, size: int, order: Literal["little", "big"] = "little"
-) -> bytes:
+def put(rng: Random, data: bytes, at: int, size: int, order: Literal["little", "big"] = "little") -> bytes:
     """In place of an integer one that is often one too many, or far too large."""
     old, top = int.from_bytes(data[at : at + size], order), 256**size - 1
-    new = rng.choice((
-        0, 1, 2, 5, 8, 10, 12, 13, 14, 93, 95, 99, 255, 512, 4096, 65535, 2**16, 2**31 - 1, 2**31,
-        2**32 - 1, 2**40, 2**63 - 1, 2**63, top, top - 1, top // 2, len(data), rng.randrange(top),
-        old ^ 1, old ^ 8, old + 1, old - 1, 2 * old, old // 2,
-    ))  # fmt: skip
+    new = rng.choice(
+        (
+            0,
+            1,
+            2,
+            5,
+            8,
+            10,
+            12,
+            13,
+            14,
+            93,
+            95,
+            99,
+            255,
+            512,
+            4096,
+            65535,
+            2**16,
+            2**31 - 1,
+            2**31,
+            2**32 - 1,
+            2**40,
+            2**63 - 1,
+            2**63,
+            top,
+            top - 1,
+            top // 2,
+            len(data),
+            rng.randrange(top),
+            old ^ 1,
+            old ^ 8,
+            old + 1,
+            old - 1,
+            2 * old,
+            old // 2,
+        )
+    )
     return data[:at] + (new % (top + 1)).to_bytes(size, order) + data[at + size :]
 
 
@@ -227,16 +322,38 @@ LOCAL, CENTRAL, END = b"PK\3\4", b"PK\1\2", b"PK\5\6"
 ZIP_FIELDS = {
     # offset and size of what a reader believes, by record
     LOCAL: [(4, 2), (6, 2), (8, 2), (10, 4), (14, 4), (18, 4), (22, 4), (26, 2), (28, 2)],
-    CENTRAL: [(6, 2), (8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (32, 2),
-              (34, 2), (38, 4), (42, 4)],
+    CENTRAL: [(6, 2), (8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (32, 2), (34, 2), (38, 4), (42, 4)],
     END: [(4, 2), (6, 2), (8, 2), (10, 2), (12, 4), (16, 4), (20, 2)],
-}  # fmt: skip
+}
 ZIP_NAMES = (
-    "../evil", "resources/../../evil", "/evil", "//evil", "..\\evil", "C:evil", "C:\\evil", "",
-    ".", "..", "resources", "resources/robot.urdf/x", "modelDescription.xml", "./x", "~/evil",
-    "modelDescription.xml/", "binaries/linux64/../../../evil", "a" * 300, "a/" * 2100 + "b", "a\nb",
-    "\x1b[31m", "con", "ö", "resources/robot.urdf", "binaries/linux64/other.so", "x/", "a\0b",
-)  # fmt: skip
+    "../evil",
+    "resources/../../evil",
+    "/evil",
+    "//evil",
+    "..\\evil",
+    "C:evil",
+    "C:\\evil",
+    "",
+    ".",
+    "..",
+    "resources",
+    "resources/robot.urdf/x",
+    "modelDescription.xml",
+    "./x",
+    "~/evil",
+    "modelDescription.xml/",
+    "binaries/linux64/../../../evil",
+    "a" * 300,
+    "a/" * 2100 + "b",
+    "a\nb",
+    "\x1b[31m",
+    "con",
+    "ö",
+    "resources/robot.urdf",
+    "binaries/linux64/other.so",
+    "x/",
+    "a\0b",
+)
 
 
 def _zip_field(rng: Random, data: bytes) -> bytes:
@@ -255,10 +372,7 @@ def _zip_member(rng: Random, data: bytes) -> bytes:
     if not members:
         return data
     name, victim = rng.choice(ZIP_NAMES), rng.choice([*members])
-    link, method = (
-        (stat.S_IFLNK | 0o777) << 16,
-        rng.choice((0, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)),
-    )
+    link, method = ((stat.S_IFLNK | 0o777) << 16, rng.choice((0, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)))
     target = rng.choice((b"/", b"..", b"/etc/passwd", b"../../secret", victim.encode()))
     attributes = rng.choice((link, 0o40755 << 16, stat.S_IFIFO << 16, 0x10, 0xFFFFFFFF))
     match rng.randrange(7):
@@ -327,9 +441,7 @@ def raw_zip(members: Iterable[tuple[str, bytes, int, int]]) -> bytes:
             body += struct.pack("<4s5H3L2H", LOCAL, 20, *fields) + name.encode() + packed
         directory += struct.pack("<4s2H", CENTRAL, 20, 20) + struct.pack("<4H3L2H", *fields)
         directory += struct.pack("<3H2L", 0, 0, 0, 0, offsets[id(packed)]) + name.encode()
-    return bytes(body + directory) + struct.pack(
-        "<4s4H2LH", END, 0, 0, 0xFFFF, 0xFFFF, len(directory), len(body), 0
-    )
+    return bytes(body + directory) + struct.pack("<4s4H2LH", END, 0, 0, 0xFFFF, 0xFFFF, len(directory), len(body), 0)
 
 
 def deflated_zeros(size: int) -> bytes:
@@ -368,9 +480,28 @@ def _json_node(rng: Random, data: bytes) -> bytes:
         del node[key]
     else:
         node[key] = rng.choice(
-            (value(rng), value(rng), value(rng), None, True, -1, 0, 1e308, float("nan"),
-             float("inf"), 10**30, "", [], {}, [[]], {"": 0}, [None], [1, "2"], [[0, {}]])
-        )  # fmt: skip
+            (
+                value(rng),
+                value(rng),
+                value(rng),
+                None,
+                True,
+                -1,
+                0,
+                1e308,
+                float("nan"),
+                float("inf"),
+                10**30,
+                "",
+                [],
+                {},
+                [[]],
+                {"": 0},
+                [None],
+                [1, "2"],
+                [[0, {}]],
+            )
+        )
     return json.dumps(tree).encode()
 
 
@@ -457,28 +588,48 @@ mcap = several(_mcap_records, _mcap_records, _mcap_records, _mcap_chunk, blind)
 # --- SQLite ---
 
 SQLITE_FIELDS = [
-    (16, 2), (18, 1), (19, 1), (20, 1), (21, 1), (24, 4), (28, 4), (32, 4), (36, 4), (40, 4),
-    (44, 4), (52, 4), (56, 4), (60, 4), (64, 4), (92, 4), (96, 4),
-]  # fmt: skip
+    (16, 2),
+    (18, 1),
+    (19, 1),
+    (20, 1),
+    (21, 1),
+    (24, 4),
+    (28, 4),
+    (32, 4),
+    (36, 4),
+    (40, 4),
+    (44, 4),
+    (52, 4),
+    (56, 4),
+    (60, 4),
+    (64, 4),
+    (92, 4),
+    (96, 4),
+]
 STATEMENTS = (
-    "DROP TABLE {table}", "DELETE FROM {table}", "ALTER TABLE {table} RENAME TO other",
-    "UPDATE messages SET timestamp = {number}", "UPDATE messages SET topic_id = {number}",
-    "UPDATE messages SET data = x'00'", "UPDATE messages SET data = 'text'",
+    "DROP TABLE {table}",
+    "DELETE FROM {table}",
+    "ALTER TABLE {table} RENAME TO other",
+    "UPDATE messages SET timestamp = {number}",
+    "UPDATE messages SET topic_id = {number}",
+    "UPDATE messages SET data = x'00'",
+    "UPDATE messages SET data = 'text'",
     "UPDATE messages SET data = zeroblob(3000000) WHERE id < 10",
     "UPDATE messages SET data = substr(data, 1, 40) WHERE id = 3",
     "UPDATE messages SET timestamp = 'noon' WHERE id = 2",
     "UPDATE messages SET timestamp = timestamp + {number} WHERE id = 4",
-    "UPDATE topics SET type = 'no/msg/Such'", "UPDATE topics SET name = {number}",
+    "UPDATE topics SET type = 'no/msg/Such'",
+    "UPDATE topics SET name = {number}",
     "UPDATE topics SET offered_qos_profiles = '- [', serialization_format = 'json'",
     "UPDATE topics SET offered_qos_profiles = x'ff'",
     "INSERT INTO topics SELECT id + 100, name, type, serialization_format,"
     " offered_qos_profiles, type_description_hash FROM topics",
     "UPDATE message_definitions SET encoding = 'x'",
     "UPDATE message_definitions SET encoded_message_definition = x'ff'",
-    "UPDATE schema SET schema_version = {number}", "UPDATE metadata SET metadata = '['",
-    "INSERT INTO messages(topic_id, timestamp, data)"
-    " SELECT topic_id, timestamp, data FROM messages",
-)  # fmt: skip
+    "UPDATE schema SET schema_version = {number}",
+    "UPDATE metadata SET metadata = '['",
+    "INSERT INTO messages(topic_id, timestamp, data) SELECT topic_id, timestamp, data FROM messages",
+)
 TABLES = ("messages", "topics", "schema", "metadata", "message_definitions")
 
 

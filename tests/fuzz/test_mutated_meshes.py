@@ -41,9 +41,7 @@ def test_mesh_of_the_corpus_is_read(file: Path, caplog: pytest.LogCaptureFixture
 
 
 @pytest.mark.parametrize("file", BROKEN, ids=lambda file: file.name)
-def test_mesh_that_broke_its_reader_is_left_out(
-    file: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_mesh_that_broke_its_reader_is_left_out(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     with Meshes({file.name: file.read_bytes()}.get) as meshes:
         assert meshes.scaled(file.name, np.ones(3)) == []
     (record,) = caplog.records
@@ -68,9 +66,7 @@ def test_mutated_mesh(file: Path, seed: int, caplog: pytest.LogCaptureFixture) -
             assert part.triangles.max() < len(part.vertices)
     texts = [record.getMessage() for record in caplog.records]
     left_out = [name for name, parts in drawn.items() if not parts]
-    assert [text.partition("' is left out: ")[0] for text in texts] == [
-        f"mesh '{name}" for name in left_out
-    ]
+    assert [text.partition("' is left out: ")[0] for text in texts] == [f"mesh '{name}" for name in left_out]
     assert all("\n" not in text and len(text) < 600 for text in texts)
     assert after.ru_maxrss * 1024 < max(MAX_MESH_MEMORY, before.ru_maxrss * 1024 + 1)
     starts = 2 * MAX_FATAL_MESHES + 2

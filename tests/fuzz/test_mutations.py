@@ -45,9 +45,7 @@ TEXTS = {
     "(documentation|sources|model.png)": mutations.text,
 }
 FMU = mutations.several(mutations.container, mutations.member(TEXTS, kept="binaries/"), most=1)
-PYTHON_FMU = mutations.member(
-    {"resources/.*[.]py": mutations.text, "resources/.*(txt|json)": mutations.json_tree}
-)
+PYTHON_FMU = mutations.member({"resources/.*[.]py": mutations.text, "resources/.*(txt|json)": mutations.json_tree})
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +55,7 @@ def fmi3_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return twodof.build_fmu(tmp_path_factory.mktemp("fmi3") / "TwoDof-3.fmu", options)
 
 
-def test_mutated_fmu(
-    seed: int, jail: Jail, native_path: Path, fmi3_path: Path, fmu_path: Path
-) -> None:
+def test_mutated_fmu(seed: int, jail: Jail, native_path: Path, fmi3_path: Path, fmu_path: Path) -> None:
     rng = Random(seed)
     python = rng.random() < 0.1
     native = rng.choice((native_path, fmi3_path))

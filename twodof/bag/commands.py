@@ -34,9 +34,13 @@ Stored = list[tuple[int, str, bytes]]
 
 
 def read_commands(
-    fmu: Fmu | str | Path, path: str | Path, topic: str | None = None, *,
-    step: float | None = None, settings: Mapping[str, Setting] | None = None,
-) -> Changes:  # fmt: skip
+    fmu: Fmu | str | Path,
+    path: str | Path,
+    topic: str | None = None,
+    *,
+    step: float | None = None,
+    settings: Mapping[str, Setting] | None = None,
+) -> Changes:
     """Return the commands of any bag: times, s, and the inputs that change there.
 
     JointStates, points or poses, as the FMU's control follows them (``ros.commands``), each at the
@@ -80,9 +84,7 @@ def read_commands(
     return [((came - begin) / NANOSECONDS, dict(command.inputs)) for came, command in read]
 
 
-def _messages(
-    path: Path, types: Sequence[str], topic: str | None
-) -> tuple[dict[str, Stored], dict[str, int]]:
+def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict[str, Stored], dict[str, int]]:
     """Return candidate command messages by topic, and each joint-state topic's first time."""
     topics: dict[str, Stored] = {}
     begins: dict[str, int] = {}
@@ -125,9 +127,7 @@ def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Se
     raise InputError(f"'{path}' has no commands{where} for this FMU, which follows {kinds}")
 
 
-def _read(
-    commands: Stored, begin: int, read: Callable[[int, str, bytes], Read], bag: str
-) -> list[tuple[int, Read]]:
+def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read], bag: str) -> list[tuple[int, Read]]:
     """Return the time and content of each command; errors name the bag."""
     said = []
     for came, kind, data in commands:
@@ -142,14 +142,10 @@ def _read(
     return said
 
 
-def _followed(
-    commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str
-) -> Changes:
+def _followed(commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str) -> Changes:
     """Return inputs with which joints follow trajectories, at the steps where they change."""
     joints = {name: i for i, name in enumerate(fmu.joints)}
-    read = _read(
-        commands, begin, lambda came, _, data: read_trajectory(data, joints, came, begin), bag
-    )
+    read = _read(commands, begin, lambda came, _, data: read_trajectory(data, joints, came, begin), bag)
     trajectories = [trajectory for _, trajectory in read]
     begun, ended = min(it.start for it in trajectories), max(it.times[-1] for it in trajectories)
     if not ended - begun <= MAX_COMMANDS * step < inf:

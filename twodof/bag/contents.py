@@ -37,9 +37,7 @@ def stated_count(folder: Path) -> int | None:
     Raises:
         OSError: it cannot be read.
     """
-    text = read_file(folder / "metadata.yaml", MAX_METADATA, follow=False).decode(
-        "utf-8", "replace"
-    )
+    text = read_file(folder / "metadata.yaml", MAX_METADATA, follow=False).decode("utf-8", "replace")
     stated = re.search(r"^  message_count: (\d{1,18})$", text, re.MULTILINE)
     return int(stated[1]) if stated else None
 

@@ -163,9 +163,7 @@ class Tables:
         return Batch(self.channels[channel], stamps, rows[:, MESSAGE_HEAD.size : end])
 
 
-def _records(
-    path: Path, allowance: Allowance, wanted: Sequence[int] = READ
-) -> Iterator[tuple[int, bytes]]:
+def _records(path: Path, allowance: Allowance, wanted: Sequence[int] = READ) -> Iterator[tuple[int, bytes]]:
     """Yield the opcode of each record up to the requested footer, and the record with its header.
 
     Of a chunk, the content alone.

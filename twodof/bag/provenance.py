@@ -31,15 +31,19 @@ PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
 
 SHAPE = {
     "fmu": {"name": str, "guid": str, "file": str},
-    "robot": str, "frame": str, "root": str, "axes": str,
+    "robot": str,
+    "frame": str,
+    "root": str,
+    "axes": str,
     "joints": [str],
-    "start_time": NUMBER, "step": NUMBER,
+    "start_time": NUMBER,
+    "step": NUMBER,
     "start_values": VALUES,
     "versions": dict,
     "command_line": str,
     "urdf": str | None,
     "input_changes": [(NUMBER, VALUES)],
-}  # fmt: skip
+}
 """Of what is read back, as ``fits`` takes it."""
 
 
@@ -178,11 +182,7 @@ def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
     single = path.suffix == ".mcap" and path.is_file()
     file = path if single else path / file_of(namespace)
     try:
-        text = (
-            read_metadata(path, KEY, FILE).encode()
-            if single
-            else read_file(file, MAX_PROVENANCE, follow=False)
-        )
+        text = read_metadata(path, KEY, FILE).encode() if single else read_file(file, MAX_PROVENANCE, follow=False)
         if single and not text:
             return {}
         content = parsed(text)

@@ -42,9 +42,7 @@ def read_bag(path: str | Path) -> Recording:
     return _read(Path(path), _JointStates, _Targets())
 
 
-def read_outline(
-    path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]
-) -> Recording:
+def read_outline(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
     """Read a bag as ``read_bag`` does, downsampled to at most ``most`` samples for drawing.
 
     Besides those of a chunk of the bag no more are in memory. ``lines`` gives what is drawn over
@@ -108,14 +106,11 @@ def _refusing(path: Path) -> Iterator[None]:
         raise BagError(f"cannot read the bag '{path}': {error.strerror}") from error
     except DamageError as error:
         raise BagError(
-            f"cannot read the bag '{path}': {error};"
-            f" 'twodof recover {path}' saves what comes before"
+            f"cannot read the bag '{path}': {error}; 'twodof recover {path}' saves what comes before"
         ) from error
 
 
-def _read(
-    path: Path, kind: type[_JointStates], targets: _Targets | None, outline: Outline | None = None
-) -> Recording:
+def _read(path: Path, kind: type[_JointStates], targets: _Targets | None, outline: Outline | None = None) -> Recording:
     """Read a bag's joint states by a kind of reader, and downsample them."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states, total = "", kind(path), 0
@@ -166,11 +161,7 @@ def _check_count(path: Path, count: int) -> None:
 
 
 def _recording(
-    path: Path,
-    counts: Counter[tuple[str, str]],
-    chosen: str,
-    states: _JointStates,
-    targets: _Targets | None,
+    path: Path, counts: Counter[tuple[str, str]], chosen: str, states: _JointStates, targets: _Targets | None
 ) -> Recording:
     if not counts[chosen, JOINT_STATE]:
         _, robot = robot_in(path)
@@ -201,10 +192,7 @@ def whole_bag(path: Path) -> list[Path]:
     if files != [path] and not (path / "metadata.yaml").is_file():
         if is_being_written(path):
             raise BagError(f"the bag '{path}' is still being written")
-        raise BagError(
-            f"the bag '{path}' is unfinished: its writer died;"
-            f" make it whole with 'twodof recover {path}'"
-        )
+        raise BagError(f"the bag '{path}' is unfinished: its writer died; make it whole with 'twodof recover {path}'")
     return files
 
 

@@ -86,10 +86,7 @@ class Recording:
     provenance: dict[str, Any]
 
     def __repr__(self) -> str:
-        return (
-            f"<Recording '{self.path}': {self.count} samples in {self.t[-1]:g} s"
-            f" of {', '.join(self.joints)}>"
-        )
+        return f"<Recording '{self.path}': {self.count} samples in {self.t[-1]:g} s of {', '.join(self.joints)}>"
 
     @property
     def t(self) -> Array:
@@ -107,9 +104,7 @@ class Recording:
         try:
             starts = self.provenance.get("start_values", {})
             changes: Sequence[Any] = self.provenance.get("input_changes", [])
-            if not all(
-                map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))
-            ):
+            if not all(map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))):
                 raise ValueError("values are not finite")
             schedule: Schedule = [(0, ChainMap({}, starts))]
             changed: dict[str, Any] = {}
@@ -194,9 +189,5 @@ class Recording:
         except ImportError as missing:
             raise BagError(f"{missing}; pip install pandas") from missing
         parts = {"q": self.q, "v": self.v, "tau": self.tau, "x": self.x, "x_des": self.target}
-        columns = {
-            f"{group}[{i + 1}]": part[:, i]
-            for group, part in parts.items()
-            for i in range(part.shape[1])
-        }
+        columns = {f"{group}[{i + 1}]": part[:, i] for group, part in parts.items() for i in range(part.shape[1])}
         return pd.DataFrame(columns, index=pd.Index(self.t, name="t"))

@@ -203,9 +203,7 @@ class _Topics:
             self._profiles[text] = []
             self._yaml += len(text)
             if self._yaml < MAX_PROFILES:
-                with suppress(
-                    ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError
-                ):
+                with suppress(ReaderError, LookupError, TypeError, ValueError, AttributeError, RecursionError):
                     self._profiles[text] = parse_qos(text)
         return self._profiles[text]
 

@@ -38,12 +38,7 @@ REMOVED = "it was removed while it was being written"
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
 OVERHEAD = 64  # bytes that a message takes beside its data until it is flushed
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
-RECORD = np.dtype(
-    [
-        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-        ("times", "<u8", 2),
-    ]
-)  # fmt: skip
+RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("times", "<u8", 2)])
 """What MCAP has before the data of a message."""
 MESSAGE_INDEX = 7  # opcode
 CHECKSUM = struct.Struct("<I8s")  # of the summary, and the magic: the end of a file
@@ -150,9 +145,7 @@ class Sqlite3Storage(Sqlite3Writer):
         """Pass all messages to the operating system, and with ``sync`` to the disk."""
         if sync and not self.conn.in_transaction:  # new topics open one, the next flush waits
             self.conn.execute(SYNCHRONOUS[True])
-        self.conn.executemany(
-            "INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", self._rows
-        )
+        self.conn.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", self._rows)
         self.conn.commit()
         self._rows.clear()
 
@@ -171,9 +164,7 @@ class Sqlite3Storage(Sqlite3Writer):
 class BagWriter(Writer):
     """rosbags' writer with these storages; with ``fsync`` each flush waits for the disk."""
 
-    STORAGE_PLUGINS = MappingProxyType(
-        {StoragePlugin.MCAP: McapStorage, StoragePlugin.SQLITE3: Sqlite3Storage}
-    )
+    STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: McapStorage, StoragePlugin.SQLITE3: Sqlite3Storage})
     storage: McapStorage | Sqlite3Storage | None
 
     def __init__(self, path: Path, storage: str, *, fsync: bool = False) -> None:

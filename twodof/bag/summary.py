@@ -56,15 +56,16 @@ class McapSummary:
         """
         numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
         chunks = [chunk for chunk in self.chunks if chunk.channels & numbers]
-        yield from self._until(sorted(chunks, key=lambda c: c.first), topic, allowance,
-                               lambda chunk, stamps: chunk.first > min(stamps))  # fmt: skip
-        yield from self._until(sorted(chunks, key=lambda c: -c.last), topic, allowance,
-                               lambda chunk, stamps: chunk.last < max(stamps))  # fmt: skip
+        yield from self._until(
+            sorted(chunks, key=lambda c: c.first), topic, allowance, lambda chunk, stamps: chunk.first > min(stamps)
+        )
+        yield from self._until(
+            sorted(chunks, key=lambda c: -c.last), topic, allowance, lambda chunk, stamps: chunk.last < max(stamps)
+        )
 
     def _until(
-        self, chunks: list[Chunk], topic: str, allowance: Allowance,
-        beyond: Callable[[Chunk, list[int]], bool],
-    ) -> Iterator[Batch]:  # fmt: skip
+        self, chunks: list[Chunk], topic: str, allowance: Allowance, beyond: Callable[[Chunk, list[int]], bool]
+    ) -> Iterator[Batch]:
         """Yield the topic's messages chunk by chunk, while a chunk can have an earlier or later one."""
         stamps: list[int] = []
         with self.path.open("rb") as file, refusing_damage(self.path):

@@ -17,61 +17,57 @@ def add(build: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu")
-    option(
-        "robot", nargs="?", type=Path, metavar="URDF",
-        help="or a xacro file; default: the shipped planar 2-DoF arm",
-    )  # fmt: skip
+    option("robot", nargs="?", type=Path, metavar="URDF", help="or a xacro file; default: the shipped planar 2-DoF arm")
     option("--urdf", type=Path, metavar="U", help="the same")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="leave the URDF's meshes out of the FMU")
     option("--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)")
     option(
-        "--lock", dest="locks", action="append", default=[], metavar="JOINT[=VALUE]",
+        "--lock",
+        dest="locks",
+        action="append",
+        default=[],
+        metavar="JOINT[=VALUE]",
         help="fix joints, names or shell patterns, at a position (0), rad or m",
-    )  # fmt: skip
+    )
     option("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
     option(
-        "--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"),
+        "--gravity",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
         help="m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)",
-    )  # fmt: skip
+    )
     option("--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m")
     option(
-        "--control", choices=("task", "joint", "effort"), default="task",
-        help="what drives the robot: a target of the frame, one for each joint, or efforts"
-        " (%(default)s)",
-    )  # fmt: skip
+        "--control",
+        choices=("task", "joint", "effort"),
+        default="task",
+        help="what drives the robot: a target of the frame, one for each joint, or efforts (%(default)s)",
+    )
     flag("--orientation", help="of the frame too: a target orientation beside the position")
-    option(
-        "--name", type=not_empty,
-        help="name of the model (the URDF's file name, TwoDof for the shipped arm)",
-    )  # fmt: skip
+    option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
     flag("--overwrite", help="replace an existing file that is not the default arm's FMU")
     flag("--link-environment", help="remember in the FMU where this Python's packages are")
     flag("--native", help="compiled C, which needs no Python where it runs")
     option(
-        "--platform", dest="platforms", action="append", default=[], metavar="P",
+        "--platform",
+        dest="platforms",
+        action="append",
+        default=[],
+        metavar="P",
         help="of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
         " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
-    )  # fmt: skip
-    option(
-        "--fmi", type=int, choices=(2, 3),
-        help="version of a native FMU (2; 3 on machines that 2 has no name for)",
-    )  # fmt: skip
-    flag(
-        "--scalars",
-        help="in FMI 3 each element of a vector is a variable, for tools that know no arrays",
     )
+    option("--fmi", type=int, choices=(2, 3), help="version of a native FMU (2; 3 on machines that 2 has no name for)")
+    flag("--scalars", help="in FMI 3 each element of a vector is a variable, for tools that know no arrays")
 
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     if options.urdf and options.robot:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
-    check_company(
-        options,
-        needs={"--mesh-dir": "a URDF"},
-        excludes={"--no-meshes": "--mesh-dir"},
-    )
+    check_company(options, needs={"--mesh-dir": "a URDF"}, excludes={"--no-meshes": "--mesh-dir"})
     if options.orientation and options.control != "task":
         raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
     if options.scalars and options.fmi != 3:
@@ -106,10 +102,7 @@ def call(options: argparse.Namespace) -> int:
         ("controlled", controlled(fmu)),
     )
     here = fmu.platform in fmu.platforms
-    print_next(
-        f"twodof run {quote(path)}" if here else "twodof build --native",
-        f"twodof info {quote(path)}",
-    )
+    print_next(f"twodof run {quote(path)}" if here else "twodof build --native", f"twodof info {quote(path)}")
     return 0
 
 

@@ -24,9 +24,7 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
         raise CommandLineError(f"--frame is of a URDF that is given; leave it out beside {what}")
     if options.fmu and not of_urdf:
         if options.native:
-            raise CommandLineError(
-                "--native builds the default arm's FMU; leave it out beside an FMU"
-            )
+            raise CommandLineError("--native builds the default arm's FMU; leave it out beside an FMU")
         return Path(options.fmu)
     from ..export.compiler import host_platform
 

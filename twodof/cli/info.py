@@ -78,11 +78,10 @@ def _print_fmu_json(fmu: Fmu) -> None:
         root=fmu.root,
         axes=fmu.axes,
         variables=[
-            {"name": v.name, "causality": v.causality, "type": v.type, "unit": v.unit,
-             "start": v.start}
+            {"name": v.name, "causality": v.causality, "type": v.type, "unit": v.unit, "start": v.start}
             for v in fmu.variables.values()
         ],
-    )  # fmt: skip
+    )
 
 
 def _bag_facts(bag: Recording) -> dict[str, Any]:

@@ -28,9 +28,7 @@ def call(options: argparse.Namespace) -> int:
     from ..ros.layouts import layouts
 
     chosen = chosen_fmu(options)
-    rviz, juggler, foxglove = layouts(
-        chosen, options.folder, namespace=options.namespace, overwrite=options.overwrite
-    )
+    rviz, juggler, foxglove = layouts(chosen, options.folder, namespace=options.namespace, overwrite=options.overwrite)
     print_table(
         ("RViz", str(rviz)),
         ("PlotJuggler", f"{juggler}: File, Load Layout"),

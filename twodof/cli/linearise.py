@@ -16,10 +16,13 @@ def add(linearise: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     linearise.add_argument("fmu", metavar="FMU")
     linearise.add_argument(
-        "--at", action="append", default=[], metavar="NAME=VALUE",
+        "--at",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
         help="of the point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
         " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
-    )  # fmt: skip
+    )
     add_options(linearise, "--json")
 
 
@@ -44,9 +47,7 @@ def _print_json(model: LinearModel) -> None:
 
 
 def _print(model: LinearModel) -> None:
-    print_table(
-        *((name, f"{value:.6g} {model.units[name]}".strip()) for name, value in model.point.items())
-    )
+    print_table(*((name, f"{value:.6g} {model.units[name]}".strip()) for name, value in model.point.items()))
     for remark in model.remarks:
         say(f"note: {remark}")
     say("\neigenvalue, 1/s          damping  frequency, rad/s")

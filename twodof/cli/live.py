@@ -27,10 +27,15 @@ def call(options: argparse.Namespace) -> int:
     fmu = fast_fmu(options)
     with asked_to_stop() as asked:
         bags = live(
-            fmu, asked, lambda url: open_page(options, url, fmu=fmu),
-            **place(options), step=options.step, settings=settings, bag=options.output,
+            fmu,
+            asked,
+            lambda url: open_page(options, url, fmu=fmu),
+            **place(options),
+            step=options.step,
+            settings=settings,
+            bag=options.output,
             command_line=options.command_line,
-        )  # fmt: skip
+        )
     for bag in bags:
         say(f"bag   {bag}")
     if bags:

@@ -141,9 +141,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     log.setFormatter(_Words("%(levelname)s: %(message)s"))
     logging.basicConfig(handlers=[log], level=logging.WARNING)
     # those of matplotlib have names of an untrusted file
-    warnings.showwarning = lambda warning, *_, **__: logging.getLogger("twodof").warning(
-        "%s", warning
-    )
+    warnings.showwarning = lambda warning, *_, **__: logging.getLogger("twodof").warning("%s", warning)
     # the FMU's errors come back with the exception that they cause
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     return options

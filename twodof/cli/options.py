@@ -35,54 +35,51 @@ def output_file(text: str) -> str:
 
 OPTIONS: dict[str, dict[str, Any]] = {
     # what is run, for how long
-    "--frame": dict(
-        type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)",
-    ),
+    "--frame": dict(type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)"),
     "--native": dict(action="store_true", help="build and run a native FMU, of a URDF or none"),
     "--stop-time": dict(type=float, metavar="S", help="s (the FMU's own)"),
     "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's own)"),
     "--set": dict(
-        dest="settings", action="append", default=[], metavar="NAME=VALUE",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
         help="start value of an input or parameter: Kp=80, x_des=0.25,0.1, limit_effort=true",
     ),
     "--input": dict(
-        metavar="CSV|BAG[:TOPIC]",
-        help="inputs over time: a column 'time' and one for each input; or a bag's commands",
+        metavar="CSV|BAG[:TOPIC]", help="inputs over time: a column 'time' and one for each input; or a bag's commands"
     ),
     # what it leaves
     "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)"),
-    "--scene": dict(
-        action="store_true", help="add robot description, tf, target and end effector"
-    ),
+    "--scene": dict(action="store_true", help="add robot description, tf, target and end effector"),
     "--effort": dict(action="store_true", help="add the control effort"),
     "--stamp-start": dict(type=float, metavar="S", help="first stamp, s since the epoch (now)"),
-    "--overwrite": dict(
-        action="store_true", help="replace an existing bag, or the FMU of a URDF"
-    ),
+    "--overwrite": dict(action="store_true", help="replace an existing bag, or the FMU of a URDF"),
     "--json": dict(action="store_true", help="print the facts as JSON, SI units"),
-    "--fsync": dict(
-        action="store_true", help="wait for the disk twice a second, for a power loss"
-    ),
+    "--fsync": dict(action="store_true", help="wait for the disk twice a second, for a power loss"),
     "--namespace": dict(default="", metavar="NS", help="of the topics"),
     # where a page is served
     "--host": dict(help="address to listen on (127.0.0.1, this machine alone)"),
     "--port": dict(type=int, help="(8080); 0: any that is free"),
     "--no-browser": dict(action="store_true", help="open no browser"),
-}  # fmt: skip
+}
 
 OF_A_RUN = (
-    "--native", "--set", "--input", "--storage", "--scene", "--effort", "--stamp-start",
-    "--overwrite", "--json", "--fsync",
-)  # fmt: skip
+    "--native",
+    "--set",
+    "--input",
+    "--storage",
+    "--scene",
+    "--effort",
+    "--stamp-start",
+    "--overwrite",
+    "--json",
+    "--fsync",
+)
 """That may leave a bag, but for what is run."""
 OF_A_PAGE = ("--host", "--port", "--no-browser")
 
-SAME = {
-    "-o": ("output",),
-    "--platform": ("platforms",),
-    "a URDF": ("robot", "urdf"),
-    "--range": ("ranges",),
-}
+SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "urdf"), "--range": ("ranges",)}
 """What options are called in the namespace, where that is not their own name."""
 
 
@@ -94,9 +91,7 @@ def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
 
 def add_fmu(parser: argparse.ArgumentParser, default: str, metavar: str = "FMU|URDF") -> None:
     """Add the optional FMU or URDF to run."""
-    parser.add_argument(
-        "fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}"
-    )
+    parser.add_argument("fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}")
 
 
 def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
@@ -106,9 +101,7 @@ def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for the robot of a third-party bag."""
-    parser.add_argument(
-        "--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none"
-    )
+    parser.add_argument("--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none")
     parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
 
 
@@ -118,9 +111,7 @@ def said(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def check_company(
-    options: argparse.Namespace,
-    needs: dict[str, str] | None = None,
-    excludes: dict[str, str] | None = None,
+    options: argparse.Namespace, needs: dict[str, str] | None = None, excludes: dict[str, str] | None = None
 ) -> None:
     """Refuse options that have no effect without, or beside, another one; name both."""
     for option, other in (needs or {}).items():
@@ -134,8 +125,7 @@ def check_company(
 def _given(options: argparse.Namespace, option: str) -> bool:
     """Return whether an option is on the command line; such options have no default of their own."""
     names = SAME.get(option, (option.lstrip("-").replace("-", "_"),))
-    return any(value is not None and value is not False and value != []
-               for value in said(options, *names).values())  # fmt: skip
+    return any(value is not None and value is not False and value != [] for value in said(options, *names).values())
 
 
 def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:

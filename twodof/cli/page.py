@@ -17,9 +17,12 @@ def add(page: argparse.ArgumentParser) -> None:
     )
     add_fmu(page, "the default arm's native FMU")
     page.add_argument(
-        "-o", dest="output", type=output_file, metavar="FILE.html",
+        "-o",
+        dest="output",
+        type=output_file,
+        metavar="FILE.html",
         help="default: <name>.html; - is the standard output",
-    )  # fmt: skip
+    )
     add_options(page, "--frame", "--step", "--set")
 
 

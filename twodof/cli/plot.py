@@ -23,9 +23,12 @@ def add(plot: argparse.ArgumentParser) -> None:
     )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
     plot.add_argument(
-        "-o", dest="output", type=output_file, metavar="FILE",
+        "-o",
+        dest="output",
+        type=output_file,
+        metavar="FILE",
         help=".png, .svg, .pdf or .html; - is the standard output, as PNG (a window)",
-    )  # fmt: skip
+    )
     plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     add_robot_options(plot)
 

@@ -13,9 +13,13 @@ from pathlib import Path
 
 ARGUMENT = re.compile(r"`(\w+)(?:=True)?`")
 OPTIONS = {
-    "path": "-o", "output": "-o", "platforms": "--platform", "changes": "--input",
-    "robots": "NAME=FMU", "set_gains": "--foxglove-control",
-}  # fmt: skip
+    "path": "-o",
+    "output": "-o",
+    "platforms": "--platform",
+    "changes": "--input",
+    "robots": "NAME=FMU",
+    "set_gains": "--foxglove-control",
+}
 """Options that are not called as the argument of the library which they give."""
 NEEDS = {"plot": "matplotlib", "view": "websockets"}
 """Modules that verbs need, of the extra 'view'."""
@@ -47,9 +51,7 @@ def say(text: str = "", *, error: bool = False) -> None:
     print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
-def print_table(
-    *rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = ""
-) -> None:
+def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.ljust, before: str = "") -> None:
     """Print rows of texts in aligned columns, each line after a prefix."""
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:

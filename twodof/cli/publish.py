@@ -29,10 +29,11 @@ def add(publish: argparse.ArgumentParser) -> None:
     )
     option, flag = publish.add_argument, partial(publish.add_argument, action="store_true")
     option(
-        "robots", nargs="*", metavar="[NAME=]FMU|URDF",
-        help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME"
-        " or its file's",
-    )  # fmt: skip
+        "robots",
+        nargs="*",
+        metavar="[NAME=]FMU|URDF",
+        help="default: TwoDof.fmu, built if need be; several run in step, each in a namespace, NAME or its file's",
+    )
     add_output(publish, "BAG", "record a bag too, one of all robots")
     add_options(publish, "--frame")
     option("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
@@ -44,18 +45,18 @@ def add(publish: argparse.ArgumentParser) -> None:
     add_options(publish, "--namespace")
     option("--state-topic", default="joint_states", metavar="TOPIC", help="(%(default)s)")
     option(
-        "--command-topic", metavar="TOPIC",
+        "--command-topic",
+        metavar="TOPIC",
         help="where commands are heard (joint_commands or target_command, as the control takes)",
-    )  # fmt: skip
+    )
     flag("--lockstep", help="do a step when its command has come, by stamp")
     option(
-        "--timeout", type=float, metavar="S",
+        "--timeout",
+        type=float,
+        metavar="S",
         help="s without a command until the robot is held (0.5), or in lockstep until the end (10)",
-    )  # fmt: skip
-    option(
-        "--on-timeout", choices=("hold", "ramp"),
-        help="hold the last command (targets), or ramp to zero (efforts)",
-    )  # fmt: skip
+    )
+    option("--on-timeout", choices=("hold", "ramp"), help="hold the last command (targets), or ramp to zero (efforts)")
     flag("--clock", help="publish /clock, and hear /pause and /step")
     option("--speed", type=float, metavar="FACTOR", help="of real time (1; in lockstep unlimited)")
     add_options(publish, *OF_A_RUN)
@@ -81,31 +82,38 @@ def call(options: argparse.Namespace) -> int:
         space = options.namespace
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
     wire = said(
-        options, "scene", "effort", "clock", "namespace", "state_topic", "command_topic",
-        "lockstep", "timeout", "on_timeout",
-    )  # fmt: skip
-    wire["place"] = network(subnet=options.subnet)
-    wire["opened"] = (
-        (lambda _: None) if options.json else partial(_print_network, options.stop_time)
+        options,
+        "scene",
+        "effort",
+        "clock",
+        "namespace",
+        "state_topic",
+        "command_topic",
+        "lockstep",
+        "timeout",
+        "on_timeout",
     )
+    wire["place"] = network(subnet=options.subnet)
+    wire["opened"] = (lambda _: None) if options.json else partial(_print_network, options.stop_time)
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
     with asked_to_stop() as asked:
         if "" in robots:
             viewer = _foxglove(options) if options.foxglove else None
             summary = publish(
-                robots[""], *filter(None, [viewer, *bags.values()]), wire=Publisher(**wire),
-                pace=pace, stop=asked, steer=viewer.command if viewer else dict,
-            )  # fmt: skip
+                robots[""],
+                *filter(None, [viewer, *bags.values()]),
+                wire=Publisher(**wire),
+                pace=pace,
+                stop=asked,
+                steer=viewer.command if viewer else dict,
+            )
             summaries = {"": summary}
         else:
             sinks = {name: [bag] for name, bag in bags.items()}
             summaries = publish_together(robots, sinks=sinks, pace=pace, stop=asked, **wire)
     if options.json:
-        facts = {
-            name: facts_of(robots[name], bags.get(name), summary, pace)
-            for name, summary in summaries.items()
-        }
+        facts = {name: facts_of(robots[name], bags.get(name), summary, pace) for name, summary in summaries.items()}
         print_json(**facts.get("", facts))
     else:
         for name, summary in summaries.items():
@@ -151,10 +159,7 @@ def _foxglove(options: argparse.Namespace) -> Foxglove:
         say(f"open  Foxglove, Open connection, Foxglove WebSocket: {server.url}")
 
     port = {} if options.foxglove_port is None else {"port": options.foxglove_port}
-    return Foxglove(
-        **port, scene=options.scene, effort=options.effort, set_gains=options.foxglove_control,
-        opened=tell,
-    )  # fmt: skip
+    return Foxglove(**port, scene=options.scene, effort=options.effort, set_gains=options.foxglove_control, opened=tell)
 
 
 def _print_network(stop_time: float | None, wire: Publisher) -> None:

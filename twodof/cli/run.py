@@ -9,16 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .fmus import chosen_fmu
-from .options import (
-    OF_A_RUN,
-    CommandLineError,
-    add_fmu,
-    add_options,
-    add_output,
-    dated,
-    parse_settings,
-    said,
-)
+from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_output, dated, parse_settings, said
 from .printing import print_json, print_next, print_table, quote
 from .signals import INTERRUPTED, asked_to_stop
 
@@ -46,9 +37,7 @@ def call(options: argparse.Namespace) -> int:
     from ..simulation.pace import RealTime
 
     if options.stop_time == math.inf:
-        raise CommandLineError(
-            "stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C"
-        )
+        raise CommandLineError("stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C")
     run = experiment_of(options, options.stop_time, options.step)
     bag = bag_of(options, options.output or dated("rosbag2"))
     pace = RealTime() if options.realtime else None
@@ -63,9 +52,7 @@ def call(options: argparse.Namespace) -> int:
     return INTERRUPTED if summary.stopped else 0
 
 
-def experiment_of(
-    options: argparse.Namespace, stop_time: float | None, step: float | None
-) -> Experiment:
+def experiment_of(options: argparse.Namespace, stop_time: float | None, step: float | None) -> Experiment:
     """Return the experiment of the options."""
     from ..fmu import load_fmu
     from ..simulation.experiments import experiment
@@ -83,9 +70,14 @@ def experiment_of(
             table = None
             changes = read_commands(fmu, folder, topic, step=step, settings=settings)
     return experiment(
-        fmu, stop_time=stop_time, step=step, settings=settings,
-        input_file=table, changes=changes, stamp_start=options.stamp_start,
-    )  # fmt: skip
+        fmu,
+        stop_time=stop_time,
+        step=step,
+        settings=settings,
+        input_file=table,
+        changes=changes,
+        stamp_start=options.stamp_start,
+    )
 
 
 def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
@@ -96,9 +88,7 @@ def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
     return Bag(path, **said(options, *names))
 
 
-def facts_of(
-    run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None
-) -> dict[str, Any]:
+def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None) -> dict[str, Any]:
     """Return the facts of a run for another program."""
     last = summary.last
     return dict(
@@ -107,19 +97,23 @@ def facts_of(
         joint_states=last.k + 1,
         end_time=last.t,
         stopped=summary.stopped,
-        q=last.q, v=last.v, x=last.x, x_des=last.target, error=summary.error,
-        turn_error=summary.turn_error, joint_error=summary.joint_error,
+        q=last.q,
+        v=last.v,
+        x=last.x,
+        x_des=last.target,
+        error=summary.error,
+        turn_error=summary.turn_error,
+        joint_error=summary.joint_error,
         beyond_limits=[excess._asdict() for excess in summary.beyond_limits],
         wall_time=summary.wall_time,
         missed=None if pace is None else pace.missed,
         worst=None if pace is None else pace.worst,
-    )  # fmt: skip
+    )
 
 
 def print_summary(
-    options: argparse.Namespace, run: Experiment, bag: Bag | None, summary: Summary,
-    pace: RealTime | None,
-) -> None:  # fmt: skip
+    options: argparse.Namespace, run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None
+) -> None:
     """Print the summary of a run."""
     last = summary.last
     rows = [("FMU", f"{run.fmu.path}")]
@@ -173,10 +167,12 @@ def _progress() -> list[Sink]:
         def __enter__(self) -> Progress:
             run = self._run
             self._bar = tqdm(
-                total=run.steps * run.step, unit="s", leave=False, desc="simulating",
-                bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s,"
-                " {remaining} left",
-            )  # fmt: skip
+                total=run.steps * run.step,
+                unit="s",
+                leave=False,
+                desc="simulating",
+                bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left",
+            )
             return self
 
         def write(self, sample: Sample) -> None:

@@ -11,16 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .fmus import fast_fmu
-from .options import (
-    CommandLineError,
-    add_fmu,
-    add_options,
-    add_output,
-    check_company,
-    dated,
-    parse_settings,
-    said,
-)
+from .options import CommandLineError, add_fmu, add_options, add_output, check_company, dated, parse_settings, said
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 
@@ -37,15 +28,18 @@ def add(sweep: argparse.ArgumentParser) -> None:
     option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
     add_fmu(sweep, "the default arm's", "FMU")
     option(
-        "--grid", dest="grids", action="append", default=[], metavar="NAME=LOW:HIGH:COUNT",
+        "--grid",
+        dest="grids",
+        action="append",
+        default=[],
+        metavar="NAME=LOW:HIGH:COUNT",
         help="values evenly spaced; all combinations of several",
-    )  # fmt: skip
+    )
     option("--random", type=int, metavar="N", help="draws of each --range")
     option("--seed", type=int, metavar="S", help="of the draws (0)")
     option(
-        "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH",
-        help="values drawn uniformly",
-    )  # fmt: skip
+        "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH", help="values drawn uniformly"
+    )
     add_options(sweep, "--stop-time", "--step", "--set")
     add_output(sweep, "OUT", "default: sweep_<date and time>")
     flag("--resume", help="go on with OUT; what is done is not repeated")
@@ -61,21 +55,14 @@ def call(options: argparse.Namespace) -> int:
 
     from ..sweeps.coordinator import sweep
 
-    check_company(
-        options,
-        needs={"--resume": "-o", "--seed": "--random"},
-        excludes={"--workers": "--scheduler"},
-    )
+    check_company(options, needs={"--resume": "-o", "--seed": "--random"}, excludes={"--workers": "--scheduler"})
     grid, ranges = _grids(options.grids), _ranges(options.ranges)
     settings = parse_settings(options.settings)
     fmu = fast_fmu(options)
     output = Path(options.output or dated("sweep"))
     begin = time.perf_counter()
     total = 0
-    with (
-        asked_to_stop() as asked,
-        tqdm(unit="run", disable=None, leave=False, desc="sweeping", smoothing=0.05) as bar,
-    ):
+    with asked_to_stop() as asked, tqdm(unit="run", disable=None, leave=False, desc="sweeping", smoothing=0.05) as bar:
 
         def progress(done: int, runs: int) -> None:
             nonlocal total
@@ -85,19 +72,24 @@ def call(options: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         table = sweep(
-            fmu, grid=grid, ranges=ranges, random=options.random or 0, seed=options.seed or 0,
-            settings=settings, output=output, progress=progress, stop=asked,
-            **said(options, "stop_time", "step", "resume", "bags", "workers", "scheduler",
-                   "command_line"),
-        )  # fmt: skip
+            fmu,
+            grid=grid,
+            ranges=ranges,
+            random=options.random or 0,
+            seed=options.seed or 0,
+            settings=settings,
+            output=output,
+            progress=progress,
+            stop=asked,
+            **said(options, "stop_time", "step", "resume", "bags", "workers", "scheduler", "command_line"),
+        )
     stopped = len(table) < total
     counts = table["outcome"].value_counts()
     outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
     if options.json:
         print_json(
-            fmu=str(fmu), sweep=str(output), runs=total, done=len(table),
-            outcomes=counts.to_dict(), **best_facts(table),
-        )  # fmt: skip
+            fmu=str(fmu), sweep=str(output), runs=total, done=len(table), outcomes=counts.to_dict(), **best_facts(table)
+        )
         return INTERRUPTED if stopped else 0
     print_table(
         ("FMU", f"{fmu}"),

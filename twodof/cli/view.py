@@ -18,13 +18,13 @@ def add(view: argparse.ArgumentParser) -> None:
     view.description = "Replay a bag in the browser, or write a page that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path)
     view.add_argument(
-        "--export", type=output_file, metavar="FILE.html",
+        "--export",
+        type=output_file,
+        metavar="FILE.html",
         help="write one self-contained file instead; - is the standard output",
-    )  # fmt: skip
-    add_robot_options(view)
-    view.add_argument(
-        "--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes"
     )
+    add_robot_options(view)
+    view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes")
     view.add_argument("--fmu", metavar="FMU", help="where the robot's meshes are")
     add_options(view, *OF_A_PAGE)
 
@@ -40,10 +40,7 @@ def call(options: argparse.Namespace) -> int:
         say(f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:
-        view(
-            options.bag, asked, lambda url, remarks: open_page(options, url, remarks),
-            **place(options), **robot,
-        )  # fmt: skip
+        view(options.bag, asked, lambda url, remarks: open_page(options, url, remarks), **place(options), **robot)
     return 0
 
 
@@ -52,9 +49,7 @@ def place(options: argparse.Namespace) -> dict[str, Any]:
     return {key: value for key, value in said(options, "host", "port").items() if value is not None}
 
 
-def open_page(
-    options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None
-) -> None:
+def open_page(options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None) -> None:
     """Print the URL of a page, and open it where there is a display."""
     _print_remarks(remarks)
     what = f"{fmu}; " if fmu is not None else ""

@@ -43,9 +43,7 @@ class Body:
 
     def __add__(self, other: Body) -> Body:
         """Return two bodies as one, in the same frame."""
-        return Body(
-            self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia
-        )
+        return Body(self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia)
 
     def moved(self, R: Array, p: Array) -> Body:
         """Return the body in the frame in which its own frame has the pose (R, p)."""
@@ -134,9 +132,7 @@ SKEW = 0.1
 """Sine of the angle of two axes above which the place where they come nearest is worth knowing."""
 
 
-def _frames(
-    axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]
-) -> list[Frame]:
+def _frames(axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]) -> list[Frame]:
     """Return a frame for each joint, in that of Pinocchio, and the root's as the last.
 
     z is the joint's axis, x its common normal with the next one's, from which the origin is taken;

@@ -33,20 +33,26 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "aarch64-darwin": ("aarch64-macos.11.0",),
 }
 """zig's targets by FMI platform; several are joined into one universal library."""
-PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name),
-             3: tuple(name for name in TARGETS if "-" in name)}  # fmt: skip
+PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name), 3: tuple(name for name in TARGETS if "-" in name)}
 """By version of FMI."""
 ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
 UNITS = ("directional.c", "fmu.c")
 """The C files that are compiled; they include the others."""
 EXTENSIONS = {
-    name: ".dylib" if "macos" in zig[0] else ".dll" if "windows" in zig[0] else ".so"
-    for name, zig in TARGETS.items()
+    name: ".dylib" if "macos" in zig[0] else ".dll" if "windows" in zig[0] else ".so" for name, zig in TARGETS.items()
 }
 FLAGS = (
-    "-std=c99", "-O3", "-ffp-contract=off", "-fcx-limited-range", "-fno-math-errno",
-    "-fno-tree-slp-vectorize", "-fvisibility=hidden", "-Wall", "-Wextra", "-pedantic",
-)  # fmt: skip
+    "-std=c99",
+    "-O3",
+    "-ffp-contract=off",
+    "-fcx-limited-range",
+    "-fno-math-errno",
+    "-fno-tree-slp-vectorize",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+    "-pedantic",
+)
 """Multiplications are never fused with additions, so that platforms agree; complex ones are so
 without a thought for infinities. Pairing scalars into vectors takes long and gains nothing; short
 loops over joints are written out and vectorised at -O3 only by gcc, at -O2 already by zig."""
@@ -70,12 +76,7 @@ def standard_headers() -> dict[str, bytes]:
 
 
 def compile_library(
-    sources: Mapping[str, bytes],
-    platform: str,
-    name: str,
-    *,
-    units: Sequence[str] = UNITS,
-    flags: Sequence[str] = (),
+    sources: Mapping[str, bytes], platform: str, name: str, *, units: Sequence[str] = UNITS, flags: Sequence[str] = ()
 ) -> bytes:
     """Compile the shared library of an FMU.
 
@@ -104,9 +105,7 @@ def compile_library(
     return built[0] if len(built) == 1 else universal(built)
 
 
-def compile_web_module(
-    sources: Mapping[str, bytes], units: Sequence[str], functions: Sequence[str]
-) -> bytes:
+def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str], functions: Sequence[str]) -> bytes:
     """Compile C files to a WebAssembly module without imports that exports functions.
 
     Its ``_initialize`` is to be called first.
@@ -115,9 +114,7 @@ def compile_web_module(
         BuildError: there is no compiler for it, or the compiler failed.
     """
     if not compiles_for_the_web():
-        raise BuildError(
-            "cannot compile for the browser: install the package 'ziglang' (the extra 'native')"
-        )
+        raise BuildError("cannot compile for the browser: install the package 'ziglang' (the extra 'native')")
     LOG.info("compiling for the browser")
     exports = [f"-Wl,--export={function}" for function in functions]
     command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *exports, *units]
@@ -244,9 +241,8 @@ def _keep(file: Path, content: bytes) -> None:
 def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
     try:
         done = subprocess.run(
-            command, cwd=folder, env=environment,
-            capture_output=True, text=True, errors="replace", check=False,
-        )  # fmt: skip
+            command, cwd=folder, env=environment, capture_output=True, text=True, errors="replace", check=False
+        )
     except OSError as error:
         raise BuildError(f"cannot run the compiler '{command[0]}': {error}") from error
     if done.returncode != 0:
@@ -275,12 +271,18 @@ def zig_cache() -> Path | None:
             raise BuildError(
                 f"zig's cache cannot be '{named}': {reason}; ZIG_GLOBAL_CACHE_DIR names its folder"
             ) from error
-        LOG.warning("zig compiles the C library each time: it has no folder for its cache, which"
-                    " ZIG_GLOBAL_CACHE_DIR names (%s)", error)  # fmt: skip
+        LOG.warning(
+            "zig compiles the C library each time: it has no folder for its cache, which"
+            " ZIG_GLOBAL_CACHE_DIR names (%s)",
+            error,
+        )
         return None
     if not _is_ours(cache):
-        LOG.warning("zig compiles the C library each time: its cache '%s' is another user's, or"
-                    " others write to it; ZIG_GLOBAL_CACHE_DIR names another", cache)  # fmt: skip
+        LOG.warning(
+            "zig compiles the C library each time: its cache '%s' is another user's, or"
+            " others write to it; ZIG_GLOBAL_CACHE_DIR names another",
+            cache,
+        )
         return None
     return cache
 

@@ -76,9 +76,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     return flavour, files, finish
 
 
-def _flavour(
-    options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Mapping[str, Any]
-) -> Flavour:
+def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Mapping[str, Any]) -> Flavour:
     if not options.native:
         if options.platforms or options.fmi not in (None, 2) or not options.arrays:
             raise BuildError(
@@ -94,9 +92,7 @@ def _flavour(
     platforms = options.platforms or (host_platform(fmi),)
     if platforms == ("",):
         other = ", or `fmi` 3, which has one" if host_platform(3) else ""
-        raise BuildError(
-            f"FMI {fmi}.0 has no name for this machine; choose one with `platforms`{other}"
-        )
+        raise BuildError(f"FMI {fmi}.0 has no name for this machine; choose one with `platforms`{other}")
     for platform in platforms:
         if platform not in PLATFORMS[fmi]:
             names = ", ".join(PLATFORMS[fmi])
@@ -118,11 +114,11 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
     if options.control == "pose" and sum(robot.moves_frame()) < len(axes) + 3:
         logger.warning(
             "%d joints move '%s': not every position and orientation of it can be reached together",
-            sum(robot.moves_frame()), robot.frame,
-        )  # fmt: skip
+            sum(robot.moves_frame()),
+            robot.frame,
+        )
     rest = tuple(
-        0.0 if low <= 0.0 <= high else 0.5 * (low + high)
-        for low, high in zip(robot.q_min, robot.q_max, strict=True)
+        0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in zip(robot.q_min, robot.q_max, strict=True)
     )
     starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": rest}
     for key in ("gravity", "q_start"):

@@ -36,9 +36,8 @@ NO_DEPENDENCIES = b"None: the binaries need the C library and its mathematics on
 
 
 def documentation(
-    options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour,
-    guid: str, urdf: str,
-) -> Files:  # fmt: skip
+    options: FmuOptions, robot: Robot, table: Sequence[Variable], flavour: Flavour, guid: str, urdf: str
+) -> Files:
     """Return the files of the folder by their path in the FMU, which includes the URDF's text."""
     frame = html.escape(robot.frame)
     rows = []

@@ -33,9 +33,7 @@ Files = dict[str, bytes]
 """Contents by path inside the FMU."""
 
 PYTHONFMU = Path(pythonfmu.__file__).parent
-PYTHONFMU_FILES = (
-    "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
-)  # fmt: skip
+PYTHONFMU_FILES = ("_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py")
 
 
 @dataclass(frozen=True)
@@ -59,9 +57,7 @@ class Flavour:
     arrays: bool = False
 
 
-def python_flavour(
-    options: FmuOptions, robot: Robot, urdf: str, starts: Mapping[str, Any]
-) -> Flavour:
+def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Mapping[str, Any]) -> Flavour:
     """Return the Python flavour: the plant behind pythonfmu's wrapper, for linux64."""
     folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     folders += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
@@ -100,9 +96,7 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
     left_out |= set() if control == "pose" else {"orientation.c", "orientation.h"}
     left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c"}
     return {
-        path.name: path.read_bytes()
-        for path in data_file("fmu_src", "native").iterdir()
-        if path.name not in left_out
+        path.name: path.read_bytes() for path in data_file("fmu_src", "native").iterdir() if path.name not in left_out
     }
 
 
@@ -139,14 +133,7 @@ def native_flavour(
     if fmi == 3:
         files["sources/buildDescription.xml"] = build_description(name, UNITS)
         files["terminalsAndIcons/terminalsAndIcons.xml"] = terminals_and_icons(table, arrays)
-    return Flavour(
-        native=True,
-        files=files,
-        platforms=platforms,
-        signed=signed,
-        fmi=fmi,
-        arrays=arrays,
-    )
+    return Flavour(native=True, files=files, platforms=platforms, signed=signed, fmi=fmi, arrays=arrays)
 
 
 def _slave_sources() -> Files:

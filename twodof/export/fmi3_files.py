@@ -43,13 +43,10 @@ def terminals_and_icons(table: Sequence[Variable], arrays: bool) -> bytes:
     ET.SubElement(graphic, "Icon", place)
     parent = ET.SubElement(root, "Terminals")
     for name, members in terminals.items():
-        terminal = ET.SubElement(
-            parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name]
-        )
+        terminal = ET.SubElement(parent, "Terminal", name=name, matchingRule="bus", description=TERMINALS[name])
         names = (v.group if arrays else v.name for v in table if v.group in members)
         for member in dict.fromkeys(names):
             ET.SubElement(
-                terminal, "TerminalMemberVariable", variableName=member, memberName=member,
-                variableKind="signal",
-            )  # fmt: skip
+                terminal, "TerminalMemberVariable", variableName=member, memberName=member, variableKind="signal"
+            )
     return xml_text(root)

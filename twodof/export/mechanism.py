@@ -47,35 +47,27 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     bounds = np.abs(effort), effort_bounds(constants, bodies, joint, v, a, gravity)
     in_all = "const JointPosition joint[N_BODIES]"
     motion = (
-        f"{in_all}, const Carrier *carrier, const double v[N_JOINTS], const double a[N_JOINTS],"
-        " const double gravity[3]"
+        f"{in_all}, const Carrier *carrier, const double v[N_JOINTS], const double a[N_JOINTS], const double gravity[3]"
     )
     functions = {
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
-        f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements(
-            "tau", J[:3].T.dot(force)
-        ),
+        f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements("tau", J[:3].T.dot(force)),
         "load_carrier(double payload, const double place[3], Carrier *carrier)": load,
         f"inverse_dynamics({motion}, double tau[N_JOINTS])": _elements("tau", effort),
     }
     alike = {
         f"place_joints(const double q[N_JOINTS], {in_all[6:]})": _places(constants),
-        f"effort_bounds({motion}, double bound[N_JOINTS])": _elements(
-            "bound", min(bounds, key=operations)
-        ),
+        f"effort_bounds({motion}, double bound[N_JOINTS])": _elements("bound", min(bounds, key=operations)),
     }
     texts = [c_function(f"void {head}", results) for head, results in alike.items()]
     texts += [
-        c_function(f"void {head}", results, varied(results.values(), held=HELD))
-        for head, results in functions.items()
+        c_function(f"void {head}", results, varied(results.values(), held=HELD)) for head, results in functions.items()
     ]
     texts += _forward_dynamics(constants, bodies, joint, in_all)
     return "\n".join([MECHANISM, *texts])
 
 
-def _forward_dynamics(
-    robot: JointTree, bodies: Sequence[Body], joint: Array, in_all: str
-) -> list[str]:
+def _forward_dynamics(robot: JointTree, bodies: Sequence[Body], joint: Array, in_all: str) -> list[str]:
     """Return forward dynamics, and those with held joints, by factors of M or by recursion.
 
     Whichever takes fewer operations.
@@ -95,8 +87,7 @@ def _forward_dynamics(
     inertial = inverse_dynamics(robot, bodies, joint, np.zeros(n), a, np.zeros(3))
     hybrid = min(hybrids, key=lambda both: operations([*both[0], *both[1]]))
     solve = (
-        f"void acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS],"
-        " double a[N_JOINTS])"
+        f"void acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS], double a[N_JOINTS])"
     )
     hold = (
         f"void hybrid_dynamics({in_all}, const Carrier *carrier, const double free[N_JOINTS],"
@@ -148,9 +139,7 @@ def _places(robot: JointTree) -> dict[str, Value]:
 def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
     """Return the bodies, the last with the payload as variables, and the names of these."""
     carrier, place = robot.path[-1], _variables("place", 3)
-    loaded = robot.body[carrier].with_point(
-        Expression("payload"), robot.frame_p + robot.frame_R.dot(place)
-    )
+    loaded = robot.body[carrier].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(place))
     load = {"carrier->mass": loaded.mass}
     load |= _elements("carrier->moment", loaded.moment)
     load |= _elements("carrier->inertia", loaded.inertia[LOWER])
@@ -167,6 +156,4 @@ def _variables(name: str, count: int) -> Array:
 
 def _elements(name: str, values: Array) -> dict[str, Value]:
     """Return each element of an array by its name in C."""
-    return {
-        name + "".join(f"[{i}]" for i in place): value for place, value in np.ndenumerate(values)
-    }
+    return {name + "".join(f"[{i}]" for i in place): value for place, value in np.ndenumerate(values)}

@@ -57,8 +57,9 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
         missing[MAX_LISTED:] = [f"{len(missing) - MAX_LISTED} more"] * (len(missing) > MAX_LISTED)
         LOG.warning(
             "meshes are left out, as they were not found; give their folder, or that of their"
-            " packages, with `mesh_dir`: %s", ", ".join(missing),
-        )  # fmt: skip
+            " packages, with `mesh_dir`: %s",
+            ", ".join(missing),
+        )
     return ET.tostring(tree, encoding="unicode") + "\n", files
 
 

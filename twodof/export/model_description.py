@@ -73,11 +73,7 @@ LOG_CATEGORIES = {
 VENDOR = "twodof"
 AUTHOR = "the twodof developers"
 
-UNKNOWNS_3 = {
-    "Outputs": "Output",
-    "Derivatives": "ContinuousStateDerivative",
-    "InitialUnknowns": "InitialUnknown",
-}
+UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "InitialUnknowns": "InitialUnknown"}
 """Elements of 3.0 by the parts of 2.0's ModelStructure."""
 SCALAR = ("name", "valueReference", "description", "causality", "variability", "initial")
 """Attributes of 2.0's ScalarVariable; others are its type's."""
@@ -184,9 +180,8 @@ def _units(root: ET.Element, used: Collection[str], fmi: int) -> None:
 def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
     """Add the vendor annotation: facts that a logger needs besides variable names."""
     task = ET.SubElement(
-        tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes,
-        control=control,
-    )  # fmt: skip
+        tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes, control=control
+    )
     for joint, prismatic in zip(robot.joints, robot.prismatic, strict=True):
         ET.SubElement(task, "Joint", name=joint, type="prismatic" if prismatic else "revolute")
 
@@ -211,9 +206,13 @@ def _nominal(robot: Robot, variable: Variable) -> float:
 
 
 def _variables(
-    root: ET.Element, robot: Robot, table: Sequence[Variable], names: Sequence[str],
-    references: Sequence[str], flavour: Flavour,
-) -> None:  # fmt: skip
+    root: ET.Element,
+    robot: Robot,
+    table: Sequence[Variable],
+    names: Sequence[str],
+    references: Sequence[str],
+    flavour: Flavour,
+) -> None:
     variables = ET.SubElement(root, "ModelVariables")
     place = {(variable.group, variable.index): i for i, variable in enumerate(table)}
     vectors: dict[str, list[int]] = {}  # places of the elements; of a scalar there is one
@@ -239,16 +238,12 @@ def _variables(
             own = {key: attributes.pop(key) for key in SCALAR if key in attributes}
             ET.SubElement(ET.SubElement(variables, "ScalarVariable", own), first.type, attributes)
             continue
-        element = ET.SubElement(
-            variables, "Float64" if first.type == "Real" else first.type, attributes
-        )
+        element = ET.SubElement(variables, "Float64" if first.type == "Real" else first.type, attributes)
         if name != first.name:
             ET.SubElement(element, "Dimension", start=str(len(places)))
 
 
-def _attributes(
-    robot: Robot, variable: Variable, start: Value | None, exchanges: bool
-) -> dict[str, str]:
+def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges: bool) -> dict[str, str]:
     """Return the attributes of a scalar, or of an element of a vector."""
     attributes = {
         "description": variable.description,
@@ -266,9 +261,10 @@ def _attributes(
         attributes["declaredType"] = QUANTITIES[variable.unit]
     within = _range(robot, variable)
     for key, value, default in (
-        ("min", within.low, -math.inf), ("max", within.high, math.inf),
+        ("min", within.low, -math.inf),
+        ("max", within.high, math.inf),
         ("nominal", _nominal(robot, variable), 1.0),
-    ):  # fmt: skip
+    ):
         if value != default:
             attributes[key] = repr(value)
     if state:
@@ -294,25 +290,31 @@ def _description(elements: Sequence[dict[str, str]]) -> str:
 
 
 def _structure(
-    root: ET.Element, robot: Robot, table: Sequence[Variable], references: Sequence[str],
-    control: Control, fmi: int,
-) -> None:  # fmt: skip
+    root: ET.Element, robot: Robot, table: Sequence[Variable], references: Sequence[str], control: Control, fmi: int
+) -> None:
     moves = robot.moves_frame()
     inputs = (*control.inputs, *DISTURBANCES)
     law = ("gravity", *control.parameters, "limit_effort")
     own, frame, every = "that joint's", "those of joints that move the frame", "all"
     during = {
-        "q": (("q",), own), "v": (("v",), own), "der_q": (("v",), own),
-        "x": (("q",), frame), "quat": (("q",), frame),
-        "xd": (STATES, frame), "omega": (STATES, frame),
-        "tau": ((*STATES, *control.inputs), every), "der_v": ((*STATES, *inputs), every),
-    }  # fmt: skip
+        "q": (("q",), own),
+        "v": (("v",), own),
+        "der_q": (("v",), own),
+        "x": (("q",), frame),
+        "quat": (("q",), frame),
+        "xd": (STATES, frame),
+        "omega": (STATES, frame),
+        "tau": ((*STATES, *control.inputs), every),
+        "der_v": ((*STATES, *inputs), every),
+    }
     at_the_start = {
-        "q": (START, own), "x": (START, frame), "quat": (START, frame),
+        "q": (START, own),
+        "x": (START, frame),
+        "quat": (START, frame),
         **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, every)),
         "tau": ((*IMPACT, *law, *control.inputs), every),
         "der_v": ((*IMPACT, *law, *inputs), every),
-    }  # fmt: skip
+    }
     if control.commands == "effort":
         during["tau"] = (control.inputs, own)
         at_the_start["tau"] = (("limit_effort", *control.inputs), own)

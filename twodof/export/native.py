@@ -20,12 +20,7 @@ SIGNS = "change their sign where a joint meets or leaves a stop, or J⁺ its ran
 
 
 def model_header(
-    robot: Robot,
-    table: Sequence[Variable],
-    control: str,
-    guid: str,
-    fmi: int = 2,
-    arrays: bool = True,
+    robot: Robot, table: Sequence[Variable], control: str, guid: str, fmi: int = 2, arrays: bool = True
 ) -> str:
     """Return the text of ``model.h``: constants of a robot and its variables, exact to the bit.
 
@@ -61,9 +56,7 @@ def model_header(
     return "\n".join(sections)
 
 
-def engine_variables(
-    robot: Robot, table: Sequence[Variable], control: str, fmi: int
-) -> Sequence[Variable]:
+def engine_variables(robot: Robot, table: Sequence[Variable], control: str, fmi: int) -> Sequence[Variable]:
     """Return the variables in engine order; in FMI 3.0 with event indicators and the time."""
     if fmi == 2:
         return table
@@ -101,8 +94,7 @@ def _references(table: Sequence[Variable], arrays: bool) -> str:
     places = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
     return (
         "/* The values of a reference, from 1 on: from PLACE[vr] to before PLACE[vr + 1]. */\n"
-        f"enum {{ N_REFERENCES = {len(places)} }};\n"
-        + _table("int PLACE", [0, *places, len(table)])
+        f"enum {{ N_REFERENCES = {len(places)} }};\n" + _table("int PLACE", [0, *places, len(table)])
     )
 
 
@@ -127,7 +119,6 @@ def _literal(value: object) -> str:
 def _quoted(text: str) -> str:
     """Return a C string literal; all but printable ASCII as octal escapes of its UTF-8."""
     escaped = "".join(
-        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
-        for byte in text.encode()
+        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}" for byte in text.encode()
     )
     return f'"{escaped}"'

@@ -24,9 +24,7 @@ DEFAULT_ARM = b"twodof: the default arm"
 """Beginning of the zip comment of its FMUs, whichever flavour and version."""
 
 
-def build_fmu(
-    output: str | Path | None = None, options: FmuOptions | None = None, *, overwrite: bool = False
-) -> Path:
+def build_fmu(output: str | Path | None = None, options: FmuOptions | None = None, *, overwrite: bool = False) -> Path:
     """Build an FMU.
 
     Args:

@@ -67,9 +67,7 @@ def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, 
     return x, R.dot(robot.frame_R), columns.T.dot(robot.G), np.array([*a, *alpha])
 
 
-def inverse_dynamics(
-    robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
-) -> Array:
+def inverse_dynamics(robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array) -> Array:
     """Return τ = M(q) a + h(q, v): motion outwards, forces inwards.
 
         f = m a + α × d + ω × (ω × d),   n = I α + ω × I ω + d × a     with d = m c
@@ -112,18 +110,13 @@ def inverse_dynamics(
     return effort
 
 
-def effort_bounds(
-    robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array
-) -> Array:
+def effort_bounds(robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array) -> Array:
     """Return bounds of |τ| of ``inverse_dynamics``, by its recursion with norms in place of vectors.
 
     |x × y| ≤ |x| |y|, |I x| ≤ ‖I‖ |x| with Frobenius' norm, |x + y| ≤ |x| + |y|.
     """
     rates, accelerations = np.abs(robot.G.dot(v)), np.abs(robot.G.dot(a))
-    reach = [
-        _length(p) + (abs(c) if slides else 0.0)
-        for p, slides, (c, _) in zip(robot.p, robot.prismatic, joint)
-    ]
+    reach = [_length(p) + (abs(c) if slides else 0.0) for p, slides, (c, _) in zip(robot.p, robot.prismatic, joint)]
     motions: list[tuple[Any, Any, Any]] = []
     force, moment = [], []
     for i, parent in enumerate(robot.parent):
@@ -278,9 +271,7 @@ def hybrid_by_recursion(
     return a, reaction
 
 
-def _passed_on(
-    blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, free: Any
-) -> tuple[Array, Array, Array]:
+def _passed_on(blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, free: Any) -> tuple[Array, Array, Array]:
     """Return I − U Uᵀ/D of a body; along its axis a free joint transmits nothing, another everything."""
     A, B, C = blocks
     angular, linear = (B[:, 2], C[:, 2]) if slides else (A[:, 2], B[2])

@@ -125,9 +125,7 @@ def varied(
     return [pairs[place] for place in places]
 
 
-def c_function(
-    head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None
-) -> str:
+def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None) -> str:
     """Return a function that assigns each result to its lvalue, which is a variable of no result.
 
     If numbers are complex, ``complexes`` has of each result the real part and how it varies.
@@ -138,13 +136,8 @@ def c_function(
         for value, variation in complexes:
             separate[f"const Real re{len(separate)}"] = value
             separate[f"const Real im{len(separate)}"] = variation
-        combined = "".join(
-            f"\n    assign(&{target}, re{2 * i}, im{2 * i + 1});"
-            for i, target in enumerate(results)
-        )
-        body = (
-            f"#ifdef IS_COMPLEX\n{_statements(separate, 'Real')}{combined}\n#else\n{body}\n#endif"
-        )
+        combined = "".join(f"\n    assign(&{target}, re{2 * i}, im{2 * i + 1});" for i, target in enumerate(results))
+        body = f"#ifdef IS_COMPLEX\n{_statements(separate, 'Real')}{combined}\n#else\n{body}\n#endif"
     parameters = re.findall(r"(\w+)(?:\[\w+\])?[,)]", head)
     unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
     ignored = "".join(f"    (void){name};\n" for name in unused)
@@ -164,10 +157,7 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
             lines.append(f"    const {own} t{place} = {_bare(text)};")
             text = f"t{place}"
         texts.append(text)
-    lines += [
-        f"    {target} = {_bare(texts[place])};"
-        for target, place in zip(results, places, strict=True)
-    ]
+    lines += [f"    {target} = {_bare(texts[place])};" for target, place in zip(results, places, strict=True)]
     return "\n".join(lines)
 
 

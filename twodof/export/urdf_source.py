@@ -93,8 +93,7 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
         joint, element = moving[name], elements[name]
         if not joint.low <= value <= joint.high:
             raise RobotError(
-                f"joint '{name}' cannot be locked at {value:g}: its limits are"
-                f" {joint.low:g} and {joint.high:g}"
+                f"joint '{name}' cannot be locked at {value:g}: its limits are {joint.low:g} and {joint.high:g}"
             )
         turned = Rotation.from_euler("xyz", joint.rpy)
         place = np.array(joint.xyz)
@@ -109,8 +108,5 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # where roll and yaw turn about one axis, any pair does
             rpy = turned.as_euler("xyz")
-        ET.SubElement(
-            element, "origin", xyz=" ".join(map(repr, place.tolist())),
-            rpy=" ".join(map(repr, rpy.tolist())),
-        )  # fmt: skip
+        ET.SubElement(element, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
     return ET.tostring(urdf.tree, encoding="unicode")

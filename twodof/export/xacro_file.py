@@ -41,9 +41,7 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
     """
     missing = [name for name in ("xacro", "simpleeval") if find_spec(name) is None]
     if missing:
-        raise BuildError(
-            f"cannot expand '{path}': there is no {' and no '.join(missing)}; {install('xacro')}"
-        )
+        raise BuildError(f"cannot expand '{path}': there is no {' and no '.join(missing)}; {install('xacro')}")
     environment = {"LC_ALL": "C.UTF-8"}
     with Child(_expand, path, folders, most, environment=environment, output=DEVNULL) as child:
         try:
@@ -117,9 +115,11 @@ def _evaluate(expression: str, symbols: dict[str, Any], _: object = None) -> obj
     from simpleeval import BASIC_ALLOWED_ATTRS, EvalWithCompoundTypes
 
     attributes = {
-        **BASIC_ALLOWED_ATTRS, xacro.NameSpace: _Every(), xacro.YamlDictWrapper: _Every(),
+        **BASIC_ALLOWED_ATTRS,
+        xacro.NameSpace: _Every(),
+        xacro.YamlDictWrapper: _Every(),
         xacro.YamlListWrapper: BASIC_ALLOWED_ATTRS[list],
-    }  # fmt: skip
+    }
     functions = {name: f for name, f in xacro._global_symbols.items() if callable(f)}
     evaluator = EvalWithCompoundTypes(functions=functions, names=symbols, allowed_attrs=attributes)
     tree = ast.parse(expression.strip(), mode="eval").body
@@ -137,14 +137,11 @@ def _package(name: str, folders: Sequence[Path]) -> Path:
         for candidate in (folder / name, folder):
             declared = candidate / "package.xml"
             if candidate.is_dir() and (
-                candidate.name == name
-                or (declared.is_file() and f"<name>{name}</name>" in declared.read_text("utf-8"))
+                candidate.name == name or (declared.is_file() and f"<name>{name}</name>" in declared.read_text("utf-8"))
             ):
                 return candidate
     where = " or ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
-    raise ValueError(
-        f"package '{name}' not found in {where}; give the folder of the packages with `mesh_dir`"
-    )
+    raise ValueError(f"package '{name}' not found in {where}; give the folder of the packages with `mesh_dir`")
 
 
 def _guard(folders: Sequence[Path], most: int) -> Any:
@@ -155,9 +152,7 @@ def _guard(folders: Sequence[Path], most: int) -> Any:
             path = Path(os.path.realpath(arguments[0]))
             if not any(path.is_relative_to(folder) for folder in folders):
                 where = " or ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
-                raise PermissionError(
-                    errno.EACCES, f"it is not in {where}, and nothing else is read", str(path)
-                )
+                raise PermissionError(errno.EACCES, f"it is not in {where}, and nothing else is read", str(path))
             if event == "open":
                 if arguments[1] not in ("r", "rb"):
                     raise PermissionError(errno.EACCES, "nothing is written", str(path))

@@ -171,11 +171,7 @@ def load_fmu(path: str | Path) -> Fmu:
     fmu = Fmu(
         path=path,
         description=description,
-        variables={
-            scalar.name: scalar
-            for variable in description.modelVariables
-            for scalar in _scalars(variable)
-        },
+        variables={scalar.name: scalar for variable in description.modelVariables for scalar in _scalars(variable)},
         members=members,
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
         **_vendor_annotation(root),
@@ -206,9 +202,7 @@ def _check_starts(fmu: Fmu) -> None:
     for group in ("x", "x_des") if fmu.axes else ():
         names = fmu.vector(group)
         if len(names) != len(fmu.axes) and (names or group == "x"):
-            raise FmuError(
-                f"'{fmu.path}': {group} has {len(names)} elements for the axes '{fmu.axes}'"
-            )
+            raise FmuError(f"'{fmu.path}': {group} has {len(names)} elements for the axes '{fmu.axes}'")
         if group == "x_des" and any(fmu.variables[name].start is None for name in names):
             raise FmuError(f"'{fmu.path}': x_des has no start values")
 
@@ -279,8 +273,7 @@ def _check_arrays(root: ET.Element) -> None:
         room -= math.prod(max(1, int(text)) for text in texts) if dimensions else 0
         if room < 0:
             raise ValueError(
-                f"with variable '{variable.get('name')}' its arrays have more than {MAX_ELEMENTS}"
-                " elements"
+                f"with variable '{variable.get('name')}' its arrays have more than {MAX_ELEMENTS} elements"
             )
 
 

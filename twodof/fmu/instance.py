@@ -80,10 +80,7 @@ class Instance:
         identifier = fmu.description.coSimulation.modelIdentifier
         try:
             self._slave = self._instantiate(
-                guid=fmu.guid,
-                unzipDirectory=str(folder),
-                modelIdentifier=identifier,
-                instanceName=identifier,
+                guid=fmu.guid, unzipDirectory=str(folder), modelIdentifier=identifier, instanceName=identifier
             )
             self._component = c_void_p(self._slave.component)
             self._step_arguments = self._component, self._t, self._h, *self._rest
@@ -106,9 +103,7 @@ class Instance:
         self._rest: tuple[object, ...] = (c_int(1),)
         return slave
 
-    def initialise(
-        self, start_time: float, stop_time: float, values: Mapping[str, float | bool]
-    ) -> None:
+    def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
         """Set start values and pass initialisation mode; the stop time may be infinite."""
         self.set(values)
         self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
@@ -161,10 +156,7 @@ class Instance:
         """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
         references = [[self._fmu.variables[n].reference for n in u] for u in (unknown, known)]
         try:
-            columns = [
-                self._slave.getDirectionalDerivative(references[0], [k], [1.0])
-                for k in references[1]
-            ]
+            columns = [self._slave.getDirectionalDerivative(references[0], [k], [1.0]) for k in references[1]]
         except FMICallException as error:
             self._refuse(error.status)
         matrix: NDArray[np.float64] = np.array(columns).reshape(len(known), len(unknown)).T
@@ -195,9 +187,7 @@ class Instance:
         if self._said:
             raise SimulationError(self._said)
 
-    def _log(
-        self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes
-    ) -> None:
+    def _log(self, _environment: object, _name: bytes, status: int, _category: bytes, text: bytes) -> None:
         message = text.decode("utf-8", "replace").strip()
         if status > WARNING:
             self._said = message
@@ -285,9 +275,7 @@ class Instance3(Instance):
                     [reference], [variable.reference], seed, nSensitivity=len(matrix)
                 )
                 outer[reference] = np.column_stack([matrix, column])
-        return np.array([outer[v.reference][v.element] for v in rows]).reshape(
-            len(rows), len(columns)
-        )
+        return np.array([outer[v.reference][v.element] for v in rows]).reshape(len(rows), len(columns))
 
 
 @contextmanager

@@ -61,10 +61,7 @@ class Kinematics:
     def __init__(self, urdf: Urdf, joints: Sequence[str]) -> None:
         self.urdf = urdf
         self._columns = {name: i for i, name in enumerate(joints)}
-        self.origins = {
-            joint.name: Rotation.from_euler("xyz", joint.rpy).as_matrix()
-            for joint in urdf.joints.values()
-        }
+        self.origins = {joint.name: Rotation.from_euler("xyz", joint.rpy).as_matrix() for joint in urdf.joints.values()}
 
     def moves(self, joint: Joint) -> bool:
         """Return whether a joint's position depends on q."""

@@ -91,9 +91,7 @@ def _trimesh() -> Reader:
 
     def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
         files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # whatever its name
-        scene = trimesh.load_scene(
-            io.BytesIO(content), file_type=path.suffix[1:], resolver=files, process=False
-        )
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=path.suffix[1:], resolver=files, process=False)
         parts: list[Part] = []
         for mesh in scene.dump():
             material = getattr(mesh.visual, "material", None)

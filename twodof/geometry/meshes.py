@@ -110,8 +110,7 @@ class Meshes:
         self._surfaces += len(result)
         if self._triangles > MAX_TRIANGLES or self._surfaces > MAX_SURFACES:
             raise ValueError(
-                f"the robot's meshes have more than {MAX_TRIANGLES} triangles or {MAX_SURFACES}"
-                " surfaces together"
+                f"the robot's meshes have more than {MAX_TRIANGLES} triangles or {MAX_SURFACES} surfaces together"
             )
         return result
 
@@ -132,9 +131,7 @@ class Meshes:
             content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
         return self._parsed(SHAPE, suffix, content, None)
 
-    def _parsed(
-        self, kind: str, suffix: str, content: bytes, library: bytes | None
-    ) -> list[Surface]:
+    def _parsed(self, kind: str, suffix: str, content: bytes, library: bytes | None) -> list[Surface]:
         """Return a reader's surfaces of a file.
 
         A reader that has read other meshes may die of one of these: a fresh one tries again.
@@ -148,9 +145,7 @@ class Meshes:
             if self._fatal >= MAX_FATAL_MESHES:
                 raise _KilledError(f"{MAX_FATAL_MESHES} others end their reader")
             if kind not in self._readers:
-                self._readers[kind] = Child(
-                    serve, kind, self._folder, environment=ONE_THREAD, output=DEVNULL
-                )
+                self._readers[kind] = Child(serve, kind, self._folder, environment=ONE_THREAD, output=DEVNULL)
             reader = self._readers[kind]
             try:
                 reader.send((file.name, None if library is None else LIBRARY))
@@ -177,9 +172,7 @@ def _received(reader: Child) -> list[Surface]:
         raise _AnswerError(f"its answer is none: {error}") from None
     if isinstance(answer, str):
         raise ValueError(answer[:500])
-    if not fits(answer, [(int, int, NUMBER, NUMBER, NUMBER)]) or any(
-        min(row[:2]) < 0 for row in answer
-    ):
+    if not fits(answer, [(int, int, NUMBER, NUMBER, NUMBER)]) or any(min(row[:2]) < 0 for row in answer):
         raise _AnswerError("its answer is none")
     sizes = [sum(row[i] for row in answer) for i in (0, 1)]
     if sizes[0] > 3 * MAX_TRIANGLES or sizes[1] > MAX_TRIANGLES:

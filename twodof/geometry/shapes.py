@@ -46,9 +46,7 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
         RobotError: a shape is not described by numbers.
     """
     shapes, missing = [], []
-    named = {
-        material.get("name"): material for material in reversed(robot.tree.findall("material"))
-    }
+    named = {material.get("name"): material for material in reversed(robot.tree.findall("material"))}
     with Meshes(read) as meshes:
         for link in robot.tree.findall("link"):
             name = str(link.get("name"))
@@ -92,9 +90,22 @@ def _surfaces(element: ET.Element, meshes: Meshes) -> list[Surface]:
 
 
 BOX = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6),
-     (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)], dtype=np.uint32,
-)  # fmt: skip
+    [
+        (0, 1, 3),
+        (0, 3, 2),
+        (4, 6, 7),
+        (4, 7, 5),
+        (0, 4, 5),
+        (0, 5, 1),
+        (2, 3, 7),
+        (2, 7, 6),
+        (0, 2, 6),
+        (0, 6, 4),
+        (1, 5, 7),
+        (1, 7, 3),
+    ],
+    dtype=np.uint32,
+)
 
 
 def sphere(radius: float) -> tuple[Array, Indices]:

@@ -31,23 +31,39 @@ from ..simulation.experiments import Experiment, Setting, experiment
 from ..version import versions
 
 SCRIPTS = (
-    "engine.js", "samples.js", "session.js", "replay.js", "remote.js", "matrices.js", "robot.js",
-    "camera.js", "scene.js", "handle.js", "curves.js", "recording.js", "controls.js", "main.js",
-)  # fmt: skip
+    "engine.js",
+    "samples.js",
+    "session.js",
+    "replay.js",
+    "remote.js",
+    "matrices.js",
+    "robot.js",
+    "camera.js",
+    "scene.js",
+    "handle.js",
+    "curves.js",
+    "recording.js",
+    "controls.js",
+    "main.js",
+)
 """In the order in which they are read."""
 FUNCTIONS = (
-    "engine_instantiate", "engine_message", "engine_forget", "engine_allocate", "engine_reset",
-    "engine_initialise", "engine_set_reals", "engine_set_boolean", "engine_get_reals",
+    "engine_instantiate",
+    "engine_message",
+    "engine_forget",
+    "engine_allocate",
+    "engine_reset",
+    "engine_initialise",
+    "engine_set_reals",
+    "engine_set_boolean",
+    "engine_get_reals",
     "engine_step",
-)  # fmt: skip
+)
 """Of page.c, which the page calls."""
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables that a sample holds, in its order."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
-POLICY = (
-    "default-src 'none'; script-src 'sha256-{script}'{more};"
-    " style-src 'unsafe-inline'; img-src data:"
-)
+POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
 CONTAINER = b'<div class="arm" id="arm"'
 """By which a page with an arm is known."""
 
@@ -149,17 +165,28 @@ def arm_of(run: Experiment) -> Arm:
         raise PageError(f"'{fmu.path}': its robot cannot be shown: {error}") from error
     variables = [
         {
-            "name": name, "place": place, "causality": variable.causality,
-            "unit": variable.unit or "", "start": run.start_values.get(name),
+            "name": name,
+            "place": place,
+            "causality": variable.causality,
+            "unit": variable.unit or "",
+            "start": run.start_values.get(name),
             "description": variable.description,
         }
         for place, (name, variable) in enumerate(fmu.variables.items())
         if variable.causality != "local"
-    ]  # fmt: skip
+    ]
     return Arm(
-        name=fmu.name, robot=fmu.robot, joints=fmu.joints, frame=fmu.frame, axes=fmu.axes,
-        control=fmu.control, variables=variables, step=run.step, urdf=urdf, shapes=shapes,
-    )  # fmt: skip
+        name=fmu.name,
+        robot=fmu.robot,
+        joints=fmu.joints,
+        frame=fmu.frame,
+        axes=fmu.axes,
+        control=fmu.control,
+        variables=variables,
+        step=run.step,
+        urdf=urdf,
+        shapes=shapes,
+    )
 
 
 def _sources(fmu: Fmu) -> dict[str, bytes]:
@@ -172,9 +199,7 @@ def _sources(fmu: Fmu) -> dict[str, bytes]:
         }
 
 
-def arm_page(
-    title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: Any
-) -> bytes:
+def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: Any) -> bytes:
     """Return the HTML of an arm.
 
     Args:
@@ -192,9 +217,7 @@ def arm_page(
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = POLICY.format(script=digest, more=allowed)
     parts = {"facts": data, "meshes": packed(meshes), **source}.items()
-    blocks = "\n".join(
-        f'<script type="application/json" id="arm-{name}">{text}</script>' for name, text in parts
-    )
+    blocks = "\n".join(f'<script type="application/json" id="arm-{name}">{text}</script>' for name, text in parts)
     page = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -224,10 +247,7 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
         "variables": list(arm.variables),
         "links": links,
         "frameLink": number[arm.frame],
-        "shapes": [
-            {"link": number[s.link], "place": _matrix(s.place), "colour": s.colour}
-            for s in arm.shapes
-        ],
+        "shapes": [{"link": number[s.link], "place": _matrix(s.place), "colour": s.colour} for s in arm.shapes],
         "meshes": [facts for facts, _ in packed],
     }
     return facts, b"".join(content for _, content in packed)
@@ -283,7 +303,5 @@ def _mesh(shape: Shape) -> tuple[dict[str, Any], bytes]:
     whole = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     content = vertices.astype("<u2").tobytes()
     content += bytes(-len(content) % 4) + whole.astype("<u4").tobytes()
-    facts = {
-        "low": low.tolist(), "size": size, "vertices": len(vertices), "triangles": len(whole),
-    }  # fmt: skip
+    facts = {"low": low.tolist(), "size": size, "vertices": len(vertices), "triangles": len(whole)}
     return facts, content

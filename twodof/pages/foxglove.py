@@ -27,8 +27,7 @@ try:
     from foxglove.websocket import Capability, ServerListener
 except ImportError as missing:
     raise PublishError(
-        f"cannot serve Foxglove: {missing}; install the package 'foxglove-sdk' (the extra"
-        " 'foxglove')"
+        f"cannot serve Foxglove: {missing}; install the package 'foxglove-sdk' (the extra 'foxglove')"
     ) from missing
 
 LOG = logging.getLogger(__name__)
@@ -86,15 +85,17 @@ class Foxglove(Sink):
         for name, said in self._messages.topics.items():
             text, _ = store_of(said.type).generate_msgdef(said.type, ros_version=2)
             schema = Schema(name=said.type, encoding="ros2msg", data=text.encode())
-            self._channels[name] = Channel(
-                name, schema=schema, message_encoding="cdr", context=context
-            )
+            self._channels[name] = Channel(name, schema=schema, message_encoding="cdr", context=context)
         hidden = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
         try:
             self._server = start_server(
-                name="twodof", host=hidden, port=0, context=context,
-                capabilities=[Capability.Parameters], server_listener=self._gains,
-            )  # fmt: skip
+                name="twodof",
+                host=hidden,
+                port=0,
+                context=context,
+                capabilities=[Capability.Parameters],
+                server_listener=self._gains,
+            )
             talk = partial(relay, f"ws://{hidden}:{self._server.port}")
             self._door = Server(None, HOST, self._port, talk, origins=APPS, protocol=PROTOCOL)
         except (RuntimeError, OSError, PageError) as error:
@@ -151,9 +152,7 @@ class _Gains(ServerListener):
             asked, self._asked = self._asked, {}
         return asked
 
-    def on_get_parameters(
-        self, client: Any, param_names: list[str], request_id: str | None = None
-    ) -> list[Any]:
+    def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:
         """Return gains by name, all where no name is given."""
         with self._lock:
             values = {**self.held, **self._asked}
@@ -163,9 +162,7 @@ class _Gains(ServerListener):
             if not param_names or group in param_names
         ]
 
-    def on_set_parameters(
-        self, client: Any, parameters: list[Any], request_id: str | None = None
-    ) -> list[Any]:
+    def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
         """Set gains, one number for all elements or one each; return the values in effect."""
         for parameter in parameters:
             try:

@@ -192,13 +192,19 @@ class Loop:
             new = min(known, self._count - (seen if run == self._number else 0))
             rows = [*islice(self._rows, known - new, known - new + MOST_AT_ONCE)]
             return {
-                "run": self._number, "t": self._sample.t,
-                "seen": self._count - new + len(rows), "rows": rows,
-                "values": dict(self._values), "playing": self._playing,
-                "missed": self.pace.missed, "steps": self.steps, "worst": self.pace.worst,
+                "run": self._number,
+                "t": self._sample.t,
+                "seen": self._count - new + len(rows),
+                "rows": rows,
+                "values": dict(self._values),
+                "playing": self._playing,
+                "missed": self.pace.missed,
+                "steps": self.steps,
+                "worst": self.pace.worst,
                 "recorded": 0 if recording is None else recording.count,
-                "notes": [*self._notes], "noted": self._noted,
-            }  # fmt: skip
+                "notes": [*self._notes],
+                "noted": self._noted,
+            }
 
     def _obey(self, patience: float = 0.0) -> None:
         with self._lock:
@@ -275,9 +281,7 @@ class Loop:
     def _starting(self, values: Mapping[str, Value]) -> Experiment:
         """Return the run with these start values."""
         run = self._run
-        return replace(
-            run, start_values={**run.start_values, **values}, given={**run.given, **values}
-        )
+        return replace(run, start_values={**run.start_values, **values}, given={**run.given, **values})
 
     def _record(self) -> None:
         path = free_name(self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))

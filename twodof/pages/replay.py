@@ -73,13 +73,18 @@ def replay(
     count = track.recording.count
     thinned = [f"{shown} of {count} samples, extremes among them"] if shown < count else []
     arm = Arm(
-        name=track.name, robot=motion.robot if motion else "",
+        name=track.name,
+        robot=motion.robot if motion else "",
         joints=[joint.name for joint in track.joints],
         frame=motion.frame if motion else "base",
-        axes=track.task.axes if track.task else track.recording.axes, control="",
-        variables=[*_variables(track, groups)], step=float(track.t[-1]) / max(1, len(track.t) - 1),
-        urdf=text, shapes=shapes, remarks=[*remarks, *thinned],
-    )  # fmt: skip
+        axes=track.task.axes if track.task else track.recording.axes,
+        control="",
+        variables=[*_variables(track, groups)],
+        step=float(track.t[-1]) / max(1, len(track.t) - 1),
+        urdf=text,
+        shapes=shapes,
+        remarks=[*remarks, *thinned],
+    )
     samples = np.column_stack([track.t, *(groups[name] for name in RECORDED if name in groups)])
     title = " - ".join(filter(None, (arm.robot, arm.name)))
     return arm_page(title, arm, {"samples": packed(samples.astype("<f8").tobytes())}), remarks
@@ -107,17 +112,11 @@ def _variables(track: Track, groups: dict[str, Array]) -> Iterator[dict[str, Any
     starts = track.recording.provenance.get("start_values", {})
     values |= {name: starts[name] for name in starts if name.startswith("gravity[")}
     for name, start in values.items():
-        yield {
-            "name": name, "causality": "output" if start is None else "parameter", "start": start,
-        }  # fmt: skip
+        yield {"name": name, "causality": "output" if start is None else "parameter", "start": start}
 
 
 def _robot(
-    bag: Recording,
-    urdf: str | Path | None,
-    mesh_dir: str | Path | None,
-    fmu: str | Path | None,
-    remarks: list[str],
+    bag: Recording, urdf: str | Path | None, mesh_dir: str | Path | None, fmu: str | Path | None, remarks: list[str]
 ) -> tuple[str, ReadMesh]:
     """Return the URDF's text, and the source of its meshes."""
     if urdf is not None:

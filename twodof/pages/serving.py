@@ -34,9 +34,7 @@ try:
     from websockets.http11 import Request, Response
     from websockets.typing import Subprotocol
 except ImportError as missing:
-    raise PageError(
-        f"cannot show a page: {missing}; install the package 'websockets' (the extra 'view')"
-    ) from missing
+    raise PageError(f"cannot show a page: {missing}; install the package 'websockets' (the extra 'view')") from missing
 
 HOST, PORT = "127.0.0.1", 8080
 SLOW = 60.0  # s that a page may take to a browser
@@ -81,9 +79,16 @@ class Server:
     """
 
     def __init__(
-        self, page: bytes | None, host: str = HOST, port: int = PORT, talk: Talk | None = None, *,
-        origins: Collection[str] = (), protocol: str | None = None, token: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        page: bytes | None,
+        host: str = HOST,
+        port: int = PORT,
+        talk: Talk | None = None,
+        *,
+        origins: Collection[str] = (),
+        protocol: str | None = None,
+        token: str = "",
+    ) -> None:
         self._query = f"token={token}" if token else ""
         self._page, self._host, self._talk = page, host, talk
         self._origins, self._protocols = origins, protocol and [Subprotocol(protocol)]
@@ -106,10 +111,17 @@ class Server:
     async def _serve(self) -> None:
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
         server = await serve(
-            self._talked, sock=self._socket, process_request=self._answer, logger=_silent,
-            compression=None, max_size=LARGEST, open_timeout=SLOW, close_timeout=SLOW,
-            create_connection=_Answering, subprotocols=self._protocols or None,
-        )  # fmt: skip
+            self._talked,
+            sock=self._socket,
+            process_request=self._answer,
+            logger=_silent,
+            compression=None,
+            max_size=LARGEST,
+            open_timeout=SLOW,
+            close_timeout=SLOW,
+            create_connection=_Answering,
+            subprotocols=self._protocols or None,
+        )
         self._started.set()
         await self._ended.wait()
         server.close()
@@ -236,8 +248,7 @@ def _listen(host: str, port: int) -> tuple[socket.socket, str]:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise PageError(
-                f"port {port} of {host} is in use; choose another with `port`, or 0 for any that"
-                " is free"
+                f"port {port} of {host} is in use; choose another with `port`, or 0 for any that is free"
             ) from error
         raise PageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
     return bound, str(address[0])

@@ -46,9 +46,7 @@ def _weights(step: float) -> list[list[float]]:
     return [[step * weight for weight in row] for row in (*A, E)]
 
 
-def dormand_prince(
-    rates: Callable[[State], State], y: State, step: float, k1: State
-) -> tuple[State, list[State]]:
+def dormand_prince(rates: Callable[[State], State], y: State, step: float, k1: State) -> tuple[State, list[State]]:
     """Take one step from y with the derivative k1; return y_new and the derivatives at the stages.
 
     Args:
@@ -65,23 +63,13 @@ def dormand_prince(
     a, b, c, d = s5
     k5 = rates([u + (a * p + b * q + c * r + d * s) for u, p, q, r, s in zip(y, k1, k2, k3, k4)])
     a, b, c, d, e = s6
-    k6 = rates(
-        [
-            u + (a * p + b * q + c * r + d * s + e * t)
-            for u, p, q, r, s, t in zip(y, k1, k2, k3, k4, k5)
-        ]
-    )
+    k6 = rates([u + (a * p + b * q + c * r + d * s + e * t) for u, p, q, r, s, t in zip(y, k1, k2, k3, k4, k5)])
     a, _, b, c, d, e = s7
-    y_new = [
-        u + (a * p + b * q + c * r + d * s + e * t)
-        for u, p, q, r, s, t in zip(y, k1, k3, k4, k5, k6)
-    ]
+    y_new = [u + (a * p + b * q + c * r + d * s + e * t) for u, p, q, r, s, t in zip(y, k1, k3, k4, k5, k6)]
     return y_new, [k1, k2, k3, k4, k5, k6, rates(y_new)]
 
 
-def error_norm(
-    K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float
-) -> float:
+def error_norm(K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float) -> float:
     """Return the root mean square of the error over its tolerance; a step passes below 1."""
     a, _, b, c, d, e, f = _weights(step)[-1]
     k1, _, k3, k4, k5, k6, k7 = K

@@ -44,9 +44,8 @@ class Event:
 
 
 def search(
-    margin: Margin, rate: float, a: float, at_a: float, b: float, at_b: float, step: float,
-    halvings: int = HALVINGS,
-) -> float:  # fmt: skip
+    margin: Margin, rate: float, a: float, at_a: float, b: float, at_b: float, step: float, halvings: int = HALVINGS
+) -> float:
     """Return the first time in (a, b] at which a margin is negative, infinity where there is none.
 
     Args:
@@ -70,9 +69,7 @@ def search(
     return first
 
 
-def locate(
-    margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float
-) -> float:  # fmt: skip
+def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float) -> float:
     """Return the first time in (a, b] at which a margin is negative, given that it is at b.
 
     The interpolation is kept near the middle, so that it never needs many more looks than

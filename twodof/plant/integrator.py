@@ -92,9 +92,7 @@ class _Motion:
             rank, at each stage of the present step.
     """
 
-    def __init__(
-        self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float
-    ) -> None:
+    def __init__(self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float) -> None:
         n = len(stops.limits)
         self._equations = equations
         state = np.empty(2 * n)
@@ -142,9 +140,7 @@ class _Motion:
         self.margins.append(margin)
         return y[self.n :] + a
 
-    def until_event(
-        self, y: State, rates: State, t: float, end: float
-    ) -> tuple[float, State, events.Event]:
+    def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
         """Integrate from t until an event or the end; return the time, the state and the event.
 
         rates is ẏ at y.
@@ -204,9 +200,10 @@ class _Motion:
         n, stops = self.n, self.stops
         reach = [events.REACH * step * max(map(abs, speeds)) for speeds in zip(*(k[:n] for k in K))]
         near = [
-            i for i, (q, change, (low, high)) in enumerate(zip(y, reach, stops.limits))
+            i
+            for i, (q, change, (low, high)) in enumerate(zip(y, reach, stops.limits))
             if not (q - change > low and q + change < high) and i not in stops.held
-        ]  # fmt: skip
+        ]
         sweep = sum(map(float.__mul__, self._equations.swing, reach))
         near_rank = not max(self.margins[0], self.margins[-1]) > sweep
         doubtful = [i for i in stops.watched if events.may_vanish([p[i] for p in self.pressed])]

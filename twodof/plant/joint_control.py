@@ -17,9 +17,7 @@ def command(plant: Any) -> tuple[Response, Ratios]:
     """Return q̈_cmd as a function of the state, n values, inputs held; this law has no J⁺."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 
-    def commanded_acceleration(
-        q: Array, v: Array, rank: int | None
-    ) -> tuple[list[float], int, float]:
+    def commanded_acceleration(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:
         state = zip(law, q.tolist(), v.tolist())
         given = [a + Kd * (vd - vi) + Kp * (qd - qi) for (a, vd, qd, Kd, Kp), qi, vi in state]
         return given, rank or 0, inf

@@ -36,9 +36,7 @@ class Mechanism:
         place: where it is, in the task frame, m.
     """
 
-    def __init__(
-        self, robot: Robot, gravity: Sequence[float], payload: float, place: Sequence[float]
-    ) -> None:
+    def __init__(self, robot: Robot, gravity: Sequence[float], payload: float, place: Sequence[float]) -> None:
         model = robot.model.copy()
         model.gravity.linear = np.array(gravity)
         self._frame = robot.frame_id

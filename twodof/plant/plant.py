@@ -26,12 +26,7 @@ from .robot import Robot
 from .stops import Stops
 from .variables import CONTROLS, RANGES, Variable
 
-LAWS = {
-    "task": task_control,
-    "pose": task_control,
-    "joint": joint_control,
-    "effort": effort_control,
-}
+LAWS = {"task": task_control, "pose": task_control, "joint": joint_control, "effort": effort_control}
 
 
 class ParameterError(ValueError):
@@ -49,8 +44,7 @@ def refusing(kind: type[Exception]) -> Iterator[None]:
         yield
     except np.linalg.LinAlgError as error:
         raise kind(
-            "a matrix of the equations of motion is singular or not finite:"
-            " inputs, payload or speeds are too large"
+            "a matrix of the equations of motion is singular or not finite: inputs, payload or speeds are too large"
         ) from error
 
 
@@ -174,9 +168,8 @@ class Plant:
             # what overflows is refused, without a warning
             with refusing(DiscardError), np.errstate(over="ignore", invalid="ignore"):
                 self.q, self.v = advance(
-                    self.equations_of_motion(), self.q, self.v, h, stops,
-                    self.rtol, self.atol, self.max_step,
-                )  # fmt: skip
+                    self.equations_of_motion(), self.q, self.v, h, stops, self.rtol, self.atol, self.max_step
+                )
         except FloatingPointError as error:
             raise DiscardError(str(error)) from error
         except StepError as error:
@@ -261,9 +254,7 @@ class Plant:
         if cancels and not (damping.any() or external.any() or force.any()):
             return command
 
-        def acceleration(
-            q: Array, v: Array, rank: int | None
-        ) -> tuple[Sequence[float], int, float]:
+        def acceleration(q: Array, v: Array, rank: int | None) -> tuple[Sequence[float], int, float]:
             effort = external - damping * v
             if force.any():
                 effort += force @ np.array(self._real.observe(q, v)[1][:3])
@@ -283,9 +274,7 @@ class Plant:
     def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
         return self._real.observe(np.array(self.q), np.array(self.v))
 
-    def _control_effort(
-        self, command: Response, q: Array, v: Array, rank: int | None
-    ) -> tuple[Array, int, float]:
+    def _control_effort(self, command: Response, q: Array, v: Array, rank: int | None) -> tuple[Array, int, float]:
         given, rank, margin = command(q, v, rank)
         tau: Array = np.array(given)
         if self._commands == "acceleration":
@@ -296,9 +285,7 @@ class Plant:
 
     def _check_target(self) -> None:
         if self.control == "pose" and not any(self.quat_des):
-            raise DiscardError(
-                "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing"
-            )
+            raise DiscardError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing")
 
     def _check_parameters(self) -> None:
         try:
@@ -314,6 +301,5 @@ class Plant:
         for i, (low, high) in enumerate(zip(self.q_min, self.q_max)):
             if low > high:
                 raise ParameterError(
-                    f"q_min[{i + 1}] = {low:g} > q_max[{i + 1}] = {high:g}"
-                    f" (joint '{self.robot.joints[i]}')"
+                    f"q_min[{i + 1}] = {low:g} > q_max[{i + 1}] = {high:g} (joint '{self.robot.joints[i]}')"
                 )

@@ -15,17 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from .urdf import (
-    NUMERIC_TAGS,
-    UNBOUNDED,
-    Joint,
-    RobotError,
-    Urdf,
-    attribute,
-    check_axes,
-    number,
-    read_urdf,
-)
+from .urdf import NUMERIC_TAGS, UNBOUNDED, Joint, RobotError, Urdf, attribute, check_axes, number, read_urdf
 
 
 @dataclass(frozen=True)
@@ -135,10 +125,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
         q_min=tuple(low for low, _ in limits),
         q_max=tuple(high for _, high in limits),
         effort=tuple(joint.effort for joint in joints),
-        damping=tuple(
-            sum(j.ratio**2 * j.damping for j in moving if j.leader == joint.name)
-            for joint in joints
-        ),
+        damping=tuple(sum(j.ratio**2 * j.damping for j in moving if j.leader == joint.name) for joint in joints),
         frame=frame,
         frame_id=model.getFrameId(frame, pin.FrameType.BODY),
         axes=axes,
@@ -180,8 +167,7 @@ def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
         low, high = max(low, min(ends)), min(high, max(ends))
         if low > high:
             raise RobotError(
-                f"joint '{joint.name}' mimics '{leader.name}', but no position of that is within"
-                " the limits of both"
+                f"joint '{joint.name}' mimics '{leader.name}', but no position of that is within the limits of both"
             )
     return low, high
 
@@ -194,9 +180,7 @@ def _mass(urdf: Urdf, joint: Joint, odd: list[str]) -> float:
         body.extend(other.child for other in fixed if other.parent == name)
     links = {str(link.get("name")): link for link in urdf.tree.findall("link")}
     inertials = ((name, links[name].find("inertial")) for name in body)
-    return sum(
-        _check_inertia(name, inertial, odd) for name, inertial in inertials if inertial is not None
-    )
+    return sum(_check_inertia(name, inertial, odd) for name, inertial in inertials if inertial is not None)
 
 
 def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
@@ -213,10 +197,7 @@ def _check_inertia(link: str, inertial: ET.Element, odd: list[str]) -> float:
         odd.append(link)
     if moments[0] < -slack:
         text = ", ".join(f"{moment:.3g}" for moment in moments)
-        raise RobotError(
-            f"link '{link}': its inertia is not physical, principal moments {text} kg·m2"
-            " must be positive"
-        )
+        raise RobotError(f"link '{link}': its inertia is not physical, principal moments {text} kg·m2 must be positive")
     return mass
 
 

@@ -56,11 +56,7 @@ class Stops:
         """
         n = len(self.limits)
         contacts = self._contacts(y)
-        into = [
-            i
-            for i, side in contacts
-            if side * y[n + i] < 0.0 or ((kept[i] or self._has_no_range(i)) and y[n + i])
-        ]
+        into = [i for i, side in contacts if side * y[n + i] < 0.0 or ((kept[i] or self._has_no_range(i)) and y[n + i])]
         if not into:
             return
         if self._inverse_mass is None:
@@ -88,18 +84,12 @@ class Stops:
         contacts = [(i, side) for i, side in self._contacts(y) if y[n + i] == 0.0]
         forced = [i for i, _ in contacts if kept[i]]
         if self._inverse_mass is None:
-            self.held = [
-                i for i, side in contacts if kept[i] or self._has_no_range(i) or side * a[i] <= 0.0
-            ]
+            self.held = [i for i, side in contacts if kept[i] or self._has_no_range(i) or side * a[i] <= 0.0]
         elif contacts:
             W = self._inverse_mass(y[:n])
             reaction = self._complementary(W, contacts, a, forced)
             stopped = (W @ reaction + a).tolist()
-            self.held = [
-                i
-                for i, _ in contacts
-                if reaction[i] or kept[i] or self._has_no_range(i) or stopped[i] == 0.0
-            ]
+            self.held = [i for i, _ in contacts if reaction[i] or kept[i] or self._has_no_range(i) or stopped[i] == 0.0]
         else:
             self.held = []
         self.watched = [i for i in self.held if not kept[i] and not self._has_no_range(i)]
@@ -162,12 +152,15 @@ class Stops:
             change = W @ z
             largest = np.abs(z).max(initial=0.0)
             wrong = [
-                i for i, side in contacts
-                if i not in fixed and (
-                    side * z[i] < -ROUNDING * largest if i in active
+                i
+                for i, side in contacts
+                if i not in fixed
+                and (
+                    side * z[i] < -ROUNDING * largest
+                    if i in active
                     else side * (b[i] + change[i]) < -ROUNDING * (size[i] + abs(change[i]))
                 )
-            ]  # fmt: skip
+            ]
             if not wrong:
                 return z
             tries = BLOCK_TRIES if len(wrong) < fewest else tries - 1

@@ -33,9 +33,7 @@ def command(plant: Any) -> tuple[Response, Ratios]:
         law.extend(zip((3, 4, 5), *turn))
     Kn, rcond = plant.Kn, plant.rcond
 
-    def commanded_acceleration(
-        q: Array, v: Array, rank: int | None
-    ) -> tuple[list[float], int, float]:
+    def commanded_acceleration(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:
         x, jacobian, drift = observe(q, v)
         velocity = v.tolist()
         errors = [x_des - x[axis] for axis, x_des in place]

@@ -129,8 +129,11 @@ def read_urdf(text: str) -> Urdf:
     elements = _by_name(tree, "joint")
     moving = [name for name, joint in elements.items() if joint.get("type") != "fixed"]
     shapes = sum(len(link.findall(kind)) for kind in SHAPES for link in links.values())
-    counts = {"links": (len(links), MAX_LINKS), "moving joints": (len(moving), MAX_JOINTS),
-              "visuals and collisions": (shapes, MAX_SHAPES)}  # fmt: skip
+    counts = {
+        "links": (len(links), MAX_LINKS),
+        "moving joints": (len(moving), MAX_JOINTS),
+        "visuals and collisions": (shapes, MAX_SHAPES),
+    }
     for what, (count, most) in counts.items():
         if count > most:
             raise RobotError(f"the URDF has {count} {what}; at most {most} are supported")
@@ -144,9 +147,7 @@ def read_urdf(text: str) -> Urdf:
     warnings = []
     if frictional:
         warnings.append(f"friction is not modelled and is ignored: {_listed('joint', frictional)}")
-    if frozen := [
-        n for n, joint in joints.items() if joint.leader == n and joint.low == joint.high
-    ]:
+    if frozen := [n for n, joint in joints.items() if joint.leader == n and joint.low == joint.high]:
         warnings.append(
             "lower and upper limit are equal or missing, so that nothing moves"
             f" {_listed('joint', frozen)}: give limits, or type 'continuous' for none"
@@ -247,10 +248,12 @@ def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:
         leader = joints.get(joint.leader)
         if leader is None or not leader.moves or leader.name in seen:
             reason = (
-                "does not exist" if leader is None
-                else f"is fixed: make '{seen[-1]}' fixed too" if not leader.moves
+                "does not exist"
+                if leader is None
+                else f"is fixed: make '{seen[-1]}' fixed too"
+                if not leader.moves
                 else "follows it"
-            )  # fmt: skip
+            )
             raise RobotError(f"joint '{seen[-1]}' mimics '{joint.leader}', which {reason}")
         seen.append(leader.name)
         ratio, offset = joint.ratio * leader.ratio, joint.ratio * leader.offset + joint.offset
@@ -266,8 +269,7 @@ def _by_name(tree: ET.Element, tag: str) -> dict[str, ET.Element]:
             raise RobotError(f"the URDF has a <{tag}> without a name")
         if len(name) > MAX_NAME:
             raise RobotError(
-                f"the URDF has a <{tag}> whose name has {len(name)} characters;"
-                f" at most {MAX_NAME} are supported"
+                f"the URDF has a <{tag}> whose name has {len(name)} characters; at most {MAX_NAME} are supported"
             )
         if name in elements:
             raise RobotError(f"the URDF has two {tag}s named '{name}'")
@@ -304,9 +306,7 @@ def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> 
     for name, joint in joints.items():
         for side in ("parent", "child"):
             if _link(joint, side) not in links:
-                raise RobotError(
-                    f"joint '{name}': its {side} link '{_link(joint, side)}' does not exist"
-                )
+                raise RobotError(f"joint '{name}': its {side} link '{_link(joint, side)}' does not exist")
         child = _link(joint, "child")
         if child in parent:
             raise RobotError(f"link '{child}' has two parents: closed loops are not supported")

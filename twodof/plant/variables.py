@@ -110,23 +110,24 @@ class Control:
 CONTROLS = {
     "task": Control(
         "operational-space control of {frame}",
-        ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn"), ("rcond", "payload_known"),
-        "acceleration", False,
+        ("x_des", "xd_des", "xdd_des", "Kp", "Kd", "Kn"),
+        ("rcond", "payload_known"),
+        "acceleration",
+        False,
     ),
     "pose": Control(
         "operational-space control of {frame}, with its orientation",
-        (
-            "x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des",
-            "Kp", "Kd", "Kp_rot", "Kd_rot", "Kn",
-        ),
-        ("rcond", "payload_known"), "acceleration", False, ("quat", "omega"),
+        ("x_des", "xd_des", "xdd_des", "quat_des", "omega_des", "alpha_des", "Kp", "Kd", "Kp_rot", "Kd_rot", "Kn"),
+        ("rcond", "payload_known"),
+        "acceleration",
+        False,
+        ("quat", "omega"),
     ),
     "joint": Control(
-        "joint-space control",
-        ("q_des", "v_des", "a_des", "Kp", "Kd"), ("payload_known",), "acceleration", True,
+        "joint-space control", ("q_des", "v_des", "a_des", "Kp", "Kd"), ("payload_known",), "acceleration", True
     ),
     "effort": Control("effort control, the bare plant", ("tau_cmd",), (), "effort", True),
-}  # fmt: skip
+}
 """By name. The law is in the file <name>_control, of Python here and of C in the native engine;
 "pose" is "task" with three more rows."""
 
@@ -170,17 +171,34 @@ def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]
     rows = m + 3 * ("quat_des" in CONTROLS[control].inputs)
     controlled = m if "x_des" in CONTROLS[control].inputs else n
     return {
-        "xd_des": (0.0,) * m, "xdd_des": (0.0,) * m, "v_des": (0.0,) * n, "a_des": (0.0,) * n,
-        "omega_des": (0.0,) * 3, "alpha_des": (0.0,) * 3, "Kp_rot": (50.0,) * 3,
-        "Kd_rot": (40.0,) * 3, "Kp": (50.0,) * controlled, "Kd": (40.0,) * controlled,
+        "xd_des": (0.0,) * m,
+        "xdd_des": (0.0,) * m,
+        "v_des": (0.0,) * n,
+        "a_des": (0.0,) * n,
+        "omega_des": (0.0,) * 3,
+        "alpha_des": (0.0,) * 3,
+        "Kp_rot": (50.0,) * 3,
+        "Kd_rot": (40.0,) * 3,
+        "Kp": (50.0,) * controlled,
+        "Kd": (40.0,) * controlled,
         "Kn": 10.0 if n > rows else 0.0,
-        "tau_cmd": (0.0,) * n, "tau_ext": (0.0,) * n, "f_ext": (0.0,) * 3,
-        "v_start": (0.0,) * n, "q_min": robot.q_min, "q_max": robot.q_max,
-        "gravity": (0.0, 0.0, -9.81), "payload": 0.0, "payload_com": (0.0,) * 3,
-        "rcond": 0.01, "rtol": 1e-3, "atol": 1e-6, "max_step": 1e-3,
-        "limit_effort": False, "rigid_stops": CONTROLS[control].rigid_stops,
+        "tau_cmd": (0.0,) * n,
+        "tau_ext": (0.0,) * n,
+        "f_ext": (0.0,) * 3,
+        "v_start": (0.0,) * n,
+        "q_min": robot.q_min,
+        "q_max": robot.q_max,
+        "gravity": (0.0, 0.0, -9.81),
+        "payload": 0.0,
+        "payload_com": (0.0,) * 3,
+        "rcond": 0.01,
+        "rtol": 1e-3,
+        "atol": 1e-6,
+        "max_step": 1e-3,
+        "limit_effort": False,
+        "rigid_stops": CONTROLS[control].rigid_stops,
         "payload_known": False,
-    }  # fmt: skip
+    }
 
 
 def _rows(robot: Robot, control: str) -> list[Row]:
@@ -240,7 +258,7 @@ def _rows(robot: Robot, control: str) -> list[Row]:
         ("limit_effort", "parameter", [], [""], limited),
         ("rigid_stops", "parameter", [], [""], "joint stops act on the other joints too"),
         ("payload_known", "parameter", [], [""], "the controller knows the payload"),
-    ]  # fmt: skip
+    ]
 
 
 def count_event_indicators(robot: Robot, control: str) -> int:

@@ -24,23 +24,40 @@ try:
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.lines import Line2D
 except ImportError as missing:
-    raise PlotError(
-        f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')"
-    ) from missing
+    raise PlotError(f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')") from missing
 
 STYLE = {
-    "font.size": 8.0, "axes.titlesize": 8.5, "axes.labelsize": 8.0, "axes.titlelocation": "left",
-    "text.color": INK, "text.parse_math": False, "axes.labelcolor": INK, "axes.edgecolor": GREY,
-    "axes.linewidth": 0.7, "axes.grid": True, "axes.axisbelow": True, "lines.linewidth": 1.4,
-    "lines.dash_capstyle": "butt", "legend.fontsize": 7.5, "legend.frameon": False,
-    "legend.borderpad": 0.0, "legend.borderaxespad": 0.0, "savefig.dpi": 200,
-    "svg.hashsalt": "twodof", "pdf.fonttype": 42,
-}  # fmt: skip
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.0,
+    "axes.titlelocation": "left",
+    "text.color": INK,
+    "text.parse_math": False,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    "lines.dash_capstyle": "butt",
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "legend.borderpad": 0.0,
+    "legend.borderaxespad": 0.0,
+    "savefig.dpi": 200,
+    "svg.hashsalt": "twodof",
+    "pdf.fonttype": 42,
+}
 LETTER = 0.058  # inches, mean width
 TICK_STYLE: dict[str, Any] = {
-    "direction": "in", "width": 0.7, "color": GREY, "labelsize": 7.0, "labelcolor": INK,
-    "grid_color": HAIR, "grid_linewidth": 0.6,
-}  # fmt: skip
+    "direction": "in",
+    "width": 0.7,
+    "color": GREY,
+    "labelsize": 7.0,
+    "labelcolor": INK,
+    "grid_color": HAIR,
+    "grid_linewidth": 0.6,
+}
 """Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
 
 
@@ -124,11 +141,7 @@ def show(drawing: Drawing) -> bool:
 
 
 def draw_head(
-    figure: Figure,
-    title: str,
-    texts: Iterable[str],
-    size: tuple[float, float],
-    handles: Sequence[Line2D] = (),
+    figure: Figure, title: str, texts: Iterable[str], size: tuple[float, float], handles: Sequence[Line2D] = ()
 ) -> SubFigure:
     """Draw a title, texts and a legend; return the part for the panels, of a size in inches."""
     letters = int((size[0] - 0.3) / LETTER)
@@ -144,9 +157,16 @@ def draw_head(
     figure.suptitle(_end(title, letters // 2), **look)
     room = figure.add_subfigure(figure.add_gridspec()[0])
     legend = room.legend(
-        handles=handles, title="\n".join(lines), alignment="left", loc="outside upper left",
-        ncols=columns, handlelength=3.5, fontsize=8.0, title_fontsize=8.0, borderaxespad=0.8,
-    )  # fmt: skip
+        handles=handles,
+        title="\n".join(lines),
+        alignment="left",
+        loc="outside upper left",
+        ncols=columns,
+        handlelength=3.5,
+        fontsize=8.0,
+        title_fontsize=8.0,
+        borderaxespad=0.8,
+    )
     legend.get_title().set_color(GREY)
     return room
 

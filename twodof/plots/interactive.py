@@ -30,14 +30,21 @@ ROW, GAP, EDGE, TOP = 150, 34, 44, 50
 """Pixels: a panel's height, between panels, below the last, and above the first, for its heading
 and plotly's buttons above that."""
 LAYOUT: dict[str, Any] = {
-    "font": {"family": "sans-serif", "size": 12, "color": INK}, "plot_bgcolor": "white",
-    "paper_bgcolor": "white", "showlegend": False, "separators": ".", "dragmode": "zoom",
+    "font": {"family": "sans-serif", "size": 12, "color": INK},
+    "plot_bgcolor": "white",
+    "paper_bgcolor": "white",
+    "showlegend": False,
+    "separators": ".",
+    "dragmode": "zoom",
     "margin": {"l": 64, "r": 14, "t": TOP, "b": EDGE},
-}  # fmt: skip
+}
 AXIS: dict[str, Any] = {
-    "gridcolor": HAIR, "linecolor": GREY, "zeroline": False, "showline": True,
+    "gridcolor": HAIR,
+    "linecolor": GREY,
+    "zeroline": False,
+    "showline": True,
     "exponentformat": "power",
-}  # fmt: skip
+}
 
 
 def body(tracks: Sequence[Track]) -> str:
@@ -85,11 +92,15 @@ def _trace(stroke: Stroke) -> dict[str, Any]:
         mark = {"size": size, "color": "white", "line": line}
     modes = [*["lines"] * (stroke.width > 0.0), *["markers"] * bool(stroke.mark)]
     return {
-        "type": "scatter", "mode": "+".join(modes), "name": stroke.label, "marker": mark,
-        "x": _numbers(stroke.x), "y": _numbers(stroke.y),
+        "type": "scatter",
+        "mode": "+".join(modes),
+        "name": stroke.label,
+        "marker": mark,
+        "x": _numbers(stroke.x),
+        "y": _numbers(stroke.y),
         "line": {**_line(stroke), "simplify": False},  # which bends curves visibly
         "meta": [stroke.track, stroke.joint, stroke.kind],
-    }  # fmt: skip
+    }
 
 
 def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
@@ -124,11 +135,14 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, Any]]:
     """Return the legend's rows: each track, and each of its joints."""
     return [
         {
-            "bag": i, "joint": joint, "label": look.label, "colour": look.colour,
+            "bag": i,
+            "joint": joint,
+            "label": look.label,
+            "colour": look.colour,
             "dashes": ",".join(f"{CURVE * part:g}" for part in look.dashes),
         }
         for (i, joint), look in _looks(tracks).items()
-    ]  # fmt: skip
+    ]
 
 
 # --- over time ---
@@ -145,14 +159,27 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         rows.setdefault(heading, []).append(panel)
     height = len(rows) * (ROW + GAP) - GAP
     time = {
-        **AXIS, "range": [0.0, duration(tracks)], "title": {"text": "time in s"},
-        "anchor": f"y{len(rows)}", "showspikes": True, "spikemode": "across", "spikethickness": 1,
-        "spikecolor": GREY, "spikedash": "solid", "spikesnap": "hovered data",
-    }  # fmt: skip
+        **AXIS,
+        "range": [0.0, duration(tracks)],
+        "title": {"text": "time in s"},
+        "anchor": f"y{len(rows)}",
+        "showspikes": True,
+        "spikemode": "across",
+        "spikethickness": 1,
+        "spikecolor": GREY,
+        "spikedash": "solid",
+        "spikesnap": "hovered data",
+    }
     layout = {
-        **LAYOUT, "height": height + EDGE + TOP, "xaxis": time, "hovermode": "x",
-        "hoverdistance": -1, "spikedistance": -1, "hoversubplots": "axis", "annotations": [],
-    }  # fmt: skip
+        **LAYOUT,
+        "height": height + EDGE + TOP,
+        "xaxis": time,
+        "hovermode": "x",
+        "hoverdistance": -1,
+        "spikedistance": -1,
+        "hoversubplots": "axis",
+        "annotations": [],
+    }
     most = POINTS // sum(not s.is_limit for each in rows.values() for p in each for s in p.strokes)
     data = []
     for row, (heading, panels) in enumerate(rows.items(), start=1):
@@ -183,9 +210,16 @@ def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str,
 def _heading(text: str, top: float) -> dict[str, Any]:
     text = html.escape(text, quote=False)  # plotly reads tags
     return {
-        "text": text, "x": 0.0, "y": top, "xref": "paper", "yref": "paper",
-        "xanchor": "left", "yanchor": "bottom", "showarrow": False, "font": {"size": 13},
-    }  # fmt: skip
+        "text": text,
+        "x": 0.0,
+        "y": top,
+        "xref": "paper",
+        "yref": "paper",
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 13},
+    }
 
 
 # --- the workspace ---
@@ -203,10 +237,14 @@ def _view(view: View, title: str) -> dict[str, Any]:
     ]
     strokes = sorted(view.strokes, key=lambda stroke: stroke.depth)
     layout = {
-        **LAYOUT, "height": 394 + TOP, "annotations": [_heading(title, 1.0)],
-        "hovermode": "closest", "xaxis": axes[0], "yaxis": {**axes[1], "scaleanchor": "x"},
+        **LAYOUT,
+        "height": 394 + TOP,
+        "annotations": [_heading(title, 1.0)],
+        "hovermode": "closest",
+        "xaxis": axes[0],
+        "yaxis": {**axes[1], "scaleanchor": "x"},
         "shapes": [line for stroke in strokes if stroke.is_whole for line in _whole_lines(stroke)],
-    }  # fmt: skip
+    }
     hover = {"hovertemplate": "%{x:.4f}, %{y:.4f} m"}
     data = [{**_trace(stroke), **hover} for stroke in strokes if not stroke.is_whole]
     return {"data": data, "layout": layout}

@@ -122,9 +122,7 @@ def load_linkage(text: str, frame: str, axes: str, names: Sequence[str]) -> Link
     check_axes(axes)
     urdf = read_urdf(text)
     moving = tuple(
-        joint
-        for joint in urdf.joints.values()
-        if joint.moves and (joint.leader == joint.name or joint.name in names)
+        joint for joint in urdf.joints.values() if joint.moves and (joint.leader == joint.name or joint.name in names)
     )
     if not frame:
         depths = {link: sum(j.moves for j in urdf.chain(link)) for link in urdf.links}

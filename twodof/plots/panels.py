@@ -126,13 +126,19 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
 
 
 def _curve(
-    label: str, track: int, t: Array, y: Array, look: Look, width: float = CURVE,
-    depth: float = 2.0, *, joint: str = "", kind: str = "",
-) -> Stroke:  # fmt: skip
+    label: str,
+    track: int,
+    t: Array,
+    y: Array,
+    look: Look,
+    width: float = CURVE,
+    depth: float = 2.0,
+    *,
+    joint: str = "",
+    kind: str = "",
+) -> Stroke:
     mark = "." * (len(t) == 1)
-    return Stroke(
-        label, track, t, y, look.colour, width, look.dashes, mark, depth, joint=joint, kind=kind
-    )
+    return Stroke(label, track, t, y, look.colour, width, look.dashes, mark, depth, joint=joint, kind=kind)
 
 
 def _limits(kind: str, joint: JointTrack) -> list[float]:

@@ -43,9 +43,7 @@ ABOVE = 13.0  # points from a panel to its title, with room for the limits betwe
 POINTS = 4000  # of a curve; panels are fewer pixels wide
 
 
-def plot(
-    *bags: Recording | str | Path, urdf: str | Path | None = None, frame: str | None = None
-) -> Figure:
+def plot(*bags: Recording | str | Path, urdf: str | Path | None = None, frame: str | None = None) -> Figure:
     """Return a figure of one bag, or of several for comparison.
 
     Args:
@@ -92,15 +90,10 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     texts += [TARGET] * any(joint.target.size for track in tracks for joint in track.joints)
     texts += [outcome(tracks[0])] * (len(tracks) == 1)
     size = width + BESIDE * bool(pictures), height
-    handles = [
-        Line2D([], [], label=look.label, **_line(look.colour, look.dashes))
-        for look in bags * (len(bags) > 1)
-    ]
+    handles = [Line2D([], [], label=look.label, **_line(look.colour, look.dashes)) for look in bags * (len(bags) > 1)]
     room = draw_head(figure, title(tracks), texts, size, handles)
     if pictures:
-        cells = room.add_gridspec(
-            2, 2, width_ratios=(width, BESIDE), height_ratios=(most, max(height - most, 1e-3))
-        )
+        cells = room.add_gridspec(2, 2, width_ratios=(width, BESIDE), height_ratios=(most, max(height - most, 1e-3)))
         _draw_workspace(room.add_subfigure(cells[0, 1]), pictures, workspace_title(tracks))
         room = room.add_subfigure(cells[:, 0])
     heights = [pitch - 0.2] * rows + [ERROR] * bool(error)
@@ -159,8 +152,12 @@ def _draw_workspace(figure: SubFigure, pictures: Sequence[View], heading: str) -
     every[0].set_title(heading, pad=ABOVE)
     figure.legend(
         handles=_key(stroke for view in pictures for stroke in view.strokes),
-        loc="outside lower left", ncols=3, handlelength=1.7, columnspacing=1.0, borderaxespad=0.9,
-    )  # fmt: skip
+        loc="outside lower left",
+        ncols=3,
+        handlelength=1.7,
+        columnspacing=1.0,
+        borderaxespad=0.9,
+    )
 
 
 def _draw_joint(axes: Axes, panel: Panel) -> None:
@@ -173,8 +170,7 @@ def _draw_joint(axes: Axes, panel: Panel) -> None:
 
 
 def _tell(axes: Axes, text: str) -> None:
-    axes.text(1.0, 1.01, text, transform=axes.transAxes, ha="right", va="bottom",
-              fontsize=7.0, color=GREY)  # fmt: skip
+    axes.text(1.0, 1.01, text, transform=axes.transAxes, ha="right", va="bottom", fontsize=7.0, color=GREY)
 
 
 def _draw_error(axes: Axes, panel: Panel) -> None:
@@ -219,10 +215,15 @@ def _marks(stroke: Stroke) -> dict[str, Any]:
         return {"marker": "o", "markersize": 3}
     if stroke.mark:
         return {
-            "marker": "o", "markersize": stroke.width + 1.5, "markerfacecolor": "white",
-            "markeredgecolor": stroke.colour, "markeredgewidth": 0.3 * stroke.width,
-            "solid_joinstyle": "round", "solid_capstyle": "round", "markevery": slice(0, -1),
-        }  # fmt: skip
+            "marker": "o",
+            "markersize": stroke.width + 1.5,
+            "markerfacecolor": "white",
+            "markeredgecolor": stroke.colour,
+            "markeredgewidth": 0.3 * stroke.width,
+            "solid_joinstyle": "round",
+            "solid_capstyle": "round",
+            "markevery": slice(0, -1),
+        }
     return {"solid_capstyle": "butt"}
 
 
@@ -235,11 +236,14 @@ def _key(strokes: Iterable[Stroke]) -> list[Line2D]:
             handles[stroke.label] = first._replace(colour=GREY, dashes=())
     return [
         Line2D(
-            [0, 1], [0, 1], label=stroke.label, linewidth=stroke.width,
+            [0, 1],
+            [0, 1],
+            label=stroke.label,
+            linewidth=stroke.width,
             **{**_line(stroke.colour, stroke.dashes), **_marks(stroke)},
         )
         for stroke in handles.values()
-    ]  # fmt: skip
+    ]
 
 
 def _set_ticks(axis: Axis, most: int) -> None:

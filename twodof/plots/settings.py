@@ -9,10 +9,22 @@ from ..bag.recording import Recording
 from ..plant.urdf import UNBOUNDED
 
 UNITS = {
-    "x_des": "m", "xd_des": "m/s", "xdd_des": "m/s²", "Kp": "s⁻²", "Kd": "s⁻¹", "Kn": "s⁻¹",
-    "omega_des": "rad/s", "alpha_des": "rad/s²", "Kp_rot": "s⁻²", "Kd_rot": "s⁻¹",
-    "gravity": "m/s²", "max_step": "s", "payload": "kg", "payload_com": "m", "f_ext": "N",
-}  # fmt: skip
+    "x_des": "m",
+    "xd_des": "m/s",
+    "xdd_des": "m/s²",
+    "Kp": "s⁻²",
+    "Kd": "s⁻¹",
+    "Kn": "s⁻¹",
+    "omega_des": "rad/s",
+    "alpha_des": "rad/s²",
+    "Kp_rot": "s⁻²",
+    "Kd_rot": "s⁻¹",
+    "gravity": "m/s²",
+    "max_step": "s",
+    "payload": "kg",
+    "payload_com": "m",
+    "f_ext": "N",
+}
 """Units of variables, where they do not depend on the joint."""
 
 

@@ -77,10 +77,7 @@ class Stroke(NamedTuple):
 
 def looks(names: Iterable[str]) -> list[Look]:
     """Return a style for each name."""
-    return [
-        Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)])
-        for i, name in enumerate(names)
-    ]
+    return [Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]) for i, name in enumerate(names)]
 
 
 def outline(values: Array, most: int) -> Indices:

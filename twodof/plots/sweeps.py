@@ -67,10 +67,7 @@ def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -
     shown = {"run": "run", **{name: f"{name}{_in(table.attrs['units'][name])}" for name in varied}}
     known = [key for key in METRICS if table[key].notna().any()]
     shown |= {key: f"{METRICS[key].title}{_in(METRICS[key].unit)}" for key in known}
-    columns = [
-        {title: f"{row[key]:.4g}" for key, title in shown.items()}
-        for row in best.head(5).to_dict("records")
-    ]
+    columns = [{title: f"{row[key]:.4g}" for key, title in shown.items()} for row in best.head(5).to_dict("records")]
     title = f"{provenance['fmu']['name']}: {len(table)} runs over {', '.join(varied)}"
     options = provenance["options"]
     settings = [f"{options['stop_time']:g} s each in steps of {options['step']:g} s"]
@@ -84,12 +81,7 @@ def _in(unit: str) -> str:
 
 
 def _draw(
-    table: pandas.DataFrame,
-    varied: Sequence[str],
-    grids: set[str],
-    title: str,
-    settings: str,
-    figure: Figure,
+    table: pandas.DataFrame, varied: Sequence[str], grids: set[str], title: str, settings: str, figure: Figure
 ) -> None:
     panels, across = _panels(table, varied)
     rows = ceil(len(panels) / across)
@@ -157,19 +149,29 @@ def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
     axes.grid(False)
     axes.patch.set(**MISSING)
     return axes.pcolormesh(
-        _edges(cells.columns.to_numpy()), _edges(cells.index.to_numpy()), values,
-        norm=_norm(values.compressed()), cmap="viridis", rasterized=values.size > 2500,
-        edgecolors="face", linewidth=0.3,  # else readers of SVG and PDF show seams
-    )  # fmt: skip
+        _edges(cells.columns.to_numpy()),
+        _edges(cells.index.to_numpy()),
+        values,
+        norm=_norm(values.compressed()),
+        cmap="viridis",
+        rasterized=values.size > 2500,
+        edgecolors="face",
+        linewidth=0.3,  # else readers of SVG and PDF show seams
+    )
 
 
 def _draw_dots(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
     missing = rows[rows[panel.metric].isna()]
     axes.scatter(missing[panel.x], missing[panel.y], s=7, facecolors="none", edgecolors=PALE)
     return axes.scatter(
-        rows[panel.x], rows[panel.y], c=rows[panel.metric], s=12, linewidths=0.0, cmap="viridis",
+        rows[panel.x],
+        rows[panel.y],
+        c=rows[panel.metric],
+        s=12,
+        linewidths=0.0,
+        cmap="viridis",
         norm=_norm(rows[panel.metric].to_numpy(dtype=float)),
-    )  # fmt: skip
+    )
 
 
 def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
@@ -196,10 +198,7 @@ def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
         axes.scatter([best[panel.x]], [best[panel.y or panel.metric]], zorder=3, **BEST)
         at = ", ".join(f"{name} {best[name]:.4g}" for name in (panel.x, panel.y) if name)
         text = f"★ {shown} at {at}"
-    axes.annotate(
-        text, (0, 1), (0, 4), xycoords="axes fraction",
-        textcoords="offset points", fontsize=7.0, color=GREY,
-    )  # fmt: skip
+    axes.annotate(text, (0, 1), (0, 4), xycoords="axes fraction", textcoords="offset points", fontsize=7.0, color=GREY)
     named = {name: f"{name}{_in(unit)}" for name, unit in table.attrs["units"].items()}
     axes.set(xlabel=named[panel.x], ylabel=named[panel.y] if panel.y else "")
 

@@ -163,9 +163,7 @@ def _track(bag: Recording, urdf: str | None, source: str, frame: str | None) -> 
         raise PlotError(f"the run.json in '{bag.path}' does not fit its samples") from error
 
 
-def _with_robot(
-    bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None
-) -> Track:
+def _with_robot(bag: Recording, names: Sequence[str], urdf: str | None, source: str, frame: str | None) -> Track:
     run, settings = bag.provenance, settings_of(bag)
     if urdf is None:
         return Track(bag, settings, bag.t, _joints(bag, names, None), None, None)
@@ -184,9 +182,7 @@ def _with_robot(
     return Track(bag, settings, bag.t, joints, motion, task)
 
 
-def _joints(
-    bag: Recording, names: Sequence[str], linkage: Linkage | None
-) -> tuple[JointTrack, ...]:
+def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tuple[JointTrack, ...]:
     n, starts = len(names), bag.provenance.get("start_values", {})
     first = bag.schedule[0][1]
     efforts, targets = bag.tau, bag.held("q_des", n)
@@ -204,8 +200,7 @@ def _joints(
         limits = [None if x is None or abs(x) >= UNBOUNDED else x for x in limits]
         low, high, effort, speed = limits
         q, v, tau, target = (
-            values[:, i] if values.shape == bag.q.shape else np.empty(0)
-            for values in (bag.q, bag.v, efforts, targets)
+            values[:, i] if values.shape == bag.q.shape else np.empty(0) for values in (bag.q, bag.v, efforts, targets)
         )
         if effort is not None and first.get("limit_effort"):  # of commands; a bag's are within it
             tau = np.clip(tau, -effort, effort)
@@ -236,9 +231,7 @@ def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: 
 # --- the task ---
 
 
-def _task(
-    bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array
-) -> Task:
+def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Array, v0: Array, path: Array) -> Task:
     axes = ["xyz".index(axis) for axis in linkage.axes]
     x, target = path[:, axes], bag.target
 

@@ -12,12 +12,26 @@ from .settings import number
 from .track import JointTrack, Track
 
 TOLD = {
-    "x_des": "", "q_des": "", "tau_cmd": "", "xd_des": "0 m/s", "xdd_des": "0 m/s²",
-    "quat_des": "", "omega_des": "0 rad/s", "alpha_des": "0 rad/s²",
-    "Kp": "", "Kd": "", "Kp_rot": "", "Kd_rot": "", "Kn": "0 s⁻¹",
-    "tau_ext": "0", "f_ext": "0 N", "payload": "0 kg", "limit_effort": "false", "step": "",
+    "x_des": "",
+    "q_des": "",
+    "tau_cmd": "",
+    "xd_des": "0 m/s",
+    "xdd_des": "0 m/s²",
+    "quat_des": "",
+    "omega_des": "0 rad/s",
+    "alpha_des": "0 rad/s²",
+    "Kp": "",
+    "Kd": "",
+    "Kp_rot": "",
+    "Kd_rot": "",
+    "Kn": "0 s⁻¹",
+    "tau_ext": "0",
+    "f_ext": "0 N",
+    "payload": "0 kg",
+    "limit_effort": "false",
+    "step": "",
     "FMU": "",
-}  # fmt: skip
+}
 """Settings that a figure tells, and the values that go without saying."""
 
 
@@ -26,8 +40,7 @@ def labels(tracks: Sequence[Track]) -> list[str]:
     every = list(dict.fromkeys(key for track in tracks for key in track.settings))
     differing = [key for key in every if len({track.settings.get(key) for track in tracks}) > 1]
     words = [
-        ", ".join(_setting(key, track.settings[key]) for key in differing if key in track.settings)
-        for track in tracks
+        ", ".join(_setting(key, track.settings[key]) for key in differing if key in track.settings) for track in tracks
     ]
     clear = 0 < len(differing) <= 3 and all(words) and len(set(words)) == len(words)
     if clear and max(map(len, words)) <= 80:

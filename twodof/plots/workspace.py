@@ -60,11 +60,7 @@ def _planes(tracks: Sequence[Track]) -> list[tuple[int, int]]:
 
 
 def _view(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> View:
-    strokes = [
-        *_arms(plane, tracks, looks),
-        *_paths(plane, tracks, looks),
-        *_circles(plane, tracks),
-    ]
+    strokes = [*_arms(plane, tracks, looks), *_paths(plane, tracks, looks), *_circles(plane, tracks)]
     limits = []
     for values in ("x", "y"):
         seen = np.concatenate([getattr(stroke, values) for stroke in strokes if stroke.framed])
@@ -131,9 +127,15 @@ def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
             centre = reach.centre[list(plane)]
             key = tuple(np.round([*centre, reach.radius], 9))
             circles[key] = _stroke(
-                f"reach {reach.radius:.3g} m", None, centre + reach.radius * circle, GREY, THIN,
-                (6, 4), depth=2.0, framed=False,
-            )  # fmt: skip
+                f"reach {reach.radius:.3g} m",
+                None,
+                centre + reach.radius * circle,
+                GREY,
+                THIN,
+                (6, 4),
+                depth=2.0,
+                framed=False,
+            )
     return list(circles.values())
 
 

@@ -90,10 +90,7 @@ class Layout:
         """Return the numbers of N messages, N × count each; None where other bytes differ."""
         if rows.shape[1] != self.size or (rows[:, self._fixed] != self._plain[self._fixed]).any():
             return None
-        return [
-            np.ascontiguousarray(rows[:, where]).view("<f8").astype(np.float64)
-            for where in self._numbers
-        ]
+        return [np.ascontiguousarray(rows[:, where]).view("<f8").astype(np.float64) for where in self._numbers]
 
 
 class JointStateLayout(Layout):
@@ -189,7 +186,6 @@ def _names(names: Sequence[str], order: str) -> tuple[NDArray[np.uint8], NDArray
     count = struct.pack(f"{order}I", len(names))
     texts = [_text(name, order) for name in names]
     plain, other = (
-        np.frombuffer(count + b"".join(t + gap * _gap(4, len(t)) for t in texts), np.uint8)
-        for gap in (b"\0", b"\1")
+        np.frombuffer(count + b"".join(t + gap * _gap(4, len(t)) for t in texts), np.uint8) for gap in (b"\0", b"\1")
     )
     return plain, plain == other

@@ -115,9 +115,7 @@ class Commands:
 
     def __init__(self, fmu: Fmu) -> None:
         self._axes, self._root = fmu.axes, fmu.root
-        self._groups = {
-            group: fmu.vector(group) for group in ("x_des", "quat_des", "q_des", "v_des", "tau_cmd")
-        }
+        self._groups = {group: fmu.vector(group) for group in ("x_des", "quat_des", "q_des", "v_des", "tau_cmd")}
         self._joints = {name: i for i, name in enumerate(fmu.joints)}
         self.types: tuple[str, ...] = ()
         if self._groups["x_des"] and fmu.axes:
@@ -150,9 +148,7 @@ class Commands:
             elsewhere = f"{frame[:LONGEST_NAME]!r}, not in '{self._root}'"
             raise CommandError("frame", f"is in frame {elsewhere}")
         point = message.pose.position if kind == POSE else message.point
-        given = {
-            name: getattr(point, axis) for name, axis in zip(self._groups["x_des"], self._axes)
-        }
+        given = {name: getattr(point, axis) for name, axis in zip(self._groups["x_des"], self._axes)}
         if kind == POSE:
             turn = message.pose.orientation
             quat = (turn.x, turn.y, turn.z, turn.w)

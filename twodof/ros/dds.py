@@ -17,9 +17,7 @@ from .messages import store_of
 try:
     from cyclonedds import idl, qos, topic
 except ImportError as missing:
-    raise PublishError(
-        f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')"
-    ) from missing
+    raise PublishError(f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')") from missing
 
 
 class Carrier:
@@ -50,9 +48,7 @@ def dds_type(name: str) -> Any:
     """Return the DDS type of a ROS 2 message type, named as rosidl_generator_dds_idl names it."""
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
-    struct = idl.make_idl_struct(
-        f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False
-    )
+    struct = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
     for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
         setattr(struct, method, vars(Carrier)[method])  # a base would be part of the type
     return struct

@@ -51,8 +51,9 @@ def layouts(
     types = {prefix + name: topic.type for name, topic in own.items()}
     units = {
         part: ", ".join(dict.fromkeys(str(fmu.variables[name].unit) for name in fmu.vector(group)))
-        for part, group in PARTS.items() if fmu.vector(group)
-    }  # fmt: skip
+        for part, group in PARTS.items()
+        if fmu.vector(group)
+    }
     texts = {
         ".rviz": _rviz(fmu, prefix, types),
         ".plotjuggler.xml": _plotjuggler(fmu, prefix, units),
@@ -76,9 +77,12 @@ def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
     def topic(name: str, *, latched: bool = False) -> dict[str, Any]:
         durability = "Transient Local" if latched else "Volatile"
         return {
-            "Value": name, "Depth": 5, "History Policy": "Keep Last",
-            "Reliability Policy": "Reliable", "Durability Policy": durability,
-        }  # fmt: skip
+            "Value": name,
+            "Depth": 5,
+            "History Policy": "Keep Last",
+            "Reliability Policy": "Reliable",
+            "Durability Policy": durability,
+        }
 
     def display(kind: str, name: str, **more: Any) -> dict[str, Any]:
         return {"Class": f"rviz_default_plugins/{kind}", "Name": name, "Enabled": True, **more}
@@ -86,28 +90,38 @@ def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
     displays = [
         display("Grid", "Grid", **{"Cell Size": 0.1, "Plane Cell Count": 20}),
         display(
-            "RobotModel", "RobotModel",
-            **{"Description Source": "Topic",
-               "Description Topic": topic(prefix + DESCRIPTION, latched=True)},
+            "RobotModel",
+            "RobotModel",
+            **{"Description Source": "Topic", "Description Topic": topic(prefix + DESCRIPTION, latched=True)},
         ),
         display("TF", "TF", **{"Show Names": False, "Marker Scale": 0.2}),
-    ]  # fmt: skip
+    ]
     for name, kind in types.items():
         if name.endswith(("/target", "/end_effector")):
             shape = "Pose" if kind == POSE else "PointStamped"
             displays.append(display(shape, name.rpartition("/")[2], Topic=topic(name)))
     from_above = "".join(fmu.axes) == "xy"
-    view = {"Class": "rviz_default_plugins/Orbit", "Name": "Current View", "Distance": 2.0,
-            "Pitch": 1.57 if from_above else 0.5, "Yaw": 4.712 if from_above else 0.8}  # fmt: skip
+    view = {
+        "Class": "rviz_default_plugins/Orbit",
+        "Name": "Current View",
+        "Distance": 2.0,
+        "Pitch": 1.57 if from_above else 0.5,
+        "Yaw": 4.712 if from_above else 0.8,
+    }
     clicked = topic(f"{prefix}/clicked_point")
     tools = [
         {"Class": "rviz_default_plugins/MoveCamera"},
         {"Class": "rviz_default_plugins/PublishPoint", "Single click": True, "Topic": clicked},
     ]
     manager = {
-        "Class": "", "Displays": displays, "Enabled": True, "Name": "root", "Tools": tools,
-        "Global Options": {"Fixed Frame": fmu.root, "Frame Rate": 30}, "Views": {"Current": view},
-    }  # fmt: skip
+        "Class": "",
+        "Displays": displays,
+        "Enabled": True,
+        "Name": "root",
+        "Tools": tools,
+        "Global Options": {"Fixed Frame": fmu.root, "Frame Rate": 30},
+        "Views": {"Current": view},
+    }
     panels = [{"Class": f"rviz_common/{name}", "Name": name} for name in ("Displays", "Views")]
     return json.dumps({"Panels": panels, "Visualization Manager": manager}, indent=2) + "\n"
 
@@ -119,14 +133,17 @@ def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
     tab = ET.SubElement(window, "Tab", tab_name=fmu.name, containers="1")
     size = ";".join([f"{1 / len(units):.6f}"] * len(units))
     splitter = ET.SubElement(
-        ET.SubElement(tab, "Container"), "DockSplitter",
-        orientation="-", count=str(len(units)), sizes=size,
-    )  # fmt: skip
+        ET.SubElement(tab, "Container"), "DockSplitter", orientation="-", count=str(len(units)), sizes=size
+    )
     for part, unit in units.items():
         plot = ET.SubElement(
-            ET.SubElement(splitter, "DockArea", name=f"{part} ({unit})"), "plot",
-            mode="TimeSeries", style="Lines", flip_x="false", flip_y="false",
-        )  # fmt: skip
+            ET.SubElement(splitter, "DockArea", name=f"{part} ({unit})"),
+            "plot",
+            mode="TimeSeries",
+            style="Lines",
+            flip_x="false",
+            flip_y="false",
+        )
         ET.SubElement(plot, "limitY")
         for i, joint in enumerate(fmu.joints):
             name = f"{prefix}{JOINT_STATES}/{joint}/{part}"
@@ -141,29 +158,30 @@ def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[st
     shown = [prefix + DESCRIPTION, *(name for name, kind in types.items() if kind == POSE)]
     panels: dict[str, Any] = {
         "3D!robot": {
-            "followTf": fmu.root, "cameraState": {"distance": 1.5},
+            "followTf": fmu.root,
+            "cameraState": {"distance": 1.5},
             "topics": {name: {"visible": True} for name in shown},
-        },
-    }  # fmt: skip
+        }
+    }
     for part, unit in units.items():
         paths = [
             {
-                "value": f"{prefix}{JOINT_STATES}.{part}[{i}]", "label": joint, "enabled": True,
-                "color": COLOURS[i % len(COLOURS)], "timestampMethod": "headerStamp",
+                "value": f"{prefix}{JOINT_STATES}.{part}[{i}]",
+                "label": joint,
+                "enabled": True,
+                "color": COLOURS[i % len(COLOURS)],
+                "timestampMethod": "headerStamp",
             }
             for i, joint in enumerate(fmu.joints)
-        ]  # fmt: skip
-        panels[f"Plot!{part}"] = {
-            "foxglovePanelTitle": part, "paths": paths, "yAxisLabel": unit, "showLegend": True,
-        }  # fmt: skip
+        ]
+        panels[f"Plot!{part}"] = {"foxglovePanelTitle": part, "paths": paths, "yAxisLabel": unit, "showLegend": True}
     *upper, plots = [f"Plot!{part}" for part in units]
     for plot in reversed(upper):
         plots = {"direction": "column", "first": plot, "second": plots}  # type: ignore[assignment]
     left: Any = "3D!robot"
     if any(group in GAINS for group in fmu.groups("input")):
         panels["Parameters!gains"] = {"title": "Gains"}
-        left = {"direction": "column", "first": left, "second": "Parameters!gains",
-                "splitPercentage": 75}  # fmt: skip
+        left = {"direction": "column", "first": left, "second": "Parameters!gains", "splitPercentage": 75}
     mosaic = {"direction": "row", "first": left, "second": plots}
     layout = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": mosaic}
     return json.dumps(layout, indent=2) + "\n"

@@ -88,15 +88,19 @@ class Listener:
     """
 
     def __init__(
-        self, participant: Any, follows: Commands, heard: Mapping[str, str], *,
-        orders: bool, oldest: float | None, run: Experiment,
-    ) -> None:  # fmt: skip
+        self,
+        participant: Any,
+        follows: Commands,
+        heard: Mapping[str, str],
+        *,
+        orders: bool,
+        oldest: float | None,
+        run: Experiment,
+    ) -> None:
         self._commanders = Commanders(participant, run)
         self._follows, self._heard, self._oldest = follows, heard, oldest
         self._readers = {
-            name: sub.DataReader(
-                participant, dds_topic(participant, name, kind), dds_qos(STREAM, kind)
-            )
+            name: sub.DataReader(participant, dds_topic(participant, name, kind), dds_qos(STREAM, kind))
             for name, kind in {**heard, **(ORDERS if orders else {})}.items()
         }
         self._news = core.WaitSet(participant)
@@ -158,9 +162,7 @@ class Listener:
                 else:
                     self._steps += order.data
 
-    def _come(
-        self, name: str, read: Callable[[bytes], Read], what: str
-    ) -> Iterator[tuple[Read, int]]:
+    def _come(self, name: str, read: Callable[[bytes], Read], what: str) -> Iterator[tuple[Read, int]]:
         """Return the last few messages of a topic, as read, with their writers."""
         for message in self._readers[name].take(STREAM.depth):
             if message.sample_info.valid_data:

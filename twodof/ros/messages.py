@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -51,8 +44,7 @@ DEFINITIONS = {
     "std_msgs/msg/Bool": "bool data",
     "std_msgs/msg/UInt32": "uint32 data",
     "std_msgs/msg/String": "string data",
-    JOINT_STATE: "std_msgs/Header header\nstring[] name\n"
-    "float64[] position\nfloat64[] velocity\nfloat64[] effort",
+    JOINT_STATE: "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort",
     "geometry_msgs/msg/Point": XYZ,
     "geometry_msgs/msg/Vector3": XYZ,
     "geometry_msgs/msg/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1",
@@ -61,10 +53,8 @@ DEFINITIONS = {
     POSE: "std_msgs/Header header\ngeometry_msgs/Pose pose",
     "trajectory_msgs/msg/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\n"
     "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start",
-    JOINT_TRAJECTORY: "std_msgs/Header header\nstring[] joint_names\n"
-    "trajectory_msgs/JointTrajectoryPoint[] points",
-    "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\n"
-    "geometry_msgs/Quaternion rotation",
+    JOINT_TRAJECTORY: "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points",
+    "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
     "geometry_msgs/msg/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
     "geometry_msgs/Transform transform",
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -102,9 +92,16 @@ class Topic(NamedTuple):
 
 
 STREAM = Qos(
-    QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
-    FOREVER, FOREVER, QosLiveliness.AUTOMATIC, FOREVER, False,
-)  # fmt: skip
+    QosHistory.KEEP_LAST,
+    10,
+    QosReliability.RELIABLE,
+    QosDurability.VOLATILE,
+    FOREVER,
+    FOREVER,
+    QosLiveliness.AUTOMATIC,
+    FOREVER,
+    False,
+)
 LATCHED = STREAM._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 SCENE_TOPICS = {
     "/robot_description": Topic("std_msgs/msg/String", LATCHED),

@@ -31,9 +31,7 @@ RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
 LAST_DOMAIN = 232  # the ports of later ones are beyond 65535
 LOOPBACK = {"lo": "127.0.0.1"}
 MOST_PARTICIPANTS = 32  # of one host, that are looked for; as rmw_cyclonedds
-NO_NETWORK = (
-    "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
-)
+NO_NETWORK = "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
 ANNOUNCED = 1  # s between two announcements to participants of this host
 SO_ATTACH_FILTER = 26  # of Linux, on the architectures that there are packages for
 INTERFACE, SOURCE = 0xFFFFF008, 0xFFF0000C  # a packet's interface and IPv4 source, for its filter
@@ -165,9 +163,7 @@ def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) 
         return Network(int(number), loopback=True, custom=custom)
     reach = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or RANGES[0]
     if reach not in RANGES:
-        raise PublishError(
-            f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', not one of {', '.join(RANGES)}"
-        )
+        raise PublishError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', not one of {', '.join(RANGES)}")
     return Network(int(number), reach, _peers(variables), custom=custom)
 
 
@@ -258,9 +254,7 @@ def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, di
             os.close(kept)
         account = trace.read_text("utf-8", "replace")
         lines = errors.read_text("utf-8", "replace").splitlines()
-    present = dict(
-        re.findall(r"(\S+) udp/([\d.]+)", "".join(re.findall(": interfaces: .*", account)))
-    )
+    present = dict(re.findall(r"(\S+) udp/([\d.]+)", "".join(re.findall(": interfaces: .*", account))))
     chosen = re.findall(r"(\S+) \(index", "".join(re.findall("selected interfaces: .*", account)))
     # each line of an error begins with time, domain and program
     said = "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)

@@ -130,9 +130,7 @@ class Publisher(Sink):
         named = [*self.topics, *self.commands, *(ORDERS if self._clock else ())]
         for name in named:
             if named.count(name) > 1:
-                raise InputError(
-                    f"'{name}' would be two topics; name `state_topic` or `command_topic` otherwise"
-                )
+                raise InputError(f"'{name}' would be two topics; name `state_topic` or `command_topic` otherwise")
         return self
 
     def _named(self, name: str) -> str:
@@ -153,16 +151,18 @@ class Publisher(Sink):
                 participant = self._participant = domain.DomainParticipant(self.place.domain)
             self._writers = {
                 name: pub.DataWriter(
-                    participant,
-                    dds_topic(participant, self._named(name), said.type),
-                    dds_qos(said.qos, said.type),
+                    participant, dds_topic(participant, self._named(name), said.type), dds_qos(said.qos, said.type)
                 )
                 for name, said in self._messages.topics.items()
             }
             self._listener = Listener(
-                participant, self._follows, self._heard, orders=self._clock,
-                oldest=None if self._watchdog is None else self._watchdog.timeout, run=self._run,
-            )  # fmt: skip
+                participant,
+                self._follows,
+                self._heard,
+                orders=self._clock,
+                oldest=None if self._watchdog is None else self._watchdog.timeout,
+                run=self._run,
+            )
         except core.DDSException as error:
             raise PublishError(f"DDS domain {self.place.domain} fails: {error}") from error
         self._opened(self)
@@ -222,8 +222,7 @@ class Publisher(Sink):
             waited = time.monotonic() - begun
             if waited > (self._timeout or LOCKSTEP_TIMEOUT):
                 raise PublishError(
-                    f"no command for the sample at t = {sample.t:g} s in {waited:.3g} s:"
-                    f" {self._missing(latest)}"
+                    f"no command for the sample at t = {sample.t:g} s in {waited:.3g} s: {self._missing(latest)}"
                 )
             if not self._listener.wait() and not self._answered:
                 self._publish(self._messages.of(sample))  # who comes now has missed it
@@ -321,9 +320,7 @@ def publish_together(
         check_name("robots", name)
     shared, now, members = open_domain(place or network()), time.time(), list[Member]()
     for name, run in robots.items():
-        wire = Publisher(
-            shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options
-        )
+        wire = Publisher(shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options)
         stamped = run if run.stamp_start is not None else replace(run, stamp_start=now)
         own = sinks.get(name, ())
         members.append(_member(stamped, wire, own, pace, stop, lambda: None))

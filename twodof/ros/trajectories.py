@@ -149,9 +149,7 @@ class _Path:
         return values
 
 
-def follow(
-    trajectories: Iterable[Trajectory], rest: Sequence[float], grid: Array
-) -> dict[int, Array]:
+def follow(trajectories: Iterable[Trajectory], rest: Sequence[float], grid: Array) -> dict[int, Array]:
     """Return the motion of joints along trajectories, each along the latest that names it.
 
     Where a trajectory has points after its start alone, it goes to the first of them from what was
@@ -175,8 +173,7 @@ def follow(
                 times, points = [start, *times], [wanted, *points]
             first = max(k for k, t in enumerate(times) if t <= start)
             pieces = [
-                _piece(t[1] - t[0], *ends)
-                for t, ends in zip(pairwise(times[first:]), pairwise(points[first:]))
+                _piece(t[1] - t[0], *ends) for t, ends in zip(pairwise(times[first:]), pairwise(points[first:]))
             ] + [np.vstack([points[-1][:1], np.zeros((DEGREE, len(joints)))])]
             pieces[0] = _moved(pieces[0], start - times[first])
             for path, own_pieces in zip(own, np.stack(pieces).transpose(2, 0, 1)):

@@ -61,10 +61,7 @@ class Experiment:
 
     def __repr__(self) -> str:
         end = "without end" if self.steps == inf else f"to {self.time(self.steps):g} s"
-        return (
-            f"<Experiment: {self.fmu.path.name} from {self.start_time:g} s {end}"
-            f" in steps of {self.step:g} s>"
-        )
+        return f"<Experiment: {self.fmu.path.name} from {self.start_time:g} s {end} in steps of {self.step:g} s>"
 
     def time(self, k: float) -> float:
         """Return the time after k steps, s; never accumulated."""
@@ -152,8 +149,7 @@ def _tell_late(run: Experiment, source: str) -> None:
     end = run.time(run.steps)
     if late := sum(t > end + TIME_TOLERANCE * run.step for t, _ in run.changes):
         LOG.warning(
-            f"{source}: {late} of its times are after the run's end at {end:g} s, and their inputs"
-            " are never set"
+            f"{source}: {late} of its times are after the run's end at {end:g} s, and their inputs are never set"
         )
 
 
@@ -306,9 +302,7 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
             try:
                 values[name] = float(cell)
             except ValueError:
-                raise InputError(
-                    f"'{path}' row {number}: {name} = '{cell:.50}' is not a number"
-                ) from None
+                raise InputError(f"'{path}' row {number}: {name} = '{cell:.50}' is not a number") from None
             if not isfinite(values[name]):
                 raise InputError(f"'{path}' row {number}: {name} = {cell:.50} is not finite")
         time = values.pop("time")

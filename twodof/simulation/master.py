@@ -21,16 +21,7 @@ from typing import Any, NamedTuple
 
 from ..errors import InputError, SimulationError, check_keywords, diverged, step_failure
 from ..fmu import Fmu, Instance, Values, instantiate
-from .experiments import (
-    NANOSECONDS,
-    TIME_TOLERANCE,
-    Experiment,
-    Setting,
-    Value,
-    experiment,
-    pop_until,
-    resolve,
-)
+from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, Setting, Value, experiment, pop_until, resolve
 from .pace import RealTime
 from .peaks import Excess, Peaks, limits_of
 from .sample import Sample, Sink
@@ -79,9 +70,14 @@ def samples(
 
 
 def _stepped(
-    run: Experiment, watch: Callable[[Values], object], pace: RealTime | None, stop: Stop,
-    ready: Callable[[], object], resume: Resume, instance: Instance | None,
-) -> Samples:  # fmt: skip
+    run: Experiment,
+    watch: Callable[[Values], object],
+    pace: RealTime | None,
+    stop: Stop,
+    ready: Callable[[], object],
+    resume: Resume,
+    instance: Instance | None,
+) -> Samples:
     """Yield the samples of a run; ``watch`` receives the outputs of each as a buffer."""
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
@@ -115,9 +111,8 @@ def _stepped(
 
 
 def as_experiment(
-    called: Callable[..., object], run: Experiment | Fmu | str | Path, options: Mapping[str, Any],
-    **usual: Any,
-) -> Experiment:  # fmt: skip
+    called: Callable[..., object], run: Experiment | Fmu | str | Path, options: Mapping[str, Any], **usual: Any
+) -> Experiment:
     """Return the experiment itself, or that of an FMU with the options of ``experiment``.
 
     Raises:
@@ -156,9 +151,7 @@ def _sampler(
     return take
 
 
-def _resumed(
-    run: Experiment, sample: Sample, error: SimulationError, resume: Resume
-) -> dict[str, Value]:
+def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Resume) -> dict[str, Value]:
     """Return start values with which a run continues after a failed step; raise where there are none."""
     failure = step_failure(sample.k, sample.t, error)
     settings = resume(sample, failure) if error.outcome == "discarded" else None
@@ -176,9 +169,13 @@ def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
     still = (0.0,) * len(sample.v)
     start = {"q_start": sample.q, "v_start": still}
     targets = {
-        "x_des": sample.x, "quat_des": sample.quat,
-        "q_des": sample.q, "v_des": still, "a_des": still, "tau_cmd": still,
-    }  # fmt: skip
+        "x_des": sample.x,
+        "quat_des": sample.quat,
+        "q_des": sample.q,
+        "v_des": still,
+        "a_des": still,
+        "tau_cmd": still,
+    }
     meant = {group: value for group, value in targets.items() if value and fmu.vector(group)}
     return {**start, **meant} if meant and all(map(fmu.vector, start)) else None
 

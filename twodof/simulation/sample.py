@@ -77,10 +77,7 @@ class Sample(NamedTuple):
         """Angle between the end effector's orientation and its target, rad; None without one."""
         if self.target_quat is None:
             return None
-        apart = (
-            dist(self.quat, self.target_quat),
-            hypot(*map(sum, zip(self.quat, self.target_quat))),
-        )
+        apart = (dist(self.quat, self.target_quat), hypot(*map(sum, zip(self.quat, self.target_quat))))
         return 4.0 * asin(min(1.0, 0.5 * min(apart)))
 
 

@@ -39,9 +39,7 @@ class JobPlugin(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Worker) -> None:
         """Refuse mixed versions, whose results might differ."""
         if __version__ != self._version:
-            raise SweepError(
-                f"worker {worker.address} has twodof {__version__}, not {self._version}"
-            )
+            raise SweepError(f"worker {worker.address} has twodof {__version__}, not {self._version}")
         self._lock = Lock()  # for workers of several threads: the FMU has one instance
 
     def teardown(self, worker: Worker) -> None:

@@ -92,9 +92,7 @@ def sweep(
 
 
 def _collect(
-    staff: AbstractContextManager[Iterable[list[Row]]],
-    results: Results,
-    progress: Callable[[int, int], None],
+    staff: AbstractContextManager[Iterable[list[Row]]], results: Results, progress: Callable[[int, int], None]
 ) -> None:
     """Store rows as they arrive; nothing is written before the workers have started."""
     progress(int(results.done.sum()), len(results.done))
@@ -112,7 +110,9 @@ def _job(fmu: Fmu, names: tuple[str, ...], options: dict[str, Any], bags: Path |
 def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
     return {
         "fmu": {
-            "file": fmu.path.name, "name": fmu.name, "guid": fmu.guid,
+            "file": fmu.path.name,
+            "name": fmu.name,
+            "guid": fmu.guid,
             "sha256": hashlib.sha256(job.content).hexdigest(),
         },
         "design": asdict(design),
@@ -120,13 +120,17 @@ def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[s
         "bags": job.bags is not None,
         "versions": versions(*PACKAGES),
         "command_line": command_line,
-    }  # fmt: skip
+    }
 
 
 def _workers(
-    job: Job, design: Design, missing: NDArray[np.bool_],
-    count: int | None, scheduler: str | None, stop: Callable[[], bool],
-) -> AbstractContextManager[Iterable[list[Row]]]:  # fmt: skip
+    job: Job,
+    design: Design,
+    missing: NDArray[np.bool_],
+    count: int | None,
+    scheduler: str | None,
+    stop: Callable[[], bool],
+) -> AbstractContextManager[Iterable[list[Row]]]:
     """Return a context that yields rows from the workers."""
     numbers, values = np.flatnonzero(missing).tolist(), design.points()
     if not numbers:

@@ -46,9 +46,7 @@ class Design:
         low, high = np.array([*self.ranges.values()]).reshape(-1, 2).T
         drawn = np.random.default_rng(self.seed).uniform(low, high, (self.draws, len(low)))
         combinations = np.array([*product(*self.grids.values())])
-        return np.hstack(
-            [np.repeat(combinations, self.draws, axis=0), np.tile(drawn, (len(combinations), 1))]
-        )
+        return np.hstack([np.repeat(combinations, self.draws, axis=0), np.tile(drawn, (len(combinations), 1))])
 
 
 def make_design(

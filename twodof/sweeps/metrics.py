@@ -41,40 +41,32 @@ class Metric(NamedTuple):
 
 METRICS: Mapping[str, Metric] = {
     "settling_time": Metric(
-        "settling time (2 %)", "s",
+        "settling time (2 %)",
+        "s",
         "first t_k - t_0 from which on |e| stays within 2 % of |e_0|, and θ within 2 % of θ_0,"
         " until the end of the run",
     ),
     "overshoot": Metric(
-        "overshoot", "",
-        "largest -e_k·d / |e_0|, the part of the way by which the target is passed; 0: not passed",
+        "overshoot", "", "largest -e_k·d / |e_0|, the part of the way by which the target is passed; 0: not passed"
     ),
     "final_error": Metric("final error", "m", "|e_N| of the end effector"),
     "final_turn_error": Metric("final orientation error", "rad", "θ_N"),
     "final_joint_error": Metric(
         "final joint error", "rad", "largest |q_des - q_N| of any joint; m for prismatic joints"
     ),
-    "rms_error": Metric(
-        "RMS error", "m", "root of the mean of |e_k|² of the end effector over all samples"
-    ),
-    "peak_effort": Metric(
-        "peak |τ|", "N.m", "largest |τ_i| of any joint at any sample; N for prismatic joints"
-    ),
-    "peak_velocity": Metric(
-        "peak |v|", "rad/s", "largest |v_i| of any joint at any sample; m/s for prismatic joints"
-    ),
+    "rms_error": Metric("RMS error", "m", "root of the mean of |e_k|² of the end effector over all samples"),
+    "peak_effort": Metric("peak |τ|", "N.m", "largest |τ_i| of any joint at any sample; N for prismatic joints"),
+    "peak_velocity": Metric("peak |v|", "rad/s", "largest |v_i| of any joint at any sample; m/s for prismatic joints"),
     "time_at_limits": Metric(
-        "time at joint limits", "s", "h times the number of samples after the first at which any"
-        " joint is at one of its limits",
+        "time at joint limits",
+        "s",
+        "h times the number of samples after the first at which any joint is at one of its limits",
     ),
     "effort_use": Metric(
-        "peak |τ| / limit", "", "largest |τ_i| as a share of the URDF's effort limit; above 1 the"
-        " robot cannot do it",
+        "peak |τ| / limit", "", "largest |τ_i| as a share of the URDF's effort limit; above 1 the robot cannot do it"
     ),
-    "velocity_use": Metric(
-        "peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; likewise",
-    ),
-}  # fmt: skip
+    "velocity_use": Metric("peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; likewise"),
+}
 """By name of the column. A metric is NaN where it is not defined: what a run that was not finished
 would have done, the settling of one that did not settle, the settling and overshoot of one that
 starts within 1e-9 m or rad of its target, and what needs an output, target or limit that the FMU

@@ -21,17 +21,7 @@ from numpy.typing import NDArray
 
 from ..bounds import MAX_RUNS, MAX_SWEEP
 from ..errors import SweepError
-from ..files import (
-    NUMBER,
-    VALUES,
-    check_file,
-    fits,
-    is_being_written,
-    lock,
-    parsed,
-    refusing,
-    write_file,
-)
+from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..version import install
 from .metrics import METRICS
 from .runner import Row
@@ -80,9 +70,15 @@ class Results:
     """
 
     def __init__(
-        self, path: str | Path, names: Sequence[str], units: Sequence[str], runs: int,
-        provenance: dict[str, Any], *, resume: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        path: str | Path,
+        names: Sequence[str],
+        units: Sequence[str],
+        runs: int,
+        provenance: dict[str, Any],
+        *,
+        resume: bool = False,
+    ) -> None:
         self.path = _named(Path(path))
         self._schema = _schema(names, units, provenance)
         self._rows: list[Row] = []
@@ -310,17 +306,13 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
                 " begin this sweep in another `output`, or resume that one as it was begun"
             )
     if there["versions"]["twodof"] != wanted["versions"]["twodof"]:
-        raise SweepError(
-            f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version"
-        )
+        raise SweepError(f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version")
 
 
 def _differing(there: dict[str, Any], wanted: dict[str, Any]) -> str:
     """Return the settings of a design or of options that differ from the stored ones."""
     return ", ".join(
-        f"{key.replace('_', ' ')} {json.dumps(value):.200}"
-        for key, value in there.items()
-        if value != wanted.get(key)
+        f"{key.replace('_', ' ')} {json.dumps(value):.200}" for key, value in there.items() if value != wanted.get(key)
     )
 
 
