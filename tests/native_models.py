@@ -73,11 +73,11 @@ class Model:
         plant.initialise()
         return plant
 
-    def place(self, name: str) -> int:
+    def index(self, name: str) -> int:
         return next(i for i, v in enumerate(self.table) if name in (v.name, v.group))
 
     def reference(self, name: str) -> int:
-        return self.place(name) + 1
+        return self.index(name) + 1
 
     def sources(self, *more: Path, fmi: int = 2) -> dict[str, bytes]:
         headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{fmi}*.h")
@@ -229,10 +229,10 @@ class Engine:
         self.call("acceleration_of_effort", q, tau, a)
         return a
 
-    def obstacle(self) -> tuple[int, int, float]:
+    def failure(self) -> tuple[int, int, float]:
         """Why the last step was refused: the reason, the fastest joint, its rate in 1/s."""
         row = np.empty(3)
-        self.call("obstacle", row)
+        self.call("failure", row)
         return int(row[0]), int(row[1]), float(row[2])
 
     def values(self, plant: Plant) -> np.ndarray:

@@ -336,7 +336,7 @@ def test_targets_are_known_where_they_are_in_one_frame(tmp_path: Path, frames: S
         for topic, parts in (("/joint_states", states), ("/target", targets))
         for k, message in enumerate(parts)
     ]
-    heard = twodof.read_bag(write_elsewhere(tmp_path / "bag", messages)).heard
+    heard = twodof.read_bag(write_elsewhere(tmp_path / "bag", messages)).received
     assert (heard.frame if heard else "") == known
 
 

@@ -47,8 +47,8 @@ def joint_state(
 def test_joints_are_matched_by_name_in_any_order_and_number(arm: Build) -> None:
     joint, effort = Commands(arm("joint")), Commands(arm("effort"))
     both = joint_state(("joint2", "joint1"), (0.2, 0.1), (2.0, 1.0), (20.0, 10.0), (3, 4))
-    stamp, inputs, strangers = joint.read(JOINT_STATE, both)
-    assert stamp == 3_000_000_004 and strangers == ()
+    stamp, inputs, unknown_joints = joint.read(JOINT_STATE, both)
+    assert stamp == 3_000_000_004 and unknown_joints == ()
     assert inputs == {"q_des[1]": 0.1, "q_des[2]": 0.2, "v_des[1]": 1.0, "v_des[2]": 2.0}
     assert effort.read(JOINT_STATE, both).inputs == {"tau_cmd[1]": 10.0, "tau_cmd[2]": 20.0}
     some = joint_state(("finger", "joint2"), (0.7, 0.2), (), (7.0, 20.0))
@@ -95,12 +95,12 @@ def test_efforts_are_ramped_to_zero(arm: Build, caplog: pytest.LogCaptureFixture
     dog = Watchdog(arm("effort"), timeout=0.5)
     assert not any(asked_each_tenth(dog, 5))  # before the first command
     with caplog.at_level(logging.WARNING, "twodof"):
-        dog.heard(1.0, {"tau_cmd[2]": 8.0})
+        dog.received(1.0, {"tau_cmd[2]": 8.0})
         assert dog.asked(1.4) == {}
         assert dog.asked(1.5) == {"tau_cmd[2]": 8.0}
         assert dog.asked(1.5 + RAMP / 4) == {"tau_cmd[2]": 6.0}
         assert dog.asked(1.5 + RAMP) == dog.asked(9.0) == {"tau_cmd[2]": 0.0}
-        dog.heard(9.0, {"tau_cmd[1]": 4.0})
+        dog.received(9.0, {"tau_cmd[1]": 4.0})
         assert dog.asked(9.1) == {}
         assert dog.asked(20.0) == {"tau_cmd[1]": 0.0, "tau_cmd[2]": 0.0}
     (record,) = caplog.records
@@ -109,11 +109,11 @@ def test_efforts_are_ramped_to_zero(arm: Build, caplog: pytest.LogCaptureFixture
 
 def test_targets_are_held_without_their_velocity(arm: Build) -> None:
     dog = Watchdog(arm("joint"), timeout=0.5)
-    dog.heard(1.0, {"q_des[1]": 0.3, "v_des[1]": 2.0})
+    dog.received(1.0, {"q_des[1]": 0.3, "v_des[1]": 2.0})
     assert dog.asked(1.4) == {}
     assert dog.asked(1.6) == dog.asked(9.0) == {"v_des[1]": 0.0}
     held = Watchdog(arm("effort"), timeout=0.5, ramp=False)
-    held.heard(1.0, {"tau_cmd[1]": 4.0})
+    held.received(1.0, {"tau_cmd[1]": 4.0})
     assert held.asked(9.0) == {}
     with pytest.raises(InputError, match="on_timeout` 'ramp' is for control 'effort'"):
         Watchdog(arm("joint"), timeout=0.5, ramp=True)

@@ -19,7 +19,7 @@ class Derivatives(Engine):
         self.count = len(of.table)
         self.names = [v.name for v in of.table]
         self.computed = [i for i, v in enumerate(of.table) if v.causality in ("output", "local")]
-        self.known = [i for i in range(self.count) if i < of.place("x")]
+        self.known = [i for i in range(self.count) if i < of.index("x")]
 
     def jacobian(self, values, held=None):
         """∂ computed/∂ known, a row each of the variables from q on up to the parameters."""
@@ -179,7 +179,7 @@ def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
 def test_a_direction_of_any_size_has_its_derivative():
     engine = Derivatives(model("twodof", "effort"))
     values = at_random(engine, np.random.default_rng(5))
-    held, k = np.zeros(2, dtype=np.int32), engine.model.place("q")
+    held, k = np.zeros(2, dtype=np.int32), engine.model.index("q")
     results = []
     for size in (1.0, 1e-250, 1e250):
         change, derivative = np.zeros(engine.count), np.zeros(engine.count)

@@ -17,7 +17,7 @@ import pytest
 from bags import START, STORAGES, assert_consistent, both_storages, logging, read_with_rosbags
 
 from twodof.bag.contents import read_messages, storage_files
-from twodof.bag.records import Allowance, DamageError
+from twodof.bag.records import DamageError, ReadBudget
 from twodof.cli import info
 from twodof.cli.main import main
 
@@ -39,7 +39,7 @@ def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
 def has_samples(bag: Path) -> bool:
     """Whether the first sample of a run is in its bag, beside which the reserve is then."""
     try:
-        return (bag / "reserve").exists() and any(any(read_messages(file, Allowance())) for file in storage_files(bag))
+        return (bag / "reserve").exists() and any(any(read_messages(file, ReadBudget())) for file in storage_files(bag))
     except (OSError, DamageError):
         return False
 

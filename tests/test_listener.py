@@ -24,7 +24,7 @@ from nodes import Node, ended, environment, published, recorded, stamp_of
 import twodof
 from twodof.cli.main import main
 from twodof.errors import PublishError
-from twodof.ros.network import network
+from twodof.ros.network import network_of_environment
 
 GAINS = {2: (2.0, 0.2), 7: (60.0, 8.0)}
 GOALS = {2: (0.9, -0.6), 7: (0.3, -0.4, 0.2, -1.8, 0.1, 1.6, 0.5)}
@@ -187,22 +187,22 @@ def test_lockstep_says_who_is_missing(
 ) -> None:
     node = listen(*topics) if topics else None
 
-    def opened(wire: twodof.Publisher) -> None:
+    def opened(publisher: twodof.Publisher) -> None:
         """Wait until both have found each other, as a timeout does not."""
         if node is None:
             return
         node.until(lambda: all(["matched", it.split("=")[0], 1] in node.told for it in topics))
-        wait_until(lambda: wire._listener.is_matched("/joint_commands"))
+        wait_until(lambda: publisher._listener.is_matched("/joint_commands"))
         if len(topics) > 1:
-            wait_until(wire._writers["/joint_states"].get_matched_subscriptions)
+            wait_until(publisher._writers["/joint_states"].get_matched_subscriptions)
         if command:
             node.say(f"/joint_commands {command}")
 
-    place, bag = network(environment(number)), twodof.Bag(tmp_path / "bag")
-    wire = twodof.Publisher(place, lockstep=True, timeout=0.5, opened=opened)
+    place, bag = network_of_environment(environment(number)), twodof.Bag(tmp_path / "bag")
+    publisher = twodof.Publisher(place, lockstep=True, timeout=0.5, opened=opened)
     expected = rf"no command for the sample at t = 0 s in 0[.]\d+ s: {re.escape(missing)}"
     with pytest.raises(PublishError, match=expected):
-        twodof.publish(bare(2), bag, wire=wire, stamp_start=9.0)
+        twodof.publish(bare(2), bag, publisher=publisher, stamp_start=9.0)
     assert len(recorded(tmp_path / "bag")["/joint_states"]) == 1
 
 

@@ -320,7 +320,7 @@ def forged(arm, field, value):
     names += [f"{what}[{i + 1}]" for what in ("held", "watched") for i in range(joints)]
     names += ["any_held", "any_watched", "rank", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
-    place = n + 1 + names.index(field) if field in names else 1 + arm.of.place(field)
+    place = n + 1 + names.index(field) if field in names else 1 + arm.of.index(field)
     fields[place] = value
     fields[-1] = fnv(layout.pack(*fields)[:-8])
     return layout.pack(*fields)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import twodof
-from twodof.bag.outline import extremes
-from twodof.bag.reader import read_bag, read_outline
+from twodof.bag.downsampling import extremes
+from twodof.bag.reader import read_bag, read_downsampled
 from twodof.bag.recording import Array, Recording
 from twodof.plots.track import Track, read_tracks
 
@@ -74,7 +74,7 @@ def test_a_target_on_a_topic_is_that_of_its_time(bag: Path, tmp_path: Path) -> N
     """Of a bag without provenance; repeated points are not kept."""
     (bag / "run.json").rename(tmp_path / "run.json")
     try:
-        whole, few = read_bag(bag), read_outline(bag, MOST, lambda part: [*part.target.T])
+        whole, few = read_bag(bag), read_downsampled(bag, MOST, lambda part: [*part.target.T])
     finally:
         (tmp_path / "run.json").rename(bag / "run.json")
     assert whole.target.shape == (20_001, 3) and len(few.t) <= MOST / 4
@@ -87,7 +87,7 @@ def test_a_bag_that_is_not_long_is_read_whole(bag: Path) -> None:
     def none(part: Recording) -> list[Array]:
         raise AssertionError
 
-    read = read_outline(bag, 20_001, none)
+    read = read_downsampled(bag, 20_001, none)
     np.testing.assert_array_equal(read.q, read_bag(bag).q)
 
 

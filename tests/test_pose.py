@@ -293,11 +293,11 @@ from cyclonedds.topic import Topic
 import numpy as np
 from twodof.ros.cdr import Layout, Numbers, Stamp
 from twodof.ros.messages import POSE, STREAM
-from twodof.ros.network import network, open_domain
+from twodof.ros.network import network_of_environment, open_domain
 from twodof.ros.dds import dds_qos, dds_type
 
-domain = open_domain(network())
-participant = DomainParticipant(network().domain)
+domain = open_domain(network_of_environment())
+participant = DomainParticipant(network_of_environment().domain)
 writer = DataWriter(
     participant, Topic(participant, "rt/target_command", dds_type(POSE)), dds_qos(STREAM, POSE)
 )
@@ -332,18 +332,18 @@ def test_a_pose_on_the_network_is_the_target(
     text = "".join(f"({f!r}, {p!r}, {q!r})\n".replace("inf", "float('inf')") for f, p, q in messages)
 
     def hears() -> Any:
-        asked.append(wire.command())
+        asked.append(publisher.command())
         return asked[-1]
 
     with (
         caplog.at_level(logging.WARNING, "twodof"),
-        Publisher(scene=True).begin(run) as wire,
+        Publisher(scene=True).begin(run) as publisher,
         subprocess.Popen([sys.executable, "-c", TALKER], stdin=subprocess.PIPE, text=True) as talker,
     ):
         assert talker.stdin is not None
         talker.stdin.write(text)
         talker.stdin.close()
-        wire.write(next(twodof.samples(run)))
+        publisher.write(next(twodof.samples(run)))
         wait_until(hears)
         talker.kill()
     assert [command for command in asked if command] == [

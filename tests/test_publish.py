@@ -1,4 +1,4 @@
-"""A run on the wire, heard and steered by Fast DDS: another maker's DDS, with an IDL of its own.
+"""A run on the publisher, heard and steered by Fast DDS: another maker's DDS, with an IDL of its own.
 
 Truth is the bag that is recorded at the same time, read by the MCAP project's reader. All stays on
 the loopback interface, or in network namespaces that lead nowhere.
@@ -27,7 +27,7 @@ from twodof.cli.main import main
 from twodof.errors import InputError
 from twodof.files import data_file
 from twodof.plots.track import read_tracks
-from twodof.ros.network import LAST_DOMAIN, Network, network
+from twodof.ros.network import LAST_DOMAIN, Network, network_of_environment
 
 HASHES = {
     "sensor_msgs JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
@@ -182,8 +182,8 @@ def test_points_that_mean_nothing_or_cannot_be_followed_end_no_run(
     bag = twodof.read_bag(tmp_path / "bag")
     np.testing.assert_allclose(bag.x[-1], (0.25, 0.0625), atol=1e-2)
     (track,) = read_tracks([bag])
-    assert track.task is not None and bag.heard is not None
-    expected = np.linalg.norm(bag.x - bag.heard.points[:, :2], axis=1)
+    assert track.task is not None and bag.received is not None
+    expected = np.linalg.norm(bag.x - bag.received.points[:, :2], axis=1)
     np.testing.assert_allclose(track.task.error, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -373,9 +373,9 @@ from twodof.ros.publisher import Publisher
 
 steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
 run = twodof.experiment(sys.argv[1], stop_time=steps / 100)
-wire, memory = Publisher(scene=True), Memory(steps // 10)
+publisher, memory = Publisher(scene=True), Memory(steps // 10)
 pace = RealTime() if paced else None
-summary = twodof.simulate(run, wire, memory, pace=pace, steer=wire.command)
+summary = twodof.simulate(run, publisher, memory, pace=pace, steer=publisher.command)
 assert summary.last.k == steps
 print(memory.growth)
 """
@@ -415,7 +415,7 @@ def test_an_hour_has_flat_memory(
     ],
 )
 def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> None:
-    assert network(variables) == place
+    assert network_of_environment(variables) == place
 
 
 @pytest.mark.parametrize(
@@ -475,15 +475,15 @@ def test_a_publisher_tells_each_run_what_holds_for_it(
     native_path: Path, number: int, listen: Callable[..., Node]
 ) -> None:
     """Also the second, whose robot may be another."""
-    wire = twodof.Publisher(network(environment(number)), scene=True)
+    publisher = twodof.Publisher(network_of_environment(environment(number)), scene=True)
     run = twodof.experiment(native_path, stop_time=0.02)
-    twodof.publish(run, wire=wire)
+    twodof.publish(run, publisher=publisher)
     node = listen("/robot_description", "/joint_states")
 
     def heard() -> bool:
         return bool(node.messages("/robot_description"))
 
-    twodof.publish(twodof.experiment(native_path), wire=wire, stop=heard)
+    twodof.publish(twodof.experiment(native_path), publisher=publisher, stop=heard)
     node.until(heard)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import twodof
 from twodof.cli.main import main
-from twodof.sweeps.ranking import places
+from twodof.sweeps.ranking import ranks
 
 UR5 = "ur_description/urdf/ur5_robot.urdf"
 GOAL = (0.9, 0.1, 0.3, 0.2)
@@ -194,6 +194,6 @@ def test_what_rounding_tells_apart_is_equal(
     ],
 )
 def test_places_are_those_of_the_values(values: tuple[float, ...], expected: tuple[int, ...]) -> None:
-    assert tuple(places(np.array(values))) == expected
+    assert tuple(ranks(np.array(values))) == expected
     shuffled = np.random.default_rng(1).permutation(len(values))
-    assert tuple(places(np.array(values)[shuffled])) == tuple(np.array(expected, int)[shuffled])
+    assert tuple(ranks(np.array(values)[shuffled])) == tuple(np.array(expected, int)[shuffled])

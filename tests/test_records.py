@@ -40,7 +40,7 @@ import twodof
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_bag, read_ends
 from twodof.bag.recording import Recording
-from twodof.bag.records import Allowance, DamageError
+from twodof.bag.records import DamageError, ReadBudget
 from twodof.cli.main import main
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -186,7 +186,7 @@ def test_mcap_of_records_that_are_all_alike_is_not_read_to_its_end(bag: Path) ->
     file.write_bytes(TOPIC + packed * 100 + FOOTER)
     numbers = count()
     with pytest.raises(DamageError, match="unpacks to more than 1000 times its size"):
-        for _ in read_messages(file, Allowance()):
+        for _ in read_messages(file, ReadBudget()):
             next(numbers)
     assert next(numbers) < file.stat().st_size
 
@@ -218,7 +218,7 @@ def test_mcap_of_what_is_at_rest_is_read_at_any_length(tmp_path: Path, what: str
     messages = b"".join(message(data(stamp), stamp) for stamp in stamps)
     packed = chunk(PACKERS[compression](messages), len(messages), compression)
     (tmp_path / "x.mcap").write_bytes(TOPIC + packed + FOOTER)
-    found = read_messages(tmp_path / "x.mcap", Allowance(left=10_000))
+    found = read_messages(tmp_path / "x.mcap", ReadBudget(left=10_000))
     assert np.concatenate([stamps for _, stamps, _ in found]).tolist() == stamps
 
 

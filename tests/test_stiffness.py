@@ -90,8 +90,8 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
     # D (M⁻¹)₂₂, what joint 2 answers to its own speed with
     inertia = pin.crba(plant.robot.model, plant.robot.model.createData(), np.array(plant.q))
     rate = 1e6 * np.linalg.inv(np.triu(inertia) + np.triu(inertia, 1).T)[1, 1]
-    *obstacle, found = of.obstacle()
-    assert obstacle == [MANY_EVALUATIONS, 1] and found == pytest.approx(rate, rel=1e-3)
+    *failure, found = of.failure()
+    assert failure == [MANY_EVALUATIONS, 1] and found == pytest.approx(rate, rel=1e-3)
     if length(1, 0):  # a million evaluations in Python
         with pytest.raises(DiscardError, match="joint 'joint2' changes at a rate") as told:
             plant.step(STEP)
@@ -108,7 +108,7 @@ def test_a_largest_step_beyond_the_budget_is_refused_at_once(max_step):
     before = values.copy()
     assert of.call("advance", values, STEP) == 0
     assert (values == before).all()
-    assert of.obstacle()[0] == MANY_STEPS
+    assert of.failure()[0] == MANY_STEPS
     with pytest.raises(DiscardError, match=f"max_step = {max_step:g} s divides .*; enlarge max_step"):
         plant.step(STEP)
     assert plant.q == [0.5, 0.35]
@@ -120,7 +120,7 @@ def test_tolerances_that_nothing_satisfies_are_named(tolerance, length):
     plant = shipped(of, rtol=tolerance, atol=tolerance)
     values = of.values(plant)
     assert of.call("advance", values, STEP) == 0
-    assert of.obstacle()[0] in (MANY_EVALUATIONS, SMALL_STEPS)
+    assert of.failure()[0] in (MANY_EVALUATIONS, SMALL_STEPS)
     if length(1, 0):
         with pytest.raises(DiscardError, match=f"^rtol = {tolerance:g} and atol = .* enlarge rtol"):
             plant.step(STEP)

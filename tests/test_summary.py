@@ -18,7 +18,7 @@ from mcap.writer import Writer
 import twodof
 from twodof.bag.contents import read_messages
 from twodof.bag.reader import read_ends
-from twodof.bag.records import Allowance
+from twodof.bag.records import ReadBudget
 from twodof.bag.summary import read_summary
 from twodof.cli.main import main
 
@@ -73,7 +73,7 @@ def test_summary_is_that_of_the_mcap_project(bag: Path) -> None:
     assert ours.counts == theirs.statistics.channel_message_counts
     assert sum(ours.counts.values()) == read == 4 * 3001 + 2
     assert {n: c.topic for n, c in ours.channels.items()} == {n: c.topic for n, c in theirs.channels.items()}
-    assert [c.place for c in ours.chunks] == [c.chunk_start_offset for c in theirs.chunk_indexes]
+    assert [c.offset for c in ours.chunks] == [c.chunk_start_offset for c in theirs.chunk_indexes]
     assert len(ours.chunks) > 2
 
 
@@ -92,7 +92,7 @@ def test_a_summary_is_not_read_with_all_that_comes_before(bag: Path) -> None:
     summary, content = read_summary(file), bytearray(file.read_bytes())
     assert summary is not None
     middle = summary.chunks[len(summary.chunks) // 2]
-    content[middle.place + 200 : middle.place + middle.length] = bytes(middle.length - 200)
+    content[middle.offset + 200 : middle.offset + middle.length] = bytes(middle.length - 200)
     file.write_bytes(content)
     assert ends(bag) == expected
     with pytest.raises(twodof.TwoDofError, match="damaged"):
@@ -159,7 +159,7 @@ def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag: Path) -> Non
     file = file_of(bag)
     summary, content = read_summary(file), bytearray(file.read_bytes())
     assert summary is not None
-    content[summary.chunks[-1].place] = 7
+    content[summary.chunks[-1].offset] = 7
     file.write_bytes(content)
     with pytest.raises(twodof.TwoDofError, match="is damaged at byte"):
         read_ends(bag)
@@ -210,7 +210,7 @@ def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path: Path) -> 
             writer.add_message(channels[i], k, data, k)
         writer.finish()
     read: list[tuple[int, int, bytes]] = []
-    for channel, stamps, messages in read_messages(file, Allowance()):
+    for channel, stamps, messages in read_messages(file, ReadBudget()):
         for stamp, message in zip(stamps.tolist(), messages, strict=True):
             read.append((int(channel.topic[1:]), stamp, message.tobytes()))
     read.sort(key=lambda each: each[0])  # stable

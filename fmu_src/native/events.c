@@ -23,10 +23,10 @@ static const double SLOW = 1e-4;
 
 void find_stops(const Plant *plant, Stops *stops)
 {
-    const int kept[N_JOINTS] = {0};
+    const int anti_chatter[N_JOINTS] = {0};
     double a[N_JOINTS], pressed[N_JOINTS];
     stops->rank = acceleration(plant, &plant->value[Q], &plant->value[V], ANY_RANK, a, NULL);
-    hold(plant, &plant->value[Q], a, kept, stops, pressed);
+    hold(plant, &plant->value[Q], a, anti_chatter, stops, pressed);
 }
 
 /* Distance to a place past a limit, and more where a joint moves away from it, at v: there a solver's
@@ -67,7 +67,7 @@ int handle_event(Plant *plant, Stops *stops)
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     double before[N_STATES], y[N_STATES], fastest = 0.0;
-    int kept[N_JOINTS] = {0};
+    int anti_chatter[N_JOINTS] = {0};
     memcpy(before, &plant->value[Q], sizeof before);
     memcpy(y, before, sizeof y);
     for (int i = 0; i < N_JOINTS; i++) {
@@ -80,8 +80,8 @@ int handle_event(Plant *plant, Stops *stops)
             fastest = fmax(fastest, (y[i] == high[i] ? 1.0 : -1.0) * y[N_JOINTS + i]);
     }
     for (int i = 0; i < N_JOINTS; i++)
-        kept[i] = stops->held[i] && fastest < SLOW;
-    impact(plant, y, kept);
+        anti_chatter[i] = stops->held[i] && fastest < SLOW;
+    impact(plant, y, anti_chatter);
     memcpy(&plant->value[Q], y, sizeof y);
     find_stops(plant, stops);
     return memcmp(before, y, sizeof y) != 0;

@@ -173,7 +173,7 @@ Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
     double *value = state->plant.value;
-    const int kept[N_JOINTS] = {0};
+    const int anti_chatter[N_JOINTS] = {0};
     if (check_limits(instance) != OK || check_inputs(instance) != OK)
         return ERROR;
     for (int i = 0; i < N_JOINTS; i++) {
@@ -187,7 +187,7 @@ Status initialise(Instance *instance, int warn)
         value[Q + i] = q;
         value[V + i] = value[V_START + i];
     }
-    impact(&state->plant, &value[Q], kept);
+    impact(&state->plant, &value[Q], anti_chatter);
     state->initialised = 1;
     state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
     return OK;

@@ -15,27 +15,27 @@
 #include "stops.h"
 
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
-/* As parts of the largest step, of PATIENCE, of the last hold, and of PATIENCE. Anti-chatter: where a
-   joint is back at its limit sooner than PATIENCE after it left, it is held there for FIRST_HOLD, and
-   at each repetition LONGER; from HOLD_OF_ALL on, with all joints at limits. Where an acceleration only
-   grazes zero, or where impacts drive joints off each other's limits, they would else leave and return
-   without end; a joint that returns once is held for some nanoseconds. The rank of J⁺ is held in the
-   same way where it drops soon after a rise: the motion leads back to the jump from both sides, and
-   slides along it. A higher rank is never held, as its J⁺ has no bound. */
-static const double PATIENCE = 0.5, FIRST_HOLD = 1.0 / 32768.0, LONGER = 8.0,
+/* Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held
+   there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
+   HOLD_OF_ALL (part of CHATTER_TIME) or more covers all joints at limits. Otherwise an acceleration that grazes
+   zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A
+   joint that returns once is held for some nanoseconds. The rank of J⁺ is held in the same way where it drops
+   soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
+   never held, because its J⁺ is unbounded. */
+static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 32768.0, HOLD_GROWTH = 8.0,
                     HOLD_OF_ALL = 1.0 / 4096.0;
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
 
 /* Set out at y, where joints may rest at a limit. */
-static void set_out(Step *step, const int kept[N_JOINTS], int rank_held)
+static void set_out(Step *step, const int anti_chatter[N_JOINTS], int rank_held)
 {
     double *a = step->K[0] + N_JOINTS;
-    impact(step->plant, step->y, kept);
+    impact(step->plant, step->y, anti_chatter);
     step->evaluations++;
     step->stops.rank = acceleration(step->plant, step->y, step->y + N_JOINTS,
                                     rank_held ? step->stops.rank : ANY_RANK, a, &step->margin);
-    hold(step->plant, step->y, a, kept, &step->stops, step->pressed[0]);
+    hold(step->plant, step->y, a, anti_chatter, &step->stops, step->pressed[0]);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
 }
 
@@ -50,12 +50,12 @@ static int is_finite(const Step *step)
 
 /* Name the joint whose own acceleration answers most to its position or velocity at y: the rate is
    the largest of |∂q̈ᵢ/∂vᵢ| and |∂q̈ᵢ/∂qᵢ|½. */
-static void find_fastest(Step *step, Obstacle *obstacle)
+static void find_fastest(Step *step, Failure *failure)
 {
     double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS], pressed[N_JOINTS];
     evaluate(step, step->y, a, pressed, NULL);
-    obstacle->joint = 0;
-    obstacle->rate = -1.0;
+    failure->joint = 0;
+    failure->rate = -1.0;
     for (int i = 0; i < N_STATES; i++) {
         const int joint = i % N_JOINTS;
         memcpy(nudged, step->y, sizeof nudged);
@@ -63,9 +63,9 @@ static void find_fastest(Step *step, Obstacle *obstacle)
         evaluate(step, nudged, answer, pressed, NULL);
         double rate = fabs(answer[joint] - a[joint]) / NUDGE;
         rate = !isfinite(rate) ? HUGE_VAL : i < N_JOINTS ? sqrt(rate) : rate;
-        if (rate > obstacle->rate) {
-            obstacle->joint = joint;
-            obstacle->rate = rate;
+        if (rate > failure->rate) {
+            failure->joint = joint;
+            failure->rate = rate;
         }
     }
 }
@@ -73,7 +73,7 @@ static void find_fastest(Step *step, Obstacle *obstacle)
 /* Integrate from the time t, at y, until an event or until the end: the time reached, y being the
    state there; NaN where that cannot be done. */
 static double until_event(Step *step, double t, double end, int rank_held, Event *event,
-                          Obstacle *obstacle)
+                          Failure *failure)
 {
     const double max_step = step->plant->value[MAX_STEP];
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
@@ -100,27 +100,27 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
             next = step->size * (isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
             if (next < 10.0 * (nextafter(end, HUGE_VAL) - end)) {
-                obstacle->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
-                find_fastest(step, obstacle);
+                failure->reason = is_finite(step) ? SMALL_STEPS : NOT_FINITE;
+                find_fastest(step, failure);
                 return NAN;
             }
         }
     }
-    obstacle->reason = MANY_EVALUATIONS;
-    find_fastest(step, obstacle);
+    failure->reason = MANY_EVALUATIONS;
+    find_fastest(step, failure);
     return NAN;
 }
 
 /* How long joints are held at their limits, or the rank of J⁺. */
 typedef struct {
-    double until, wait;
+    double until, length;
 } Hold;
 
-static void hold_for_a_while(Hold *hold, double t, double patience)
+static void hold_for_a_while(Hold *hold, double t, double chatter_time)
 {
-    const int again = t - hold->until < patience;
-    hold->wait = again ? fmin(LONGER * hold->wait, patience) : FIRST_HOLD * patience;
-    hold->until = t + hold->wait;
+    const int again = t - hold->until < chatter_time;
+    hold->length = again ? fmin(HOLD_GROWTH * hold->length, chatter_time) : FIRST_HOLD * chatter_time;
+    hold->until = t + hold->length;
 }
 
 static int is_at_limit(const Step *step, int i)
@@ -129,34 +129,33 @@ static int is_at_limit(const Step *step, int i)
     return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
 }
 
-/* Hold joints that chatter at t, and with those that do so for long all at limits. Joints are kept while
-   they are held. */
+/* Hold the joints that chatter at t; long holds cover all joints at limits. */
 static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *hold, double t,
-                        double patience, int kept[N_JOINTS])
+                        double chatter_time, int anti_chatter[N_JOINTS])
 {
     int any = 0;
     for (int i = 0; i < N_JOINTS; i++)
         any |= chattering[i];
     if (any)
-        hold_for_a_while(hold, t, patience);
+        hold_for_a_while(hold, t, chatter_time);
     else if (hold->until > t)
         return;
-    const int all = any && hold->wait >= HOLD_OF_ALL * patience;
+    const int all = any && hold->length >= HOLD_OF_ALL * chatter_time;
     for (int i = 0; i < N_JOINTS; i++)
-        kept[i] = all ? is_at_limit(step, i) : chattering[i];
+        anti_chatter[i] = all ? is_at_limit(step, i) : chattering[i];
 }
 
-int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle *obstacle)
+int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Failure *failure)
 {
-    const double patience = PATIENCE * fmin(plant->value[MAX_STEP], h);
+    const double chatter_time = CHATTER_TIME * fmin(plant->value[MAX_STEP], h);
     double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
     Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0};
-    int kept[N_JOINTS] = {0}, chattering[N_JOINTS] = {0};
+    int anti_chatter[N_JOINTS] = {0}, chattering[N_JOINTS] = {0};
     Event event = {{0}, {0}};
     Step step;
     double t = 0.0;
     if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
-        obstacle->reason = MANY_STEPS;
+        failure->reason = MANY_STEPS;
         return 0;
     }
     step.plant = plant;
@@ -172,10 +171,10 @@ int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle 
         const int before = step.stops.rank, rank_held = rank.until > t;
         double end = rank_held ? fmin(h, rank.until) : h;
         int again = 0;
-        hold_joints(&step, chattering, &joints, t, patience, kept);
+        hold_joints(&step, chattering, &joints, t, chatter_time, anti_chatter);
         if (joints.until > t)
             end = fmin(end, joints.until);
-        set_out(&step, kept, rank_held);
+        set_out(&step, anti_chatter, rank_held);
         for (int i = 0; i < N_JOINTS; i++) {
             if (!step.stops.held[i] && is_at_limit(&step, i))
                 left[i] = t;
@@ -187,13 +186,13 @@ int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle 
             continue;
         if (step.stops.rank > before)
             risen = t;
-        if (step.stops.rank < before && t - risen < patience) {
-            hold_for_a_while(&rank, t, patience);
+        if (step.stops.rank < before && t - risen < chatter_time) {
+            hold_for_a_while(&rank, t, chatter_time);
             continue;
         }
-        t = until_event(&step, t, end, rank_held, &event, obstacle);
+        t = until_event(&step, t, end, rank_held, &event, failure);
         for (int i = 0; i < N_JOINTS; i++) {
-            chattering[i] = event.stopped[i] && t - left[i] < patience;
+            chattering[i] = event.stopped[i] && t - left[i] < chatter_time;
             if (stopped_at && event.stopped[i])
                 stopped_at[i] = fmin(stopped_at[i], t);
         }
@@ -201,8 +200,8 @@ int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle 
     if (isnan(t))
         return 0;
     if (!(joints.until > h))
-        memset(kept, 0, sizeof kept);
-    impact(plant, step.y, kept);
+        memset(anti_chatter, 0, sizeof anti_chatter);
+    impact(plant, step.y, anti_chatter);
     memcpy(&plant->value[Q], step.y, sizeof step.y);
     return 1;
 }

@@ -16,11 +16,11 @@ typedef struct {
     } reason;
     int joint;   /* where too fast: the joint that changes fastest */
     double rate; /* of its change, 1/s */
-} Obstacle;
+} Failure;
 
 /* Advance the plant's state by h seconds, inputs held: Dormand–Prince 5(4) with located
    joint-limit stops. False, and the plant unchanged, where that cannot be done. stopped_at, which may be
    NULL, has the time within the step at which each joint first reached a limit, HUGE_VAL where none did. */
-INTERNAL int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Obstacle *obstacle);
+INTERNAL int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Failure *failure);
 
 #endif

@@ -42,8 +42,8 @@ INTERNAL void task_frame(const JointPosition joint[N_BODIES], const double v[N_J
 INTERNAL void effort_of_force(const JointPosition joint[N_BODIES], const double force[3],
                               double tau[N_JOINTS]);
 
-/* The carrier with a point mass, kg, at a place in the task frame, m. */
-INTERNAL void load_carrier(double payload, const double place[3], Carrier *carrier);
+/* The carrier with a point mass, kg, at an offset in the task frame, m. */
+INTERNAL void load_carrier(double payload, const double offset[3], Carrier *carrier);
 
 /* τ = M(q) a + h(q, v), joint efforts in N·m or N. The gravity is in the root's axes, m/s2. */
 INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const Carrier *carrier,

@@ -72,11 +72,11 @@ int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, d
         return 0;
     Plant again = *plant;
     Stops at_start = *stops;
-    Obstacle obstacle;
+    Failure failure;
     double stopped_at[N_JOINTS], first = HUGE_VAL;
     memcpy(&again.value[Q], start.y, sizeof start.y);
     handle_event(&again, &at_start); /* a solver's rounding is no motion */
-    if (!advance_plant(&again, h, stopped_at, &obstacle))
+    if (!advance_plant(&again, h, stopped_at, &failure))
         return any;
     for (int i = 0; i < N_JOINTS; i++)
         if (turned[i] && stopped_at[i] < first) {

@@ -14,24 +14,24 @@ static int is_far(double point, double time)
 }
 
 /* Say why a step cannot be done, and what would help. */
-static Status discard(Instance *instance, double point, double h, const Obstacle *obstacle)
+static Status discard(Instance *instance, double point, double h, const Failure *failure)
 {
     const char *call = call_name(DO_STEP);
     const double *value = instance->state.plant.value;
-    if (obstacle->reason == NOT_FINITE)
+    if (failure->reason == NOT_FINITE)
         return report(instance, DISCARD, "%s at %.12g s: the equations of motion gave a value"
                       " that is not finite: inputs, payload or speeds are too large", call, point);
-    if (obstacle->reason == MANY_STEPS)
+    if (failure->reason == MANY_STEPS)
         return report(instance, DISCARD, "%s at %.12g s: max_step = %g s divides a step"
                       " of %g s into more than %d integration steps; enlarge max_step or shorten"
                       " the step", call, point, value[MAX_STEP], h, BUDGET / STAGES);
     char need[80] = "integration steps below the resolution of time";
-    if (obstacle->reason == MANY_EVALUATIONS)
+    if (failure->reason == MANY_EVALUATIONS)
         snprintf(need, sizeof need, "more than %d evaluations for the step of %g s", BUDGET, h);
     return report(instance, DISCARD, "%s at %.12g s: rtol = %g and atol = %g need %s:"
                   " joint '%s' changes at a rate of %.3g 1/s; shorten the step, lessen damping or"
                   " gains, or enlarge rtol and atol", call, point, value[RTOL], value[ATOL], need,
-                  JOINT_NAME[obstacle->joint], obstacle->rate);
+                  JOINT_NAME[failure->joint], failure->rate);
 }
 
 Status do_step(void *component, double point, double h)
@@ -52,10 +52,10 @@ Status do_step(void *component, double point, double h)
                       " the stop time, %.12g s", call, h, point, state->stop_time);
     if (check_inputs(instance) != OK)
         return ERROR;
-    Obstacle obstacle;
-    if (!advance_plant(&state->plant, h, NULL, &obstacle)) {
+    Failure failure;
+    if (!advance_plant(&state->plant, h, NULL, &failure)) {
         state->phase = AFTER_DISCARD;
-        return discard(instance, point, h, &obstacle);
+        return discard(instance, point, h, &failure);
     }
     state->time = point + h;
     state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;

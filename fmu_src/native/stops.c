@@ -24,14 +24,14 @@ typedef struct {
     double side; /* the sign of the way back into the range */
 } Contact;
 
-/* The joints at limits; a joint without a range, and those in kept, have stops that act both ways. */
-static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int kept[N_JOINTS],
+/* The joints at limits; a joint without a range, and those in anti_chatter, have stops that act both ways. */
+static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int anti_chatter[N_JOINTS],
                           Contact contact[N_JOINTS])
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     for (int i = 0; i < N_JOINTS; i++) {
         contact[i].there = q[i] >= high[i] || q[i] <= low[i];
-        contact[i].fixed = kept[i] || low[i] == high[i];
+        contact[i].fixed = anti_chatter[i] || low[i] == high[i];
         contact[i].side = q[i] >= high[i] ? -1.0 : 1.0;
     }
 }
@@ -88,12 +88,12 @@ static void complementary(const Plant *plant, const double q[N_JOINTS],
     }
 }
 
-void impact(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS])
+void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
 {
     Contact contact[N_JOINTS];
     double *v = y + N_JOINTS, impulse[N_JOINTS];
     int any = 0;
-    find_contacts(plant, y, kept, contact);
+    find_contacts(plant, y, anti_chatter, contact);
     for (int i = 0; i < N_JOINTS; i++)
         any |= is_pressed(&contact[i], v[i]);
     if (any && plant->value[RIGID_STOPS] != 0.0)
@@ -105,13 +105,13 @@ void impact(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS])
 }
 
 void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
-          const int kept[N_JOINTS], Stops *stops, double pressed[N_JOINTS])
+          const int anti_chatter[N_JOINTS], Stops *stops, double pressed[N_JOINTS])
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
     Contact contact[N_JOINTS];
     double stopped[N_JOINTS], reaction[N_JOINTS] = {0};
     *stops = (Stops){.rank = stops->rank};
-    find_contacts(plant, y, kept, contact);
+    find_contacts(plant, y, anti_chatter, contact);
     for (int i = 0; i < N_JOINTS; i++)
         contact[i].there &= y[N_JOINTS + i] == 0.0; /* the others move away */
     memcpy(stopped, a, sizeof stopped);

@@ -14,15 +14,15 @@ typedef struct {
 } Stops;
 
 #ifndef IS_COMPLEX
-/* Take the velocity that points into a limit, from the state y = (q, v). Joints in kept stop there,
-   whichever way they move: where two in turn drive off each other, as the feet of a rocking block,
-   impacts would else not end in finite time. */
-INTERNAL void impact(const Plant *plant, double y[N_STATES], const int kept[N_JOINTS]);
+/* Remove the velocity that points into a limit from the state y = (q, v). Joints in anti_chatter stop in
+   both directions: otherwise mutual impacts, as of the feet of a rocking block, would repeat for ever in
+   finite time (Zeno). */
+INTERNAL void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS]);
 
-/* Find the joints that rest at y, after an impact; a, q̈ without stops, becomes that with them. Those
-   in kept stay whether they are pressed or not. Pressed is that of restrain. */
+/* Find the joints that rest at y after an impact; a, q̈ without stops, becomes q̈ with them. Joints in
+   anti_chatter stay at their limits whatever the contact force. pressed is that of restrain. */
 INTERNAL void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
-                   const int kept[N_JOINTS], Stops *stops, double pressed[N_JOINTS]);
+                   const int anti_chatter[N_JOINTS], Stops *stops, double pressed[N_JOINTS]);
 #endif
 
 /* Whether a joint is nearer to its upper limit than to its lower one. */

@@ -68,14 +68,14 @@ FMI2_Export void probe_pseudo_inverse(double J[], double b[], double rcond, doub
 #endif
 
 /* q̈ with stops at a state after an impact, that state, and the joints that rest. */
-FMI2_Export void probe_stopped(double value[], const int kept[], double a[], double held[])
+FMI2_Export void probe_stopped(double value[], const int anti_chatter[], double a[], double held[])
 {
     const Plant *plant = (Plant *)value;
     Stops stops;
     double pressed[N_JOINTS];
-    impact(plant, &value[Q], kept);
+    impact(plant, &value[Q], anti_chatter);
     acceleration(plant, &value[Q], &value[V], ANY_RANK, a, NULL);
-    hold(plant, &value[Q], a, kept, &stops, pressed);
+    hold(plant, &value[Q], a, anti_chatter, &stops, pressed);
     for (int i = 0; i < N_JOINTS; i++)
         held[i] = stops.held[i];
 }
@@ -93,18 +93,18 @@ static int rank_of(const double value[])
     return acceleration((const Plant *)value, &value[Q], &value[V], ANY_RANK, a, NULL);
 }
 
-static Obstacle obstacle;
+static Failure failure;
 
 FMI2_Export int probe_advance(double value[], double h)
 {
-    return advance_plant((Plant *)value, h, NULL, &obstacle);
+    return advance_plant((Plant *)value, h, NULL, &failure);
 }
 
-FMI2_Export void probe_obstacle(double result[])
+FMI2_Export void probe_failure(double result[])
 {
-    result[0] = obstacle.reason;
-    result[1] = obstacle.joint;
-    result[2] = obstacle.rate;
+    result[0] = failure.reason;
+    result[1] = failure.joint;
+    result[2] = failure.rate;
 }
 
 FMI2_Export void probe_outputs(double value[])

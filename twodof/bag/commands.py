@@ -23,7 +23,7 @@ from ..simulation.experiments import NANOSECONDS, Changes, Setting, Value, defau
 from .contents import read_messages
 from .provenance import KNOWN_UNTIL, read_provenance, robot_in
 from .reader import whole_bag
-from .records import Allowance, DamageError
+from .records import DamageError, ReadBudget
 
 LOG = logging.getLogger(__name__)
 SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of what a robot did
@@ -89,8 +89,8 @@ def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict
     topics: dict[str, Stored] = {}
     begins: dict[str, int] = {}
     try:
-        files, allowance = whole_bag(path), Allowance()
-        messages = chain.from_iterable(read_messages(file, allowance) for file in files)
+        files, budget = whole_bag(path), ReadBudget()
+        messages = chain.from_iterable(read_messages(file, budget) for file in files)
         for channel, stamps, data in messages:
             if channel.type == JOINT_STATE:
                 first = int(stamps.min())
@@ -136,9 +136,9 @@ def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read],
         except CommandError as error:
             t = (came - begin) / NANOSECONDS
             raise InputError(f"{bag}: the command at {t:g} s {error}") from error
-    if names := {name for _, command in said for name in command.strangers}:
-        strangers = ", ".join(sorted(names))[:LONGEST_NAME]
-        LOG.warning(f"{bag}: joints that this robot has not are left out: {strangers!r}")
+    if names := {name for _, command in said for name in command.unknown_joints}:
+        unknown_joints = ", ".join(sorted(names))[:LONGEST_NAME]
+        LOG.warning(f"{bag}: joints that this robot has not are left out: {unknown_joints!r}")
     return said
 
 

@@ -10,7 +10,7 @@ from ..bounds import MAX_METADATA
 from ..errors import BagError
 from ..files import read_file
 from .mcap import mcap_messages
-from .records import Allowance, Batch, refusing_damage
+from .records import Batch, ReadBudget, refusing_damage
 from .sqlite import sqlite3_messages
 
 
@@ -42,12 +42,12 @@ def stated_count(folder: Path) -> int | None:
     return int(stated[1]) if stated else None
 
 
-def read_messages(file: Path, allowance: Allowance) -> Iterator[Batch]:
+def read_messages(file: Path, budget: ReadBudget) -> Iterator[Batch]:
     """Read all messages of a file; those of a channel are in order.
 
     Args:
         file: one of a bag's.
-        allowance: of the bag.
+        budget: of the bag.
 
     Raises:
         DamageError: where the file ends in the middle or is not sound.
@@ -55,4 +55,4 @@ def read_messages(file: Path, allowance: Allowance) -> Iterator[Batch]:
     """
     mcap = file.suffix == ".mcap"
     with refusing_damage(file):
-        yield from mcap_messages(file, allowance) if mcap else sqlite3_messages(file)
+        yield from mcap_messages(file, budget) if mcap else sqlite3_messages(file)

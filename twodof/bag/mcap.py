@@ -15,7 +15,7 @@ import numpy as np
 
 from ..bounds import MAX_CHUNK, MAX_RATIO, MAX_TOPICS
 from ..ros.cdr import Rows
-from .records import RECORD, TEXT, Allowance, Batch, Channel, DamageError, refusing_damage
+from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, refusing_damage
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -31,26 +31,26 @@ STAMP = slice(15, 23)  # the first of them
 MANY = 1000  # records outside of chunks
 
 
-def mcap_messages(path: Path, allowance: Allowance) -> Iterator[Batch]:
+def mcap_messages(path: Path, budget: ReadBudget) -> Iterator[Batch]:
     """Read all messages of a file; errors as of ``read_messages``."""
     tables = Tables()
-    for records in _chunks(path, allowance):
-        yield from messages_in(path, records, tables, allowance)
+    for records in _chunks(path, budget):
+        yield from messages_in(path, records, tables, budget)
 
 
-def _chunks(path: Path, allowance: Allowance) -> Iterator[bytes]:
+def _chunks(path: Path, budget: ReadBudget) -> Iterator[bytes]:
     """Yield the records of each chunk, and those outside of chunks, many at a time."""
     loose: list[bytes] = []
     try:
-        for opcode, content in _records(path, allowance):
-            allowance.left += MAX_RATIO * len(content)
+        for opcode, content in _records(path, budget):
+            budget.left += MAX_RATIO * len(content)
             if opcode != CHUNK:
                 loose.append(content)
             if opcode == CHUNK or len(loose) > MANY:
                 before, loose = b"".join(loose), []
                 yield before
             if opcode == CHUNK:
-                yield unpack_chunk(path, content, allowance)
+                yield unpack_chunk(path, content, budget)
     except DamageError:  # what came before is sound
         yield b"".join(loose)
         raise
@@ -60,25 +60,25 @@ def _chunks(path: Path, allowance: Allowance) -> Iterator[bytes]:
 def read_metadata(path: Path, name: str, key: str) -> str:
     """Return an entry of a file's own metadata, "" where it has none; errors as of ``read_messages``."""
     with refusing_damage(path):
-        for _, content in _records(path, Allowance(), (METADATA,)):
+        for _, content in _records(path, ReadBudget(), (METADATA,)):
             title, _, position = fields("sI", content, HEAD.size)
             if title == name:
                 return _entries(content[position:]).get(key, "")
     return ""
 
 
-def messages_in(path: Path, chunk: bytes, tables: Tables, allowance: Allowance) -> Iterator[Batch]:
+def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) -> Iterator[Batch]:
     """Return the messages of a chunk.
 
     Where messages of equal lengths come in turns, as a writer's of ROS 2 mostly do, all are taken
     at once: record by record, Python would take a microsecond for each.
     """
     position = 0
-    seen: dict[bytes, int] = {}  # heads of the last records, which are messages, and their places
+    seen: dict[bytes, int] = {}  # heads of the last records, which are messages, and their offsets
 
-    def alone(places: Iterable[int]) -> Iterator[Batch]:
-        for place in places:
-            yield tables.batch(path, np.frombuffer(chunk, np.uint8, offset=place)[None])
+    def alone(offsets: Iterable[int]) -> Iterator[Batch]:
+        for offset in offsets:
+            yield tables.batch(path, np.frombuffer(chunk, np.uint8, offset=offset)[None])
 
     while position + HEAD.size <= len(chunk):
         opcode, length = HEAD.unpack_from(chunk, position)
@@ -87,21 +87,21 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, allowance: Allowance) 
             break
         head = chunk[position : position + HEAD.size + 2]
         if head in seen:
-            turn = [place for place in seen.values() if place >= seen[head]]
+            turn = [offset for offset in seen.values() if offset >= seen[head]]
             yield from alone([*seen.values()][: -len(turn)])
             rows = _turns(chunk, turn, position)
-            allowance.spend(RECORD * (len(rows) - 1) * len(turn))
-            for place in turn:
-                yield tables.batch(path, rows[:, place - turn[0] :])
+            budget.spend(RECORD * (len(rows) - 1) * len(turn))
+            for offset in turn:
+                yield tables.batch(path, rows[:, offset - turn[0] :])
             position, seen = turn[0] + rows.size, {}
             continue
-        allowance.spend(RECORD)
+        budget.spend(RECORD)
         if opcode == MESSAGE:
             seen[head] = position
         elif opcode in (SCHEMA, CHANNEL):
             yield from alone(seen.values())
             seen = {}
-            allowance.spend(TEXT * length)
+            budget.spend(TEXT * length)
             tables.add(path, opcode, chunk, position + HEAD.size)
         position = end
     yield from alone(seen.values())
@@ -117,8 +117,8 @@ def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
     every = np.frombuffer(chunk, np.uint8, offset=turn[0])
     length = end - turn[0]
     rows = every[: len(every) // length * length].reshape(-1, length)
-    heads = np.concatenate([np.arange(place, place + HEAD.size + 2) for place in turn]) - turn[0]
-    channels = {chunk[place + HEAD.size : place + HEAD.size + 2] for place in turn}
+    heads = np.concatenate([np.arange(offset, offset + HEAD.size + 2) for offset in turn]) - turn[0]
+    channels = {chunk[offset + HEAD.size : offset + HEAD.size + 2] for offset in turn}
     if len(channels) < len(turn):
         return rows[:1]
     count, ahead = 1, 16
@@ -163,7 +163,7 @@ class Tables:
         return Batch(self.channels[channel], stamps, rows[:, MESSAGE_HEAD.size : end])
 
 
-def _records(path: Path, allowance: Allowance, wanted: Sequence[int] = READ) -> Iterator[tuple[int, bytes]]:
+def _records(path: Path, budget: ReadBudget, wanted: Sequence[int] = READ) -> Iterator[tuple[int, bytes]]:
     """Yield the opcode of each record up to the requested footer, and the record with its header.
 
     Of a chunk, the content alone.
@@ -178,7 +178,7 @@ def _records(path: Path, allowance: Allowance, wanted: Sequence[int] = READ) -> 
             if len(head) < HEAD.size:
                 raise DamageError(f"'{path.name}' ends in the middle, at byte {start + len(head)}")
             opcode, length = HEAD.unpack(head)
-            allowance.spend(RECORD)
+            budget.spend(RECORD)
             position += HEAD.size + length
             if opcode == 0 or position > size:
                 raise DamageError(f"'{path.name}' ends in the middle or is damaged at byte {start}")
@@ -195,13 +195,13 @@ def _records(path: Path, allowance: Allowance, wanted: Sequence[int] = READ) -> 
                 file.seek(length, 1)
 
 
-def unpack_chunk(path: Path, content: bytes, allowance: Allowance) -> bytes:
+def unpack_chunk(path: Path, content: bytes, budget: ReadBudget) -> bytes:
     """Return the records of a chunk."""
     _, _, size, crc, compression, length, start = fields("QQQIsQ", content, 0)
     packed = content[start : start + length]
     if size > MAX_CHUNK:
         raise DamageError(f"'{path.name}' has a chunk of {size} bytes")
-    allowance.spend(size)
+    budget.spend(size)
     try:
         if compression == "zstd":
             packed = zstd.ZstdDecompressor().decompress(packed, max_length=size)

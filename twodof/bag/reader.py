@@ -18,10 +18,10 @@ from ..files import is_being_written, shown
 from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
 from .contents import read_messages, stated_count, storage_files
-from .outline import Indices, Outline
+from .downsampling import Downsampler, Indices
 from .provenance import file_of, read_provenance, robot_in, robots_of
-from .recording import Array, Heard, Recording, TopicCount
-from .records import Allowance, DamageError, Stamps
+from .recording import Array, ReceivedTargets, Recording, TopicCount
+from .records import DamageError, ReadBudget, Stamps
 from .summary import read_summary
 
 MAX_JOINT_STATE = 1024**2  # bytes; some ten thousand joints
@@ -42,13 +42,13 @@ def read_bag(path: str | Path) -> Recording:
     return _read(Path(path), _JointStates, _Targets())
 
 
-def read_outline(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
+def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
     """Read a bag as ``read_bag`` does, downsampled to at most ``most`` samples for drawing.
 
     Besides those of a chunk of the bag no more are in memory. ``lines`` gives what is drawn over
     time beside positions and velocities, of a part of the bag; what it raises is raised here too.
     """
-    return _read(Path(path), _JointStates, _Targets(), Outline(most, lines))
+    return _read(Path(path), _JointStates, _Targets(), Downsampler(most, lines))
 
 
 def read_ends(path: str | Path) -> Recording:
@@ -78,9 +78,9 @@ def read_ends(path: str | Path) -> Recording:
         if len(stating) > 1 and usual not in stating:  # that which begins first in the file
             return _read(path, _Ends, None)
         chosen = usual if usual in stating else "".join(stating)
-        ends, allowance = _Ends(path), Allowance()
+        ends, budget = _Ends(path), ReadBudget()
         for summary in filter(None, summaries):
-            for batch in summary.ends(chosen, allowance):
+            for batch in summary.ends(chosen, budget):
                 ends.add(batch.stamps, batch.messages)
         _check_count(folder, total)
         return _recording(path, counts, chosen, ends, None)
@@ -110,19 +110,21 @@ def _refusing(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _read(path: Path, kind: type[_JointStates], targets: _Targets | None, outline: Outline | None = None) -> Recording:
+def _read(
+    path: Path, kind: type[_JointStates], targets: _Targets | None, downsampler: Downsampler | None = None
+) -> Recording:
     """Read a bag's joint states by a kind of reader, and downsample them."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states, total = "", kind(path), 0
-    allowance, thinned = Allowance(), False
+    budget, thinned = ReadBudget(), False
 
-    def thin(outline: Outline) -> None:
-        states.keep(outline.choose(_recording(path, counts, chosen, states, targets)))
+    def thin(downsampler: Downsampler) -> None:
+        states.keep(downsampler.choose(_recording(path, counts, chosen, states, targets)))
 
     folder, prefix, others = _place(path)
     with _refusing(folder):
         for file in whole_bag(folder):
-            for channel, stamps, messages in read_messages(file, allowance):
+            for channel, stamps, messages in read_messages(file, budget):
                 total += len(stamps)
                 if not _is_within(channel.topic, prefix, others):
                     continue
@@ -133,8 +135,8 @@ def _read(path: Path, kind: type[_JointStates], targets: _Targets | None, outlin
                         chosen, states = channel.topic, kind(path)
                     if channel.topic == chosen:
                         states.add(stamps, messages)
-                        if outline is not None and len(states) > outline.most:
-                            thin(outline)
+                        if downsampler is not None and len(states) > downsampler.most:
+                            thin(downsampler)
                             thinned = True
                 elif targets and channel.topic == prefix + TARGET and channel.type in (POINT, POSE):
                     targets.add(stamps, messages)
@@ -145,8 +147,8 @@ def _read(path: Path, kind: type[_JointStates], targets: _Targets | None, outlin
             f"'{path}' has several topics of joint states, {', '.join(map(shown, stating))};"
             f" what is read is {shown(chosen)}"
         )
-    if outline is not None and thinned:
-        thin(outline)  # the end alike
+    if downsampler is not None and thinned:
+        thin(downsampler)  # the end alike
     return _recording(path, counts, chosen, states, targets)
 
 
@@ -177,7 +179,7 @@ def _recording(
         q=q,
         v=v,
         tau=tau,
-        heard=targets.heard(stamps) if targets is not None else None,
+        received=targets.received(stamps) if targets is not None else None,
         provenance=read_provenance(*robot_in(path)),
     )
 
@@ -293,7 +295,7 @@ class _Targets:
         self._stamps.frombytes(stamps[new].tobytes())
         self._points.frombytes(points[new].tobytes())
 
-    def heard(self, stamps: Stamps) -> Heard | None:
+    def received(self, stamps: Stamps) -> ReceivedTargets | None:
         """Return the latest target at each stamp; None where there are none, or several frames."""
         if self._frame is None or not self._sound:
             return None
@@ -301,5 +303,5 @@ class _Targets:
         order = np.argsort(own, kind="stable")
         points = np.asarray(self._points).reshape(-1, 3)[order]
         latest = np.searchsorted(own[order], stamps, side="right") - 1
-        heard = np.where((latest >= 0)[:, None], points[latest], np.nan)
-        return Heard(self._frame.decode("utf-8", "replace"), heard)
+        received = np.where((latest >= 0)[:, None], points[latest], np.nan)
+        return ReceivedTargets(self._frame.decode("utf-8", "replace"), received)

@@ -40,7 +40,7 @@ class TopicCount:
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedTargets:
     """Targets received on a bag's /target: for each sample the latest one.
 
     Attributes:
@@ -66,7 +66,7 @@ class Recording:
         joints: joint names.
         q, v: positions (rad, m) and velocities, N × n.
         tau: efforts (N·m, N), N × n, or N × 0 where the bag has none.
-        heard: what /target said; None where the bag has no such points.
+        received: what /target said; None where the bag has no such points.
         provenance: what the logger wrote about the run, {} for a bag from elsewhere.
 
     Raises:
@@ -82,7 +82,7 @@ class Recording:
     q: Array
     v: Array
     tau: Array
-    heard: Heard | None
+    received: ReceivedTargets | None
     provenance: dict[str, Any]
 
     def __repr__(self) -> str:
@@ -141,9 +141,9 @@ class Recording:
         if held.size:
             return held
         root = self.provenance.get("root")
-        if self.heard is None or root not in (None, self.heard.frame):
+        if self.received is None or root not in (None, self.received.frame):
             return np.empty((len(self.stamps), 0))
-        return self.heard.points[:, ["xyz".index(axis) for axis in self.axes or "xyz"]]
+        return self.received.points[:, ["xyz".index(axis) for axis in self.axes or "xyz"]]
 
     @property
     def target_quat(self) -> Array:

@@ -51,7 +51,7 @@ class DamageError(Exception):
 
 
 @dataclass
-class Allowance:
+class ReadBudget:
     """Read budget of a bag: the bytes to which its files may still unpack.
 
     A few bytes can unpack to millions, and to records without end that are all alike. The messages

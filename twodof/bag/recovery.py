@@ -22,7 +22,7 @@ from ..errors import BagError
 from ..files import lock, read_file, sync
 from . import provenance
 from .contents import read_messages, stated_count, storage_files
-from .records import Allowance, Channel, DamageError
+from .records import Channel, DamageError, ReadBudget
 from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, check_path
 from .summary import read_summary
 
@@ -120,9 +120,9 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
     try:
         stated = stated_count(folder)
         summaries = [read_summary(file) for file in files]
-        allowance = Allowance()
+        budget = ReadBudget()
         for file in files:
-            for channel, stamps, _ in read_messages(file, allowance):
+            for channel, stamps, _ in read_messages(file, budget):
                 counts[channel.topic] += len(stamps)
     except (OSError, DamageError):
         return None
@@ -134,7 +134,7 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
 def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
     """Write readable messages into a new bag; return messages by topic, and the reason why reading ended."""
     damage = []
-    allowance = Allowance()
+    budget = ReadBudget()
     robots = provenance.robots_of(folder)
     others = set()
     writer = BagWriter(new, KINDS[files[0].suffix])
@@ -151,7 +151,7 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
         topics, pending = _Topics(writer), 0
         for file in files:
             try:
-                for channel, stamps, messages in read_messages(file, allowance):
+                for channel, stamps, messages in read_messages(file, budget):
                     if channel.serialization != "cdr":
                         others.add(channel.topic)
                         continue

@@ -66,8 +66,8 @@ class McapStorage(McapWriter):
             self.channel_stats[connection] += len(stamps)
         begin, times = chunk.bio.tell(), stamps.tolist()
         for connection, offset in zip(messages, ends):
-            places = range(begin + offset, begin + ends[-1] * len(times), ends[-1])
-            chunk.msgs[connection] += zip(times, places)
+            positions = range(begin + offset, begin + ends[-1] * len(times), ends[-1])
+            chunk.msgs[connection] += zip(times, positions)
         chunk.bio.write(np.hstack(parts).tobytes())
         for of in (self, chunk):
             of.message_start_time = min(of.message_start_time, min(times))
@@ -78,13 +78,13 @@ class McapStorage(McapWriter):
         chunk, data, begin = self.chunk, self.chunk.bio.getvalue(), self.bio.tell()
         times = struct.pack("<QQ", chunk.message_start_time, chunk.message_end_time)
         self._write(CHUNK, times + struct.pack("<QIIQ", len(data), 0, 0, len(data)), data)
-        end, places = self.bio.tell(), b""
+        end, positions = self.bio.tell(), b""
         for channel, messages in chunk.msgs.items():
-            places += struct.pack("<HQ", channel, self.bio.tell())
+            positions += struct.pack("<HQ", channel, self.bio.tell())
             index = struct.pack(f"<{2 * len(messages)}Q", *chain.from_iterable(messages))
             self._write(MESSAGE_INDEX, struct.pack("<HI", channel, len(index)), index)
         self.chunks.append(record := BytesIO())
-        record.write(times + struct.pack("<QQI", begin, end - begin, len(places)) + places)
+        record.write(times + struct.pack("<QQI", begin, end - begin, len(positions)) + positions)
         record.write(struct.pack("<QIQQ", self.bio.tell() - end, 0, len(data), len(data)))
         self.chunk = PendingChunk(2**63 - 1, 0, BytesIO(), defaultdict(list))
         self._end = self.bio.tell()

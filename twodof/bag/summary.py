@@ -18,13 +18,13 @@ from zlib import crc32
 
 from ..bounds import MAX_SUMMARY
 from .mcap import CHANNEL, CHUNK, FOOTER, HEAD, MAGIC, SCHEMA, Tables, messages_in, unpack_chunk
-from .records import Allowance, Batch, Channel, DamageError, refusing_damage
+from .records import Batch, Channel, DamageError, ReadBudget, refusing_damage
 
 CHUNK_INDEX, STATISTICS = 8, 11  # opcodes
 FOOTER_FIELDS = struct.Struct("<QQI")
 END = HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
-CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, place, length, bytes of what follows
+CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of what follows
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Chunk:
 
     first: int
     last: int
-    place: int
+    offset: int
     length: int
     channels: frozenset[int]
 
@@ -47,7 +47,7 @@ class McapSummary:
     counts: dict[int, int]
     chunks: list[Chunk]
 
-    def ends(self, topic: str, allowance: Allowance) -> Iterator[Batch]:
+    def ends(self, topic: str, budget: ReadBudget) -> Iterator[Batch]:
         """Return batches that include the first and the last message of a topic.
 
         Raises:
@@ -57,14 +57,14 @@ class McapSummary:
         numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
         chunks = [chunk for chunk in self.chunks if chunk.channels & numbers]
         yield from self._until(
-            sorted(chunks, key=lambda c: c.first), topic, allowance, lambda chunk, stamps: chunk.first > min(stamps)
+            sorted(chunks, key=lambda c: c.first), topic, budget, lambda chunk, stamps: chunk.first > min(stamps)
         )
         yield from self._until(
-            sorted(chunks, key=lambda c: -c.last), topic, allowance, lambda chunk, stamps: chunk.last < max(stamps)
+            sorted(chunks, key=lambda c: -c.last), topic, budget, lambda chunk, stamps: chunk.last < max(stamps)
         )
 
     def _until(
-        self, chunks: list[Chunk], topic: str, allowance: Allowance, beyond: Callable[[Chunk, list[int]], bool]
+        self, chunks: list[Chunk], topic: str, budget: ReadBudget, beyond: Callable[[Chunk, list[int]], bool]
     ) -> Iterator[Batch]:
         """Yield the topic's messages chunk by chunk, while a chunk can have an earlier or later one."""
         stamps: list[int] = []
@@ -72,13 +72,13 @@ class McapSummary:
             for chunk in chunks:
                 if stamps and beyond(chunk, stamps):
                     return
-                file.seek(chunk.place)
+                file.seek(chunk.offset)
                 opcode, length = HEAD.unpack(file.read(HEAD.size))
                 if opcode != CHUNK or HEAD.size + length != chunk.length:
-                    raise DamageError(f"'{self.path.name}' is damaged at byte {chunk.place}")
-                allowance.left += chunk.length
-                content = unpack_chunk(self.path, file.read(length), allowance)
-                for batch in messages_in(self.path, content, Tables(self.channels), allowance):
+                    raise DamageError(f"'{self.path.name}' is damaged at byte {chunk.offset}")
+                budget.left += chunk.length
+                content = unpack_chunk(self.path, file.read(length), budget)
+                for batch in messages_in(self.path, content, Tables(self.channels), budget):
                     if batch.channel.topic == topic:
                         stamps += [int(batch.stamps.min()), int(batch.stamps.max())]
                         yield batch
@@ -121,17 +121,17 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
         if opcode in (SCHEMA, CHANNEL):
             tables.add(path, opcode, content, position)
         elif opcode == CHUNK_INDEX:
-            first, last, place, size, more = CHUNK_FIELDS.unpack_from(content, position)
+            first, last, offset, size, more = CHUNK_FIELDS.unpack_from(content, position)
             offsets = content[position + CHUNK_FIELDS.size :][:more]
             channels = frozenset(number for number, _ in struct.iter_unpack("<HQ", offsets))
-            chunks.append(Chunk(first, last, place, size, channels))
+            chunks.append(Chunk(first, last, offset, size, channels))
         elif opcode == STATISTICS:
             said, *_, chunk_count, _, _, size = STATISTICS_FIELDS.unpack_from(content, position)
             pairs = content[position + STATISTICS_FIELDS.size :][:size]
             counts = dict(struct.iter_unpack("<HQ", pairs))
         position += length
     whole = counts is not None and sum(counts.values()) == said and len(chunks) == chunk_count
-    inside = all(len(MAGIC) <= c.place and c.place + c.length <= start for c in chunks)
+    inside = all(len(MAGIC) <= c.offset and c.offset + c.length <= start for c in chunks)
     if counts is None or not whole or not inside:
         return None
     indexed = frozenset().union(*(chunk.channels for chunk in chunks))

@@ -65,7 +65,7 @@ def add(publish: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
-    from ..ros.network import network
+    from ..ros.network import network_of_environment
     from ..ros.publisher import Publisher, publish, publish_together
     from ..simulation.pace import RealTime
 
@@ -81,7 +81,7 @@ def call(options: argparse.Namespace) -> int:
     if bag is not None:  # a part of it for each robot, in its namespace
         space = options.namespace
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
-    wire = said(
+    publisher = said(
         options,
         "scene",
         "effort",
@@ -93,8 +93,8 @@ def call(options: argparse.Namespace) -> int:
         "timeout",
         "on_timeout",
     )
-    wire["place"] = network(subnet=options.subnet)
-    wire["opened"] = (lambda _: None) if options.json else partial(_print_network, options.stop_time)
+    publisher["network"] = network_of_environment(subnet=options.subnet)
+    publisher["opened"] = (lambda _: None) if options.json else partial(_print_network, options.stop_time)
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
     with asked_to_stop() as asked:
@@ -103,7 +103,7 @@ def call(options: argparse.Namespace) -> int:
             summary = publish(
                 robots[""],
                 *filter(None, [viewer, *bags.values()]),
-                wire=Publisher(**wire),
+                publisher=Publisher(**publisher),
                 pace=pace,
                 stop=asked,
                 steer=viewer.command if viewer else dict,
@@ -111,7 +111,7 @@ def call(options: argparse.Namespace) -> int:
             summaries = {"": summary}
         else:
             sinks = {name: [bag] for name, bag in bags.items()}
-            summaries = publish_together(robots, sinks=sinks, pace=pace, stop=asked, **wire)
+            summaries = publish_together(robots, sinks=sinks, pace=pace, stop=asked, **publisher)
     if options.json:
         facts = {name: facts_of(robots[name], bags.get(name), summary, pace) for name, summary in summaries.items()}
         print_json(**facts.get("", facts))
@@ -162,12 +162,12 @@ def _foxglove(options: argparse.Namespace) -> Foxglove:
     return Foxglove(**port, scene=options.scene, effort=options.effort, set_gains=options.foxglove_control, opened=tell)
 
 
-def _print_network(stop_time: float | None, wire: Publisher) -> None:
-    place = wire.place
+def _print_network(stop_time: float | None, publisher: Publisher) -> None:
+    network = publisher.network
     print_table(
-        ("topics", ", ".join(wire.topics)),
-        ("network", f"DDS domain {place.domain} on {wire.interface}, {in_options(place.reach)}"),
-        ("commands", f"from {', '.join(wire.commands)}" if wire.commands else "none"),
+        ("topics", ", ".join(publisher.topics)),
+        ("network", f"DDS domain {network.domain} on {publisher.interface}, {in_options(network.reach)}"),
+        ("commands", f"from {', '.join(publisher.commands)}" if publisher.commands else "none"),
         ("end", "Ctrl-C" if stop_time is None else f"after {stop_time:g} s, or Ctrl-C"),
     )
-    print_next(f"ros2 topic echo {wire.topics[0]}")
+    print_next(f"ros2 topic echo {publisher.topics[0]}")

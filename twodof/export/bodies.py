@@ -1,6 +1,6 @@
 """Constants of a robot: its bodies, the transforms of its joints, and their coupling.
 
-Vectors and matrices of a body are in the frame of its joint, whose axis is z: frames are turned
+Vectors and matrices of a body are in the frame of its joint, whose axis is z: frames are rotated
 here, once, so that all else knows one kind of axis. Pinocchio has read the URDF.
 """
 
@@ -27,7 +27,7 @@ class Body:
 
     Attributes:
         mass: kg.
-        moment: mass times the place of its centre, kg·m, 3 values.
+        moment: mass times the offset of its centre, kg·m, 3 values.
         inertia: about the frame's origin, kg·m², 3 × 3.
     """
 
@@ -35,10 +35,10 @@ class Body:
     moment: Array
     inertia: Array
 
-    def with_point(self, mass: Any, place: Array) -> Body:
+    def with_point(self, mass: Any, offset: Array) -> Body:
         """Return the body with an added point mass."""
-        points = place * mass
-        tensor = np.eye(3) * place.dot(points) - np.outer(place, points)
+        points = offset * mass
+        tensor = np.eye(3) * offset.dot(points) - np.outer(offset, points)
         return self + Body(mass, points, tensor)
 
     def __add__(self, other: Body) -> Body:
@@ -50,8 +50,8 @@ class Body:
         d = R.dot(self.moment)
         # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
         half = d + p * (0.5 * self.mass)
-        turned = R.dot(self.inertia).dot(R.T)
-        inertia = turned - np.outer(half, p) - np.outer(p, half) + np.eye(3) * (2.0 * half.dot(p))
+        rotated = R.dot(self.inertia).dot(R.T)
+        inertia = rotated - np.outer(half, p) - np.outer(p, half) + np.eye(3) * (2.0 * half.dot(p))
         return Body(self.mass, d + p * self.mass, symmetric(inertia))
 
 
@@ -129,14 +129,14 @@ def joint_tree(robot: Robot) -> JointTree:
 
 
 SKEW = 0.1
-"""Sine of the angle of two axes above which the place where they come nearest is worth knowing."""
+"""Sine of the angle of two axes above which the offset where they come nearest is worth knowing."""
 
 
 def _frames(axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]) -> list[Frame]:
     """Return a frame for each joint, in that of Pinocchio, and the root's as the last.
 
     z is the joint's axis, x its common normal with the next one's, from which the origin is taken;
-    so rotations to the next frame are about x, and the place of that has a component less. Source:
+    so rotations to the next frame are about x, and the offset of that has a component less. Source:
     Khalil & Kleinfinger, "A new geometric notation for open and closed-loop robots", ICRA 1986.
     """
     frames = []

@@ -52,7 +52,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     functions = {
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
         f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements("tau", J[:3].T.dot(force)),
-        "load_carrier(double payload, const double place[3], Carrier *carrier)": load,
+        "load_carrier(double payload, const double offset[3], Carrier *carrier)": load,
         f"inverse_dynamics({motion}, double tau[N_JOINTS])": _elements("tau", effort),
     }
     alike = {
@@ -107,7 +107,7 @@ MECHANISM = """\
 
 #include <math.h>
 """
-HELD = ("carrier->", "gravity[", "payload", "place[")
+HELD = ("carrier->", "gravity[", "payload", "offset[")
 """Parameters, along which there are no derivatives."""
 LOWER = np.tril_indices(3)
 
@@ -127,19 +127,19 @@ def _solution(solution: Array, inertial: Array) -> list[Varied]:
 
 def _places(robot: JointTree) -> dict[str, Value]:
     angles = robot.G.dot(_variables("q", robot.G.shape[1])) + robot.c
-    places: dict[str, Value] = {}
+    variables: dict[str, Value] = {}
     for i, (angle, slides) in enumerate(zip(angles, robot.prismatic)):
         if slides:
-            places[f"joint[{i}].c"] = angle
+            variables[f"joint[{i}].c"] = angle
         else:
-            places[f"joint[{i}]"] = Expression("turn", (angle,))
-    return places
+            variables[f"joint[{i}]"] = Expression("turn", (angle,))
+    return variables
 
 
 def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
     """Return the bodies, the last with the payload as variables, and the names of these."""
-    carrier, place = robot.path[-1], _variables("place", 3)
-    loaded = robot.body[carrier].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(place))
+    carrier, offset = robot.path[-1], _variables("offset", 3)
+    loaded = robot.body[carrier].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
     load = {"carrier->mass": loaded.mass}
     load |= _elements("carrier->moment", loaded.moment)
     load |= _elements("carrier->inertia", loaded.inertia[LOWER])

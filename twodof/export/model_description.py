@@ -214,24 +214,24 @@ def _variables(
     flavour: Flavour,
 ) -> None:
     variables = ET.SubElement(root, "ModelVariables")
-    place = {(variable.group, variable.index): i for i, variable in enumerate(table)}
-    vectors: dict[str, list[int]] = {}  # places of the elements; of a scalar there is one
+    row_of = {(variable.group, variable.index): i for i, variable in enumerate(table)}
+    vectors: dict[str, list[int]] = {}  # indices of the elements; of a scalar there is one
     for i, name in enumerate(names):
         vectors.setdefault(name, []).append(i)
-    for name, places in vectors.items():
-        first, elements = table[places[0]], []
-        for i in places:
+    for name, indices in vectors.items():
+        first, elements = table[indices[0]], []
+        for i in indices:
             group, index, start = table[i].group, table[i].index, table[i].start
             if group in STATES:
-                start = table[place[f"{group}_start", index]].start
+                start = table[row_of[f"{group}_start", index]].start
             attributes = _attributes(robot, table[i], start, flavour.native)
             elements.append({"valueReference": str(i), **attributes})
         shared = set.intersection(*(set(element.items()) for element in elements))
         attributes = {"name": name} | {k: v for k, v in elements[0].items() if (k, v) in shared}
-        attributes["valueReference"] = references[places[0]]
+        attributes["valueReference"] = references[indices[0]]
         attributes["description"] = _description(elements)
         if first.derivative_of:
-            attributes["derivative"] = references[place[first.derivative_of, first.index]]
+            attributes["derivative"] = references[row_of[first.derivative_of, first.index]]
         if "start" in elements[0]:
             attributes["start"] = " ".join(element["start"] for element in elements)
         if flavour.fmi == 2:
@@ -240,7 +240,7 @@ def _variables(
             continue
         element = ET.SubElement(variables, "Float64" if first.type == "Real" else first.type, attributes)
         if name != first.name:
-            ET.SubElement(element, "Dimension", start=str(len(places)))
+            ET.SubElement(element, "Dimension", start=str(len(indices)))
 
 
 def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges: bool) -> dict[str, str]:

@@ -48,15 +48,15 @@ def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, 
     rates = robot.G.dot(v)
     R: Array = np.eye(3)
     x = omega = alpha = a = np.zeros(3)
-    axes, places = [], []
+    axes, positions = [], []
     for i in robot.path:
         x = x + R.dot(origins[i])
         R = R.dot(rotations[i])
         axes.append(R[:, 2])
-        places.append(x)
+        positions.append(x)
     x = x + R.dot(robot.frame_p)
     columns = np.zeros((len(robot.parent), 6), dtype=object)
-    for i, z, o in zip(robot.path, axes, places):
+    for i, z, o in zip(robot.path, axes, positions):
         before, turning = omega, z * rates[i]
         if robot.prismatic[i]:
             columns[i, :3] = z

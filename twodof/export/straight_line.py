@@ -98,7 +98,7 @@ def varied(
     as such. ``parts`` has those of variables by name; of others they are the real and the imaginary
     part, but for names that begin as one of ``held``, which have no imaginary part.
     """
-    nodes, places = _ordered(results)
+    nodes, indices = _ordered(results)
     pairs: list[Varied] = []
     for operation, operands in nodes:
         (a, da), (b, db) = ([pairs[operand] for operand in operands] + [(0.0, 0.0)] * 2)[:2]
@@ -122,7 +122,7 @@ def varied(
         else:
             pair = Expression(f"creal({operation})"), Expression(f"cimag({operation})")
         pairs.append(pair)
-    return [pairs[place] for place in places]
+    return [pairs[index] for index in indices]
 
 
 def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None) -> str:
@@ -146,18 +146,18 @@ def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Vari
 
 
 def _statements(results: Mapping[str, Value], kind: str) -> str:
-    nodes, places = _ordered(results.values())
-    uses = Counter(places) + Counter(operand for _, operands in nodes for operand in operands)
+    nodes, indices = _ordered(results.values())
+    uses = Counter(indices) + Counter(operand for _, operands in nodes for operand in operands)
     texts: list[str] = []
     lines: list[str] = []
-    for place, (operation, operands) in enumerate(nodes):
+    for index, (operation, operands) in enumerate(nodes):
         text = _c(operation, [texts[operand] for operand in operands])
-        if operands and (uses[place] > 1 or len(text) > WIDTH - 40):
+        if operands and (uses[index] > 1 or len(text) > WIDTH - 40):
             own = STRUCTS.get(operation, kind)
-            lines.append(f"    const {own} t{place} = {_bare(text)};")
-            text = f"t{place}"
+            lines.append(f"    const {own} t{index} = {_bare(text)};")
+            text = f"t{index}"
         texts.append(text)
-    lines += [f"    {target} = {_bare(texts[place])};" for target, place in zip(results, places, strict=True)]
+    lines += [f"    {target} = {_bare(texts[index])};" for target, index in zip(results, indices, strict=True)]
     return "\n".join(lines)
 
 
@@ -168,7 +168,7 @@ def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]
     seen: dict[int, int] = {}
     wanted = list(results)
 
-    def place(value: Value) -> int:
+    def index(value: Value) -> int:
         operands: tuple[int, ...] = ()
         if isinstance(value, Expression):
             operation = value.operation
@@ -192,7 +192,7 @@ def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]
             if missing:
                 pending += reversed(missing)
             else:
-                seen[id(value)] = place(value)
+                seen[id(value)] = index(value)
                 pending.pop()
     return nodes, [seen[id(result)] for result in wanted]
 

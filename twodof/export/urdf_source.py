@@ -95,18 +95,18 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
             raise RobotError(
                 f"joint '{name}' cannot be locked at {value:g}: its limits are {joint.low:g} and {joint.high:g}"
             )
-        turned = Rotation.from_euler("xyz", joint.rpy)
+        rotated = Rotation.from_euler("xyz", joint.rpy)
         place = np.array(joint.xyz)
         if joint.prismatic:
-            place = place + turned.apply(np.array(joint.axis) * value)
+            place = place + rotated.apply(np.array(joint.axis) * value)
         else:
-            turned = turned * Rotation.from_rotvec(np.array(joint.axis) * value)
+            rotated = rotated * Rotation.from_rotvec(np.array(joint.axis) * value)
         for tag in ("origin", "mimic", "limit", "dynamics"):
             for child in element.findall(tag):
                 element.remove(child)
         element.set("type", "fixed")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # where roll and yaw turn about one axis, any pair does
-            rpy = turned.as_euler("xyz")
+            rpy = rotated.as_euler("xyz")
         ET.SubElement(element, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
     return ET.tostring(urdf.tree, encoding="unicode")

@@ -246,19 +246,19 @@ class Instance3(Instance):
         wanted = [self._fmu.variables[name] for name in names]
         distinct = list(dict.fromkeys(variable.reference for variable in wanted))
         first = dict(zip(distinct, accumulate((self._sizes[r] for r in distinct), initial=0)))
-        places = [first[variable.reference] + variable.element for variable in wanted]
+        columns = [first[variable.reference] + variable.element for variable in wanted]
         size = sum(self._sizes[reference] for reference in distinct)
         references = (c_uint * len(distinct))(*distinct)
         whole = (c_double * size)()
         asked = byref(references), c_size_t(len(distinct)), byref(whole), c_size_t(size)
         read = self._reader(whole, "fmi3GetFloat64", *asked)
-        if places == [*range(size)]:
+        if columns == [*range(size)]:
             return read
-        values = (c_double * len(places))()
+        values = (c_double * len(columns))()
 
         def read_elements() -> Values:
             read()
-            values[:] = [whole[place] for place in places]
+            values[:] = [whole[column] for column in columns]
             return values
 
         return read_elements

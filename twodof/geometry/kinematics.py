@@ -37,11 +37,11 @@ class Placement(NamedTuple):
 
     def __mul__(self, inner: Placement) -> Placement:  # type: ignore[override]
         """Compose two transforms."""
-        translation = self.translation + turned(self.rotation, inner.translation)
+        translation = self.translation + rotated(self.rotation, inner.translation)
         return Placement(translation, self.rotation @ inner.rotation)
 
 
-def turned(rotation: Array, vectors: ArrayLike) -> Array:
+def rotated(rotation: Array, vectors: ArrayLike) -> Array:
     """Return R v at N samples."""
     return np.asarray(np.einsum("...ij,...j->...i", rotation, np.asarray(vectors)))
 
@@ -77,7 +77,7 @@ class Kinematics:
         """Return the transforms of a joint's child in its parent."""
         origin, along = self.origins[joint.name], self._moved(joint, q) * joint.axis
         if joint.prismatic:
-            return Placement(joint.xyz + turned(origin, along), origin[None])
+            return Placement(joint.xyz + rotated(origin, along), origin[None])
         turn = Rotation.from_rotvec(along).as_matrix()
         return Placement(np.asarray(joint.xyz, dtype=np.float64)[None], origin @ turn)
 
@@ -88,8 +88,8 @@ class Kinematics:
         """
         moved, still = self._moved(joint, q), Rotation.from_matrix(self.origins[joint.name])
         if joint.prismatic:
-            place = joint.xyz + moved * still.apply(joint.axis)
-            return np.hstack([place, np.broadcast_to(still.as_quat(), (len(moved), 4))])
+            position = joint.xyz + moved * still.apply(joint.axis)
+            return np.hstack([position, np.broadcast_to(still.as_quat(), (len(moved), 4))])
         half = still * Rotation.from_quat([*joint.axis, 0.0])  # a half turn
         quat = np.cos(moved / 2) * still.as_quat() + np.sin(moved / 2) * half.as_quat()
         return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
@@ -105,10 +105,10 @@ class Kinematics:
     def along(self, chain: Iterable[Joint], q: ArrayLike) -> list[Placement]:
         """Return the transforms of the root and of the child of each joint of a chain from the root."""
         n = len(np.asarray(q))
-        places = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
+        transforms = [Placement(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))]
         for joint in chain:
-            places.append(places[-1] * self._in_parent(joint, q))
-        return places
+            transforms.append(transforms[-1] * self._in_parent(joint, q))
+        return transforms
 
     def path(self, link: str, q: ArrayLike) -> Array:
         """Return positions of a link's origin in the root frame, N × 3, m."""
@@ -144,14 +144,14 @@ class Kinematics:
     def jacobian(self, link: str, q: ArrayLike) -> Array:
         """Return the Jacobian of the link in the root's axes, N × 6 × joints: linear, then angular rows."""
         chain = self.urdf.chain(link)
-        places = self.along(chain, q)
-        end = places[-1].translation
+        transforms = self.along(chain, q)
+        end = transforms[-1].translation
         jacobian = np.zeros((len(end), 6, len(self._columns)))
-        for joint, place in zip(chain, places[1:]):
+        for joint, transform in zip(chain, transforms[1:]):
             column, ratio, _ = self.column(joint)
             if column is not None:
-                axis = ratio * turned(place.rotation, joint.axis)
-                arm = end - place.translation
+                axis = ratio * rotated(transform.rotation, joint.axis)
+                arm = end - transform.translation
                 if joint.prismatic:
                     jacobian[:, :3, column] += axis
                 else:

@@ -27,7 +27,7 @@ class Shape(NamedTuple):
     """Triangles on a link: V × 3 in m in the axes of a frame fixed to the link, and T × 3."""
 
     link: str
-    place: Placement
+    transform: Placement
     colour: Colour
     vertices: Array
     triangles: Indices
@@ -56,11 +56,11 @@ def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
                     continue
                 element = geometry[0]
                 try:
-                    place, colour = origin(visual.find("origin")), _colour(visual, named)
+                    transform, colour = origin(visual.find("origin")), _colour(visual, named)
                     drawn = _surfaces(element, meshes)
                 except ValueError as error:
                     raise RobotError(f"link {name!r} cannot be drawn: {error}") from error
-                shapes += [Shape(name, place, s.colour or colour, *s[:2]) for s in drawn]
+                shapes += [Shape(name, transform, s.colour or colour, *s[:2]) for s in drawn]
                 if element.tag == "mesh" and not drawn and read(_file(element)) is None:
                     missing.append(_file(element))
     return shapes or _sticks(robot), missing
@@ -140,14 +140,14 @@ def _sticks(robot: Urdf) -> list[Shape]:
     still = np.eye(3)
     shapes = []
     for i, joint in enumerate(joints):
-        place = Placement(np.array(joint.xyz), still)
-        shapes.append(Shape(joint.parent, place, BALL, *sphere(1.4 * radius)))
+        transform = Placement(np.array(joint.xyz), still)
+        shapes.append(Shape(joint.parent, transform, BALL, *sphere(1.4 * radius)))
         length = float(np.linalg.norm(joint.xyz))
         if length > radius:
             along = Rotation.align_vectors([joint.xyz], [(0.0, 0.0, 1.0)])[0]
-            place = Placement(np.array(joint.xyz) / 2, along.as_matrix())
+            transform = Placement(np.array(joint.xyz) / 2, along.as_matrix())
             stick = cylinder(radius, length)
-            shapes.append(Shape(joint.parent, place, STICKS[i % len(STICKS)], *stick))
+            shapes.append(Shape(joint.parent, transform, STICKS[i % len(STICKS)], *stick))
     return shapes
 
 

@@ -247,7 +247,7 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
         "variables": list(arm.variables),
         "links": links,
         "frameLink": number[arm.frame],
-        "shapes": [{"link": number[s.link], "place": _matrix(s.place), "colour": s.colour} for s in arm.shapes],
+        "shapes": [{"link": number[s.link], "place": _matrix(s.transform), "colour": s.colour} for s in arm.shapes],
         "meshes": [facts for facts, _ in packed],
     }
     return facts, b"".join(content for _, content in packed)
@@ -284,11 +284,11 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dic
     return links, number
 
 
-def _matrix(place: Placement) -> list[float]:
+def _matrix(transform: Placement) -> list[float]:
     """Return a 4 × 4 matrix by columns, as WebGL requires."""
     matrix = np.eye(4)
-    matrix[:3, :3] = place.rotation
-    matrix[:3, 3] = place.translation
+    matrix[:3, :3] = transform.rotation
+    matrix[:3, 3] = transform.translation
     values: list[float] = matrix.T.reshape(-1).tolist()
     return values
 

@@ -33,7 +33,7 @@ TOLD = ("x_des", "quat_des", "q_des")
 """Inputs that are told with a sample."""
 
 
-class Excerpt(Bag):
+class PartialBag(Bag):
     """A partial bag that begins during a run, at the current sample.
 
     Its provenance is that of a run which starts there: from the joint positions and velocities and
@@ -88,7 +88,7 @@ class Loop:
         self.pace = RealTime()
         self.steps = 0
         self.viewers = 0
-        self._recording: Excerpt | None = None
+        self._recording: PartialBag | None = None
         self._changes: dict[str, Value] = {}
         self._playing = True
         self._orders: deque[tuple[str, Any]] = deque()
@@ -286,7 +286,7 @@ class Loop:
     def _record(self) -> None:
         path = free_name(self._bag or time.strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
         try:
-            self._recording = Excerpt(path, self._run, self._sample, self._command_line)
+            self._recording = PartialBag(path, self._run, self._sample, self._command_line)
         except BagError as error:
             self.note(f"There is no recording: {error}")
         self.pace.restart()  # opening a bag may wait for the disk: time has stood still

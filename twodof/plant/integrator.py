@@ -54,14 +54,14 @@ class Equations:
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-PATIENCE, FIRST_HOLD, LONGER, HOLD_OF_ALL = 0.5, 2.0**-15, 8.0, 2.0**-12
-"""As parts of the largest step, of PATIENCE, of the last hold, and of PATIENCE. Anti-chatter: where
-a joint is back at its limit sooner than PATIENCE after it left, it is held there for FIRST_HOLD,
-and at each repetition LONGER; from HOLD_OF_ALL on, with all joints at limits. Where an acceleration
-only grazes zero, or where impacts drive joints off each other's limits, they would else leave and
-return without end; a joint that returns once is held for some nanoseconds. The rank of J⁺ is held
-in the same way where it drops soon after a rise: the motion leads back to the jump from both sides,
-and slides along it. A higher rank is never held, as its J⁺ has no bound."""
+CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-15, 8.0, 2.0**-12
+"""Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held
+there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
+HOLD_OF_ALL (part of CHATTER_TIME) or more covers all joints at limits. Otherwise an acceleration that grazes
+zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A joint
+that returns once is held for some nanoseconds. The rank of J⁺ is held in the same way where it drops soon after a
+rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is never held, because
+its J⁺ is unbounded."""
 MOST_ROWS = 6
 """Rows of a task's Jacobian at most: three axes and three of an orientation."""
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
@@ -105,17 +105,17 @@ class _Motion:
         self.pressed: list[list[float]] = []
         self.margins: list[float] = []
 
-    def set_out(self, y: State, keep: Sequence[bool], rank_held: bool) -> State:
+    def set_out(self, y: State, anti_chatter: Sequence[bool], rank_held: bool) -> State:
         """Determine the regime at a state after an impact; return ẏ in it.
 
         Args:
             y: the state (q, v).
-            keep: joints that stay at their limits, whether they are pressed or not.
+            anti_chatter: joints that stay at their limits whatever the contact force.
             rank_held: the rank stays what it is.
         """
         self.rank_held = rank_held
         a, self.rank, margin = self._acceleration(y, self.rank if rank_held else None)
-        pressed = self.stops.hold(y, a, keep)
+        pressed = self.stops.hold(y, a, anti_chatter)
         self.pressed, self.margins = [pressed], [margin]
         return y[self.n :] + a
 
@@ -260,13 +260,13 @@ class _Hold:
     """A hold of joints at their limits, or of the rank of J⁺: its end and its length, s."""
 
     until: float = -inf
-    wait: float = 0.0
+    length: float = 0.0
 
-    def again(self, t: float, patience: float) -> None:
+    def again(self, t: float, chatter_time: float) -> None:
         """Begin a hold at t, longer than the last one where that ended within the anti-chatter time."""
-        repeated = t - self.until < patience
-        self.wait = min(LONGER * self.wait, patience) if repeated else FIRST_HOLD * patience
-        self.until = t + self.wait
+        repeated = t - self.until < chatter_time
+        self.length = min(HOLD_GROWTH * self.length, chatter_time) if repeated else FIRST_HOLD * chatter_time
+        self.until = t + self.length
 
 
 def advance(
@@ -304,22 +304,22 @@ def advance(
 def _regimes(motion: _Motion, y: State, h: float) -> State:
     """Return the state after h, integrated from event to event."""
     n, stops, t = motion.n, motion.stops, 0.0
-    patience = PATIENCE * min(motion.max_step, h)
+    chatter_time = CHATTER_TIME * min(motion.max_step, h)
     joint_hold, rank_hold = _Hold(), _Hold()
     left, risen = [-inf] * n, -inf  # when each joint left its limit, when the rank rose
-    event, chattering, keep = events.Event(), [False] * n, [False] * n
+    event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):
-            joint_hold.again(t, patience)
-            keep = chattering
-            if joint_hold.wait >= HOLD_OF_ALL * patience:
-                keep = stops.at_limits(y)
+            joint_hold.again(t, chatter_time)
+            anti_chatter = chattering
+            if joint_hold.length >= HOLD_OF_ALL * chatter_time:
+                anti_chatter = stops.at_limits(y)
         elif joint_hold.until <= t:
-            keep = [False] * n
+            anti_chatter = [False] * n
         rank, rank_held = motion.rank, rank_hold.until > t
         end = min((hold.until for hold in (joint_hold, rank_hold) if hold.until > t), default=h)
-        stops.impact(y, keep)
-        rates = motion.set_out(y, keep, rank_held)
+        stops.impact(y, anti_chatter)
+        rates = motion.set_out(y, anti_chatter, rank_held)
         for i, at_limit in enumerate(stops.at_limits(y)):
             if at_limit and i not in stops.held:
                 left[i] = t
@@ -329,12 +329,12 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
             continue
         if motion.rank > rank:
             risen = t
-        if motion.rank < rank and t - risen < patience:
-            rank_hold.again(t, patience)
+        if motion.rank < rank and t - risen < chatter_time:
+            rank_hold.again(t, chatter_time)
             continue
         t, y, event = motion.until_event(y, rates, t, min(end, h))
-        chattering = [i in event.stopped and t - left[i] < patience for i in range(n)]
+        chattering = [i in event.stopped and t - left[i] < chatter_time for i in range(n)]
     if joint_hold.until <= h:
-        keep = [False] * n
-    stops.impact(y, keep)
+        anti_chatter = [False] * n
+    stops.impact(y, anti_chatter)
     return y

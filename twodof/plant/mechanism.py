@@ -33,16 +33,16 @@ class Mechanism:
         robot: the robot.
         gravity: in the root's axes, m/s².
         payload: the point mass, kg.
-        place: where it is, in the task frame, m.
+        offset: its position in the task frame, m.
     """
 
-    def __init__(self, robot: Robot, gravity: Sequence[float], payload: float, place: Sequence[float]) -> None:
+    def __init__(self, robot: Robot, gravity: Sequence[float], payload: float, offset: Sequence[float]) -> None:
         model = robot.model.copy()
         model.gravity.linear = np.array(gravity)
         self._frame = robot.frame_id
         if payload:
             frame = model.frames[self._frame]
-            mass = pin.Inertia(payload, frame.placement.act(np.array(place)), np.zeros((3, 3)))
+            mass = pin.Inertia(payload, frame.placement.act(np.array(offset)), np.zeros((3, 3)))
             model.inertias[frame.parentJoint] += mass
         self._model, self._data = model, model.createData()
         self._G, self._c = robot.coupling, robot.offset

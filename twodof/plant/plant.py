@@ -144,10 +144,10 @@ class Plant:
 
     def prepare(self) -> None:
         """Apply parameters that were set directly, for example by restoring a state."""
-        place = self.payload_com
-        self._real = self.known = Mechanism(self.robot, self.gravity, self.payload, place)
+        offset = self.payload_com
+        self._real = self.known = Mechanism(self.robot, self.gravity, self.payload, offset)
         if self.payload and not getattr(self, "payload_known", False):
-            self.known = Mechanism(self.robot, self.gravity, 0.0, place)
+            self.known = Mechanism(self.robot, self.gravity, 0.0, offset)
 
     def step(self, h: float) -> None:
         """Advance the state by one communication step of h seconds, inputs held.

@@ -46,53 +46,59 @@ class Stops:
         self.held: list[int] = []
         self.watched: list[int] = []
 
-    def impact(self, y: list[float], kept: Sequence[bool]) -> None:
+    def impact(self, y: list[float], anti_chatter: Sequence[bool]) -> None:
         """Remove the velocity that points into a limit from the state (q, v).
 
         Args:
             y: the state; changed.
-            kept: joints that stop whichever way they move: where two in turn drive off each other,
-                as the feet of a rocking block, impacts would else not end in finite time.
+            anti_chatter: joints that stop in both directions. Otherwise mutual impacts, as of the feet
+                of a rocking block, would repeat for ever in finite time (Zeno).
         """
         n = len(self.limits)
         contacts = self._contacts(y)
-        into = [i for i, side in contacts if side * y[n + i] < 0.0 or ((kept[i] or self._has_no_range(i)) and y[n + i])]
+        into = [
+            i
+            for i, side in contacts
+            if side * y[n + i] < 0.0 or ((anti_chatter[i] or self._has_no_range(i)) and y[n + i])
+        ]
         if not into:
             return
         if self._inverse_mass is None:
             stopped = into
         else:
             W = self._inverse_mass(y[:n])
-            forced = [i for i, _ in contacts if kept[i]]
+            forced = [i for i, _ in contacts if anti_chatter[i]]
             impulse = self._complementary(W, contacts, y[n:], forced)
             y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
             stopped = [i for i, _ in contacts if impulse[i]]
         for i in stopped:
             y[n + i] = 0.0
 
-    def hold(self, y: Sequence[float], a: list[float], kept: Sequence[bool]) -> list[float]:
+    def hold(self, y: Sequence[float], a: list[float], anti_chatter: Sequence[bool]) -> list[float]:
         """Find the joints that rest at (q, v) after an impact, and make their acceleration 0.
 
-        Returns how each is pressed into its limit, as ``restrain``.
+        Returns the contact forces of ``restrain``.
 
         Args:
             y: the state.
             a: q̈ without stops; changed to that with them.
-            kept: joints that stay whether they are pressed or not.
+            anti_chatter: joints that stay at their limits whatever the contact force.
         """
         n = len(self.limits)
         contacts = [(i, side) for i, side in self._contacts(y) if y[n + i] == 0.0]
-        forced = [i for i, _ in contacts if kept[i]]
+        forced = [i for i, _ in contacts if anti_chatter[i]]
         if self._inverse_mass is None:
-            self.held = [i for i, side in contacts if kept[i] or self._has_no_range(i) or side * a[i] <= 0.0]
+            self.held = [i for i, side in contacts if anti_chatter[i] or self._has_no_range(i) or side * a[i] <= 0.0]
         elif contacts:
             W = self._inverse_mass(y[:n])
             reaction = self._complementary(W, contacts, a, forced)
             stopped = (W @ reaction + a).tolist()
-            self.held = [i for i, _ in contacts if reaction[i] or kept[i] or self._has_no_range(i) or stopped[i] == 0.0]
+            self.held = [
+                i for i, _ in contacts if reaction[i] or anti_chatter[i] or self._has_no_range(i) or stopped[i] == 0.0
+            ]
         else:
             self.held = []
-        self.watched = [i for i in self.held if not kept[i] and not self._has_no_range(i)]
+        self.watched = [i for i in self.held if not anti_chatter[i] and not self._has_no_range(i)]
         return self.restrain(y, a)
 
     def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:

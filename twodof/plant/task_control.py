@@ -26,7 +26,7 @@ def command(plant: Any) -> tuple[Response, Ratios]:
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]
     law = list(zip(axes, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))
-    place = list(zip(axes, plant.x_des))
+    axis_targets = list(zip(axes, plant.x_des))
     quat_des = plant.quat_des if plant.control == "pose" else None
     if quat_des is not None:
         turn = (plant.omega_des, plant.alpha_des, plant.Kp_rot, plant.Kd_rot)
@@ -36,7 +36,7 @@ def command(plant: Any) -> tuple[Response, Ratios]:
     def commanded_acceleration(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:
         x, jacobian, drift = observe(q, v)
         velocity = v.tolist()
-        errors = [x_des - x[axis] for axis, x_des in place]
+        errors = [x_des - x[axis] for axis, x_des in axis_targets]
         if quat_des is not None:
             errors += rotation_error(quat_des, plant.known.rotation)
         rows, command = [], []

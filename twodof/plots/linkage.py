@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..export.urdf_source import DEFAULT_FRAME
-from ..geometry.kinematics import Array, Kinematics, turned
+from ..geometry.kinematics import Array, Kinematics, rotated
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
 
 LOOKS = 2000  # for singularities, along the way
@@ -74,9 +74,9 @@ class Linkage(NamedTuple):
     def _skeletons(self, q: Array) -> Array:
         """Return origins of the root, of the frame's joints, and of the frame; N × points × 3."""
         chain = self.urdf.chain(self.frame)
-        places = self.kinematics.along(chain, q)
+        transforms = self.kinematics.along(chain, q)
         shown = [0, *(i for i, joint in enumerate(chain, start=1) if joint.moves), -1]
-        return np.stack([places[i].translation for i in shown], axis=1)
+        return np.stack([transforms[i].translation for i in shown], axis=1)
 
     def _reach(self) -> Reach | None:
         """Return the reach circle, where all joints rotate about one of the root's axes.
@@ -88,8 +88,8 @@ class Linkage(NamedTuple):
         chain = self.urdf.chain(self.frame)
         turns = np.abs(
             [
-                turned(place.rotation, joint.axis)[0] * (not joint.prismatic)
-                for joint, place in zip(chain, self.kinematics.along(chain, at_zero)[1:])
+                rotated(transform.rotation, joint.axis)[0] * (not joint.prismatic)
+                for joint, transform in zip(chain, self.kinematics.along(chain, at_zero)[1:])
                 if joint.moves
             ]
         )

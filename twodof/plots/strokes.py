@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..bag.outline import Indices, extremes
+from ..bag.downsampling import Indices, extremes
 from .closed_form import Array
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -71,7 +71,7 @@ class Stroke(NamedTuple):
         """Return the line downsampled to a number of points."""
         if len(self.x) <= most:
             return self
-        kept = outline(self.y, most)
+        kept = downsampled(self.y, most)
         return self._replace(x=self.x[kept], y=self.y[kept])
 
 
@@ -80,7 +80,7 @@ def looks(names: Iterable[str]) -> list[Look]:
     return [Look(name, COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]) for i, name in enumerate(names)]
 
 
-def outline(values: Array, most: int) -> Indices:
+def downsampled(values: Array, most: int) -> Indices:
     """Return indices of a limited number of samples that draw the same line (M4).
 
     From near by too, so that a jump is one: of parts as short as may be the first, last, smallest

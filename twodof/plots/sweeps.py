@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import PlotError
 from ..sweeps.metrics import METRICS
-from ..sweeps.ranking import ROUNDING, USE, beyond_limits, candidates, places, ranked, remark
+from ..sweeps.ranking import ROUNDING, USE, beyond_limits, candidates, ranked, ranks, remark
 from .closed_form import Array
 from .figure import Drawing, draw_head
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
@@ -187,7 +187,7 @@ def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
 def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
     """Mark the candidate with the least value; none where several are equal."""
     runs = candidates(table).dropna(subset=[panel.metric])
-    least = runs[places(runs[panel.metric].to_numpy(dtype=float)) == 0]
+    least = runs[ranks(runs[panel.metric].to_numpy(dtype=float)) == 0]
     metric = METRICS[panel.metric]
     axes.set_title(f"{metric.title}{_in(metric.unit)}", pad=14.0)
     value = least[panel.metric].min()  # of none it is not a number

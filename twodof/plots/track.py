@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..bag.provenance import KNOWN_UNTIL, robot_in
-from ..bag.reader import read_bag, read_outline
+from ..bag.reader import read_bag, read_downsampled
 from ..bag.recording import Recording
 from ..errors import BuildError, PlotError
 from ..export.urdf_source import read_text
@@ -70,7 +70,7 @@ class Task:
             has fewer joints than the task has coordinates.
         off: distance between the two positions, m, N values; None likewise.
         disturbances: what was at work that the closed form does not have.
-        turned: angle from the target orientation at the end, rad; None where there is none.
+        turn_error: angle from the target orientation at the end, rad; None where there is none.
     """
 
     axes: str
@@ -79,7 +79,7 @@ class Task:
     closed_form: Array | None
     off: Array | None
     disturbances: tuple[str, ...]
-    turned: float | None
+    turn_error: float | None
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def read_tracks(
         raise PlotError(str(error)) from error
     track = partial(_track, urdf=text, source=str(urdf), frame=frame)
     if len(bags) == 1 and not isinstance(bags[0], Recording):
-        return [track(read_outline(bags[0], most, lambda part: _lines(track(part))))]
+        return [track(read_downsampled(bags[0], most, lambda part: _lines(track(part))))]
     return [track(bag if isinstance(bag, Recording) else read_bag(bag)) for bag in bags]
 
 
@@ -174,7 +174,7 @@ def _with_robot(bag: Recording, names: Sequence[str], urdf: str | None, source: 
         raise PlotError(f"{source}: {error}") from error
     joints, q = _joints(bag, names, linkage), _of_linkage(bag, linkage, names, bag.q)
     motion, task = linkage.motion(q), None
-    rooted = run or (bag.heard is not None and bag.heard.frame == linkage.urdf.root)
+    rooted = run or (bag.received is not None and bag.received.frame == linkage.urdf.root)
     known = bag.target.size and not np.isnan(bag.target[-1]).any()
     if rooted and known and run.get("frame", linkage.frame) == linkage.frame:
         v = _of_linkage(bag, linkage, names, bag.v)
@@ -244,14 +244,14 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
             raise ValueError("positions or targets are beyond all bounds")
         first = bag.schedule[0][1]
         turns = "quat_des[1]" in first
-        quat, turned = bag.target_quat[-1], None
+        quat, turn_error = bag.target_quat[-1], None
         if quat.size:
-            turned = linkage.kinematics.angle(linkage.frame, q[-1], quat)
+            turn_error = linkage.kinematics.angle(linkage.frame, q[-1], quat)
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
-        freedoms = {joint.leader for joint in linkage.chain}
-        followed = len(axes) + 3 * turns <= len(freedoms)  # in all that is asked for at a time
+        dof = {joint.leader for joint in linkage.chain}
+        followed = len(axes) + 3 * turns <= len(dof)  # in all that is asked for at a time
         if not (inputs_known and followed and all(f"{g}[1]" in first for g in Held._fields)):
-            return Task(linkage.axes, target, error, None, None, (), turned)
+            return Task(linkage.axes, target, error, None, None, (), turn_error)
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
         xd0 = (linkage.kinematics.jacobian(linkage.frame, q[:1])[0] @ v0)[axes]
         e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
@@ -267,4 +267,4 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         "external torque": any(values[name] for _, values in bag.schedule for name in external),
     }
     disturbances = tuple(name for name, present in at_work.items() if present)
-    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances, turned)
+    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances, turn_error)

@@ -73,8 +73,8 @@ def outcome(track: Track) -> str:
     texts = []
     if track.task is not None:
         texts.append(f"{track.task.error[-1]:.3g} m from its target at the end")
-        if track.task.turned is not None:
-            texts[0] += f", {track.task.turned:.3g} rad from its target orientation"
+        if track.task.turn_error is not None:
+            texts[0] += f", {track.task.turn_error:.3g} rad from its target orientation"
         if track.task.off is not None:
             texts.append(f"at most {track.task.off.max():.1g} m off the closed form")
     if driven := [joint for joint in track.joints if joint.target.size]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from .closed_form import Array
 from .panels import CURVE, THIN, Looks
-from .strokes import GREY, INK, PALE, SMALLEST_RANGE, Stroke, outline
+from .strokes import GREY, INK, PALE, SMALLEST_RANGE, Stroke, downsampled
 from .track import Task, Track
 
 # isort: split
@@ -149,5 +149,5 @@ def _drawable(points: Array) -> Array:
     corners = np.asarray(Polyline(points * (POINTS * SIDE / size)).cleaned(simplify=True).vertices)
     if len(corners) <= MANY_CORNERS:
         return points
-    x, y = (outline(values, MANY_CORNERS // 5) for values in points.T)
+    x, y = (downsampled(values, MANY_CORNERS // 5) for values in points.T)
     return np.asarray(points[np.union1d(x, y)])

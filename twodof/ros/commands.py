@@ -54,12 +54,12 @@ class Command(NamedTuple):
     Attributes:
         stamp: ns since the epoch; 0 where it has none.
         inputs: values of the FMU's inputs.
-        strangers: names of joints that the robot has not.
+        unknown_joints: names of joints that the robot has not.
     """
 
     stamp: int
     inputs: Inputs
-    strangers: tuple[str, ...] = ()
+    unknown_joints: tuple[str, ...] = ()
 
 
 def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
@@ -138,9 +138,9 @@ class Commands:
         if not all(map(isfinite, given.values())):
             raise CommandError("finite", "is not finite")
         names = message.name if kind == JOINT_STATE else ()
-        strangers = tuple(name for name in names if name not in self._joints)
+        unknown_joints = tuple(name for name in names if name not in self._joints)
         stamp = message.header.stamp
-        return Command(stamp.sec * NANOSECONDS + stamp.nanosec, given, strangers)
+        return Command(stamp.sec * NANOSECONDS + stamp.nanosec, given, unknown_joints)
 
     def _of_frame(self, kind: str, message: Any) -> Inputs:
         frame = message.header.frame_id
@@ -194,7 +194,7 @@ class Watchdog:
         self._last: Inputs = {}
         self._warn = warner(LOG)
 
-    def heard(self, t: float, inputs: Inputs) -> None:
+    def received(self, t: float, inputs: Inputs) -> None:
         """Register a command that arrived at a time, s."""
         self._since = t
         self._last |= inputs

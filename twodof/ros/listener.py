@@ -81,7 +81,7 @@ class Listener:
     Args:
         participant: of the DDS domain.
         follows: what messages ask of the FMU.
-        heard: topics and types of commands.
+        received: topics and types of commands.
         orders: hear /pause and /step.
         oldest: s before a sample that joint commands for it may be stamped; None: any time.
         run: in which the nodes that command are recorded.
@@ -91,17 +91,17 @@ class Listener:
         self,
         participant: Any,
         follows: Commands,
-        heard: Mapping[str, str],
+        received: Mapping[str, str],
         *,
         orders: bool,
         oldest: float | None,
         run: Experiment,
     ) -> None:
         self._commanders = Commanders(participant, run)
-        self._follows, self._heard, self._oldest = follows, heard, oldest
+        self._follows, self._heard, self._oldest = follows, received, oldest
         self._readers = {
             name: sub.DataReader(participant, dds_topic(participant, name, kind), dds_qos(STREAM, kind))
-            for name, kind in {**heard, **(ORDERS if orders else {})}.items()
+            for name, kind in {**received, **(ORDERS if orders else {})}.items()
         }
         self._news = core.WaitSet(participant)
         for reader in self._readers.values():
@@ -131,10 +131,10 @@ class Listener:
 
             for command, writer in self._come(name, read, WHAT[kind]):
                 self._commanders.note(self._readers[name], writer, sample.t)
-                if command.strangers:
+                if command.unknown_joints:
                     reason = f"a command on {name} is of joints that this robot has not"
-                    names = ", ".join(command.strangers)[:LONGEST_NAME]
-                    self._warn("strangers", f"{reason}, {names!r}: they are left out")
+                    names = ", ".join(command.unknown_joints)[:LONGEST_NAME]
+                    self._warn("unknown_joints", f"{reason}, {names!r}: they are left out")
                 yield command
 
     def await_go(self, stop: Callable[[], bool], pace: RealTime | None) -> None:

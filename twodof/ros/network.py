@@ -138,7 +138,7 @@ class Network(NamedTuple):
         )
 
 
-def network(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) -> Network:
+def network_of_environment(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) -> Network:
     """Return the network that ROS 2's environment variables select.
 
     Unlike ROS 2, whose default range is SUBNET, nothing leaves the host unless asked for.
@@ -193,46 +193,46 @@ class OpenDomain(NamedTuple):
     """A DDS domain that closes with its last reference; several publishers may share it.
 
     Attributes:
-        place: the network.
+        network: the network.
         interface: names of the network interfaces in use.
         handle: Cyclone DDS's.
     """
 
-    place: Network
+    network: Network
     interface: str
     handle: Any
 
 
-def open_domain(place: Network) -> OpenDomain:
+def open_domain(network: Network) -> OpenDomain:
     """Open the DDS domain of a network.
 
     Raises:
         PublishError: saying what Cyclone DDS says.
     """
-    own = LOOPBACK if place.loopback else None
-    opened, used, said = _try_to_open(place, own)
-    if opened and place.range == "LOCALHOST" and not used.keys() & LOOPBACK:
+    own = LOOPBACK if network.loopback else None
+    opened, used, said = _try_to_open(network, own)
+    if opened and network.range == "LOCALHOST" and not used.keys() & LOOPBACK:
         del opened  # which closes it
-        opened, both, said = _try_to_open(place, {**used, **LOOPBACK})
+        opened, both, said = _try_to_open(network, {**used, **LOOPBACK})
         if opened:
             used = both
         else:  # CYCLONEDDS_URI names interfaces, and none may be named twice
-            opened, used, said = _try_to_open(place, own)
+            opened, used, said = _try_to_open(network, own)
     interfaces = ", ".join(used) or "an interface of CYCLONEDDS_URI"
     if opened is None and "failed to find interfaces" in said:
         LOG.warning("there is no network interface: nobody can hear what is published")
         interfaces = "no interface"
-        opened = domain.Domain(place.domain, NO_NETWORK)
+        opened = domain.Domain(network.domain, NO_NETWORK)
     elif opened is None:
         names = ", ".join(name for _, name in socket.if_nameindex())
-        blame = f"; correct CYCLONEDDS_URI (interfaces here: {names})" if place.custom else ""
-        raise PublishError(f"DDS domain {place.domain} cannot be opened: {said}{blame}")
+        blame = f"; correct CYCLONEDDS_URI (interfaces here: {names})" if network.custom else ""
+        raise PublishError(f"DDS domain {network.domain} cannot be opened: {said}{blame}")
     elif said:
         LOG.warning("Cyclone DDS: %s", said)
-    return OpenDomain(place, interfaces, opened)
+    return OpenDomain(network, interfaces, opened)
 
 
-def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
+def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
     """Return a domain or None, the addresses of the interfaces in use by name, and the error.
 
     Cyclone DDS tells interfaces in its trace, and reasons of a failure on the standard error alone.
@@ -245,8 +245,8 @@ def _try_to_open(place: Network, own: Mapping[str, str] | None) -> tuple[Any, di
         try:
             with errors.open("wb") as file:
                 os.dup2(file.fileno(), 2)
-            with place.guarded():
-                opened = domain.Domain(place.domain, place.configuration(str(trace), own))
+            with network.guarded():
+                opened = domain.Domain(network.domain, network.configuration(str(trace), own))
         except (core.DDSException, UnicodeEncodeError):
             opened = None
         finally:

@@ -22,7 +22,7 @@ from .commands import TIMEOUT, Commands, Inputs, Watchdog, warner
 from .dds import dds_qos, dds_topic
 from .listener import ORDERS, Listener
 from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name
-from .network import Network, OpenDomain, network, open_domain
+from .network import Network, OpenDomain, network_of_environment, open_domain
 
 # isort: split
 from cyclonedds import core, domain, pub  # where missing, dds says so
@@ -36,7 +36,7 @@ class Publisher(Sink):
     """A sink that publishes each sample, and receives targets and commands.
 
     Args:
-        place: the network, or one that is open already; None: what the environment asks for.
+        network: the network, or one that is open already; None: what the environment asks for.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         clock: also the samples' stamps as /clock; and hear /pause and /step.
@@ -52,7 +52,7 @@ class Publisher(Sink):
 
     Attributes:
         lockstep: as given.
-        place: the network.
+        network: the network.
         interface: names of the network interfaces in use, known when it is open.
         topics: what is published.
         commands: the topics on which commands are heard; none where the FMU has no inputs for
@@ -65,7 +65,7 @@ class Publisher(Sink):
 
     def __init__(
         self,
-        place: Network | OpenDomain | None = None,
+        network: Network | OpenDomain | None = None,
         *,
         scene: bool = False,
         effort: bool = False,
@@ -86,8 +86,8 @@ class Publisher(Sink):
         if timeout is not None and not 0.0 < timeout < inf:
             raise InputError(f"`timeout` {timeout:g} is no time")
         self._opened = opened
-        self._shared = place if isinstance(place, OpenDomain) else None
-        self.place = place.place if isinstance(place, OpenDomain) else place or network()
+        self._shared = network if isinstance(network, OpenDomain) else None
+        self.network = network.network if isinstance(network, OpenDomain) else network or network_of_environment()
         self.interface, self.lockstep = "", lockstep
         self._scene, self._effort, self._clock = scene, effort, clock
         self._prefix = f"/{namespace.strip('/')}" if namespace else ""
@@ -144,11 +144,11 @@ class Publisher(Sink):
         return name if name.startswith("/") else f"{self._prefix}/{name}"
 
     def __enter__(self) -> Publisher:
-        self._domain = self._shared or open_domain(self.place)
+        self._domain = self._shared or open_domain(self.network)
         self.interface = self._domain.interface
         try:
-            with self.place.guarded():  # one may have sockets of its own, by CYCLONEDDS_URI
-                participant = self._participant = domain.DomainParticipant(self.place.domain)
+            with self.network.guarded():  # one may have sockets of its own, by CYCLONEDDS_URI
+                participant = self._participant = domain.DomainParticipant(self.network.domain)
             self._writers = {
                 name: pub.DataWriter(
                     participant, dds_topic(participant, self._named(name), said.type), dds_qos(said.qos, said.type)
@@ -164,7 +164,7 @@ class Publisher(Sink):
                 run=self._run,
             )
         except core.DDSException as error:
-            raise PublishError(f"DDS domain {self.place.domain} fails: {error}") from error
+            raise PublishError(f"DDS domain {self.network.domain} fails: {error}") from error
         self._opened(self)
         return self
 
@@ -207,7 +207,7 @@ class Publisher(Sink):
         if self._watchdog is not None:
             if not asked:
                 return self._watchdog.asked(self._sample.t)
-            self._watchdog.heard(self._sample.t, asked)
+            self._watchdog.received(self._sample.t, asked)
         return asked
 
     def _await_command(self, stop: Callable[[], bool]) -> Inputs | None:
@@ -256,7 +256,7 @@ class Publisher(Sink):
 def publish(
     run: Experiment | Fmu | str | Path,
     *sinks: Sink,
-    wire: Publisher | None = None,
+    publisher: Publisher | None = None,
     pace: RealTime | None = None,
     stop: Callable[[], bool] = lambda: False,
     steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
@@ -268,7 +268,7 @@ def publish(
         run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
             a stop time it has no end.
         sinks: what consumes the samples too, a bag for instance.
-        wire: the publisher; None: one of the joint states.
+        publisher: the publisher; None: one of the joint states.
         pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
         stop, steer: as of ``simulate``; commands from the network have the last word.
 
@@ -278,10 +278,10 @@ def publish(
         SimulationError: the FMU refused or failed a call.
     """
     run = as_experiment(publish, run, options, stop_time=inf)
-    wire = wire or Publisher()
-    if pace is None and not wire.lockstep:
+    publisher = publisher or Publisher()
+    if pace is None and not publisher.lockstep:
         pace = RealTime()
-    member = _member(run, wire, sinks, pace, stop, steer)
+    member = _member(run, publisher, sinks, pace, stop, steer)
     return simulate_together([member], pace=pace, stop=stop)[0]
 
 
@@ -289,7 +289,7 @@ def publish_together(
     robots: Mapping[str, Experiment],
     *,
     sinks: Mapping[str, Sequence[Sink]] = MappingProxyType({}),
-    place: Network | None = None,
+    network: Network | None = None,
     clock: bool = False,
     namespace: str = "",
     pace: RealTime | None = None,
@@ -301,7 +301,7 @@ def publish_together(
     Args:
         robots: an experiment by namespace, all of the same times; their first stamp is one.
         sinks: what consumes a robot's samples too.
-        place, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
+        network, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
         pace, stop: as of ``publish``.
 
     Raises:
@@ -318,18 +318,18 @@ def publish_together(
         raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
     for name in robots:
         check_name("robots", name)
-    shared, now, members = open_domain(place or network()), time.time(), list[Member]()
+    shared, now, members = open_domain(network or network_of_environment()), time.time(), list[Member]()
     for name, run in robots.items():
-        wire = Publisher(shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options)
+        publisher = Publisher(shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options)
         stamped = run if run.stamp_start is not None else replace(run, stamp_start=now)
         own = sinks.get(name, ())
-        members.append(_member(stamped, wire, own, pace, stop, lambda: None))
+        members.append(_member(stamped, publisher, own, pace, stop, lambda: None))
     return dict(zip(robots, simulate_together(members, pace=pace, stop=stop)))
 
 
 def _member(
     run: Experiment,
-    wire: Publisher,
+    publisher: Publisher,
     sinks: Sequence[Sink],
     pace: RealTime | None,
     stop: Callable[[], bool],
@@ -338,7 +338,7 @@ def _member(
     """Return a published run that follows commands; those from the network take precedence."""
 
     def asked() -> Mapping[str, Setting]:
-        commands = wire.command(stop, pace) or {}
+        commands = publisher.command(stop, pace) or {}
         return {**(steer() or {}), **commands}
 
-    return Member(run, (wire, *sinks), asked, wire.resume)
+    return Member(run, (publisher, *sinks), asked, publisher.resume)

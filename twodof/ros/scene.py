@@ -99,13 +99,13 @@ def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement]
         size, centre = high - low, (low + high) / 2
         candidates.append((float(np.prod(size)), "box", size, rotation, centre))
         for k in range(3):
-            turned = rotation[:, [(k + 1) % 3, (k + 2) % 3, k]]  # the cylinder's axis is z
-            local_turned = vertices @ turned
-            middle = (local_turned.min(axis=0) + local_turned.max(axis=0)) / 2
-            r = float(np.linalg.norm(local_turned[:, :2] - middle[:2], axis=1).max())
-            height = float(np.ptp(local_turned[:, 2]))
+            rotated = rotation[:, [(k + 1) % 3, (k + 2) % 3, k]]  # the cylinder's axis is z
+            local_rotated = vertices @ rotated
+            middle = (local_rotated.min(axis=0) + local_rotated.max(axis=0)) / 2
+            r = float(np.linalg.norm(local_rotated[:, :2] - middle[:2], axis=1).max())
+            height = float(np.ptp(local_rotated[:, 2]))
             round_size = np.array([r, height])
-            candidates.append((math.pi * r * r * height, "cylinder", round_size, turned, middle))
+            candidates.append((math.pi * r * r * height, "cylinder", round_size, rotated, middle))
     _, kind, size, rotation, centre = min(candidates, key=lambda candidate: candidate[0])
     placement = Placement(rotation @ centre, rotation)
     if kind == "box":
@@ -134,17 +134,17 @@ def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
         return None
 
 
-def _place(part: ET.Element, place: Placement) -> None:
+def _place(part: ET.Element, transform: Placement) -> None:
     origin = part.find("origin")
     if origin is None:
         origin = ET.SubElement(part, "origin")
-    r = place.rotation
+    r = transform.rotation
     # roll from what yaw leaves: exact too where the two turn about one axis, as SciPy's are not
     yaw = math.atan2(r[1, 0], r[0, 0])
     sin, cos = math.sin(yaw), math.cos(yaw)
     pitch = math.atan2(-r[2, 0], cos * r[0, 0] + sin * r[1, 0])
     roll = math.atan2(sin * r[0, 2] - cos * r[1, 2], cos * r[1, 1] - sin * r[0, 1])
-    origin.set("xyz", _text(place.translation))
+    origin.set("xyz", _text(transform.translation))
     origin.set("rpy", _text((roll, pitch, yaw)))
 
 

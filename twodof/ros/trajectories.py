@@ -52,14 +52,14 @@ class Trajectory(NamedTuple):
         joints: indices of the n joints.
         times: of the points, s, ascending; some may be before the start.
         points: position and, where they have any, velocity and acceleration, k × n each.
-        strangers: names of joints that the robot has not.
+        unknown_joints: names of joints that the robot has not.
     """
 
     start: float
     joints: list[int]
     times: list[float]
     points: list[Array]
-    strangers: tuple[str, ...] = ()
+    unknown_joints: tuple[str, ...] = ()
 
 
 def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int) -> Trajectory:
@@ -95,8 +95,8 @@ def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int
     if not all(np.isfinite(point).all() for point in points):
         raise CommandError("finite", "is not finite")
     begins, *seconds = ((t - begin) / NANOSECONDS for t in (came, *times))
-    strangers = tuple(name for name in message.joint_names if name not in joints)
-    return Trajectory(begins, [i for i, _ in known], seconds, points, strangers)
+    unknown_joints = tuple(name for name in message.joint_names if name not in joints)
+    return Trajectory(begins, [i for i, _ in known], seconds, points, unknown_joints)
 
 
 def _nanoseconds(time: Any) -> int:

@@ -26,7 +26,7 @@ USE = ["effort_use", "velocity_use"]
 ROUNDING = 1e-12  # relative, and absolute below 1: values that are nearer count as equal
 
 
-def places(values: Array) -> NDArray[np.int64]:
+def ranks(values: Array) -> NDArray[np.int64]:
     """Return the rank of each value, 0 for the least; values equal up to rounding share it.
 
     NaN have the last place.
@@ -57,13 +57,13 @@ def candidates(table: pandas.DataFrame) -> pandas.DataFrame:
 def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
     """Return the candidates, the best first: by settling time, effort and errors at the end."""
     runs = candidates(table)
-    keys = [places(runs[name].to_numpy(dtype=float)) for name in RANKED]
+    keys = [ranks(runs[name].to_numpy(dtype=float)) for name in RANKED]
     return runs.iloc[np.lexsort(keys[::-1])] if len(runs) else runs
 
 
 def equals(runs: pandas.DataFrame) -> int:
     """Count the ranked runs that equal the first, up to rounding."""
-    keys = np.array([places(runs[name].to_numpy(dtype=float)) for name in RANKED])
+    keys = np.array([ranks(runs[name].to_numpy(dtype=float)) for name in RANKED])
     return int((keys == keys[:, :1]).all(axis=0).sum()) if len(runs) else 0
 
 

@@ -19,7 +19,7 @@ from .recording import Array, Recording
 Indices = NDArray[np.intp]
 
 
-class Outline:
+class Downsampler:
     """Downsampler that chooses among its earlier samples and those that came since.
 
     At most ``most`` samples wait to be chosen from, of which a quarter is left at most; ``lines``
@@ -56,6 +56,6 @@ def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
     for line in lines:
         line = np.where(np.isfinite(line), line, np.nan)
         for extreme in (np.fmin, np.fmax):
-            places = np.flatnonzero(line == np.repeat(extreme.reduceat(line, starts), sizes))
-            kept[places[np.diff(parts[places], prepend=-1) > 0]] = True
+            positions = np.flatnonzero(line == np.repeat(extreme.reduceat(line, starts), sizes))
+            kept[positions[np.diff(parts[positions], prepend=-1) > 0]] = True
     return np.flatnonzero(kept)
