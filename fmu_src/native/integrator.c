@@ -19,11 +19,11 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
    there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
    HOLD_OF_ALL (part of CHATTER_TIME) or more covers all joints at limits. Otherwise an acceleration that grazes
    zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A
-   joint that returns once is held for some nanoseconds. The rank of J⁺ is held in the same way where it drops
+   joint that returns once is held for some picoseconds. The rank of J⁺ is held in the same way where it drops
    soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
    never held, because its J⁺ is unbounded. */
-static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 32768.0, HOLD_GROWTH = 8.0,
-                    HOLD_OF_ALL = 1.0 / 4096.0;
+static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 16777216.0, HOLD_GROWTH = 8.0,
+                    HOLD_OF_ALL = 1.0 / 512.0;
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
 

@@ -54,12 +54,12 @@ class Equations:
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-15, 8.0, 2.0**-12
+CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-24, 8.0, 2.0**-9
 """Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held
 there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
 HOLD_OF_ALL (part of CHATTER_TIME) or more covers all joints at limits. Otherwise an acceleration that grazes
 zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A joint
-that returns once is held for some nanoseconds. The rank of J⁺ is held in the same way where it drops soon after a
+that returns once is held for some picoseconds. The rank of J⁺ is held in the same way where it drops soon after a
 rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is never held, because
 its J⁺ is unbounded."""
 MOST_ROWS = 6
