@@ -522,7 +522,7 @@ def test_a_page_whose_server_ends_goes_on_with_the_next(
             page.wait_for_timeout(1500)  # it looks for one more than once
             assert "this page waits for it" in told(page)
             with served("live", slider, "--set", "Kp=100", cwd=tmp_path, port=port) as following:
-                page.wait_for_function("() => globalThis.arm?.facts.robot === 'slider'")
+                page.wait_for_function("() => globalThis.arm?.facts?.robot === 'slider'")
                 assert page.evaluate("arm.held('Kp')") == [100, 100]
                 names = page.locator("#arm-readout td:first-child").all_text_contents()
                 assert names[:2] == ["_slide", "swing"]

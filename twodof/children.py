@@ -32,7 +32,7 @@ BOOT = """
 import sys
 from contextlib import suppress
 from multiprocessing.connection import Connection
-with Connection(int(sys.argv[1])) as pipe, suppress(OSError):  # nobody is left to be told
+with Connection(int(sys.argv[1])) as pipe, suppress(OSError):  # the parent has ended
     try:
         sys.path[:] = pipe.recv()
         pipe.recv()(pipe)

@@ -93,7 +93,7 @@ def shown(path: str | Path) -> str:
 def check_archive(path: str | Path) -> None:
     """Refuse a zip archive that is unsafe to unzip, or has too many members to list.
 
-    zipfile reads the whole list before it can be asked how long it is.
+    zipfile reads the whole list of members before it can tell the length.
 
     Raises:
         OSError: with the reason in ``strerror``.
@@ -168,7 +168,7 @@ def write_file(path: Path, content: bytes) -> None:
     if mode:
         check_file(path, sys.maxsize)
     target = Path(os.path.realpath(path))
-    os.stat(f"{target.parent}/")  # else it is the temporary file's name that is told
+    os.stat(f"{target.parent}/")  # otherwise the error would name the temporary file
     partial = target.with_name(f".twodof-{secrets.token_hex(8)}")
     new = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:

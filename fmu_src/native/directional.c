@@ -14,7 +14,7 @@
 
 typedef double Real;
 
-/* Of the changes, and no less than what can be divided by. */
+/* Scale of the changes, at least the smallest safe divisor. */
 static Real largest_of(const Real change[], int count)
 {
     Real largest = DBL_MIN;

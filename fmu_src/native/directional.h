@@ -5,10 +5,10 @@
 
 #include "internal.h"
 
-/* Which computed variables are wanted. */
+/* Requested computed variables. */
 enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4 };
 
-/* How all variables change at value, by place, where inputs and states do as in change.
+/* Changes of all variables at value, by index, given those of inputs and states in change.
    Those that hold are the joints at rest at a limit, which stay there; the rank is that of J⁺. */
 #define differentiate PREFIXED(twodof_differentiate)
 HIDDEN void differentiate(const double value[], const int held[], int rank, int wanted,

@@ -15,7 +15,7 @@
 #include "pseudo_inverse.h"
 #endif
 
-/* Of Dormand and Prince's interpolant, which weighs the derivatives of the stages: the largest sum of
+/* Weights of the stages in Dormand and Prince's interpolant: the largest sum of
    the weights' magnitudes, and that of their rates. */
 static const double REACH = 1.66, PACE = 3.72;
 /* A force that presses a joint falls below what the stages show of it by less than its range there. It is
@@ -27,7 +27,7 @@ static const double DOUBT = 0.25;
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
-/* What is negative once a regime has ended, at a time within the step. */
+/* A margin, negative once a regime has ended, at a time within the step. */
 typedef double Margin(Step *step, double passed, int joint);
 
 static void interpolated(const Step *step, double passed, double y[N_STATES])
@@ -44,7 +44,7 @@ static double limit_margin(Step *step, double passed, int joint)
     return fmin(value[Q_MAX + joint] - q, q - value[Q_MIN + joint]);
 }
 
-/* How joints at rest are pressed into their limits. */
+/* Contact forces of joints at rest. */
 static void press(Step *step, double passed, double pressed[N_JOINTS])
 {
     double y[N_STATES], a[N_JOINTS];
@@ -286,7 +286,7 @@ static double sweep(const Step *step, int near[N_JOINTS])
     return change;
 }
 
-/* What the event at a time within the step is, where the state is y. */
+/* Determine the event at a time within the step, with state y. */
 static void name_event(Step *step, double passed, const double y[N_STATES], Event *event)
 {
     double a[N_JOINTS], pressed[N_JOINTS] = {0};

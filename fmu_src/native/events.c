@@ -10,7 +10,7 @@
 #include "control.h"
 #endif
 
-/* How far past a limit an event is, as a part of max(1, |limit|): some hundred units in the last
+/* Distance of an event past a limit, as a part of max(1, |limit|): some hundred units in the last
    place. */
 static const double PAST = 1e-13;
 /* s: what a joint gains in room for its speed away from a limit. */

@@ -13,7 +13,7 @@ INTERNAL void find_stops(const Plant *plant, Stops *stops);
 INTERNAL void event_indicators(const Plant *plant, const Stops *stops,
                                double indicator[N_INDICATORS]);
 
-/* What happens at an event: decided by the state alone, so that it is the same whether the importer came
+/* Changes at an event: decided by the state alone, so that it is the same whether the importer came
    early, late or for nothing. Whether the state is another now. */
 INTERNAL int handle_event(Plant *plant, Stops *stops);
 

@@ -154,7 +154,7 @@ fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *count)
     return tell(instance, N_STATES, count);
 }
 
-/* What the modelDescription says that there is not: clocks, structural parameters, event mode in
+/* Functions of features that modelDescription.xml excludes: clocks, structural parameters, event mode in
    co-simulation, scheduled execution, dependencies of elements. */
 #if defined __GNUC__
 #pragma GCC diagnostic ignored "-Wunused-parameter"

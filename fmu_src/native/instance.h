@@ -21,7 +21,7 @@
 #define REAL_NAME "Float64"
 #define OTHER_NAME "another type"
 #define TOKEN "instantiation token"
-/* What it spells in another way. */
+/* The same names in another spelling. */
 #define DeSerializeFMUstate DeserializeFMUState
 #define FreeFMUstate FreeFMUState
 #define GetDerivatives GetContinuousStateDerivatives
@@ -142,7 +142,7 @@ INTERNAL Status report(Instance *instance, Status status, const char *format, ..
 /* A new instance as the draft says; NULL where it has no name or another token. */
 INTERNAL Instance *instantiate(Instance draft, const char *token, int logging_on);
 
-/* Take over the times of the experiment; its tolerance is told to be ignored. */
+/* Take over the times of the experiment; a tolerance is ignored, with a message. */
 INTERNAL Status set_up(Instance *instance, Call call, const double *tolerance, double start,
                        const double *stop);
 
@@ -171,7 +171,7 @@ INTERNAL Status do_step(void *component, double point, double h);
 
 /* --- exchange.c --- */
 
-/* Whether the states q and v are others is told. */
+/* Reports whether the states q and v have changed. */
 INTERNAL Status update_discrete_states(void *component, Boolean *states_changed);
 
 /* --- variables.c: each reference is of so many values as PLACE says, in all n_values --- */

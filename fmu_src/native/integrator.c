@@ -111,7 +111,7 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
     return NAN;
 }
 
-/* How long joints are held at their limits, or the rank of J⁺. */
+/* A hold of joints at their limits, or of the rank of J⁺. */
 typedef struct {
     double until, length;
 } Hold;

@@ -1,4 +1,4 @@
-/* What all files of the FMU share. Other code of the process, the C library and other FMUs among it, has
+/* Declarations for all files of the FMU. Other code of the process, the C library and other FMUs among it, has
    functions of the same names: those of the FMU are static, but those of the standard and
    `twodof_differentiate`, which carry the prefix of a program that has the FMU as sources. */
 #ifndef INTERNAL_H

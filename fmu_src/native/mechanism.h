@@ -50,7 +50,7 @@ INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const Carrie
                                const double v[N_JOINTS], const double a[N_JOINTS],
                                const double gravity[3], double tau[N_JOINTS]);
 
-/* What no |τ| of these exceeds, but for rounding, in fewer operations from a few joints on. */
+/* Bounds of |τ| but for rounding, in fewer operations from a few joints on. */
 INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const Carrier *carrier,
                             const double v[N_JOINTS], const double a[N_JOINTS],
                             const double gravity[3], double bound[N_JOINTS]);

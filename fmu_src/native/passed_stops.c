@@ -1,6 +1,6 @@
 /* Find the stops that an importer's step has passed. The quintic through position, velocity and acceleration of both
    ends tells whether a joint turned near its limit or outside it; where one did, the engine takes the step
-   anew, from its start, and its stops decide. */
+   again, from its start, and its stops decide. */
 #include "passed_stops.h"
 
 #include <math.h>

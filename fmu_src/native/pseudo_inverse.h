@@ -12,7 +12,7 @@
 INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
                                   int rank, double result[N_JOINTS], double *margin);
 
-/* How far the singular values next to a rank are from rcond, as ratios to the largest; negative where
+/* Distance of the singular values next to a rank from rcond, as ratios to the largest; negative where
    the rule σ > rcond·σ_max gives another rank. */
 INTERNAL double rank_margin(const double ratio[N_ROWS], double rcond, int rank);
 

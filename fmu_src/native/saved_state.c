@@ -38,7 +38,7 @@ static int are_booleans(const double value[])
     return 1;
 }
 
-/* Whether the joints that are said to rest are so by truth values; what these amount to is counted. */
+/* Check that held and watched flags are 0 or 1; recompute any_*. */
 static int are_stops(Stops *stops)
 {
     int sound = stops->rank >= 0 && stops->rank <= N_ROWS;
@@ -64,7 +64,7 @@ static int is_passage(const Passage *passage)
 }
 
 /* Take over a state from bytes that may be anybody's, with whatever checksum: each field is checked,
-   and what follows from others is computed anew. A refusal is logged. */
+   dependent values are recomputed. A refusal is logged. */
 static Status take_over(Instance *instance, const void *bytes)
 {
     State *state = &instance->state;
@@ -73,7 +73,7 @@ static Status take_over(Instance *instance, const void *bytes)
     int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
                 && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN])
                 && are_stops(&state->stops) && is_passage(&state->passage);
-    const int runs = state->phase >= STEP; /* before, what is wrong is told where it begins */
+    const int runs = state->phase >= STEP; /* before, initialisation reports errors */
     const int steps = runs && instance->kind == CO_SIMULATION; /* solvers try what they like */
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));

@@ -73,7 +73,7 @@ static int settable(Instance *instance, Call call, int variable)
                    VARIABLE_NAME[variable]);
 }
 
-/* Take over a value; outputs that follow from it are computed anew when they are read. That of q or v
+/* Take over a value; dependent outputs are recomputed when they are read. That of q or v
    before the run is their start. */
 static void set(Instance *instance, int variable, double value)
 {
@@ -216,7 +216,7 @@ Status set_others(void *component, const Reference vr[], size_t count, const voi
     return instance && known(instance, SET_OTHER, OTHER, vr, count, value, n_values) ? OK : ERROR;
 }
 
-/* What of the computed variables derivatives of the unknowns by the knowns need; -1, which is logged,
+/* The computed variables that the derivatives of the unknowns by the knowns need; -1, which is logged,
    where there are none. */
 static int wanted(Instance *instance, Call call, const Reference unknown[], size_t n_unknown,
                   const Reference given[], size_t n_given)

@@ -8,7 +8,7 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["gains", true, GAINS],
   ["disturbance and payload", false, ["f_ext", "tau_ext", "payload", "payload_com", "payload_known"]],
   ["feedforward", false, ["quat_des", "xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
-  ["parameters, which begin the run anew", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
+  ["Parameters (a change restarts the simulation)", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
 ]);
 
 /** An element with text, and what it holds. */
@@ -154,7 +154,7 @@ function digits(value) {
 }
 
 class Readout {
-  /** @type {Map<string, HTMLElement>} cells of what is told beside the joints, by its name */
+  /** @type {Map<string, HTMLElement>} cells of the values beside the joints, by name */
   more = new Map();
 
   /**

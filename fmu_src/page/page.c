@@ -150,7 +150,7 @@ EXPORT int engine_instantiate(void)
     return instance ? engine_reset() : WARNING + 1;
 }
 
-/* What it has logged last, and from then on nothing until it logs again. */
+/* The last log message, which is then cleared. */
 EXPORT const char *engine_message(void)
 {
     return said;

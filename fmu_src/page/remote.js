@@ -104,7 +104,7 @@ class Remote extends Samples {
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify([order, value]));
   }
 
-  /** Set an input from the next step on; a parameter begins the run anew. */
+  /** Set an input from the next step on; a parameter restarts the simulation. */
   /** @type {(name: string, value: Value | number[]) => void} */
   set(name, value) {
     const pairs = this.checked(name, value);
@@ -118,7 +118,7 @@ class Remote extends Samples {
     this.tell("play", on);
   }
 
-  /** It is advanced elsewhere. */
+  /** The server advances it. */
   advance() {}
 
   step() {

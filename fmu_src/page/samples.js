@@ -1,5 +1,5 @@
 /**
- * A robot's motion, sample by sample: what was told, and what came of it; by whoever it is stepped.
+ * Samples of a robot's motion: inputs and outputs, from any source.
  *
  * @typedef {Object} JointFacts
  * @property {string} name
@@ -44,7 +44,7 @@ class Samples {
   count = 0;
   playing = true;
   steered = true; // by its inputs
-  said = ""; // what the user is to know, until something is asked for
+  said = ""; // message to the user, until the next request
   notice = ""; // the same, for some time
   recorded = 0; // samples in a bag that is being written
   /** @type {string[]} what of the page it has no use for */
@@ -190,7 +190,7 @@ class Samples {
     return this.steered && k === this.count - 1 ? this.held(group) : [...this.at(group, k)];
   }
 
-  /** What it is meant to follow, and the target that it has; null where there is none. */
+  /** Followed input and current target; null where there is none. */
   get follows() {
     return [["x", "x_des"], ["q", "q_des"]].find(([, target]) => this.groups.has(target)) ?? null;
   }

@@ -25,7 +25,7 @@ class Session extends Samples {
     this.startAgain();
   }
 
-  /** Begin anew; inputs and parameters as they are, or as the FMU has them. */
+  /** Restart; inputs and parameters keep their values, or take the FMU's. */
   /** @type {(all?: boolean) => void} */
   startAgain(all = false) {
     if (all) this.values = this.defaults();
@@ -48,20 +48,20 @@ class Session extends Samples {
       if (typeof value === "boolean") this.engine.setBoolean(this.variable(name).place, value);
   }
 
-  /** Set an input from the next step on; a parameter begins the run anew. */
+  /** Set an input from the next step on; a parameter restarts the simulation. */
   /** @type {(name: string, value: Value | number[]) => void} */
   set(name, value) {
     const pairs = this.checked(name, value);
     /** @type {Map<string, Value>} */
     const before = this.values;
-    const anew = this.variable(pairs[0][0]).causality === "parameter";
+    const restarts = this.variable(pairs[0][0]).causality === "parameter";
     this.values = new Map([...before, ...pairs]);
     try {
-      if (anew) return this.startAgain();
+      if (restarts) return this.startAgain();
       this.apply(pairs);
     } catch (refused) {
       this.values = before;
-      if (anew) this.startAgain();
+      if (restarts) this.startAgain();
       throw refused;
     }
     this.note(Object.fromEntries(pairs.filter(([n, v]) => v !== before.get(n))));

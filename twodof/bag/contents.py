@@ -20,7 +20,7 @@ def storage_files(folder: Path) -> list[Path]:
     An MCAP file alone, as pages and other tools write them, is a bag too.
 
     Raises:
-        BagError: one is a link: a bag from elsewhere would name any file of this machine.
+        BagError: a file is a link: an untrusted bag could name any file of this machine.
     """
     if folder.suffix == ".mcap" and folder.is_file():
         return [folder]

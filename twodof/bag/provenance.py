@@ -50,8 +50,8 @@ SHAPE = {
 class ProvenanceFile:
     """run.json of a bag in progress, complete at any moment with the changes so far.
 
-    The changes of inputs stand at its end, before who commanded the robot alone, so that adding
-    some writes no other byte anew.
+    The changes of inputs stand at its end, before the commanders only, so that adding one rewrites
+    few bytes.
 
     Args:
         folder: of the bag.
@@ -60,7 +60,7 @@ class ProvenanceFile:
         command_line: that made the bag; "" where none did.
 
     Raises:
-        OSError: it cannot be written; so does ``add``, which can be called again then.
+        OSError: it cannot be written; ``add`` raises it too, and can be called again.
     """
 
     def __init__(self, folder: Path, namespace: str, run: Experiment, command_line: str) -> None:

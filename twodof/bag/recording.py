@@ -67,7 +67,7 @@ class Recording:
         q, v: positions (rad, m) and velocities, N × n.
         tau: efforts (N·m, N), N × n, or N × 0 where the bag has none.
         received: what /target said; None where the bag has no such points.
-        provenance: what the logger wrote about the run, {} for a bag from elsewhere.
+        provenance: the logger's facts of the run, {} for a third-party bag.
 
     Raises:
         BagError: by what the provenance tells, where it does not fit the samples, and by ``steps``

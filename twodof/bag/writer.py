@@ -88,7 +88,7 @@ class Bag(Sink):
         """Receive the experiment of the samples to come.
 
         Raises:
-            BagError: the FMU has not what is asked for.
+            BagError: the FMU lacks a requested output.
         """
         self._run = run
         self._inputs = run.start_values

@@ -157,7 +157,7 @@ def _facts_beside(output: str | None) -> AbstractContextManager[object]:
 
 def _fail(message: str, status: int = 1) -> int:
     line = " ".join(message.split())
-    if len(line) > LONGEST_LINE:  # a name of a file from elsewhere can have any length
+    if len(line) > LONGEST_LINE:  # names of untrusted files can have any length
         line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
     say(f"twodof: error: {line}", error=True)
     return status

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from ..errors import SimulationError
 
 INTERRUPTED = 130
-"""Exit status of what was asked to end."""
+"""Exit status after a request to end."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
-PATIENCE = 5.0  # s for what is under way to end when it was asked to
+PATIENCE = 5.0  # s in which the work in progress ends on request
 _interrupts: list[int] = []
 
 
@@ -37,9 +37,8 @@ def is_interrupt(error: ImportError | OSError) -> bool:
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Return whether a signal asked the run to end; read between steps, so that no step is cut.
 
-    SIGINT, SIGTERM, and SIGHUP from a terminal that is closed. A second one interrupts at once, and
-    so does the clock where the first has no effect; more are ignored, as all that is left is
-    closing the bag.
+    SIGINT, SIGTERM, and SIGHUP of a closed terminal. A second signal interrupts at once, and so does a
+    time-out where the first has no effect; further ones are ignored while the bag is closed.
     """
     asked = False
 

@@ -37,7 +37,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     """Return the flavour, the files that the GUID covers, and a function that compiles the others.
 
     Raises:
-        BuildError, RobotError: naming what is wrong; so does what compiles.
+        BuildError, RobotError: naming the culprit; the compiling function raises them too.
     """
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")

@@ -50,8 +50,8 @@ class _Staying:
 def _loading() -> Iterator[None]:
     """Prevent FMPy from changing the working directory while it loads a library.
 
-    It goes to the library's folder meanwhile, as Windows needs it, and all threads of the process
-    with it, whose own files are elsewhere then.
+    FMPy changes to the library's folder, as Windows requires, which would change the relative paths
+    of all threads.
     """
     with LOADING:
         vars(fmi1)["os"] = _Staying()

@@ -73,7 +73,7 @@ class Foxglove(Sink):
         """Receive the experiment of the samples to come.
 
         Raises:
-            BagError: the FMU has not what is asked for.
+            BagError: the FMU lacks a requested output.
         """
         self._messages = Messages(run, scene=self._scene, effort=self._effort)
         self._gains = _Gains(run, self._set_gains)

@@ -16,7 +16,7 @@ from .arm import arm_of, arm_page
 from .loop import Loop
 from .serving import HOST, PORT, Connection, Server, user_token
 
-RATE = 30.0  # Hz, of what is told to pages
+RATE = 30.0  # Hz, of the news to pages
 
 
 def live(

@@ -24,13 +24,13 @@ from ..simulation.pace import RealTime
 from ..simulation.sample import Sample
 
 MOST_ROWS = 1000  # that are kept for pages that have not asked yet,
-MOST_AT_ONCE = 200  # and are told at a time
+MOST_AT_ONCE = 200  # rows in one message
 MOST_NOTES = 4
 MOST_ORDERS = 16  # that wait, after which a page is not listened to for a while
 MOST_STEPS = 10  # in one order
 IDLE = 0.05  # s between two looks at whether to go on
 TOLD = ("x_des", "quat_des", "q_des")
-"""Inputs that are told with a sample."""
+"""Inputs sent with a sample."""
 
 
 class PartialBag(Bag):
@@ -134,7 +134,7 @@ class Loop:
         Orders of one kind that follow each other become one, in which the newest values win.
 
         Args:
-            order: "change" of inputs and parameters, the latter begin the run anew; "play";
+            order: "change" of inputs and parameters, a parameter restarts the simulation; "play";
                 "step"; "reset"; "record".
             value: settings by name; whether to go on; -; whether inputs and parameters are reset
                 too; whether to record.
@@ -180,7 +180,7 @@ class Loop:
             t: time of the latest sample, s.
             seen: number of the last of the rows.
             rows: time, s, and the groups of ``TOLD`` of each sample since.
-            values: inputs and parameters as they are told by now.
+            values: inputs and parameters after all requests so far.
             playing: whether it is to go on.
             missed, steps, worst: deadlines missed, of how many steps, and the largest delay, s.
             recorded: number of samples in the bag that is being recorded, 0 where there is none.
@@ -229,7 +229,7 @@ class Loop:
         inputs = self._sample.inputs
         self._changes |= {name: values[name] for name in values if name in inputs}
         with self._lock:
-            self._values |= values  # again: a reset that was asked for before came between
+            self._values |= values  # again: an earlier request to reset came between
         parameters = {name: values[name] for name in values if name not in inputs}
         if parameters:
             self._restart(parameters)

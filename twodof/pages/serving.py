@@ -206,8 +206,8 @@ def _is_own(request: Request, host: str, address: str, others: Collection[str] =
     it asks for. An address is not resolved, so where all are listened on, any is good.
 
     Args:
-        request: what is asked for.
-        host, address: what was asked to listen on, and what that is resolved to.
+        request: the request.
+        host, address: the host to listen on as given, and its resolved address.
         others: origins that may ask too.
     """
     hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))

@@ -95,7 +95,7 @@ class Control:
         inputs: groups of variables that it has, in the table's order; τ depends on them directly.
         parameters: groups of its parameters.
         commands: what the law gives, "acceleration" (q̈_cmd, by inverse dynamics) or "effort" (τ).
-        rigid_stops: whether stops have a reaction, where nothing else is said.
+        rigid_stops: whether stops have a reaction, by default.
         outputs: groups of outputs that other laws do not have.
     """
 

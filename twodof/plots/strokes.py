@@ -35,7 +35,7 @@ class Stroke(NamedTuple):
 
     Attributes:
         track: whose, or None.
-        x, y: across and up; empty where the other alone is meant, along a whole line each.
+        x, y: across and up; empty for lines across the whole picture at the other's values.
         width: of the line in points; 0: none.
         mark: "o" at all points but the last, "+" or "." at all, or "".
         depth: what is higher is drawn over what is lower.

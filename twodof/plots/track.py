@@ -121,8 +121,8 @@ def read_tracks(
 
     Args:
         urdf: the robot of all of them; None: the one that each bag carries, if any.
-        frame: the end effector's link; None: as in the run that made the bag, and for bags from
-            elsewhere the URDF's "EndEffector", or the link behind most joints.
+        frame: the end effector's link; None: as in the run that made the bag, and for third-party
+            bags the URDF's "EndEffector", or the deepest link.
 
     Raises:
         BagError: a bag cannot be read.
@@ -249,7 +249,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
             turn_error = linkage.kinematics.angle(linkage.frame, q[-1], quat)
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
         dof = {joint.leader for joint in linkage.chain}
-        followed = len(axes) + 3 * turns <= len(dof)  # in all that is asked for at a time
+        followed = len(axes) + 3 * turns <= len(dof)  # in all task rows at once
         if not (inputs_known and followed and all(f"{g}[1]" in first for g in Held._fields)):
             return Task(linkage.axes, target, error, None, None, (), turn_error)
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]

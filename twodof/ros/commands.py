@@ -18,7 +18,7 @@ from ..simulation.experiments import NANOSECONDS
 from .messages import JOINT_STATE, POINT, POSE, store_of
 
 LOG = logging.getLogger(__name__)
-LONGEST_NAME = 80  # of a frame or joint, that is told
+LONGEST_NAME = 80  # of a frame or joint in a message
 TIMEOUT = 0.5  # s without a command until the robot is held
 RAMP = 0.5  # s in which efforts come down to 0
 Inputs = dict[str, float]

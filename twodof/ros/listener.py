@@ -20,7 +20,7 @@ from cyclonedds import builtin, core, sub  # where missing, dds says so
 
 LOG = logging.getLogger(__name__)
 ORDERS = {"/pause": "std_msgs/msg/Bool", "/step": "std_msgs/msg/UInt32"}
-LOOK = 100_000_000  # ns after which it is asked whether to go on
+LOOK = 100_000_000  # ns between two checks of `stop`
 UNREAD = core.SampleState.NotRead | core.ViewState.Any | core.InstanceState.Any
 WHAT = {JOINT_STATE: "a command", POINT: "a point", POSE: "a pose"}
 Read = TypeVar("Read")
@@ -142,7 +142,7 @@ class Listener:
 
         Args:
             stop: asked while it waits; True ends that.
-            pace: begins anew after it.
+            pace: restarts after it.
         """
         if not self._orders:
             return

@@ -125,7 +125,7 @@ class Messages:
         topics: all topics by name.
 
     Raises:
-        BagError: the FMU has not what is asked for.
+        BagError: the FMU lacks a requested output.
     """
 
     def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False) -> None:

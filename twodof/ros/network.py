@@ -44,7 +44,7 @@ class Network(NamedTuple):
     Attributes:
         domain: ROS_DOMAIN_ID.
         range: how far participants look for each other, ROS_AUTOMATIC_DISCOVERY_RANGE.
-        peers: other hosts that are told of us, ROS_STATIC_PEERS.
+        peers: other hosts to announce the run to, ROS_STATIC_PEERS.
         loopback: on the loopback interface alone, ROS_LOCALHOST_ONLY.
         custom: configuration that has the last word, CYCLONEDDS_URI.
     """

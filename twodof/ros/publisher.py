@@ -36,7 +36,7 @@ class Publisher(Sink):
     """A sink that publishes each sample, and receives targets and commands.
 
     Args:
-        network: the network, or one that is open already; None: what the environment asks for.
+        network: the network, or one that is open already; None: that of the environment variables.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         clock: also the samples' stamps as /clock; and hear /pause and /step.
@@ -99,7 +99,7 @@ class Publisher(Sink):
         """Receive the experiment of the samples to come.
 
         Raises:
-            BagError: the FMU has not what is asked for.
+            BagError: the FMU lacks a requested output.
             InputError: it has nothing to command, or no effort to ramp.
         """
         self._run, self._follows = run, Commands(run.fmu)
@@ -193,7 +193,7 @@ class Publisher(Sink):
 
         Args:
             stop: asked while it waits; True ends that.
-            pace: begins anew after a pause.
+            pace: restarts after a pause.
 
         Raises:
             PublishError: in lockstep no command came in time; it says who is missing.
@@ -267,10 +267,10 @@ def publish(
     Args:
         run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
             a stop time it has no end.
-        sinks: what consumes the samples too, a bag for instance.
+        sinks: further consumers of the samples, for example a bag.
         publisher: the publisher; None: one of the joint states.
         pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
-        stop, steer: as of ``simulate``; commands from the network have the last word.
+        stop, steer: as of ``simulate``; commands from the network have precedence.
 
     Raises:
         FmuError, InputError, PublishError: before the first sample.
@@ -300,7 +300,7 @@ def publish_together(
 
     Args:
         robots: an experiment by namespace, all of the same times; their first stamp is one.
-        sinks: what consumes a robot's samples too.
+        sinks: further consumers of a robot's samples.
         network, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
         pace, stop: as of ``publish``.
 

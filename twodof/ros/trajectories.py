@@ -109,7 +109,7 @@ class _Path:
 
     Args:
         begin: from when on there is anything, s.
-        q: where it rests until it is told of more.
+        q: its rest position before the first polynomial.
     """
 
     def __init__(self, begin: float, q: float) -> None:

@@ -55,9 +55,9 @@ def samples(
         pace: waits before each sample until its time has come.
         stop: asked between two steps, and while it is waited for the next one's time; True ends the
             run.
-        ready: called when the FMU is initialised, before time and stamps begin.
+        ready: called after the initialisation, before time and stamps begin.
         resume: asked where a step was discarded; start values with which the FMU is initialised
-            anew and goes on from the sample before, or None, and the run fails.
+            again to continue from the sample before, or None to fail.
         instance: one of that FMU which is as instantiated, and stays when the run has ended;
             None: an own one.
 
@@ -187,7 +187,7 @@ class Summary:
     Attributes:
         last: the last sample.
         wall_time: s, without loading and initialisation.
-        stopped: whether it was asked to end before its stop time.
+        stopped: whether a request ended it before its stop time.
         beyond_limits: joints whose effort or velocity at a sample exceeds the URDF's limit, the
             worst first.
     """

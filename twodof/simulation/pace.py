@@ -8,7 +8,7 @@ from math import inf
 
 from ..errors import InputError
 
-LONGEST_SLEEP = 0.1  # s, after which it is asked whether to go on
+LONGEST_SLEEP = 0.1  # s, between two checks of `stop`
 
 
 class RealTime:

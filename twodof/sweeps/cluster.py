@@ -65,7 +65,7 @@ def run_batch(name: str, points: Sequence[Point]) -> tuple[list[Row], float]:
 class Cluster:
     """The workers of a cluster, as a context that needs at least one of them.
 
-    Dask is asked in a thread, since it waits for what does not answer, and mostly for ever.
+    A thread talks to Dask, because Dask can wait for ever for a peer that does not answer.
 
     Args:
         job: what all runs share.

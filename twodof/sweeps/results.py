@@ -1,8 +1,7 @@
 """The table of a sweep: a folder of Parquet files that any reader opens as one table.
 
 While the sweep runs, its rows come in parts; when all are there, they become one file, in the order
-of the runs. A table may come from elsewhere: what is read is what is written here, in bounded
-memory, or refused. All of pyarrow is here.
+of the runs. An untrusted table is read in bounded memory, or refused. All of pyarrow is here.
 """
 
 from __future__ import annotations
