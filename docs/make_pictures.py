@@ -216,7 +216,7 @@ def draw_map(fmu: Path, grid: dict, settings: dict, path: Path) -> None:
     """Draw a map of the default arm."""
     table = fmu.with_name(path.stem)
     twodof.sweep(fmu, grid=grid, settings=settings, output=table)
-    figure = drawn(drawing(*twodof.read_sweep(table), path.stem))
+    figure = drawn(drawing(twodof.read_sweep(table), path.stem))
     figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
 
 

@@ -15,6 +15,7 @@ PYTHON = {
 
 ROOMS = {
     "errors": "what can go wrong, in words; needs nothing",
+    "signatures": "keywords that functions share",
     "bounds": "on files of others, in numbers",
     "version": "of this package and of others",
     "files": "files and folders, whoever's they are",
@@ -93,7 +94,7 @@ def test_rooms_import_few_others() -> None:
         (room(path), other)
         for path in PYTHON
         for other in {name.split(".")[1] for name in imported(path) if name.startswith("twodof.")}
-        if path.parts[0] == "twodof" and other in ROOMS and other not in (room(path), "bounds")
+        if path.parts[0] == "twodof" and other in ROOMS and other not in (room(path), "bounds", "signatures")
     }
     assert len(arrows) <= MOST_ARROWS
 
@@ -132,6 +133,22 @@ def test_nothing_is_longer_than_can_be_read() -> None:
 def test_the_package_has_few_files_beside_its_rooms() -> None:
     files = {path.name for path in (ROOT / "twodof").glob("*.py")}
     assert len(files) <= MOST_FILES
+
+
+RIDDLES = {"What", "Of", "Who", "Whose", "How", "That", "Which", "Beside"}
+
+
+def test_docstrings_begin_with_no_riddle() -> None:
+    """Ruff checks the mood of functions; modules, classes and properties are noun phrases."""
+    found = {
+        f"{path}: {text.split(chr(10))[0]}"
+        for path, tree in PYTHON.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and (text := ast.get_docstring(node))
+        and (text.split()[0].rstrip(":,.") in RIDDLES or len(text.split()) < 2)
+    }
+    assert not found
 
 
 def test_one_function_prints() -> None:

@@ -30,8 +30,7 @@ def grid_sweep(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def panels(path: Path) -> dict[str, Axes]:
-    table, provenance = read_sweep(path)
-    figure = drawn(drawing(table, provenance, "a"))
+    figure = drawn(drawing(read_sweep(path), "a"))
     labels = [str(axes.get_label()) for axes in figure.axes]
     return {label: axes for label, axes in zip(labels, figure.axes) if " over " in label}
 
@@ -46,7 +45,7 @@ LINES = """() => [...document.querySelectorAll(".runs td")].map(cell => {
 def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_phone(
     grid_sweep: Path, tmp_path: Path
 ) -> None:
-    page = save(drawing(*read_sweep(grid_sweep), "a"), tmp_path / "a.html")
+    page = save(drawing(read_sweep(grid_sweep), "a"), tmp_path / "a.html")
     seen = []
     with browser.chromium() as chromium:
         for scheme in ("light", "dark"):
@@ -148,7 +147,7 @@ def test_plot_of_a_sweep_prints_the_best_runs(
     )
     assert main(["plot", str(grid_sweep), str(grid_sweep)]) == 2
     assert "is a sweep; it is drawn alone" in capsys.readouterr().err
-    found = drawing(*read_sweep(grid_sweep), "a")
+    found = drawing(read_sweep(grid_sweep), "a")
     assert f"{best['Kp']:g}" in save(found, tmp_path / "a.html").read_text("utf-8")
 
 

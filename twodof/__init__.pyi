@@ -19,11 +19,12 @@ from .pages.replay import view as view
 from .plots.runs import plot as plot
 from .ros.layouts import layouts as layouts
 from .ros.publisher import Publisher as Publisher
-from .ros.publisher import publish as publish
-from .ros.publisher import publish_together as publish_together
+from .ros.realtime import publish as publish
+from .ros.realtime import publish_together as publish_together
 from .simulation.experiments import Experiment as Experiment
 from .simulation.experiments import experiment as experiment
 from .simulation.master import Summary as Summary
+from .simulation.master import run as run
 from .simulation.master import samples as samples
 from .simulation.master import simulate as simulate
 from .simulation.pace import RealTime as RealTime

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status.
 
-    Ctrl-C ends the process at once while the command line is loaded, and not any more when the
-    command has ended.
+    Ctrl-C ends the process at once while the command line is loaded, and not any more when the command has ended.
     """
     heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or to be ignored
     if heard:

@@ -1,9 +1,8 @@
 """Child processes that each run one function over an anonymous pipe, and their confinement.
 
-A child that parses untrusted bytes confines itself: limits of memory and time hold on every POSIX
-system. On Linux, Landlock leaves the folders that are given, readable, and on x86-64 seccomp leaves
-the system calls that a parser needs; a kernel that has neither keeps the limits. Sources:
-landlock(7), seccomp(2).
+A child that parses untrusted bytes confines itself: limits of memory and time hold on every POSIX system. On Linux,
+Landlock leaves the folders that are given, readable, and on x86-64 seccomp leaves the system calls that a parser
+needs; a kernel that has neither keeps the limits. Sources: landlock(7), seccomp(2).
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
 
 ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
 """What reading a damaged, encrypted or foreign zip archive raises."""
@@ -61,24 +60,6 @@ class PageError(TwoDofError):
 
 class PublishError(TwoDofError):
     """A run cannot be published because of Cyclone DDS, the network or a ROS 2 variable."""
-
-
-def check_keywords(given: Iterable[str], called: Callable[..., object], *more: Callable[..., object]) -> None:
-    """Refuse keywords that neither the called function nor its delegates accept.
-
-    Raises:
-        TypeError: naming the function that was called, and the nearest keyword that it takes.
-    """
-    import difflib
-    from inspect import signature
-
-    parameters = [p for taker in (called, *more) for p in signature(taker).parameters.values()]
-    known = sorted({p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)})
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            remedy = f"did you mean '{near[0]}'? " if near else ""
-            raise TypeError(f"{called.__name__}() has no argument '{name}'; {remedy}It takes {', '.join(known)}")
 
 
 def diverged(k: int, t: float) -> SimulationError:

@@ -2,9 +2,8 @@
 
     ẏ = A y + B u,    z = C y + D u,    y = (q, v)
 
-A, B, C and D are the FMU's own directional derivatives, exact to rounding; deviations of states y,
-inputs u and outputs z from the operating point. An eigenvalue λ ≠ 0 of A has the frequency |λ| and
-the damping ratio −Re λ/|λ|.
+A, B, C and D are the FMU's own directional derivatives, exact to rounding; deviations of states y, inputs u and
+outputs z from the operating point. An eigenvalue λ ≠ 0 of A has the frequency |λ| and the damping ratio −Re λ/|λ|.
 """
 
 from __future__ import annotations

@@ -46,8 +46,7 @@ class Downsampler:
 def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
     """Return the first and last sample of each part, and those where a line has its extremes.
 
-    Parts are numbered, N numbers that ascend from 0 or more; values that are not finite are no
-    extremes.
+    Parts are numbered, N numbers that ascend from 0 or more; values that are not finite are no extremes.
     """
     starts = np.flatnonzero(np.diff(parts, prepend=-1))
     sizes = np.diff(starts, append=len(parts))

@@ -50,8 +50,7 @@ SHAPE = {
 class ProvenanceFile:
     """run.json of a bag in progress, complete at any moment with the changes so far.
 
-    The changes of inputs stand at its end, before the commanders only, so that adding one rewrites
-    few bytes.
+    The changes of inputs stand at its end, before the commanders only, so that adding one rewrites few bytes.
 
     Args:
         folder: of the bag.

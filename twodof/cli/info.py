@@ -32,7 +32,7 @@ def call(options: argparse.Namespace) -> int:
     if path.is_dir() and any(path.glob("*.parquet")):
         from ..sweeps.results import read_sweep
 
-        (_print_sweep_json if options.json else _print_sweep)(path, *read_sweep(path))
+        (_print_sweep_json if options.json else _print_sweep)(path, read_sweep(path))
     elif path.is_dir() or path.suffix == ".mcap" or (folder.is_dir() and not path.exists()):
         _show_bags(path, options.json)
     elif path.suffix in (".db3", ".parquet") and path.is_file():
@@ -100,7 +100,8 @@ def _bag_facts(bag: Recording) -> dict[str, Any]:
     )
 
 
-def _print_sweep_json(path: Path, table: DataFrame, provenance: dict[str, Any]) -> None:
+def _print_sweep_json(path: Path, table: DataFrame) -> None:
+    provenance = table.attrs["provenance"]
     print_json(
         kind="sweep",
         path=str(path),
@@ -112,7 +113,8 @@ def _print_sweep_json(path: Path, table: DataFrame, provenance: dict[str, Any]) 
     )
 
 
-def _print_sweep(path: Path, table: DataFrame, provenance: dict[str, Any]) -> None:
+def _print_sweep(path: Path, table: DataFrame) -> None:
+    provenance = table.attrs["provenance"]
     counts = table["outcome"].value_counts()
     fmu, times = provenance["fmu"], provenance["options"]
     varied = [*table.columns[1 : [*table.columns].index("settling_time")]]

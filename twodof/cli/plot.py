@@ -51,8 +51,8 @@ def call(options: argparse.Namespace) -> int:
     from ..sweeps.results import read_sweep
 
     folder = Path(sweeps[0])
-    table, provenance = read_sweep(folder)
-    _show_or_save(drawing(table, provenance, folder.resolve().name), options.output)
+    table = read_sweep(folder)
+    _show_or_save(drawing(table, folder.resolve().name), options.output)
     print_best(table)
     return 0
 

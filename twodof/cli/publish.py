@@ -66,7 +66,8 @@ def add(publish: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     from ..ros.network import network_of_environment
-    from ..ros.publisher import Publisher, publish, publish_together
+    from ..ros.publisher import Publisher
+    from ..ros.realtime import publish, publish_together
     from ..simulation.pace import RealTime
 
     if not 0.0 < options.rate < math.inf:

@@ -89,8 +89,7 @@ def compile_library(
         flags: further flags for the compiler.
 
     Raises:
-        BuildError: the platform does not exist, there is no compiler for it, or the compiler
-            failed.
+        BuildError: the platform does not exist, there is no compiler for it, or the compiler failed.
     """
     if platform not in TARGETS:
         raise BuildError(f"there is no platform '{platform}'; there are {', '.join(TARGETS)}")

@@ -21,9 +21,8 @@ LOG = logging.getLogger(__name__)
 def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str, dict[str, bytes]]:
     """Return the URDF with its meshes renamed to ``package://meshes/…``, and the files by that name.
 
-    The URDF may be anybody's, and the FMU is mailed: a mesh comes from ``mesh_dir``, the URDF's
-    folder or its package, however it is named or linked, or it is refused. Those that are not there
-    are left out with a warning.
+    The URDF may be anybody's, and the FMU is mailed: a mesh comes from ``mesh_dir``, the URDF's folder or its
+    package, however it is named or linked, or it is refused. Those that are not there are left out with a warning.
 
     Args:
         urdf: XML text.

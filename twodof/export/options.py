@@ -21,13 +21,11 @@ class FmuOptions:
     Attributes:
         urdf: the URDF or xacro file; None for the shipped planar arm.
         mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
-        frame: link whose origin is controlled; None: "EndEffector", or the only link without
-            a link behind it.
+        frame: link whose origin is controlled; None: "EndEffector", or the only link without a link behind it.
         lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
         meshes: whether to carry them.
         axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
-        gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else
-            (0, 0, −9.81).
+        gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else (0, 0, −9.81).
         q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
             else 0 where the limits allow and their middle where not.
         control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the

@@ -1,8 +1,7 @@
 """Kinematics and dynamics of a robot as recursions over its joints.
 
-They are written for arrays of numbers or of expressions (``straight_line``): from the one comes a
-value, from the other the C code that computes it. Vectors and matrices of a body are in the frame
-of its joint, whose axis is z.
+They are written for arrays of numbers or of expressions (``straight_line``): from the one comes a value, from the
+other the C code that computes it. Vectors and matrices of a body are in the frame of its joint, whose axis is z.
 """
 
 from __future__ import annotations

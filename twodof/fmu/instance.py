@@ -50,8 +50,7 @@ class _Staying:
 def _loading() -> Iterator[None]:
     """Prevent FMPy from changing the working directory while it loads a library.
 
-    FMPy changes to the library's folder, as Windows requires, which would change the relative paths
-    of all threads.
+    FMPy changes to the library's folder, as Windows requires, which would change the relative paths of all threads.
     """
     with LOADING:
         vars(fmi1)["os"] = _Staying()

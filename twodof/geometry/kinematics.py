@@ -7,8 +7,7 @@ with a the joint's axis, and a column of the Jacobian of a point p
 
     a                  sliding,        a × (p − p_child)        turning
 
-with a in the root's axes. Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009,
-sections 2.8 and 3.1.
+with a in the root's axes. Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 2.8 and 3.1.
 """
 
 from __future__ import annotations

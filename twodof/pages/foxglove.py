@@ -18,6 +18,7 @@ from ..plant.variables import GAINS
 from ..ros.cdr import Rows
 from ..ros.commands import warner
 from ..ros.messages import Messages, store_of
+from ..signatures import ignore
 from ..simulation.experiments import Experiment, Value, check_going_on, resolve
 from ..simulation.sample import Sample, Sink
 from .serving import HOST, Server, relay
@@ -64,7 +65,7 @@ class Foxglove(Sink):
         scene: bool = False,
         effort: bool = False,
         set_gains: bool = False,
-        opened: Callable[[Foxglove], None] = lambda server: None,
+        opened: Callable[[Foxglove], None] = ignore,
     ) -> None:
         self._port, self._opened, self.url = port, opened, ""
         self._scene, self._effort, self._set_gains = scene, effort, set_gains

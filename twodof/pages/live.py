@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..fmu import Fmu
+from ..signatures import ignore, never
 from ..simulation.experiments import Experiment, Setting, experiment
 from .arm import arm_of, arm_page
 from .loop import Loop
@@ -21,8 +22,8 @@ RATE = 30.0  # Hz, of the news to pages
 
 def live(
     fmu: Fmu | str | Path,
-    stop: Callable[[], bool] = lambda: False,
-    opened: Callable[[str], None] = lambda url: None,
+    stop: Callable[[], bool] = never,
+    opened: Callable[[str], None] = ignore,
     *,
     host: str = HOST,
     port: int = PORT,

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
 from ..bag.recording import Recording
-from ..errors import BuildError, FmuError, PageError, check_keywords
+from ..errors import BuildError, FmuError, PageError
 from ..export.meshes import collect_meshes
 from ..export.urdf_source import read_text
 from ..files import data_file, packed, refusing, write_file
@@ -21,12 +21,25 @@ from ..geometry.meshes import ReadMesh
 from ..geometry.shapes import Shape, link_shapes
 from ..plant.urdf import RobotError, read_urdf
 from ..plots.track import Track, read_tracks
+from ..signatures import check_keywords, ignore, never, with_keywords_of
 from .arm import RECORDED, Arm, arm_page
 from .serving import HOST, PORT, Server
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 MOST_SAMPLES = 100_000  # of which a quarter is shown at most where there are more
 NO_ROBOT = '<robot name="none"><link name="base"/></robot>'
 IDLE = 0.05  # s between two looks at whether to go on
+
+
+class RobotOptions(TypedDict, total=False):
+    """Keywords of ``replay``."""
+
+    urdf: str | Path | None
+    mesh_dir: str | Path | None
+    frame: str | None
+    fmu: str | Path | None
 
 
 def replay(
@@ -147,14 +160,15 @@ def _robot(
     return text, files.get if text.strip() == renamed.strip() else lambda name: None
 
 
+@with_keywords_of(replay)
 def view(
     bag: Recording | str | Path,
-    stop: Callable[[], bool] = lambda: False,
-    opened: Callable[[str, Sequence[str]], None] = lambda url, remarks: None,
+    stop: Callable[[], bool] = never,
+    opened: Callable[[str, Sequence[str]], None] = ignore,
     *,
     host: str = HOST,
     port: int = PORT,
-    **robot: Any,
+    **robot: Unpack[RobotOptions],
 ) -> None:
     """Replay a bag in the browser until ``stop`` is true.
 
@@ -165,7 +179,7 @@ def view(
         host, port: where to listen.
         robot: options of ``replay``.
     """
-    check_keywords(robot, view, replay)
+    check_keywords(robot, view)
     page, remarks = replay(bag, **robot)
     with Server(page, host, port) as server:
         opened(server.url, remarks)
@@ -173,7 +187,7 @@ def view(
             time.sleep(IDLE)
 
 
-def export(bag: Recording | str | Path, path: str | Path, **robot: Any) -> Sequence[str]:
+def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotOptions]) -> Sequence[str]:
     """Write a replay as one HTML file; return its remarks. Options are those of ``replay``.
 
     Raises:

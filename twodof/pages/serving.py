@@ -1,7 +1,6 @@
 """A server thread for one page and its websocket, or for a websocket alone.
 
-It answers requests of its own page, and of origins that are named: whatever else a browser has
-open cannot read it.
+It answers requests of its own page, and of origins that are named: whatever else a browser has open cannot read it.
 """
 
 from __future__ import annotations

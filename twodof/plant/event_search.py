@@ -1,9 +1,8 @@
 """Locate the first event within an integration step, on its dense output.
 
-An event is where a margin becomes negative: the distance of a joint to a limit, the force that
-presses a joint at rest into its limit, or the margin of the rank of J⁺. Positions are polynomials,
-whose turning points are known; the other margins are looked at as often as their rates of change
-ask for.
+An event is where a margin becomes negative: the distance of a joint to a limit, the force that presses a joint at
+rest into its limit, or the margin of the rank of J⁺. Positions are polynomials, whose turning points are known; the
+other margins are looked at as often as their rates of change ask for.
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ def search(
 
     Args:
         margin: the margin.
-        rate: its largest rate of change; with the values at the ends it says where the margin need
-            not be looked at.
+        rate: its largest rate of change; with the values at the ends it says where the margin need not be looked at.
         a, b: times within the step, s.
         at_a, at_b: the margin there.
         step: size of the step, s.
@@ -72,9 +70,8 @@ def search(
 def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float) -> float:
     """Return the first time in (a, b] at which a margin is negative, given that it is at b.
 
-    The interpolation is kept near the middle, so that it never needs many more looks than
-    bisection. Source: Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS
-    47(1), 2020.
+    The interpolation is kept near the middle, so that it never needs many more looks than bisection. Source: Oliveira
+    & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020.
 
     Args:
         margin: the margin.

@@ -1,8 +1,7 @@
 """Dormand–Prince 5(4) over one communication step, with located joint-limit stops.
 
-The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I",
-II.4). Every communication step begins afresh with the step min(max_step, h), so that no integrator
-state outlives it.
+The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every
+communication step begins afresh with the step min(max_step, h), so that no integrator state outlives it.
 
 A step is integrated in one regime: the joints that rest at a limit (``stops``) and the rank of J⁺.
 What ends it is an event, located within the step (``event_search``), at which the step ends and the

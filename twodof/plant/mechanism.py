@@ -4,8 +4,7 @@ Joints that mimic others follow exactly: with the positions G q + c of all joint
 
     M(q) = Gᵀ M_all G,    h(q, v) = Gᵀ h_all,    J(q) = J_all G.
 
-Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2; M_all, h_all and J_all
-are Pinocchio's.
+Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2; M_all, h_all and J_all are Pinocchio's.
 """
 
 from __future__ import annotations

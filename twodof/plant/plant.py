@@ -51,10 +51,9 @@ def refusing(kind: type[Exception]) -> Iterator[None]:
 class Plant:
     """A robot and its control law as a system with inputs, parameters, state and outputs.
 
-    Every variable of the table is an attribute of its group's name: lists of floats for vectors
-    (SI units; task vectors in the root frame), floats and bools for scalars. ``q`` and ``v`` are
-    the state; ``x``, ``xd``, ``tau`` and the state's derivatives ``der_q`` and ``der_v`` are
-    computed when read.
+    Every variable of the table is an attribute of its group's name: lists of floats for vectors (SI units; task
+    vectors in the root frame), floats and bools for scalars. ``q`` and ``v`` are the state; ``x``, ``xd``, ``tau``
+    and the state's derivatives ``der_q`` and ``der_v`` are computed when read.
 
     Args:
         robot: the robot.
@@ -153,9 +152,8 @@ class Plant:
         """Advance the state by one communication step of h seconds, inputs held.
 
         Raises:
-            DiscardError: the motion is too fast for the integrator, its values would no longer be
-                finite, or an input is none that the control law can follow; the state is left as it
-                was.
+            DiscardError: the motion is too fast for the integrator, its values would no longer be finite, or an input
+                is none that the control law can follow; the state is left as it was.
         """
         self._check_target()
         if STAGES * h > BUDGET * self.max_step:

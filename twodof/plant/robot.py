@@ -30,8 +30,7 @@ class Robot:
             where no joint mimics another, and they are q.
         joints: names of the n joints in the model's order.
         prismatic: per joint, True where the coordinate is a length (m), else an angle (rad).
-        q_min, q_max: position limits, rad or m, with those of the joints that follow; ∓UNBOUNDED
-            where there is none.
+        q_min, q_max: position limits, rad or m, with those of the joints that follow; ∓UNBOUNDED where there is none.
         effort: effort limits, N·m or N; infinite where the URDF has 0 or none.
         damping: viscous joint damping D, N·m·s/rad or N·s/m, with that of the joints that follow.
         frame: name of the task frame, and its Pinocchio index ``frame_id``.
@@ -217,9 +216,8 @@ def _missing(inertial: ET.Element) -> str:
 def _mechanism(urdf: Urdf) -> ET.Element:
     """Return a URDF reduced to inertias, joints and limits.
 
-    urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here, and
-    takes a number with a space behind it for 0. Continuous joints become revolute without limits,
-    so that Pinocchio's state is the angle.
+    urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here, and takes a number with
+    a space behind it for 0. Continuous joints become revolute without limits, so that Pinocchio's state is the angle.
     """
     bare = ET.Element("robot", name=urdf.name or "robot")
     for link in urdf.tree.findall("link"):

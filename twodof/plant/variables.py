@@ -30,8 +30,7 @@ class Range:
 NO_RANGE = Range(-math.inf, math.inf, "")
 NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
 POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
-"""From the smallest normal number on: C++ cannot read smaller ones, and processors may take them
-for 0."""
+"""From the smallest normal number on: C++ cannot read smaller ones, and processors may take them for 0."""
 GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
     **dict.fromkeys((*GAINS, "payload"), NOT_NEGATIVE),

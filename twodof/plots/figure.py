@@ -94,9 +94,8 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     """Save a drawing atomically to a file; return its path.
 
     Args:
-        output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the
-            drawing's name and .png in the working directory, with a number where another file has
-            that name.
+        output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the drawing's name and .png in
+            the working directory, with a number where another file has that name.
 
     Raises:
         PlotError: another kind of file, or it cannot be written.

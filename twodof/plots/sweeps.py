@@ -6,7 +6,7 @@ More: a row of such maps for each pair, which show the best over all others.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
 from math import ceil
@@ -53,12 +53,13 @@ class _Panel(NamedTuple):
     y: str | None = None
 
 
-def drawing(table: pandas.DataFrame, provenance: Mapping[str, Any], name: str) -> Drawing:
+def drawing(table: pandas.DataFrame, name: str) -> Drawing:
     """Return the drawing of a sweep, given the result of ``read_sweep``.
 
     Raises:
         PlotError: it has no finished run.
     """
+    provenance = table.attrs["provenance"]
     design = provenance["design"]
     varied = [*design["grids"], *design["ranges"]]
     best = ranked(table)

@@ -142,8 +142,7 @@ def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
 def _drawable(points: Array) -> Array:
     """Return the points, × 2, of a path: all, because matplotlib merges collinear ones.
 
-    Where that leaves too many corners, as of noise, those with which both coordinates over time
-    look the same.
+    Where that leaves too many corners, as of noise, those with which both coordinates over time look the same.
     """
     size = max(float(np.ptp(points, axis=0).max()), SMALLEST_RANGE)
     corners = np.asarray(Polyline(points * (POINTS * SIDE / size)).cleaned(simplify=True).vertices)

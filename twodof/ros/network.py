@@ -101,11 +101,10 @@ class Network(NamedTuple):
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
         """Return the configuration of Cyclone DDS, equivalent to that of rmw_cyclonedds of Jazzy.
 
-        LOCALHOST looks for others by messages to this host's own addresses, and so is heard by
-        nobody else. Unlike there it keeps doing so each second: a participant that starts later,
-        and announces itself by multicast alone, else would find us after half a minute or never.
-        And it uses the loopback interface too: Fast DDS speaks to its own host there, and Cyclone
-        DDS drops what comes by an interface that it does not use.
+        LOCALHOST looks for others by messages to this host's own addresses, and so is heard by nobody else. Unlike
+        there it keeps doing so each second: a participant that starts later, and announces itself by multicast alone,
+        else would find us after half a minute or never. And it uses the loopback interface too: Fast DDS speaks to
+        its own host there, and Cyclone DDS drops what comes by an interface that it does not use.
 
         Args:
             trace: file for the account of what was configured.

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from math import inf
-from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
-from ..errors import InputError, PublishError, SimulationError, check_keywords
-from ..fmu import Fmu
+from ..errors import InputError, PublishError, SimulationError
+from ..signatures import ignore, never
 from ..simulation.experiments import NANOSECONDS, Experiment, Setting
-from ..simulation.master import Member, Summary, as_experiment, at_rest, simulate_together
+from ..simulation.master import at_rest
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
 from .cdr import Rows
@@ -23,6 +20,9 @@ from .dds import dds_qos, dds_topic
 from .listener import ORDERS, Listener
 from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name
 from .network import Network, OpenDomain, network_of_environment, open_domain
+
+if TYPE_CHECKING:
+    pass
 
 # isort: split
 from cyclonedds import core, domain, pub  # where missing, dds says so
@@ -76,7 +76,7 @@ class Publisher(Sink):
         lockstep: bool = False,
         timeout: float | None = None,
         on_timeout: str | None = None,
-        opened: Callable[[Publisher], None] = lambda publisher: None,
+        opened: Callable[[Publisher], None] = ignore,
     ) -> None:
         names = {"namespace": namespace, "state_topic": state_topic, "command_topic": command_topic}
         for argument, name in names.items():
@@ -184,9 +184,7 @@ class Publisher(Sink):
             except core.DDSException as error:
                 self._warn(name, f"messages on {name} are lost: {error}")
 
-    def command(
-        self, stop: Callable[[], bool] = lambda: False, pace: RealTime | None = None
-    ) -> Mapping[str, Setting] | None:
+    def command(self, stop: Callable[[], bool] = never, pace: RealTime | None = None) -> Mapping[str, Setting] | None:
         """Return the inputs commanded from the latest sample on, or None.
 
         Waits while the run is paused and, in lockstep, for the command that belongs to the sample.
@@ -251,94 +249,3 @@ class Publisher(Sink):
     def __exit__(self, *exception: object) -> None:
         # entities are deleted with their last reference, writers after waiting for readers
         del self._listener, self._writers, self._participant, self._domain
-
-
-def publish(
-    run: Experiment | Fmu | str | Path,
-    *sinks: Sink,
-    publisher: Publisher | None = None,
-    pace: RealTime | None = None,
-    stop: Callable[[], bool] = lambda: False,
-    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
-    **options: Any,
-) -> Summary:
-    """Step an FMU in real time on a ROS 2 network until it is asked to stop.
-
-    Args:
-        run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
-            a stop time it has no end.
-        sinks: further consumers of the samples, for example a bag.
-        publisher: the publisher; None: one of the joint states.
-        pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
-        stop, steer: as of ``simulate``; commands from the network have precedence.
-
-    Raises:
-        FmuError, InputError, PublishError: before the first sample.
-        PublishError: in lockstep no command came in time.
-        SimulationError: the FMU refused or failed a call.
-    """
-    run = as_experiment(publish, run, options, stop_time=inf)
-    publisher = publisher or Publisher()
-    if pace is None and not publisher.lockstep:
-        pace = RealTime()
-    member = _member(run, publisher, sinks, pace, stop, steer)
-    return simulate_together([member], pace=pace, stop=stop)[0]
-
-
-def publish_together(
-    robots: Mapping[str, Experiment],
-    *,
-    sinks: Mapping[str, Sequence[Sink]] = MappingProxyType({}),
-    network: Network | None = None,
-    clock: bool = False,
-    namespace: str = "",
-    pace: RealTime | None = None,
-    stop: Callable[[], bool] = lambda: False,
-    **options: Any,
-) -> dict[str, Summary]:
-    """Step several FMUs in one loop on a ROS 2 network, each in its own namespace.
-
-    Args:
-        robots: an experiment by namespace, all of the same times; their first stamp is one.
-        sinks: further consumers of a robot's samples.
-        network, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
-        pace, stop: as of ``publish``.
-
-    Raises:
-        FmuError, InputError, PublishError, SimulationError: as ``publish``.
-    """
-    check_keywords(options, publish_together, Publisher)
-    if pace is None and not options.get("lockstep"):
-        pace = RealTime()
-    if not robots:
-        raise InputError("there are no robots to publish")
-    for name in sinks.keys() - robots.keys():
-        raise InputError(f"`sinks` has '{name}', and there are the robots {', '.join(robots)}")
-    if len(robots) > 1 and str(options.get("state_topic", "")).startswith("/"):
-        raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
-    for name in robots:
-        check_name("robots", name)
-    shared, now, members = open_domain(network or network_of_environment()), time.time(), list[Member]()
-    for name, run in robots.items():
-        publisher = Publisher(shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options)
-        stamped = run if run.stamp_start is not None else replace(run, stamp_start=now)
-        own = sinks.get(name, ())
-        members.append(_member(stamped, publisher, own, pace, stop, lambda: None))
-    return dict(zip(robots, simulate_together(members, pace=pace, stop=stop)))
-
-
-def _member(
-    run: Experiment,
-    publisher: Publisher,
-    sinks: Sequence[Sink],
-    pace: RealTime | None,
-    stop: Callable[[], bool],
-    steer: Callable[[], Mapping[str, Setting] | None],
-) -> Member:
-    """Return a published run that follows commands; those from the network take precedence."""
-
-    def asked() -> Mapping[str, Setting]:
-        commands = publisher.command(stop, pace) or {}
-        return {**(steer() or {}), **commands}
-
-    return Member(run, (publisher, *sinks), asked, publisher.resume)

@@ -14,7 +14,7 @@ from fractions import Fraction
 from itertools import chain, pairwise
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from ..bounds import MAX_CELLS, MAX_TABLE, MIN_STEP
 from ..errors import InputError
@@ -83,6 +83,18 @@ class Experiment:
         return first
 
 
+class ExperimentOptions(TypedDict, total=False):
+    """Keywords of ``experiment``."""
+
+    start_time: float
+    stop_time: float | None
+    step: float | None
+    settings: Mapping[str, Setting] | None
+    input_file: str | Path | None
+    changes: Sequence[tuple[float, Mapping[str, Setting]]] | None
+    stamp_start: float | None
+
+
 def experiment(
     fmu: Fmu | str | Path,
     *,
@@ -98,13 +110,10 @@ def experiment(
 
     Args:
         fmu: the FMU or its path.
-        start_time, stop_time, step: s; the stop a whole number of steps after the start, or
-            infinite. None: the FMU's default experiment, or 5 s after the start in steps of 10 ms.
-        settings: start values of inputs and parameters by name; a vector's name takes one value
-            for all elements or a sequence.
+        start_time, stop_time, step: s; whole steps, the stop may be infinite. None: the FMU's default, or 5 s, 10 ms.
+        settings: start values by name; a vector's name takes one value for all elements or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
-        changes: in its place, times, s, and inputs that change there, named as in settings; what
-            comes before the start, or at −∞, holds at the start where the settings say nothing.
+        changes: instead of a file, times, s, and the inputs that change then; earlier ones hold at the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
 
     Raises:
@@ -197,8 +206,7 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
     """Return values by variable name; a group's name sets all of its elements.
 
     Raises:
-        InputError: an unknown name (with the nearest that exists), an output, a wrong count or
-            kind of value, or a value that is not finite.
+        InputError: an unknown name (with the nearest one), an output, or a value of wrong count or kind, or not finite.
     """
     values: dict[str, Value] = {}
     for name, setting in settings.items():
@@ -274,9 +282,7 @@ def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     """Read inputs over time from a CSV in FMPy's form: a column ``time``, and one for each input.
 
-    Columns are named as in settings: that of a vector sets all of its elements.
-    A row's values hold from its time until the next row's; before the first row the start
-    values hold.
+    Columns are named as in settings. A row holds until the next row; before the first, start values hold.
 
     Raises:
         InputError: naming the file, and the row or column at fault.

@@ -17,14 +17,28 @@ from itertools import accumulate, chain, count
 from math import isfinite
 from pathlib import Path
 from struct import Struct
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from ..errors import InputError, SimulationError, check_keywords, diverged, step_failure
+from ..errors import InputError, SimulationError, diverged, step_failure
 from ..fmu import Fmu, Instance, Values, instantiate
-from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, Setting, Value, experiment, pop_until, resolve
+from ..signatures import check_keywords, ignore, never, with_keywords_of
+from .experiments import (
+    NANOSECONDS,
+    TIME_TOLERANCE,
+    Experiment,
+    ExperimentOptions,
+    Setting,
+    Value,
+    experiment,
+    pop_until,
+    resolve,
+)
 from .pace import RealTime
 from .peaks import Excess, Peaks, limits_of
 from .sample import Sample, Sink
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 OUTPUTS = ("q", "v", "x", "tau", "quat")
 
@@ -32,18 +46,21 @@ OUTPUTS = ("q", "v", "x", "tau", "quat")
 Stop = Callable[[], bool]
 Samples = Generator[Sample, Mapping[str, Setting] | None, None]
 Resume = Callable[[Sample, SimulationError], Mapping[str, Setting] | None]
-"""What a run goes on with after a step that was discarded: the sample before it, and the reason."""
+"""Start values to continue after a discarded step, from the sample before it and the error; None to fail."""
+Steer = Callable[[], Mapping[str, Setting] | None]
+"""New inputs after a sample; None for no change."""
 
 
+@with_keywords_of(experiment)
 def samples(
     run: Experiment | Fmu | str | Path,
     *,
     pace: RealTime | None = None,
-    stop: Stop = lambda: False,
-    ready: Callable[[], object] = lambda: None,
-    resume: Resume = lambda sample, error: None,
+    stop: Stop = never,
+    ready: Callable[[], object] = ignore,
+    resume: Resume = ignore,
     instance: Instance | None = None,
-    **options: Any,
+    **options: Unpack[ExperimentOptions],
 ) -> Samples:
     """Run an FMU; yield the initial state, then one sample per communication step.
 
@@ -53,13 +70,11 @@ def samples(
     Args:
         run: the experiment, or an FMU with the options of ``experiment`` beside it.
         pace: waits before each sample until its time has come.
-        stop: asked between two steps, and while it is waited for the next one's time; True ends the
-            run.
+        stop: asked between two steps, and while it is waited for the next one's time; True ends the run.
         ready: called after the initialisation, before time and stamps begin.
         resume: asked where a step was discarded; start values with which the FMU is initialised
             again to continue from the sample before, or None to fail.
-        instance: one of that FMU which is as instantiated, and stays when the run has ended;
-            None: an own one.
+        instance: one of that FMU which is as instantiated, and stays when the run has ended; None: an own one.
 
     Raises:
         FmuError, InputError: before the first sample.
@@ -111,7 +126,10 @@ def _stepped(
 
 
 def as_experiment(
-    called: Callable[..., object], run: Experiment | Fmu | str | Path, options: Mapping[str, Any], **usual: Any
+    called: Callable[..., object],
+    run: Experiment | Fmu | str | Path,
+    options: ExperimentOptions,
+    usual: ExperimentOptions | None = None,
 ) -> Experiment:
     """Return the experiment itself, or that of an FMU with the options of ``experiment``.
 
@@ -119,9 +137,10 @@ def as_experiment(
         FmuError, InputError: as ``experiment``; or an experiment has options beside it.
         TypeError: ``called``, which was given the options, has none of such a name.
     """
-    check_keywords(options, called, experiment)
+    check_keywords(options, called)
     if not isinstance(run, Experiment):
-        return experiment(run, **{**usual, **options})
+        merged: ExperimentOptions = options if usual is None else {**usual, **options}
+        return experiment(run, **merged)
     if options:
         beside = ", ".join(options)
         raise InputError(f"{beside} beside an experiment would do nothing; `experiment` takes them")
@@ -188,8 +207,7 @@ class Summary:
         last: the last sample.
         wall_time: s, without loading and initialisation.
         stopped: whether a request ended it before its stop time.
-        beyond_limits: joints whose effort or velocity at a sample exceeds the URDF's limit, the
-            worst first.
+        beyond_limits: joints whose effort or velocity at a sample exceeds the URDF's limit, the worst first.
     """
 
     last: Sample
@@ -213,15 +231,16 @@ class Summary:
         return self.last.joint_error
 
 
+@with_keywords_of(experiment)
 def simulate(
     run: Experiment | Fmu | str | Path,
     *sinks: Sink,
     pace: RealTime | None = None,
-    stop: Stop = lambda: False,
+    stop: Stop = never,
     instance: Instance | None = None,
-    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None,
-    resume: Resume = lambda sample, error: None,
-    **options: Any,
+    steer: Steer = ignore,
+    resume: Resume = ignore,
+    **options: Unpack[ExperimentOptions],
 ) -> Summary:
     """Run an FMU and pass every sample to every sink; sinks open once the FMU is initialised.
 
@@ -235,19 +254,20 @@ def simulate(
     return simulate_together([member], pace=pace, stop=stop)[0]
 
 
+run = simulate  # the name of the command
+
+
 class Member(NamedTuple):
     """One of several runs that advance together; its fields are the arguments of ``simulate``."""
 
     run: Experiment
     sinks: Sequence[Sink]
-    steer: Callable[[], Mapping[str, Setting] | None] = lambda: None
-    resume: Resume = lambda sample, error: None
+    steer: Steer = ignore
+    resume: Resume = ignore
     instance: Instance | None = None
 
 
-def simulate_together(
-    members: Sequence[Member], *, pace: RealTime | None = None, stop: Stop = lambda: False
-) -> list[Summary]:
+def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None, stop: Stop = never) -> list[Summary]:
     """Run FMUs in one loop: all reach a communication point before any continues.
 
     Args:

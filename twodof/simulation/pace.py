@@ -7,6 +7,7 @@ from collections.abc import Callable
 from math import inf
 
 from ..errors import InputError
+from ..signatures import never
 
 LONGEST_SLEEP = 0.1  # s, between two checks of `stop`
 
@@ -33,7 +34,7 @@ class RealTime:
         """Make the next sample due at once, and count from it."""
         self._start = None
 
-    def wait(self, elapsed: float, stop: Callable[[], bool] = lambda: False) -> None:
+    def wait(self, elapsed: float, stop: Callable[[], bool] = never) -> None:
         """Wait until ``elapsed`` s of the run have passed since the first call, or ``stop`` is true."""
         now = time.perf_counter()
         elapsed /= self._speed

@@ -24,8 +24,7 @@ class Sample(NamedTuple):
         inputs: values of all inputs by name, as they are at t.
         since: the communication point from which on the inputs have had these values, s.
         stamp: of the messages that tell of it, ns since the epoch.
-        quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has
-            none.
+        quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has none.
     """
 
     k: int

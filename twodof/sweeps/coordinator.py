@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..files import temporary_folder
 from ..fmu import Fmu, opened
+from ..signatures import ignore, never
 from ..simulation.experiments import Setting, experiment
 from ..version import versions
 from .batches import Batches
@@ -44,8 +45,8 @@ def sweep(
     bags: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, runs: None,
-    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[int, int], None] = ignore,
+    stop: Callable[[], bool] = never,
     command_line: str = "",
 ) -> pandas.DataFrame:
     """Run every point of a design; return the table, one row per run.
@@ -56,8 +57,7 @@ def sweep(
     Args:
         fmu: the FMU or its path.
         grid: values by variable; a name without an index sets all elements. All combinations.
-        ranges: low and high by variable, drawn uniformly, ``random`` times, beside each
-            combination of the grid.
+        ranges: low and high by variable, drawn uniformly, ``random`` times, beside each combination of the grid.
         random, seed: number of draws, and what makes them reproducible.
         stop_time, step, settings: of each run, as of ``experiment``.
         output: folder for the table; None: it is not kept.
@@ -88,7 +88,7 @@ def sweep(
         results = Results(path, design.names, units, len(design), provenance, resume=resume)
         staff = _workers(job, design, ~results.done, workers, scheduler, stop)
         _collect(staff, results, progress)
-        return read_sweep(path)[0]
+        return read_sweep(path)
 
 
 def _collect(

@@ -67,10 +67,9 @@ METRICS: Mapping[str, Metric] = {
     ),
     "velocity_use": Metric("peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; likewise"),
 }
-"""By name of the column. A metric is NaN where it is not defined: what a run that was not finished
-would have done, the settling of one that did not settle, the settling and overshoot of one that
-starts within 1e-9 m or rad of its target, and what needs an output, target or limit that the FMU
-has not.
+"""By name of the column. A metric is NaN where it is not defined: what a run that was not finished would have done,
+the settling of one that did not settle, the settling and overshoot of one that starts within 1e-9 m or rad of its
+target, and what needs an output, target or limit that the FMU has not.
 For all of them less is better."""
 
 

@@ -164,10 +164,11 @@ class Results:
             file.unlink()
 
 
-def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
-    """Return a sweep's table in the order of the runs, and its provenance, also if unfinished.
+def read_sweep(path: str | Path) -> pandas.DataFrame:
+    """Return a sweep's table in the order of the runs, also if unfinished.
 
-    The table's ``attrs["units"]`` holds its columns' units, "" for a number without one.
+    The table's ``attrs["units"]`` holds its columns' units, "" for a number without one, and
+    ``attrs["provenance"]`` the FMU, the design and the settings.
 
     Raises:
         SweepError: it cannot be read.
@@ -181,7 +182,8 @@ def read_sweep(path: str | Path) -> tuple[pandas.DataFrame, dict[str, Any]]:
     rows = table.to_pandas()
     said = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}
     rows.attrs["units"] = {name: unit.decode("utf-8", "replace") for name, unit in said.items()}
-    return rows, _provenance(files[0], table.schema)
+    rows.attrs["provenance"] = _provenance(files[0], table.schema)
+    return rows
 
 
 def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, Any]) -> pa.Schema:

@@ -1,0 +1,131 @@
+"""Step FMUs in real time on a ROS 2 network."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, TypedDict
+
+from ..errors import InputError
+from ..fmu import Fmu
+from ..signatures import check_keywords, ignore, never, with_keywords_of
+from ..simulation.experiments import Experiment, ExperimentOptions, Setting, experiment
+from ..simulation.master import Member, Steer, Summary, as_experiment, simulate_together
+from ..simulation.pace import RealTime
+from ..simulation.sample import Sink
+from .messages import check_name
+from .network import Network, network_of_environment, open_domain
+from .publisher import Publisher
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+@with_keywords_of(experiment)
+def publish(
+    run: Experiment | Fmu | str | Path,
+    *sinks: Sink,
+    publisher: Publisher | None = None,
+    pace: RealTime | None = None,
+    stop: Callable[[], bool] = never,
+    steer: Steer = ignore,
+    **options: Unpack[ExperimentOptions],
+) -> Summary:
+    """Step an FMU in real time on a ROS 2 network until it is asked to stop.
+
+    Args:
+        run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
+            a stop time it has no end.
+        sinks: further consumers of the samples, for example a bag.
+        publisher: the publisher; None: one of the joint states.
+        pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
+        stop, steer: as of ``simulate``; commands from the network have precedence.
+
+    Raises:
+        FmuError, InputError, PublishError: before the first sample.
+        PublishError: in lockstep no command came in time.
+        SimulationError: the FMU refused or failed a call.
+    """
+    run = as_experiment(publish, run, options, {"stop_time": inf})
+    publisher = publisher or Publisher()
+    if pace is None and not publisher.lockstep:
+        pace = RealTime()
+    member = _member(run, publisher, sinks, pace, stop, steer)
+    return simulate_together([member], pace=pace, stop=stop)[0]
+
+
+class PublisherOptions(TypedDict, total=False):
+    """Keywords of ``Publisher`` that ``publish_together`` passes on to each."""
+
+    scene: bool
+    effort: bool
+    state_topic: str
+    command_topic: str | None
+    lockstep: bool
+    timeout: float | None
+    on_timeout: str | None
+    opened: Callable[[Publisher], None]
+
+
+@with_keywords_of(Publisher)
+def publish_together(
+    robots: Mapping[str, Experiment],
+    *,
+    sinks: Mapping[str, Sequence[Sink]] = MappingProxyType({}),
+    network: Network | None = None,
+    clock: bool = False,
+    namespace: str = "",
+    pace: RealTime | None = None,
+    stop: Callable[[], bool] = never,
+    **options: Unpack[PublisherOptions],
+) -> dict[str, Summary]:
+    """Step several FMUs in one loop on a ROS 2 network, each in its own namespace.
+
+    Args:
+        robots: an experiment by namespace, all of the same times; their first stamp is one.
+        sinks: further consumers of a robot's samples.
+        network, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
+        pace, stop: as of ``publish``.
+
+    Raises:
+        FmuError, InputError, PublishError, SimulationError: as ``publish``.
+    """
+    check_keywords(options, publish_together)
+    if pace is None and not options.get("lockstep"):
+        pace = RealTime()
+    if not robots:
+        raise InputError("there are no robots to publish")
+    for name in sinks.keys() - robots.keys():
+        raise InputError(f"`sinks` has '{name}', and there are the robots {', '.join(robots)}")
+    if len(robots) > 1 and str(options.get("state_topic", "")).startswith("/"):
+        raise InputError("several robots publish on one `state_topic`; leave out its first '/'")
+    for name in robots:
+        check_name("robots", name)
+    shared, now, members = open_domain(network or network_of_environment()), time.time(), list[Member]()
+    for name, run in robots.items():
+        publisher = Publisher(shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options)
+        stamped = run if run.stamp_start is not None else replace(run, stamp_start=now)
+        own = sinks.get(name, ())
+        members.append(_member(stamped, publisher, own, pace, stop, ignore))
+    return dict(zip(robots, simulate_together(members, pace=pace, stop=stop)))
+
+
+def _member(
+    run: Experiment,
+    publisher: Publisher,
+    sinks: Sequence[Sink],
+    pace: RealTime | None,
+    stop: Callable[[], bool],
+    steer: Steer,
+) -> Member:
+    """Return a published run that follows commands; those from the network take precedence."""
+
+    def asked() -> Mapping[str, Setting]:
+        commands = publisher.command(stop, pace) or {}
+        return {**(steer() or {}), **commands}
+
+    return Member(run, (publisher, *sinks), asked, publisher.resume)

@@ -1,0 +1,54 @@
+"""Keywords that functions share, and the defaults of callbacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from inspect import Parameter, signature
+from typing import TypeVar
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def never() -> bool:
+    """Return False: nothing stops a run."""
+    return False
+
+
+def ignore(*_: object) -> None:
+    """Do nothing with the arguments."""
+
+
+def with_keywords_of(*delegates: Callable[..., object]) -> Callable[[Function], Function]:
+    """Return a decorator that shows the delegates' keywords in the signature of a function with ``**options``.
+
+    Type checkers know them by PEP 692; ``help``, editors and ``check_keywords`` know them by this.
+    """
+
+    def shown(function: Function) -> Function:
+        own = signature(function)
+        named = {name: p for name, p in own.parameters.items() if p.kind is not Parameter.VAR_KEYWORD}
+        for delegate in delegates:
+            for name, parameter in signature(delegate).parameters.items():
+                if parameter.kind is Parameter.KEYWORD_ONLY:
+                    named.setdefault(name, parameter)
+        function.__signature__ = own.replace(parameters=[*named.values()])  # type: ignore[attr-defined]
+        return function
+
+    return shown
+
+
+def check_keywords(given: Iterable[str], called: Callable[..., object]) -> None:
+    """Refuse keywords that a function with ``**options`` does not accept.
+
+    Raises:
+        TypeError: naming the function that was called, and the nearest keyword that it takes.
+    """
+    import difflib
+
+    parameters = signature(called).parameters.values()
+    known = sorted(p.name for p in parameters if p.kind is not Parameter.VAR_POSITIONAL)
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            remedy = f"did you mean '{near[0]}'? " if near else ""
+            raise TypeError(f"{called.__name__}() has no argument '{name}'; {remedy}It takes {', '.join(known)}")
