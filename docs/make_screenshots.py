@@ -1,10 +1,10 @@
-"""Make docs/view.png, live.png, panda.png and page.png, screenshots of the pages.
+"""Make docs/view.png, live.png, panda.png, page.png and panda.webp, pictures of the pages.
 
     python docs/make_screenshots.py
 
-The first is the replay of a real run of the default arm, whose target changes; the second a live
-arm, whose target has just been dragged; the third the Panda on its way to a pose, and the fourth in
-a page of its own. Needs chromium and the packages 'websockets', 'playwright' and
+The first is the replay of a real run of the default arm, whose target changes; the second a live arm, whose target
+has just been dragged; the third the Panda on its way to a pose, and the fourth in a page of its own. The last one
+moves: the Panda in its page follows three targets. Needs chromium and the packages 'websockets', 'playwright' and
 'example-robot-data'.
 """
 
@@ -27,6 +27,8 @@ from playwright.sync_api import Browser, Page  # noqa: E402
 import twodof  # noqa: E402
 
 SIZE = {"width": 1280, "height": 800}
+FRAMES, FRAME = 72, 0.08  # number; s of one
+TARGETS = [[0.5, 0.2, 0.45], [0.35, -0.3, 0.3], [0.55, 0.0, 0.6]]
 INPUTS = "time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n4,0.22,-0.08\n"
 
 
@@ -43,10 +45,11 @@ def main() -> None:
         live(chromium, folder, fmu)
         panda(chromium, folder)
         page(chromium, folder)
+        moving(chromium, folder)
 
 
-def page(chromium: Browser, folder: Path) -> None:
-    """Make docs/page.png: a Panda in a page of its own."""
+def panda_page(folder: Path) -> str:
+    """Return the URL of a Panda's page."""
     options = twodof.FmuOptions(
         urdf=robots_folder() / "panda_description/urdf/panda.urdf",
         mesh_dir=robots_folder().parent,
@@ -55,8 +58,36 @@ def page(chromium: Browser, folder: Path) -> None:
         native=True,
         name="Panda",
     )
-    file = twodof.page(twodof.build_fmu(folder / "Panda.fmu", options), folder / "panda.html")
-    with browser.opened(chromium, file.as_uri(), scale=2) as shown:
+    fmu = twodof.build_fmu(folder / "Panda.fmu", options)
+    return twodof.page(fmu, folder / "panda.html").as_uri()
+
+
+def moving(chromium: Browser, folder: Path) -> None:
+    """Make docs/panda.webp: a Panda in its page follows three targets, in real time."""
+    frames = []
+    with browser.opened(chromium, panda_page(folder)) as shown:
+        shown.locator("#arm-play").click()
+        shown.evaluate("() => { arm.startAgain(); arm.set('quat_des', [1, 0, 0, 0]); }")
+        for target in TARGETS:
+            shown.evaluate("target => arm.set('x_des', target)", target)
+            for _ in range(FRAMES // len(TARGETS)):
+                shown.evaluate("steps => arm.step(steps)", round(FRAME / 0.01))
+                shown.wait_for_timeout(100)  # until the page has drawn it
+                frames.append(Image.open(io.BytesIO(shown.screenshot())).convert("RGB").resize((720, 450)))
+    frames[0].save(
+        ROOT / "docs/panda.webp",
+        save_all=True,
+        append_images=frames[1:],
+        duration=round(1000 * FRAME),
+        loop=0,
+        quality=60,
+        method=6,
+    )
+
+
+def page(chromium: Browser, folder: Path) -> None:
+    """Make docs/page.png: a Panda in a page of its own."""
+    with browser.opened(chromium, panda_page(folder), scale=2) as shown:
         shown.locator("#arm-play").click()
         shown.evaluate(
             "() => { arm.startAgain(); arm.set('x_des', [0.5, 0.1, 0.4]);"
