@@ -8,7 +8,7 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["gains", true, GAINS],
   ["disturbance and payload", false, ["f_ext", "tau_ext", "payload", "payload_com", "payload_known"]],
   ["feedforward", false, ["quat_des", "xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
-  ["Parameters (a change restarts the simulation)", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
+  ["parameters (a change restarts the simulation)", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
 ]);
 
 /** An element with text, and what it holds. */
