@@ -123,7 +123,7 @@ def built(urdf: Path, folder: Path) -> list[str]:
     times = []
     for native in (False, True):
         options = twodof.FmuOptions(urdf=urdf, frame=frame, native=native)
-        fmu = twodof.build_fmu(folder / f"robot{native:d}.fmu", options)
+        fmu = twodof.build_fmu(folder / f"robot{native:d}.fmu", options, overwrite=True)
         clock, bag = Clock(), twodof.Bag(folder / "bag", overwrite=True)
         summary = twodof.simulate(fmu, bag, clock, stop_time=1.0, stop=clock.late)
         steps = summary.last.k
@@ -131,7 +131,7 @@ def built(urdf: Path, folder: Path) -> list[str]:
         times.append(f"{1e6 * (clock.last - clock.first) / steps:.0f}{short}")
     options = twodof.FmuOptions(urdf=urdf, frame=frame, native=True, control="effort", meshes=False)
     robot = load_robot(text, frame, "xyz")
-    off = apart(twodof.build_fmu(folder / "bare.fmu", options), robot)
+    off = apart(twodof.build_fmu(folder / "bare.fmu", options, overwrite=True), robot)
     return [str(len(robot.joints)), frame, f"{off:.0e}", *times]
 
 
@@ -183,7 +183,7 @@ def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
     paths = []
     for fmi in (2, 3):
         options = twodof.FmuOptions(urdf=urdf, frame=frame, control=control, native=True, fmi=fmi, meshes=False)
-        paths.append(twodof.build_fmu(folder / f"fmi{fmi}.fmu", options))
+        paths.append(twodof.build_fmu(folder / f"fmi{fmi}.fmu", options, overwrite=True))
     two, three = map(simulated, paths)
     size = library_size(paths[1]) / library_size(paths[0])
     fmus = [twodof.load_fmu(path) for path in paths]
