@@ -6,7 +6,7 @@ import zipfile
 import zlib
 
 ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
-"""What reading a damaged, encrypted or foreign zip archive raises."""
+"""Exceptions of a damaged, encrypted or foreign zip archive."""
 
 
 class TwoDofError(Exception):

@@ -22,7 +22,7 @@ from .records import DamageError
 FILE = "run.json"
 FORMAT = 1
 KEY = "twodof"
-"""Of the provenance in a bag's own metadata."""
+"""Key of the provenance in a bag's own metadata."""
 MAX_YAML = 256 * 1024  # bytes of changes: a writer of YAML takes 2 s for a MiB
 KNOWN_UNTIL = "inputs_known_until"
 """Key of the time, s, from which on more inputs changed than the file has room for."""
@@ -44,7 +44,7 @@ SHAPE = {
     "urdf": str | None,
     "input_changes": [(NUMBER, VALUES)],
 }
-"""Of what is read back, as ``fits`` takes it."""
+"""Shape of a valid run.json, for ``fits``."""
 
 
 class ProvenanceFile:

@@ -39,7 +39,7 @@ KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
 OVERHEAD = 64  # bytes that a message takes beside its data until it is flushed
 BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
 RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("times", "<u8", 2)])
-"""What MCAP has before the data of a message."""
+"""Header of a message record in MCAP."""
 MESSAGE_INDEX = 7  # opcode
 CHECKSUM = struct.Struct("<I8s")  # of the summary, and the magic: the end of a file
 FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # place of the summary, of its offsets; and these

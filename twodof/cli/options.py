@@ -76,11 +76,11 @@ OF_A_RUN = (
     "--json",
     "--fsync",
 )
-"""That may leave a bag, but for what is run."""
+"""Options of verbs that may write a bag, except the FMU to run."""
 OF_A_PAGE = ("--host", "--port", "--no-browser")
 
 SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "urdf"), "--range": ("ranges",)}
-"""What options are called in the namespace, where that is not their own name."""
+"""Names of options in the namespace, where these differ."""
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:

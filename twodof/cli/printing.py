@@ -24,7 +24,7 @@ OPTIONS = {
 NEEDS = {"plot": "matplotlib", "view": "websockets"}
 """Modules that verbs need, of the extra 'view'."""
 POSE = "control 'pose'"
-"""Which is two options."""
+"""An argument of the library that is two options here."""
 
 
 def in_options(text: str) -> str:

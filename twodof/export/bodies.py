@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..plant.robot import Robot
 
 Array = NDArray[Any]
-"""Of numbers, or of numbers and expressions."""
+"""Array of numbers, or of numbers and expressions."""
 Frame = tuple[Array, Array]
 """R and p: a = R b + p."""
 

@@ -34,7 +34,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 """zig's targets by FMI platform; several are joined into one universal library."""
 PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name), 3: tuple(name for name in TARGETS if "-" in name)}
-"""By version of FMI."""
+"""Platforms by version of FMI."""
 ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
 UNITS = ("directional.c", "fmu.c")
 """The C files that are compiled; they include the others."""

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
-"""By version of FMI."""
+"""Icon files by version of FMI."""
 
 
 def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:

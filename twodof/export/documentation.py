@@ -32,7 +32,7 @@ q̈_cmd = J⁺ ((a_cmd, α_cmd) − J̇ v) − Kn (I − J⁺J) v   J⁺ drops s
 }
 """The equations of the control laws."""
 NO_DEPENDENCIES = b"None: the binaries need the C library and its mathematics only.\n"
-"""Of a native FMU."""
+"""Text about dependencies of a native FMU."""
 
 
 def documentation(

@@ -59,7 +59,7 @@ QUANTITIES = {
     "s": "Time",
     "kg": "Mass",
 }
-"""What is measured in a unit, by the names of Modelica's standard library; gains are none."""
+"""Quantity of each unit, by the names of Modelica's standard library; gains have none."""
 DISPLAY = {"rad": ("deg", 180.0 / math.pi)}
 """Units for people, and how many of them are one."""
 
@@ -79,12 +79,12 @@ SCALAR = ("name", "valueReference", "description", "causality", "variability", "
 """Attributes of 2.0's ScalarVariable; others are its type's."""
 STATES = ("q", "v")
 SMALL = ("rtol", "atol", "max_step")
-"""Whose start is their size."""
+"""Variables whose start value is their nominal value."""
 EFFORTS = ("tau", "tau_cmd", "tau_ext")
 START = ("q_start", "q_min", "q_max")
-"""What q depends on at the start."""
+"""Variables on which q depends at the start."""
 IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
-"""What v depends on at the start, where it may be into a stop."""
+"""Variables on which v depends at the start, where it may point into a stop."""
 
 
 def model_description(

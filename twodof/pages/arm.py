@@ -59,13 +59,13 @@ FUNCTIONS = (
     "engine_get_reals",
     "engine_step",
 )
-"""Of page.c, which the page calls."""
+"""Functions of page.c that the page calls."""
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables that a sample holds, in its order."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
 POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
 CONTAINER = b'<div class="arm" id="arm"'
-"""By which a page with an arm is known."""
+"""Mark that identifies a page with an arm."""
 
 
 @dataclass(frozen=True)

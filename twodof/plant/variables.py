@@ -37,7 +37,7 @@ RANGES = {
     **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),
     "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
 }
-"""By group; what is not here may be any number. The FMU refuses what is outside."""
+"""Valid ranges by group; other variables may be any number. The FMU refuses values outside."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ CONTROLS = {
     ),
     "effort": Control("effort control, the bare plant", ("tau_cmd",), (), "effort", True),
 }
-"""By name. The law is in the file <name>_control, of Python here and of C in the native engine;
+"""Control laws by name. The law is in the file <name>_control, of Python here and of C in the native engine;
 "pose" is "task" with three more rows."""
 
 DISTURBANCES = ("tau_ext", "f_ext")

@@ -58,7 +58,7 @@ TICK_STYLE: dict[str, Any] = {
     "grid_color": HAIR,
     "grid_linewidth": 0.6,
 }
-"""Of each panel on its own: matplotlib makes ticks as it draws, when the style is the user's."""
+"""Styles set on each panel, because matplotlib makes ticks as it draws, when the style is the user's."""
 
 
 class Plot(Figure):

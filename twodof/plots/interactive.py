@@ -24,7 +24,7 @@ from .words import labels
 from .workspace import View, views, workspace_title
 
 POINTS = 120_000
-"""Of all curves. An hour of seven joints at 100 Hz is known by its extremes every three seconds,
+"""Total of all curves. An hour of seven joints at 100 Hz is known by its extremes every three seconds,
 and the page has some four megabytes."""
 ROW, GAP, EDGE, TOP = 150, 34, 44, 50
 """Pixels: a panel's height, between panels, below the last, and above the first, for its heading

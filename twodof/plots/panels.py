@@ -19,14 +19,14 @@ from .track import JointTrack, Track
 
 KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort", "error": "Distance from the target"}
 UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "tau": ("N·m", "N")}
-"""Of joints that turn and of those that slide."""
+"""Units of rotating and of sliding joints."""
 SMALLEST_EFFORT = 1e-6  # N·m, N: what changes less is shown at rest
 SMALLEST_PART = 1e-4  # of a value: ticks, of six digits, differ
 CURVE, THIN, THICK = 1.4, 0.9, 4.0
 """Widths: of curves, of limits and targets, of closed forms behind curves."""
 TARGET = "thin dashes: target"
 Looks = Mapping[tuple[int, str], Look]
-"""Of each track's joints, and of the track itself, whose joint is ""."""
+"""Styles of each track's joints, and of the track itself, whose joint is ""."""
 
 
 class Panel(NamedTuple):

@@ -59,7 +59,7 @@ DEFINITIONS = {
     "geometry_msgs/Transform transform",
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
 }
-"""As Humble has them; rosbags' store of all of Humble's takes longer to import than NumPy."""
+"""Definitions of Humble; rosbags' store of all of Humble's takes longer to import than NumPy."""
 _STORE = get_typestore(Stores.EMPTY)
 
 

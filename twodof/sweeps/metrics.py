@@ -20,7 +20,7 @@ from ..simulation.peaks import Limits
 Array = NDArray[np.float64]
 
 BAND = 0.02
-"""Of the initial error, the usual band of the settling time."""
+"""Band of the settling time, as a share of the initial error."""
 SMALLEST_MOVE = 1e-9  # m: below, a run that starts at its target has no band to settle in
 AT_LIMIT = 1e-9  # rad or m: a joint that the plant has stopped is at its limit to the last bit
 

@@ -39,7 +39,7 @@ class Pool:
         self._job, self._batches, self._stop = job, batches, stop
         self._count, self._failures = min(count, batches.left), 0
         self._workers: dict[Child, list[Point] | None] = {}
-        """What each is at: a batch, [] while it starts, or None."""
+        """Current batch of each worker, [] while it starts, or None."""
 
     def __enter__(self) -> Iterator[list[Row]]:
         self._exit = ExitStack()

@@ -21,7 +21,7 @@ RANKED = {
     "final_turn_error": "with least orientation error at the end",
     "final_joint_error": "with least joint error at the end",
 }
-"""By what the best run is chosen, each where those before are equal or not known; in words."""
+"""Criteria of the best run in words; each one breaks the ties of those before."""
 USE = ["effort_use", "velocity_use"]
 ROUNDING = 1e-12  # relative, and absolute below 1: values that are nearer count as equal
 

@@ -38,7 +38,7 @@ PART = re.compile(r"part-(\d{6})\.parquet")
 KEY = b"twodof"
 PERIOD = 1.0  # s between two parts
 COMPARED = ("fmu", "design", "options", "bags")
-"""What must be equal for a sweep to be resumed; so must the version of this package."""
+"""Keys that must be equal to resume a sweep, as must the version of this package."""
 
 SHAPE = {
     "fmu": {"file": str, "name": str, "guid": str},
@@ -47,7 +47,7 @@ SHAPE = {
     "versions": {"twodof": str},
     "command_line": str,
 }
-"""Of the provenance that is read back."""
+"""Shape of a valid provenance."""
 TEXTS = ["outcome", "message"]
 
 
