@@ -138,7 +138,7 @@ def publish(fmu: Path, seconds: float) -> None:
 
 
 def live(fmu: Path, seconds: float) -> None:
-    from twodof.pages.live import page_of
+    from twodof.pages.live_page import page_of
     from twodof.pages.loop import Loop
 
     run = twodof.experiment(fmu, step=STEP, stop_time=math.inf)

@@ -23,7 +23,7 @@ from tools import needs
 
 from twodof.export.compiler import compile_library, host_platform
 from twodof.export.flavours import engine_sources
-from twodof.export.mechanism import mechanism_source
+from twodof.export.mechanism_source import mechanism_source
 from twodof.export.native import model_header
 from twodof.plant.plant import Plant
 from twodof.plant.robot import Robot, load_robot

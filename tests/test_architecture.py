@@ -135,6 +135,11 @@ def test_the_package_has_few_files_beside_its_rooms() -> None:
     assert len(files) <= MOST_FILES
 
 
+def test_no_two_files_of_the_package_have_one_name() -> None:
+    names = [path.name for path in PYTHON if path.parts[0] == "twodof" and path.name != "__init__.py"]
+    assert len(names) == len({*names}), sorted(name for name in names if names.count(name) > 1)
+
+
 RIDDLES = {"What", "Of", "Who", "Whose", "How", "That", "Which", "Beside"}
 
 

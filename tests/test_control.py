@@ -13,7 +13,7 @@ from native_models import deviation, engine, loaded, model, random_plant
 from scipy.integrate import solve_ivp
 
 import twodof
-from twodof.export.options import FmuOptions
+from twodof.export.fmu_options import FmuOptions
 from twodof.export.package import build_fmu
 
 CONTROLS = ("task", "pose", "joint", "effort")

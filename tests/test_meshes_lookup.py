@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from twodof.errors import BuildError
-from twodof.export.meshes import collect_meshes
+from twodof.export.mesh_files import collect_meshes
 
 FILES = {
     "ws/arm_description/package.xml": b"<package/>",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from recordings import chain_urdf
 
-from twodof.export.mechanism import mechanism_source
+from twodof.export.mechanism_source import mechanism_source
 from twodof.export.straight_line import Expression, c_function, operations, varied
 from twodof.plant.robot import load_robot
 from twodof.plant.variables import variable_table

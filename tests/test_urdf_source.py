@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import twodof
 from twodof.cli.main import main
-from twodof.export.options import FmuOptions
+from twodof.export.fmu_options import FmuOptions
 from twodof.export.package import build_fmu
 from twodof.export.urdf_source import end_effector, lock_joints, without_meshes
 from twodof.files import data_file

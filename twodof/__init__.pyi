@@ -1,12 +1,12 @@
 """The public names, and where each is."""
 
-from .bag.commands import read_commands as read_commands
 from .bag.reader import read_bag as read_bag
+from .bag.recorded_commands import read_commands as read_commands
 from .bag.recording import Recording as Recording
 from .bag.recovery import recover as recover
 from .bag.writer import Bag as Bag
 from .errors import TwoDofError as TwoDofError
-from .export.options import FmuOptions as FmuOptions
+from .export.fmu_options import FmuOptions as FmuOptions
 from .export.package import build_fmu as build_fmu
 from .fmu import Fmu as Fmu
 from .fmu import load_fmu as load_fmu
@@ -14,13 +14,13 @@ from .linear import LinearModel as LinearModel
 from .linear import linearise as linearise
 from .pages.arm import page as page
 from .pages.foxglove import Foxglove as Foxglove
-from .pages.live import live as live
+from .pages.live_page import live as live
 from .pages.replay import view as view
 from .plots.runs import plot as plot
-from .ros.layouts import layouts as layouts
 from .ros.publisher import Publisher as Publisher
 from .ros.realtime import publish as publish
 from .ros.realtime import publish_together as publish_together
+from .ros.viewer_layouts import layouts as layouts
 from .simulation.experiments import Experiment as Experiment
 from .simulation.experiments import experiment as experiment
 from .simulation.master import Summary as Summary

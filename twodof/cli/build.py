@@ -73,7 +73,7 @@ def call(options: argparse.Namespace) -> int:
     if options.scalars and options.fmi != 3:
         raise CommandLineError("--scalars goes with --native --fmi 3")
     from ..export.compiler import PLATFORMS
-    from ..export.options import FmuOptions
+    from ..export.fmu_options import FmuOptions
     from ..export.package import build_fmu
 
     platforms = PLATFORMS[options.fmi or 2] if "all" in options.platforms else options.platforms

@@ -67,7 +67,7 @@ def _default_arm(verb: str, *, native: bool = False) -> Path:
 
 
 def _built(overwrite: bool = False, **what: Any) -> Path:
-    from ..export.options import FmuOptions
+    from ..export.fmu_options import FmuOptions
     from ..export.package import build_fmu
 
     return build_fmu(None, FmuOptions(**what), overwrite=overwrite)

@@ -25,7 +25,7 @@ def add(layouts: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
-    from ..ros.layouts import layouts
+    from ..ros.viewer_layouts import layouts
 
     chosen = chosen_fmu(options)
     rviz, juggler, foxglove = layouts(chosen, options.folder, namespace=options.namespace, overwrite=options.overwrite)

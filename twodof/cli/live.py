@@ -21,7 +21,7 @@ def add(live: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
-    from ..pages.live import live
+    from ..pages.live_page import live
 
     settings = parse_settings(options.settings)
     fmu = fast_fmu(options)

@@ -126,7 +126,7 @@ def call(options: argparse.Namespace) -> int:
 
 def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
     """Return the FMUs by namespace; a single one needs none."""
-    from ..export.options import identifier
+    from ..export.fmu_options import identifier
     from ..ros.messages import check_name
 
     robots: dict[str, Experiment] = {}

@@ -62,8 +62,8 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
     if table is not None:
         folder, _, topic = (table, "", None) if Path(table).is_dir() else table.rpartition(":")
         if Path(folder).is_dir() and folder:
-            from ..bag.commands import read_commands
             from ..bag.provenance import robots_of
+            from ..bag.recorded_commands import read_commands
 
             if topic in robots_of(Path(folder)):  # of one of several robots, as it was driven
                 folder, topic = table, None

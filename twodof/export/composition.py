@@ -19,10 +19,10 @@ from ..plant.variables import CONTROLS, Variable, variable_table
 from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
-from .meshes import collect_meshes
+from .fmu_options import FmuOptions
+from .mesh_files import collect_meshes
 from .model_description import model_description
 from .native import engine_variables
-from .options import FmuOptions
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from ..version import __version__
 from .flavours import Files, Flavour
-from .options import FmuOptions
+from .fmu_options import FmuOptions
 
 LAWS = {
     "task": """x, J    position and Jacobian of $frame, rows of the task axes, LOCAL_WORLD_ALIGNED

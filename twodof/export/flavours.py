@@ -22,9 +22,9 @@ from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from .compiler import EXTENSIONS, UNITS, compile_library, standard_headers
 from .fmi3_files import build_description, terminals_and_icons
-from .mechanism import mechanism_source
+from .fmu_options import FmuOptions
+from .mechanism_source import mechanism_source
 from .native import model_header
-from .options import FmuOptions
 from .python_wrapper import repaired_wrapper
 
 LOG = logging.getLogger(__name__)

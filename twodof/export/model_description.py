@@ -28,8 +28,8 @@ from ..version import __version__
 from .compiler import UNITS
 from .flavours import Flavour
 from .fmi3_files import xml_text
+from .fmu_options import FmuOptions
 from .native import INDICATORS
-from .options import FmuOptions
 
 DIMENSIONS: dict[str, dict[str, int]] = {
     "m": {"m": 1},

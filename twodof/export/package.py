@@ -13,7 +13,7 @@ from ..files import check_archive, data_file, descriptor_of, refusing, write_fil
 from ..plant.urdf import RobotError
 from ..version import versions
 from .compiler import compiles_for_the_web, host_platform
-from .options import FmuOptions
+from .fmu_options import FmuOptions
 
 MADE_OF = ("fmu_src", "urdf", "meshes", "export", "plant")
 """Folders of what is shipped."""

@@ -14,7 +14,7 @@ from ..bounds import MAX_URDF
 from ..errors import BuildError
 from ..files import read_file, refusing
 from ..plant.urdf import RobotError, Urdf, read_urdf
-from .meshes import places_of
+from .mesh_files import places_of
 from .xacro_file import expand
 
 DEFAULT_FRAME = "EndEffector"

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..bag.recording import Recording
 from ..errors import BuildError, FmuError, PageError
-from ..export.meshes import collect_meshes
+from ..export.mesh_files import collect_meshes
 from ..export.urdf_source import read_text
 from ..files import data_file, packed, refusing, write_file
 from ..fmu import load_fmu, read_resource
