@@ -104,8 +104,8 @@ def compile_library(
     return built[0] if len(built) == 1 else universal(built)
 
 
-def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str], functions: Sequence[str]) -> bytes:
-    """Compile C files to a WebAssembly module without imports that exports functions.
+def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str]) -> bytes:
+    """Compile C files to a WebAssembly module without imports; they name what it exports.
 
     Its ``_initialize`` is to be called first.
 
@@ -115,8 +115,7 @@ def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str], funct
     if not compiles_for_the_web():
         raise BuildError("cannot compile for the browser: install the package 'ziglang' (the extra 'native')")
     LOG.info("compiling for the browser")
-    exports = [f"-Wl,--export={function}" for function in functions]
-    command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *exports, *units]
+    command = [*ZIG, "wasm32-wasi", *FLAGS, "-mexec-model=reactor", "-s", *units]
     return _compile(sources, command, "module.wasm")
 
 

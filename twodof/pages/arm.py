@@ -47,19 +47,6 @@ SCRIPTS = (
     "main.js",
 )
 """In the order in which they are read."""
-FUNCTIONS = (
-    "engine_instantiate",
-    "engine_message",
-    "engine_forget",
-    "engine_allocate",
-    "engine_reset",
-    "engine_initialise",
-    "engine_set_reals",
-    "engine_set_boolean",
-    "engine_get_reals",
-    "engine_step",
-)
-"""Functions of page.c that the page calls."""
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables that a sample holds, in its order."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
@@ -127,8 +114,7 @@ def page(
         )
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
-    units = ("fmu.c", "page.c")  # a page asks for no derivatives
-    module = compile_web_module(files, units, FUNCTIONS)
+    module = compile_web_module(files, ["page.c"])  # a page asks for no derivatives
     provenance = {
         "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
         **{key: getattr(fmu, key) for key in ("robot", "frame", "root", "axes", "joints")},
