@@ -50,51 +50,12 @@ SECCOMP, FILTER, ALL_THREADS = 317, 1, 1
 X86_64 = 0xC000003E
 READ_ONLY = ~(os.O_CLOEXEC | os.O_NONBLOCK | os.O_DIRECTORY | os.O_NOFOLLOW | 0o100000)
 ALLOWED = (
-    0,
-    1,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    12,  # read, write, close, *stat, poll, lseek, mmap … brk
-    13,
-    14,
-    15,
-    17,
-    19,
-    20,
-    21,
-    24,
-    25,
-    28,  # rt_sig*, pread64, readv, writev, access … madvise
-    35,
-    39,
-    60,
-    79,
-    89,
-    96,
-    98,  # nanosleep, getpid, exit, getcwd … getrusage; not fcntl: SIGIO
-    131,
-    186,
-    202,
-    217,
-    228,
-    230,
-    231,  # sigaltstack, gettid, futex, getdents64 … exit_group
-    262,
-    267,
-    271,
-    273,
-    318,
-    324,
-    332,
-    334,  # fstatat, readlinkat, ppoll, getrandom, statx, rseq
+    *(0, 1, *range(3, 16), 17, 19, 20, 21),  # read, write, close, *stat, poll, lseek, mmap … brk, rt_sig*, access
+    *(24, 25, 28, 35, 39, 60, 79, 89, 96, 98),  # … madvise, nanosleep, exit, getcwd … getrusage; not fcntl: SIGIO
+    *(131, 186, 202, 217, 228, 230, 231),  # sigaltstack, gettid, futex, getdents64 … exit_group
+    *(262, 267, 271, 273, 318, 324, 332, 334),  # fstatat, readlinkat, ppoll, getrandom, statx, rseq
 )
+"""Numbers of system calls on x86-64."""
 OPEN, LIMIT = 257, 302  # openat for reading, prlimit64 of the process itself
 
 

@@ -33,12 +33,9 @@ def output_file(text: str) -> str:
     return STANDARD_OUTPUT if text == "-" else not_empty(text)
 
 
-OPTIONS: dict[str, dict[str, Any]] = {
-    # what is run, for how long
-    "--frame": dict(type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)"),
+Table = dict[str, dict[str, Any]]
+OF_A_RUN: Table = {
     "--native": dict(action="store_true", help="build and run a native FMU, of a URDF or none"),
-    "--stop-time": dict(type=float, metavar="S", help="s (the FMU's own)"),
-    "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's own)"),
     "--set": dict(
         dest="settings",
         action="append",
@@ -49,7 +46,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--input": dict(
         metavar="CSV|BAG[:TOPIC]", help="inputs over time: a column 'time' and one for each input; or a bag's commands"
     ),
-    # what it leaves
     "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)"),
     "--scene": dict(action="store_true", help="add robot description, tf, target and end effector"),
     "--effort": dict(action="store_true", help="add the control effort"),
@@ -57,27 +53,21 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--overwrite": dict(action="store_true", help="replace an existing bag, or the FMU of a URDF"),
     "--json": dict(action="store_true", help="print the facts as JSON, SI units"),
     "--fsync": dict(action="store_true", help="wait for the disk twice a second, for a power loss"),
-    "--namespace": dict(default="", metavar="NS", help="of the topics"),
-    # where a page is served
+}
+"""Options of verbs that may write a bag, except the FMU to run."""
+OF_A_PAGE: Table = {
     "--host": dict(help="address to listen on (127.0.0.1, this machine alone)"),
     "--port": dict(type=int, help="(8080); 0: any that is free"),
     "--no-browser": dict(action="store_true", help="open no browser"),
 }
-
-OF_A_RUN = (
-    "--native",
-    "--set",
-    "--input",
-    "--storage",
-    "--scene",
-    "--effort",
-    "--stamp-start",
-    "--overwrite",
-    "--json",
-    "--fsync",
-)
-"""Options of verbs that may write a bag, except the FMU to run."""
-OF_A_PAGE = ("--host", "--port", "--no-browser")
+OPTIONS: Table = {
+    "--frame": dict(type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)"),
+    "--stop-time": dict(type=float, metavar="S", help="s (the FMU's own)"),
+    "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's own)"),
+    "--namespace": dict(default="", metavar="NS", help="of the topics"),
+    **OF_A_RUN,
+    **OF_A_PAGE,
+}
 
 SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "urdf"), "--range": ("ranges",)}
 """Names of options in the namespace, where these differ."""

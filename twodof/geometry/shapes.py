@@ -89,23 +89,8 @@ def _surfaces(element: ET.Element, meshes: Meshes) -> list[Surface]:
     return []
 
 
-BOX = np.array(
-    [
-        (0, 1, 3),
-        (0, 3, 2),
-        (4, 6, 7),
-        (4, 7, 5),
-        (0, 4, 5),
-        (0, 5, 1),
-        (2, 3, 7),
-        (2, 7, 6),
-        (0, 2, 6),
-        (0, 6, 4),
-        (1, 5, 7),
-        (1, 7, 3),
-    ],
-    dtype=np.uint32,
-)
+FACES = (0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)
+BOX = np.array([half for a, b, c, d in FACES for half in ((a, b, c), (a, c, d))], dtype=np.uint32)
 
 
 def sphere(radius: float) -> tuple[Array, Indices]:

@@ -30,23 +30,8 @@ from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
 from ..simulation.experiments import Experiment, Setting, experiment
 from ..version import versions
 
-SCRIPTS = (
-    "engine.js",
-    "samples.js",
-    "session.js",
-    "replay.js",
-    "remote.js",
-    "matrices.js",
-    "robot.js",
-    "camera.js",
-    "scene.js",
-    "handle.js",
-    "curves.js",
-    "recording.js",
-    "controls.js",
-    "main.js",
-)
-"""In the order in which they are read."""
+FIRST, LAST = "samples.js", "main.js"
+"""Scripts whose class others extend, and that starts the page; of the others the order does not matter."""
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables that a sample holds, in its order."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
@@ -198,7 +183,8 @@ def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "",
     """
     known, meshes = _facts(arm)
     data = json.dumps({**known, **facts}, sort_keys=True).replace("<", "\\u003c")
-    script = "".join(_asset(name) for name in SCRIPTS)
+    others = {path.name for path in data_file("fmu_src", "page").glob("*.js")} - {FIRST, LAST}
+    script = "".join(map(_asset, [FIRST, *sorted(others), LAST]))
     script = f'(() => {{ "use strict";\n{script}}})();\n'
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = POLICY.format(script=digest, more=allowed)

@@ -9,10 +9,11 @@ import json
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from ..errors import InputError
-from ..files import write_file
+from ..files import data_file, write_file
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import GAINS
 from ..simulation.experiments import experiment
@@ -73,57 +74,18 @@ def layouts(
 
 def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
     """Return RViz's layout as JSON, which is YAML."""
+    pitch, yaw = (1.57, 4.712) if "".join(fmu.axes) == "xy" else (0.5, 0.8)
+    template = Template(data_file("ros", "layout.rviz").read_text("utf-8"))
+    layout = json.loads(template.substitute(prefix=prefix, frame=json.dumps(fmu.root), pitch=pitch, yaw=yaw))
 
-    def topic(name: str, *, latched: bool = False) -> dict[str, Any]:
-        durability = "Transient Local" if latched else "Volatile"
-        return {
-            "Value": name,
-            "Depth": 5,
-            "History Policy": "Keep Last",
-            "Reliability Policy": "Reliable",
-            "Durability Policy": durability,
-        }
+    def shows(display: Mapping[str, Any]) -> bool:
+        """Return whether a display has no topic, or one of the robot's and its type."""
+        kind = types.get(display.get("Topic", {}).get("Value"), "").rpartition("/")[2]
+        return "Topic" not in display or kind.startswith(display["Class"].rpartition("/")[2])
 
-    def display(kind: str, name: str, **more: Any) -> dict[str, Any]:
-        return {"Class": f"rviz_default_plugins/{kind}", "Name": name, "Enabled": True, **more}
-
-    displays = [
-        display("Grid", "Grid", **{"Cell Size": 0.1, "Plane Cell Count": 20}),
-        display(
-            "RobotModel",
-            "RobotModel",
-            **{"Description Source": "Topic", "Description Topic": topic(prefix + DESCRIPTION, latched=True)},
-        ),
-        display("TF", "TF", **{"Show Names": False, "Marker Scale": 0.2}),
-    ]
-    for name, kind in types.items():
-        if name.endswith(("/target", "/end_effector")):
-            shape = "Pose" if kind == POSE else "PointStamped"
-            displays.append(display(shape, name.rpartition("/")[2], Topic=topic(name)))
-    from_above = "".join(fmu.axes) == "xy"
-    view = {
-        "Class": "rviz_default_plugins/Orbit",
-        "Name": "Current View",
-        "Distance": 2.0,
-        "Pitch": 1.57 if from_above else 0.5,
-        "Yaw": 4.712 if from_above else 0.8,
-    }
-    clicked = topic(f"{prefix}/clicked_point")
-    tools = [
-        {"Class": "rviz_default_plugins/MoveCamera"},
-        {"Class": "rviz_default_plugins/PublishPoint", "Single click": True, "Topic": clicked},
-    ]
-    manager = {
-        "Class": "",
-        "Displays": displays,
-        "Enabled": True,
-        "Name": "root",
-        "Tools": tools,
-        "Global Options": {"Fixed Frame": fmu.root, "Frame Rate": 30},
-        "Views": {"Current": view},
-    }
-    panels = [{"Class": f"rviz_common/{name}", "Name": name} for name in ("Displays", "Views")]
-    return json.dumps({"Panels": panels, "Visualization Manager": manager}, indent=2) + "\n"
+    manager = layout["Visualization Manager"]
+    manager["Displays"] = [display for display in manager["Displays"] if shows(display)]
+    return json.dumps(layout, indent=2) + "\n"
 
 
 def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
