@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from ctypes import Array, byref, c_bool, c_double, c_int, c_size_t, c_uint, c_void_p
@@ -67,7 +66,8 @@ class Instance:
     SimulationError with the FMU's own words.
 
     What is called at each step goes past FMPy, by functions of the library that know no types, with
-    arguments that have theirs already: to convert those takes half of a call.
+    arguments that have theirs already: to convert those takes half of a call. Vectors of FMI 3.0 are
+    set and read whole, and a variable of FMI 2.0 is a vector of one.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
@@ -76,6 +76,12 @@ class Instance:
         self._fatal = False
         self._ends = c_bool()  # what doStep of FMI 3.0 says
         self._t, self._h = c_double(), c_double()
+        starts: dict[tuple[str, int], list[float | bool]] = {}
+        for v in fmu.variables.values():
+            vector = starts.setdefault((v.type, v.reference), [])
+            if v.element == len(vector):  # no alias, which has the reference of another
+                vector.append(v.start_value or 0.0)
+        self._starts, self._vectors = starts, dict(starts)  # by type and value reference
         identifier = fmu.description.coSimulation.modelIdentifier
         try:
             self._slave = self._instantiate(
@@ -98,7 +104,8 @@ class Instance:
         )
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
-        self._do_step = slave.dll["fmi2DoStep"]
+        self._setters = {"Real": slave.setReal, "Boolean": slave.setBoolean}
+        self._do_step, self._get = slave.dll["fmi2DoStep"], slave.dll["fmi2GetReal"]
         self._rest: tuple[object, ...] = (c_int(1),)
         return slave
 
@@ -115,15 +122,20 @@ class Instance:
     def reset(self) -> None:
         """Reset to the state after instantiation."""
         self._accept(self._slave.reset)
+        self._vectors = dict(self._starts)
 
     def set(self, values: Mapping[str, float | bool]) -> None:
-        """Set variables by name."""
-        variables = [self._fmu.variables[name] for name in values]
-        for kind, setter in (("Real", self._slave.setReal), ("Boolean", self._slave.setBoolean)):
-            chosen = [variable for variable in variables if variable.type == kind]
-            if chosen:
-                references = [variable.reference for variable in chosen]
-                self._accept(setter, references, [values[variable.name] for variable in chosen])
+        """Set variables by name; other elements of a vector keep their last values."""
+        changed: dict[tuple[str, int], list[float | bool]] = {}
+        for name, value in values.items():
+            variable = self._fmu.variables[name]
+            key = variable.type, variable.reference
+            changed.setdefault(key, list(self._vectors[key]))[variable.element] = value
+        for kind, setter in self._setters.items():
+            own = {reference: vector for (of, reference), vector in changed.items() if of == kind}
+            if own:
+                self._accept(setter, list(own), list(chain(*own.values())))
+        self._vectors.update(changed)
 
     def step(self, t: float, h: float) -> None:
         """Do one communication step from t to t + h."""
@@ -133,33 +145,56 @@ class Instance:
         if status > WARNING or self._ends:
             self._refuse(status)
 
+    def _columns(self, names: Sequence[str]) -> tuple[list[int], list[int], int]:
+        """Return references of Real variables, their places among all values of these, and how many these are."""
+        wanted = [self._fmu.variables[name] for name in names]
+        vectors = list(dict.fromkeys((variable.type, variable.reference) for variable in wanted))
+        *firsts, size = accumulate((len(self._starts[vector]) for vector in vectors), initial=0)
+        first = dict(zip(vectors, firsts))
+        columns = [first[variable.type, variable.reference] + variable.element for variable in wanted]
+        return [reference for _, reference in vectors], columns, size
+
+    def _of_size(self, size: int) -> tuple[int, ...]:
+        """Return the number of values where the version of FMI has it as an argument."""
+        return ()
+
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
         """Return a function that reads Real variables, always into the same buffer."""
-        n = len(names)
-        references = (c_uint * n)(*(self._fmu.variables[name].reference for name in names))
-        values = (c_double * n)()
-        return self._reader(values, "fmi2GetReal", byref(references), c_size_t(n), byref(values))
-
-    def _reader(self, values: Values, name: str, *arguments: object) -> Callable[[], Values]:
-        get, arguments = self._slave.dll[name], (self._component, *arguments)
+        distinct, columns, size = self._columns(names)
+        references, whole = (c_uint * len(distinct))(*distinct), (c_double * size)()
+        asked = byref(references), c_size_t(len(distinct)), byref(whole), *map(c_size_t, self._of_size(size))
+        get, arguments = self._get, (self._component, *asked)
 
         def read() -> Values:
             self._said = ""
             if (status := get(*arguments)) > WARNING:
                 self._refuse(status)
+            return whole
+
+        if columns == [*range(size)]:
+            return read
+        values = (c_double * len(columns))()
+
+        def read_elements() -> Values:
+            read()
+            values[:] = [whole[column] for column in columns]
             return values
 
-        return read
+        return read_elements
 
     def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
         """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
-        references = [[self._fmu.variables[n].reference for n in u] for u in (unknown, known)]
-        try:
-            columns = [self._slave.getDirectionalDerivative(references[0], [k], [1.0]) for k in references[1]]
-        except FMICallException as error:
-            self._refuse(error.status)
-        matrix: NDArray[np.float64] = np.array(columns).reshape(len(known), len(unknown)).T
-        return matrix
+        distinct, rows, size = self._columns(unknown)
+        matrix = np.empty((size, len(known)))
+        for k, variable in enumerate(self._fmu.variables[name] for name in known):
+            seed = np.eye(len(self._starts[variable.type, variable.reference]))[variable.element]
+            try:
+                matrix[:, k] = self._slave.getDirectionalDerivative(
+                    distinct, [variable.reference], seed, *self._of_size(size)
+                )
+            except FMICallException as error:
+                self._refuse(error.status)
+        return matrix[rows]
 
     def free(self) -> None:
         """End the instance; after a fatal failure the standard allows no further call."""
@@ -194,87 +229,23 @@ class Instance:
 
 
 class Instance3(Instance):
-    """An instance of FMI 3.0, whose vectors are set and read whole."""
-
-    def __init__(self, fmu: Fmu, folder: Path) -> None:
-        super().__init__(fmu, folder)
-        self._sizes = Counter(v.reference for v in fmu.variables.values())
-        self._arrays = self._starts()
+    """An instance of FMI 3.0."""
 
     def _instantiate(self, **what: str) -> Any:
         with _loading():
             slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=partial(self._log, b""), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
-        self._do_step = slave.dll["fmi3DoStep"]
+        self._setters = {"Real": slave.setFloat64, "Boolean": slave.setBoolean}
+        self._do_step, self._get = slave.dll["fmi3DoStep"], slave.dll["fmi3GetFloat64"]
         self._rest = (c_bool(True), *results)
         return slave
-
-    def _starts(self) -> dict[int, list[float | bool]]:
-        """Return the values of all settable variables, by value reference."""
-        arrays: dict[int, list[float | bool]] = {}
-        for variable in self._fmu.variables.values():
-            if variable.type in ("Real", "Boolean"):
-                value = variable.start_value
-                arrays.setdefault(variable.reference, []).append(0.0 if value is None else value)
-        return arrays
 
     def _set_up(self, **times: float | None) -> None:
         self._accept(self._slave.enterInitializationMode, **times)
 
-    def reset(self) -> None:
-        """Reset to the state after instantiation."""
-        super().reset()
-        self._arrays = self._starts()
-
-    def set(self, values: Mapping[str, float | bool]) -> None:
-        """Set variables by name; other elements of a vector keep their last values."""
-        variables = [self._fmu.variables[name] for name in values]
-        arrays = {v.reference: list(self._arrays[v.reference]) for v in variables}
-        for variable in variables:
-            arrays[variable.reference][variable.element] = values[variable.name]
-        for kind, setter in (("Real", self._slave.setFloat64), ("Boolean", self._slave.setBoolean)):
-            references = list(dict.fromkeys(v.reference for v in variables if v.type == kind))
-            if references:
-                values_of = chain.from_iterable(map(arrays.__getitem__, references))
-                self._accept(setter, references, list(values_of))
-        self._arrays.update(arrays)
-
-    def reader(self, names: Sequence[str]) -> Callable[[], Values]:
-        """Return a function that reads Real variables, always into the same buffer."""
-        wanted = [self._fmu.variables[name] for name in names]
-        distinct = list(dict.fromkeys(variable.reference for variable in wanted))
-        first = dict(zip(distinct, accumulate((self._sizes[r] for r in distinct), initial=0)))
-        columns = [first[variable.reference] + variable.element for variable in wanted]
-        size = sum(self._sizes[reference] for reference in distinct)
-        references = (c_uint * len(distinct))(*distinct)
-        whole = (c_double * size)()
-        asked = byref(references), c_size_t(len(distinct)), byref(whole), c_size_t(size)
-        read = self._reader(whole, "fmi3GetFloat64", *asked)
-        if columns == [*range(size)]:
-            return read
-        values = (c_double * len(columns))()
-
-        def read_elements() -> Values:
-            read()
-            values[:] = [whole[column] for column in columns]
-            return values
-
-        return read_elements
-
-    def derivatives(self, unknown: Sequence[str], known: Sequence[str]) -> NDArray[np.float64]:
-        """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
-        rows = [self._fmu.variables[name] for name in unknown]
-        columns = [self._fmu.variables[name] for name in known]
-        outer = {v.reference: np.zeros((self._sizes[v.reference], 0)) for v in rows}
-        for variable in columns:
-            seed = np.eye(self._sizes[variable.reference])[variable.element]
-            for reference, matrix in outer.items():
-                column = self._slave.getDirectionalDerivative(
-                    [reference], [variable.reference], seed, nSensitivity=len(matrix)
-                )
-                outer[reference] = np.column_stack([matrix, column])
-        return np.array([outer[v.reference][v.element] for v in rows]).reshape(len(rows), len(columns))
+    def _of_size(self, size: int) -> tuple[int, ...]:
+        return (size,)
 
 
 @contextmanager
