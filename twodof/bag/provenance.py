@@ -64,7 +64,7 @@ class ProvenanceFile:
 
     def __init__(self, folder: Path, namespace: str, run: Experiment, command_line: str) -> None:
         self.path, self.key = folder / file_of(namespace), key_of(namespace)
-        self._head = _as_json(_provenance(run, command_line))[:-1] + b',"input_changes":['
+        self._head = _as_json(provenance_of(run, command_line))[:-1] + b',"input_changes":['
         self._run, self._commanders = run, len(run.commanders)
         self.path.write_bytes(self._head + self._tail())
         self._start, self._end = run.start_time, len(self._head)
@@ -103,8 +103,8 @@ class ProvenanceFile:
         return (b"]," if rest else b"]") + _as_json(rest)[1:] + b"\n"
 
 
-def _provenance(run: Experiment, command_line: str) -> dict[str, Any]:
-    """Return the provenance without the changes of inputs."""
+def provenance_of(run: Experiment, command_line: str) -> dict[str, Any]:
+    """Return a run's provenance without the changes of inputs."""
     fmu = run.fmu
     return {
         "format": FORMAT,

@@ -25,41 +25,28 @@ from ..plant.variables import (
     count_event_indicators,
 )
 from ..version import __version__
-from .compiler import UNITS
+from .compiler import UNITS as COMPILED
 from .flavours import Flavour
 from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
 from .native import INDICATORS
 
-DIMENSIONS: dict[str, dict[str, int]] = {
-    "m": {"m": 1},
-    "m/s": {"m": 1, "s": -1},
-    "m/s2": {"m": 1, "s": -2},
-    "rad": {"rad": 1},
-    "rad/s": {"rad": 1, "s": -1},
-    "N": {"kg": 1, "m": 1, "s": -2},
-    "N.m": {"kg": 1, "m": 2, "s": -2},
-    "s": {"s": 1},
-    "1/s": {"s": -1},
-    "1/s2": {"s": -2},
-    "rad/s2": {"rad": 1, "s": -2},
-    "kg": {"kg": 1},
+UNITS: dict[str, tuple[str, dict[str, int]]] = {
+    "m": ("Length", {"m": 1}),
+    "m/s": ("Velocity", {"m": 1, "s": -1}),
+    "m/s2": ("Acceleration", {"m": 1, "s": -2}),
+    "rad": ("Angle", {"rad": 1}),
+    "rad/s": ("AngularVelocity", {"rad": 1, "s": -1}),
+    "rad/s2": ("AngularAcceleration", {"rad": 1, "s": -2}),
+    "N": ("Force", {"kg": 1, "m": 1, "s": -2}),
+    "N.m": ("Torque", {"kg": 1, "m": 2, "s": -2}),
+    "s": ("Time", {"s": 1}),
+    "kg": ("Mass", {"kg": 1}),
+    "1/s": ("", {"s": -1}),
+    "1/s2": ("", {"s": -2}),
 }
-"""Exponents of the SI base units; all factors are 1."""
-
-QUANTITIES = {
-    "m": "Length",
-    "m/s": "Velocity",
-    "m/s2": "Acceleration",
-    "rad": "Angle",
-    "rad/s": "AngularVelocity",
-    "rad/s2": "AngularAcceleration",
-    "N": "Force",
-    "N.m": "Torque",
-    "s": "Time",
-    "kg": "Mass",
-}
-"""Quantity of each unit, by the names of Modelica's standard library; gains have none."""
+"""Quantity, by the names of Modelica's standard library, and exponents of the SI base units; all factors are 1.
+Gains are no quantity."""
 DISPLAY = {"rad": ("deg", 180.0 / math.pi)}
 """Units for people, and how many of them are one."""
 
@@ -150,13 +137,13 @@ def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
         element = ET.SubElement(root, interface, {"modelIdentifier": identifier, **attributes})
         if two and native:
             files = ET.SubElement(element, "SourceFiles")
-            for name in UNITS:
+            for name in COMPILED:
                 ET.SubElement(files, "File", name=name)
 
 
 def _units(root: ET.Element, used: Collection[str], fmi: int) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
-    for name, exponents in DIMENSIONS.items():
+    for name, (_, exponents) in UNITS.items():
         if name in used:
             unit = ET.SubElement(definitions, "Unit", name=name)
             base = {key: str(exponent) for key, exponent in exponents.items()}
@@ -165,8 +152,8 @@ def _units(root: ET.Element, used: Collection[str], fmi: int) -> None:
                 display, factor = DISPLAY[name]
                 ET.SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
     definitions = ET.SubElement(root, "TypeDefinitions")
-    for name, quantity in QUANTITIES.items():
-        if name in used:
+    for name, (quantity, _) in UNITS.items():
+        if name in used and quantity:
             attributes = {"quantity": quantity, "unit": name}
             if name in DISPLAY:
                 attributes["displayUnit"] = DISPLAY[name][0]
@@ -257,8 +244,8 @@ def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges
         attributes["initial"] = "exact"
     if variable.unit:
         attributes["unit"] = variable.unit
-    if variable.unit in QUANTITIES:
-        attributes["declaredType"] = QUANTITIES[variable.unit]
+    if variable.unit and (quantity := UNITS[variable.unit][0]):
+        attributes["declaredType"] = quantity
     within = _range(robot, variable)
     for key, value, default in (
         ("min", within.low, -math.inf),

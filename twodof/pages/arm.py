@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ..bag.provenance import provenance_of
 from ..bounds import MAX_HEAD, MAX_SOURCE
 from ..errors import PageError
 from ..export.compiler import compile_web_module, standard_headers
@@ -100,13 +101,7 @@ def page(
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
     module = compile_web_module(files, ["page.c"])  # a page asks for no derivatives
-    provenance = {
-        "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
-        **{key: getattr(fmu, key) for key in ("robot", "frame", "root", "axes", "joints")},
-        "step": run.step,
-        "versions": versions(),
-        "urdf": arm.urdf,
-    }
+    provenance = {**provenance_of(run, ""), "versions": versions()}  # no other package is at work
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
     content = arm_page(arm.robot or arm.name, arm, engine, allowed, provenance=provenance)
     with refusing(PageError, f"write '{path}'"):

@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from math import inf
-from typing import TYPE_CHECKING
 
 from ..errors import InputError, PublishError, SimulationError
 from ..signatures import ignore, never
@@ -20,9 +19,6 @@ from .dds import dds_qos, dds_topic
 from .listener import ORDERS, Listener
 from .messages import CLOCK, JOINT_STATE, JOINT_STATES, POINT, Messages, check_name
 from .network import Network, OpenDomain, network_of_environment, open_domain
-
-if TYPE_CHECKING:
-    pass
 
 # isort: split
 from cyclonedds import core, domain, pub  # where missing, dds says so
