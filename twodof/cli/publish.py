@@ -67,7 +67,7 @@ def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     from ..ros.network import network_of_environment
     from ..ros.publisher import Publisher
-    from ..ros.realtime import publish, publish_together
+    from ..ros.realtime import PublisherOptions, publish, publish_together
     from ..simulation.pace import RealTime
 
     if not 0.0 < options.rate < math.inf:
@@ -82,20 +82,10 @@ def call(options: argparse.Namespace) -> int:
     if bag is not None:  # a part of it for each robot, in its namespace
         space = options.namespace
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
-    publisher = said(
-        options,
-        "scene",
-        "effort",
-        "clock",
-        "namespace",
-        "state_topic",
-        "command_topic",
-        "lockstep",
-        "timeout",
-        "on_timeout",
-    )
+    publisher = said(options, "clock", "namespace", *PublisherOptions.__optional_keys__ - {"opened"})
     publisher["network"] = network_of_environment(subnet=options.subnet)
-    publisher["opened"] = (lambda _: None) if options.json else partial(_print_network, options.stop_time)
+    if not options.json:
+        publisher["opened"] = partial(_print_network, options.stop_time)
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
     with asked_to_stop() as asked:
