@@ -130,7 +130,7 @@ def publish(fmu: Path, seconds: float) -> None:
     receiver, alone = beside("receive"), beside("bare", seconds)
     pace, clock = RealTime(), Clock()
     publisher = twodof.Publisher(Network(DOMAIN, loopback=True), scene=True)
-    twodof.simulate(run, clock, publisher, pace=pace, steer=publisher.command)
+    twodof.simulate(run, clock, publisher, pace=pace)
     print(alone.communicate()[0], end="")
     account("published", clock.times)
     print_missed(pace, len(clock.times))

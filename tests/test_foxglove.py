@@ -40,13 +40,7 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path: Pa
     bag = tmp_path / "bag"
     viewer = Foxglove(0, scene=True, effort=True, set_gains=True, opened=opened)
     twodof.simulate(
-        native_path,
-        viewer,
-        twodof.Bag(bag, scene=True, effort=True),
-        stop_time=4,
-        step=step,
-        pace=twodof.RealTime(),
-        steer=viewer.command,
+        native_path, viewer, twodof.Bag(bag, scene=True, effort=True), stop_time=4, step=step, pace=twodof.RealTime()
     )
     assert clients[0].wait(PATIENCE) == 0
     heard: dict[str, list[Any]] = {}

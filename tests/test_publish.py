@@ -375,7 +375,7 @@ steps, paced = int(sys.argv[2]), sys.argv[3] == "paced"
 run = twodof.experiment(sys.argv[1], stop_time=steps / 100)
 publisher, memory = Publisher(scene=True), Memory(steps // 10)
 pace = RealTime() if paced else None
-summary = twodof.simulate(run, publisher, memory, pace=pace, steer=publisher.command)
+summary = twodof.simulate(run, publisher, memory, pace=pace)
 assert summary.last.k == steps
 print(memory.growth)
 """

@@ -66,8 +66,7 @@ def add(publish: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     from ..ros.network import network_of_environment
-    from ..ros.publisher import Publisher
-    from ..ros.realtime import PublisherOptions, publish, publish_together
+    from ..ros.realtime import PublisherOptions, publish_together
     from ..simulation.pace import RealTime
 
     if not 0.0 < options.rate < math.inf:
@@ -82,6 +81,8 @@ def call(options: argparse.Namespace) -> int:
     if bag is not None:  # a part of it for each robot, in its namespace
         space = options.namespace
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
+    viewers = [_foxglove(options)] if options.foxglove else []
+    sinks = {name: [*viewers, *filter(None, [bags.get(name)])] for name in robots}
     publisher = said(options, "clock", "namespace", *PublisherOptions.__optional_keys__ - {"opened"})
     publisher["network"] = network_of_environment(subnet=options.subnet)
     if not options.json:
@@ -89,20 +90,7 @@ def call(options: argparse.Namespace) -> int:
     speed = 1.0 if options.speed is None and not options.lockstep else options.speed
     pace = None if speed is None else RealTime(speed)
     with asked_to_stop() as asked:
-        if "" in robots:
-            viewer = _foxglove(options) if options.foxglove else None
-            summary = publish(
-                robots[""],
-                *filter(None, [viewer, *bags.values()]),
-                publisher=Publisher(**publisher),
-                pace=pace,
-                stop=asked,
-                steer=viewer.command if viewer else dict,
-            )
-            summaries = {"": summary}
-        else:
-            sinks = {name: [bag] for name, bag in bags.items()}
-            summaries = publish_together(robots, sinks=sinks, pace=pace, stop=asked, **publisher)
+        summaries = publish_together(robots, sinks=sinks, pace=pace, stop=asked, **publisher)
     if options.json:
         facts = {name: facts_of(robots[name], bags.get(name), summary, pace) for name, summary in summaries.items()}
         print_json(**facts.get("", facts))

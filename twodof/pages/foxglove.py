@@ -18,8 +18,9 @@ from ..plant.variables import GAINS
 from ..ros.cdr import Rows
 from ..ros.commands import warner
 from ..ros.messages import Messages, store_of
-from ..signatures import ignore
+from ..signatures import ignore, never
 from ..simulation.experiments import Experiment, Value, check_going_on, resolve
+from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
 from .serving import HOST, Server, relay
 
@@ -119,7 +120,7 @@ class Foxglove(Sink):
         for name, rows in messages.items():
             self._channels[name].log(rows.tobytes(), log_time=stamp)
 
-    def command(self) -> dict[str, Value]:
+    def command(self, stop: Callable[[], bool] = never, pace: RealTime | None = None) -> dict[str, Value]:
         """Return gains that were set since the last call, as inputs of the FMU."""
         return self._gains.take()
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, TypedDict
 from ..errors import InputError
 from ..fmu import Fmu
 from ..signatures import check_keywords, ignore, never, with_keywords_of
-from ..simulation.experiments import Experiment, ExperimentOptions, Setting, experiment
-from ..simulation.master import Member, Steer, Summary, as_experiment, simulate_together
+from ..simulation.experiments import Experiment, ExperimentOptions, experiment
+from ..simulation.master import Member, Steer, Summary, as_experiment, simulate, simulate_together
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sink
 from .messages import check_name
@@ -54,8 +54,7 @@ def publish(
     publisher = publisher or Publisher()
     if pace is None and not publisher.lockstep:
         pace = RealTime()
-    member = _member(run, publisher, sinks, pace, stop, steer)
-    return simulate_together([member], pace=pace, stop=stop)[0]
+    return simulate(run, publisher, *sinks, pace=pace, stop=stop, steer=steer)
 
 
 class PublisherOptions(TypedDict, total=False):
@@ -86,7 +85,8 @@ def publish_together(
     """Step several FMUs in one loop on a ROS 2 network, each in its own namespace.
 
     Args:
-        robots: an experiment by namespace, all of the same times; their first stamp is one.
+        robots: an experiment by namespace, all of the same times; their first stamp is one. "" is
+            the namespace of a robot that is alone.
         sinks: further consumers of a robot's samples.
         network, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
         pace, stop: as of ``publish``.
@@ -107,25 +107,9 @@ def publish_together(
         check_name("robots", name)
     shared, now, members = open_domain(network or network_of_environment()), time.time(), list[Member]()
     for name, run in robots.items():
-        publisher = Publisher(shared, clock=clock and not members, namespace=f"{namespace}/{name}", **options)
-        stamped = run if run.stamp_start is not None else replace(run, stamp_start=now)
-        own = sinks.get(name, ())
-        members.append(_member(stamped, publisher, own, pace, stop, ignore))
+        space = "/".join(filter(None, (namespace, name)))
+        publisher = Publisher(shared, clock=clock and not members, namespace=space, **options)
+        if len(robots) > 1 and run.stamp_start is None:
+            run = replace(run, stamp_start=now)
+        members.append(Member(run, (publisher, *sinks.get(name, ()))))
     return dict(zip(robots, simulate_together(members, pace=pace, stop=stop)))
-
-
-def _member(
-    run: Experiment,
-    publisher: Publisher,
-    sinks: Sequence[Sink],
-    pace: RealTime | None,
-    stop: Callable[[], bool],
-    steer: Steer,
-) -> Member:
-    """Return a published run that follows commands; those from the network take precedence."""
-
-    def asked() -> Mapping[str, Setting]:
-        commands = publisher.command(stop, pace) or {}
-        return {**(steer() or {}), **commands}
-
-    return Member(run, (publisher, *sinks), asked, publisher.resume)

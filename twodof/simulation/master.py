@@ -247,7 +247,8 @@ def simulate(
     Other arguments and errors as in ``samples``.
 
     Args:
-        steer: asked after each sample for new inputs, which hold from that sample's time on.
+        steer: asked after each sample for new inputs, which hold from that sample's time on. Those
+            that a sink commands precede them.
     """
     run = as_experiment(simulate, run, options)
     member = Member(run, sinks, steer, resume, instance)
@@ -265,6 +266,23 @@ class Member(NamedTuple):
     steer: Steer = ignore
     resume: Resume = ignore
     instance: Instance | None = None
+
+    def steered(self, pace: RealTime | None, stop: Stop) -> Steer:
+        """Return a function that returns the new inputs after a sample, those of sinks before others."""
+        commands = [sink.command for sink in self.sinks if type(sink).command is not Sink.command]
+
+        def steer() -> Mapping[str, Setting] | None:
+            asked = self.steer() or {}
+            for command in commands:
+                asked = {**asked, **(command(stop, pace) or {})}
+            return asked
+
+        return steer if commands else self.steer
+
+    def resumed(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
+        """Return the first start values that ``resume`` or a sink has to continue after a discarded step."""
+        every = (resume(sample, error) for resume in (self.resume, *(sink.resume for sink in self.sinks)))
+        return next((values for values in every if values is not None), None)
 
 
 def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None, stop: Stop = never) -> list[Summary]:
@@ -292,14 +310,14 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
         sources, peaks = [], []
         limits = [limits_of(run.fmu) for run, *_ in members]
         for member in members:
-            run, _, _, resume, own = member
+            run = member.run
             ready = begin if member is members[-1] else lambda: None
             peaks.append(Peaks([*chain(*map(run.fmu.vector, OUTPUTS))]))
             watch = peaks[-1].add
-            source = _stepped(run, watch, None, lambda: ended, ready, resume, own)
+            source = _stepped(run, watch, None, lambda: ended, ready, member.resumed, member.instance)
             sources.append(stack.enter_context(closing(source)))
         latest = [next(source) for source in sources]
-        sends, steers = [s.send for s in sources], [m.steer for m in members]
+        sends, steers = [s.send for s in sources], [m.steered(pace, stop) for m in members]
         writes = [(k, sink.write) for k, member in enumerate(members) for sink in member.sinks]
         started = time.perf_counter()
         while True:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import asin, dist, hypot
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .experiments import Experiment, Value
+from ..errors import SimulationError
+from .experiments import Experiment, Setting, Value
+from .pace import RealTime
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -83,7 +85,8 @@ class Sample(NamedTuple):
 class Sink:
     """Consumer of samples: a context that receives the experiment and then each sample.
 
-    One of one's own needs ``write`` alone; the rest does nothing here.
+    One of one's own needs ``write`` alone; the rest does nothing here. Those that hear commands
+    steer the run with them.
 
     ::
 
@@ -104,3 +107,11 @@ class Sink:
 
     def write(self, sample: Sample) -> None:
         """Receive one sample."""
+
+    def command(self, stop: Callable[[], bool], pace: RealTime | None) -> Mapping[str, Setting] | None:
+        """Return new inputs from the latest sample's time on; ``stop`` and ``pace`` are the run's."""
+        return None
+
+    def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
+        """Return start values to continue after a discarded step, from the sample before it; None to fail."""
+        return None
