@@ -160,5 +160,5 @@ def long_run(default: Recording, q: np.ndarray) -> twodof.Recording:
     """A run of the default arm at 1 kHz that nothing has simulated."""
     run = twodof.read_bag(default.bag)
     stamps = START * 10**9 + np.arange(len(q)) * 10**6
-    provenance = {**run.provenance, "step": 0.001}
-    return replace(run, stamps=stamps, count=len(q), q=q, v=q - q[0], provenance=provenance)
+    run.provenance["step"] = 0.001
+    return replace(run, stamps=stamps, count=len(q), q=q, v=q - q[0])

@@ -5,12 +5,16 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import pydoc
 import re
 import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
+from html import escape
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas
@@ -121,11 +125,55 @@ def test_public_signatures_name_every_keyword() -> None:
     """An editor and ``help`` show names, types and defaults."""
     for name in dir(twodof):
         public = getattr(twodof, name)
-        if inspect.isfunction(public):
-            signature = inspect.signature(public)
-            assert not re.search(r"\bAny\b|lambda|\*\*", str(signature)), name
+        if name in ("TwoDofError", "__version__"):  # of no signature of its own
+            continue
+        own = vars(public).items() if inspect.isclass(public) else ()
+        methods = [method for key, method in own if inspect.isfunction(method) and not key.startswith("_")]
+        for callable_ in (public, *methods):
+            signature = str(inspect.signature(callable_))
+            assert not re.search(r"\bAny\b|lambda|\*\*", signature), f"{name}: {signature}"
     assert twodof.run is twodof.simulate
     assert {"stop_time", "settings", "steer"} <= inspect.signature(twodof.run).parameters.keys()
+
+
+def test_help_begins_with_every_name_of_the_package() -> None:
+    page = pydoc.plain(pydoc.render_doc(twodof)).partition("PACKAGE CONTENTS")[0]
+    assert "twodof.run(fmu" in page
+    listed = {*re.findall(r"\w+", page.partition("Build an FMU")[2])}
+    assert {*dir(twodof)} - {"__version__"} <= listed
+
+
+@pytest.mark.parametrize("kind", ["fmu", "recording", "summary", "linear model", "sweep"])
+def test_a_notebook_shows_a_table_and_a_picture(kind: str, native_path: Path, tmp_path: Path) -> None:
+    """The HTML is well-formed, has no script, and names of third parties are text in it."""
+    hostile = "<script>alert(1)</script>&\"'"
+    fmu = twodof.load_fmu(native_path)
+    fmu = replace(fmu, robot=hostile)
+    summary = twodof.run(fmu, twodof.Bag(tmp_path / "bag"), stop_time=0.5)
+    shown = {
+        "fmu": lambda: (fmu, ["joint1, joint2", escape(hostile)]),
+        "recording": lambda: (
+            replace(twodof.read_bag(tmp_path / "bag"), joints=(hostile, "b")),
+            ["51 × sensor_msgs/msg/JointState", escape(hostile)],
+        ),
+        "summary": lambda: (summary, ["after 50 steps", f"{summary.error:.3g} m"]),
+        "linear model": lambda: (twodof.linearise(fmu)._replace(remarks=(hostile,)), ["-1.292", escape(hostile)]),
+        "sweep": lambda: (twodof.sweep(fmu, grid={"Kp": [20.0, 80.0]}, stop_time=0.1), ["Sweep of 2 runs", "Kp"]),
+    }[kind]()
+    html = shown[0]._repr_html_()
+    ElementTree.fromstring(re.sub(r"<style.*?</style>", "", f"<p>{html}</p>", flags=re.S))
+    assert "<script" not in html and all(text in html for text in shown[1])
+    assert "<table" in html and re.search(r"<(polyline|circle) ", html)
+
+
+def test_the_picture_of_a_long_recording_keeps_its_extremes(native_path: Path, tmp_path: Path) -> None:
+    twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
+    bag = twodof.read_bag(tmp_path / "bag")
+    q = np.zeros((100_000, 2))
+    q[54_321] = 7.25, -3.5
+    stamps = np.arange(len(q)) * 10**6
+    html = replace(bag, q=q, stamps=stamps)._repr_html_()
+    assert "-3.5 to 7.25" in html and len(html) < 30_000
 
 
 def test_a_control_that_is_none_is_told_where_it_was_typed() -> None:
@@ -193,10 +241,12 @@ ABSENT = {
     "twodof.plot('bag')": "view",
     "twodof.sweep('x.fmu', grid={'Kp': [1.0]})": "sweep",
     "twodof.publish('x.fmu')": "ros",
+    "twodof.Publisher()": "ros",
 }
 CALLS = """
 for call in sys.argv[1:]:
-    eval(call.partition("(")[0])
+    name = call.partition("(")[0]
+    assert isinstance(eval(name), type) == name.split(".")[1][0].isupper()
     try:
         eval(call)
     except twodof.TwoDofError as error:

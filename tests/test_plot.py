@@ -19,6 +19,7 @@ from recordings import LINK, Recording, build, chain_urdf, long_run, record
 from sinks import Collector
 
 import twodof
+from twodof.bag.provenance import Provenance
 from twodof.plots.interactive import over_time
 from twodof.plots.runs import plot
 from twodof.plots.strokes import looks
@@ -411,6 +412,6 @@ def test_labels_say_what_differs(runs: list[dict[str, Any]], expected: list[str]
         fmu = {**bag.provenance["fmu"], "file": changed.pop("file", "TwoDof.fmu")}
         starts = bag.provenance["start_values"]
         assert changed.keys() <= starts.keys()
-        provenance = {**bag.provenance, "fmu": fmu, "step": step, "start_values": starts | changed}
+        provenance: Provenance = {**bag.provenance, "fmu": fmu, "step": step, "start_values": starts | changed}
         bags.append(replace(bag, path=path, provenance=provenance))
     assert labels(read_tracks(bags)) == expected

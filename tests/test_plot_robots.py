@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import oracles
@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from recordings import LINK, UR5_JOINTS, Recording, bare, build, chain_urdf, elsewhere, record, waves
 
 import twodof
+from twodof.bag.provenance import Provenance
 from twodof.errors import PlotError, TwoDofError
 from twodof.pages.replay import replay
 from twodof.plots.runs import plot
@@ -352,7 +353,7 @@ def test_a_bag_whose_provenance_makes_no_sense_is_refused(
 ) -> None:
     run = twodof.read_bag(default.bag)
     provenance = copy.deepcopy(run.provenance)
-    spoil(provenance)
+    spoil(cast(dict[str, Any], provenance))
     with pytest.raises(TwoDofError, match=r"^the run.json in '.*Kp50' does not fit its samples$"):
         plot(replace(run, provenance=provenance))
 
@@ -365,4 +366,4 @@ def test_a_bag_whose_robot_makes_no_sense_is_refused(default: Recording) -> None
         ({"frame": "hand"}, "the URDF in '.*Kp50': no frame 'hand'"),
     ):
         with pytest.raises(PlotError, match=message):
-            plot(replace(run, provenance={**run.provenance, **spoilt}))
+            plot(replace(run, provenance=cast(Provenance, {**run.provenance, **spoilt})))

@@ -1,8 +1,27 @@
-"""From a URDF to an FMU that every FMI tool loads, from a co-simulation to a ROS 2 bag.
+"""From a URDF to an FMU that every FMI tool loads, and from a co-simulation to a ROS 2 bag.
 
-fmu = twodof.build_fmu("TwoDof.fmu")
-summary = twodof.simulate(fmu, twodof.Bag("my_bag"), stop_time=5)
+    import twodof
+
+    fmu = twodof.build_fmu("TwoDof.fmu")
+    summary = twodof.run(fmu, twodof.Bag("my_bag"), stop_time=5)
+    print(summary.error, "m from the target")
+    print(twodof.read_bag("my_bag").q[-1], "rad at the end")
+
+Quantities have SI units. Functions accept an FMU's path or the ``Fmu`` that ``load_fmu`` returns.
+
+Build an FMU from a URDF:       build_fmu, FmuOptions, load_fmu, Fmu
+Run it:                         run (the same as simulate), experiment, Experiment, Summary, RealTime
+Run it step by step:            samples, Sample, Sink
+Write and read bags:            Bag, read_bag, Recording, read_commands, recover
+Draw figures and pages:         plot, view, page, live
+Run it over many gains:         sweep, read_sweep
+Linear models:                  linearise, LinearModel
+ROS 2 and Foxglove:             publish, publish_together, Publisher, Foxglove, layouts
+
+Errors that a user can mend are a TwoDofError. Functions and classes that need an extra raise one that names it.
 """
+
+from typing import NoReturn
 
 # a name is imported on first use: FMPy, rosbags and Pinocchio take a second together
 with open(f"{__file__}i", encoding="utf-8") as _stub:
@@ -23,10 +42,12 @@ def __getattr__(name: str) -> object:
 
     try:
         return getattr(importlib.import_module(_HOMES[name], __name__), name)
-    except TwoDofError as error:  # an extra is missing, which it says when it is used
+    except TwoDofError as error:  # an extra is missing: the name can be imported, and using it raises this
         missing = error
 
-    def value(*_arguments: object, **_named: object) -> None:
+    def unusable(*_arguments: object, **_named: object) -> NoReturn:
         raise missing
 
-    return value
+    unusable.__name__, unusable.__doc__ = name, str(missing)
+    is_class = name[0].isupper()
+    return type(name, (), {"__new__": unusable, "__doc__": str(missing)}) if is_class else unusable

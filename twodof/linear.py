@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError, SimulationError
 from .fmu import Fmu, Instance, instantiate, load_fmu
+from .notebook import card, picture
 from .simulation.experiments import Setting, Value, resolve
 from .simulation.peaks import limits_of
 
@@ -64,6 +65,15 @@ class LinearModel(NamedTuple):
     def __repr__(self) -> str:
         n, m, p = len(self.states), len(self.inputs), len(self.outputs)
         return f"<LinearModel: {n} states, {m} inputs, {p} outputs>"
+
+    def _repr_html_(self) -> str:
+        facts = {"states": ", ".join(self.states), "inputs": ", ".join(self.inputs), "outputs": ", ".join(self.outputs)}
+        modes = {
+            f"mode {i + 1}": f"{m.eigenvalue:.4g} 1/s, damping ratio {m.damping:.3g}" for i, m in enumerate(self.modes)
+        }
+        plane = [([m.eigenvalue.real for m in self.modes], [m.eigenvalue.imag for m in self.modes])]
+        plot = picture(plane, "Re λ in 1/s", "Im λ in 1/s", dots=True)
+        return card("Linear model", facts | modes | dict.fromkeys(self.remarks, ""), plot)
 
     @property
     def modes(self) -> list[Mode]:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
 from ..bounds import MAX_PROVENANCE
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
-from ..simulation.experiments import Changes, Experiment
+from ..simulation.experiments import Changes, Experiment, Value
 from ..version import versions
 from .mcap import read_metadata
 from .records import DamageError
@@ -24,7 +24,7 @@ FORMAT = 1
 KEY = "twodof"
 """Key of the provenance in a bag's own metadata."""
 MAX_YAML = 256 * 1024  # bytes of changes: a writer of YAML takes 2 s for a MiB
-KNOWN_UNTIL = "inputs_known_until"
+KNOWN_UNTIL: Final = "inputs_known_until"
 """Key of the time, s, from which on more inputs changed than the file has room for."""
 MAX_TAIL = 64 * 1024  # bytes of who commanded: more than 20 of them have
 PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
@@ -45,6 +45,30 @@ SHAPE = {
     "input_changes": [(NUMBER, VALUES)],
 }
 """Shape of a valid run.json, for ``fits``."""
+
+
+class Provenance(TypedDict, total=False):
+    """Content of run.json; empty for a third-party bag.
+
+    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` a time and facts of a third party.
+    """
+
+    format: int
+    fmu: dict[str, str]
+    robot: str
+    frame: str
+    root: str
+    axes: str
+    joints: list[str]
+    start_time: float
+    step: float
+    start_values: dict[str, Value]
+    versions: dict[str, str]
+    command_line: str
+    urdf: str | None
+    input_changes: list[list[Any]]
+    inputs_known_until: float
+    commanders: list[Any]
 
 
 class ProvenanceFile:
@@ -95,7 +119,7 @@ class ProvenanceFile:
 
     def _tail(self, until: float | None = None) -> bytes:
         """Return the commanders, and the time until which the changes of inputs are complete."""
-        rest: dict[str, Any] = {}
+        rest: Provenance = {}
         if self._run.commanders:
             rest["commanders"] = [*self._run.commanders]
         if until is not None:
@@ -103,13 +127,16 @@ class ProvenanceFile:
         return (b"]," if rest else b"]") + _as_json(rest)[1:] + b"\n"
 
 
-def provenance_of(run: Experiment, command_line: str) -> dict[str, Any]:
+def provenance_of(run: Experiment, command_line: str) -> Provenance:
     """Return a run's provenance without the changes of inputs."""
     fmu = run.fmu
     return {
         "format": FORMAT,
         "fmu": {"name": fmu.name, "guid": fmu.guid, "file": fmu.path.name},
-        **{key: getattr(fmu, key) for key in ("robot", "frame", "root", "axes")},
+        "robot": fmu.robot,
+        "frame": fmu.frame,
+        "root": fmu.root,
+        "axes": fmu.axes,
         "joints": list(fmu.joints),
         "start_time": run.start_time,
         "step": run.step,
@@ -165,12 +192,12 @@ def each_robot(path: Path) -> list[Path]:
     return [path] if len(robots) == 1 else [Path(f"{path}:{robot}") for robot in robots]
 
 
-def _as_json(content: Any) -> bytes:
+def _as_json(content: object) -> bytes:
     """Return JSON without spaces, because some writers of YAML fold wrongly at a space."""
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
 
 
-def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
+def read_provenance(path: Path, namespace: str = "") -> Provenance:
     """Return the provenance of a bag's robot; {} where there is none of this package.
 
     It is in the bag's folder, or in the metadata of a bag that is a single file.
@@ -188,7 +215,7 @@ def read_provenance(path: Path, namespace: str = "") -> dict[str, Any]:
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
             if not fits(content, SHAPE):
                 raise ValueError("it is damaged")
-            return content
+            return cast(Provenance, content)
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError, RecursionError, DamageError) as error:

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from math import ceil, inf, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
+from ..files import shown
+from ..notebook import card, picture
 from ..plant.urdf import RobotError, Urdf, read_urdf
-from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE
-from .provenance import KNOWN_UNTIL
+from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE, Value
+from .provenance import KNOWN_UNTIL, Provenance
 from .records import Stamps
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-Schedule = list[tuple[int, Mapping[str, Any]]]
+Schedule = list[tuple[int, Mapping[str, Value]]]
 """Communication points, ascending from 0, and values of inputs and parameters from each on."""
 
 MOST_LOST = 10  # times as many samples as there are
@@ -83,10 +85,15 @@ class Recording:
     v: Array
     tau: Array
     received: ReceivedTargets | None
-    provenance: dict[str, Any]
+    provenance: Provenance
 
     def __repr__(self) -> str:
         return f"<Recording '{self.path}': {self.count} samples in {self.t[-1]:g} s of {', '.join(self.joints)}>"
+
+    def _repr_html_(self) -> str:
+        facts = {topic.name: f"{topic.count} × {topic.type}" for topic in self.topics}
+        curves = picture(((self.t, q) for q in self.q.T), "t in s", f"q of {', '.join(self.joints)}")
+        return card(f"Recording of {self.t[-1]:g} s, {shown(self.path)}", facts, curves)
 
     @property
     def t(self) -> Array:
@@ -103,11 +110,11 @@ class Recording:
         """Inputs and parameters in effect, each from its communication point on."""
         try:
             starts = self.provenance.get("start_values", {})
-            changes: Sequence[Any] = self.provenance.get("input_changes", [])
+            changes = self.provenance.get("input_changes", [])
             if not all(map(isfinite, chain(*(v.values() for v in (starts, *(c for _, c in changes)))))):
                 raise ValueError("values are not finite")
             schedule: Schedule = [(0, ChainMap({}, starts))]
-            changed: dict[str, Any] = {}
+            changed: dict[str, Value] = {}
             for time, values in changes:
                 steps = (time - self.provenance["start_time"]) / self.provenance["step"]
                 k = max(0, ceil(steps - TIME_TOLERANCE))

@@ -16,12 +16,15 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import fmpy
+import numpy as np
 from fmpy.model_description import ModelDescription, ModelVariable
 
 from ..bounds import MAX_DESCRIPTION, MAX_ELEMENTS, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError
 from ..export.compiler import host_platform
-from ..files import UnsafeArchiveError, check_archive, read_member
+from ..files import UnsafeArchiveError, check_archive, read_member, shown
+from ..notebook import card, picture
+from ..plant.urdf import RobotError, read_urdf
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,12 @@ class Fmu:
     def __repr__(self) -> str:
         return f"<Fmu '{self.path}': {self.name}, joints {', '.join(self.joints)}>"
 
+    def _repr_html_(self) -> str:
+        facts = {"FMI": str(self.version), "platforms": ", ".join(self.platforms), "joints": ", ".join(self.joints)}
+        facts |= {key: getattr(self, key) or "not known" for key in ("robot", "control", "frame", "axes")}
+        facts |= {f"{kind}s": ", ".join(self.groups(kind)) for kind in ("input", "output", "parameter")}
+        return card(f"FMU {self.name}, {shown(self.path)}", facts, _pose(self))
+
     @property
     def name(self) -> str:
         """The model's name."""
@@ -142,6 +151,22 @@ class Fmu:
             if variable.causality == causality:
                 groups.setdefault(name.partition("[")[0], []).append(name)
         return groups
+
+
+def _pose(fmu: Fmu) -> str:
+    """Return a picture of the robot at its start, seen along the axis in which it extends least; "" without a URDF."""
+    from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
+
+    try:
+        urdf = read_urdf(fmu.urdf or "")
+    except RobotError:
+        return ""
+    q = [[float(fmu.start_values.get(name, 0.0)) for name in fmu.vector("q_start")]]
+    kinematics, parents = Kinematics(urdf, fmu.joints[: len(q[0])]), {joint.parent for joint in urdf.joints.values()}
+    chains = [urdf.chain(link) for link in urdf.links if link not in parents]
+    bodies = [np.concatenate([frame.translation for frame in kinematics.along(chain, q)]) for chain in chains]
+    a, b = sorted(np.argsort(np.ptp(np.concatenate(bodies), axis=0))[1:])
+    return picture(((body[:, a], body[:, b]) for body in bodies), f"{'xyz'[a]} in m", f"{'xyz'[b]} in m", equal=True)
 
 
 def load_fmu(path: str | Path) -> Fmu:

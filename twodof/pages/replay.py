@@ -143,7 +143,7 @@ def _robot(
             remarks.append(str(error))
             return text, lambda name: None
         return renamed, files.get
-    text = bag.provenance["urdf"]
+    text = bag.provenance["urdf"] or ""
     if fmu is not None:
         return text, partial(read_resource, load_fmu(fmu))
     maker = bag.provenance["fmu"]

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
 
+from .control_law import ControlledPlant
 from .integrator import Array, Ratios, Response
 
 
-def command(plant: Any) -> tuple[Response, Ratios]:
+def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
     """Return τ as a function of the state, n values, inputs held; this law has no J⁺."""
     tau = list(plant.tau_cmd)
 

@@ -8,12 +8,12 @@ Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2.
 from __future__ import annotations
 
 from math import inf
-from typing import Any
 
+from .control_law import ControlledPlant
 from .integrator import Array, Ratios, Response
 
 
-def command(plant: Any) -> tuple[Response, Ratios]:
+def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
     """Return q̈_cmd as a function of the state, n values, inputs held; this law has no J⁺."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 

@@ -18,6 +18,7 @@ from operator import mul
 import numpy as np
 
 from . import effort_control, joint_control, task_control
+from .control_law import ControlLaw, ControlledPlant
 from .dormand_prince import STAGES
 from .integrator import BUDGET, Array, Equations, Response, StepError, advance
 from .mechanism import Mechanism
@@ -26,7 +27,12 @@ from .robot import Robot
 from .stops import Stops
 from .variables import CONTROLS, RANGES, Variable
 
-LAWS = {"task": task_control, "pose": task_control, "joint": joint_control, "effort": effort_control}
+LAWS: dict[str, ControlLaw] = {
+    "task": task_control,
+    "pose": task_control,
+    "joint": joint_control,
+    "effort": effort_control,
+}
 
 
 class ParameterError(ValueError):
@@ -48,7 +54,7 @@ def refusing(kind: type[Exception]) -> Iterator[None]:
         ) from error
 
 
-class Plant:
+class Plant(ControlledPlant):
     """A robot and its control law as a system with inputs, parameters, state and outputs.
 
     Every variable of the table is an attribute of its group's name: lists of floats for vectors (SI units; task
@@ -64,23 +70,8 @@ class Plant:
         known: the robot as its control law knows it.
     """
 
-    x_des: list[float]
-    xd_des: list[float]
-    xdd_des: list[float]
-    quat_des: list[float]
-    omega_des: list[float]
-    alpha_des: list[float]
-    Kp_rot: list[float]
-    Kd_rot: list[float]
-    q_des: list[float]
-    v_des: list[float]
-    a_des: list[float]
-    Kp: list[float]
-    Kd: list[float]
-    tau_cmd: list[float]
     tau_ext: list[float]
     f_ext: list[float]
-    Kn: float
     q_start: list[float]
     v_start: list[float]
     q_min: list[float]
@@ -89,7 +80,6 @@ class Plant:
     payload: float
     payload_com: list[float]
     payload_known: bool
-    rcond: float
     rtol: float
     atol: float
     max_step: float

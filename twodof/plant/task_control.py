@@ -12,16 +12,16 @@ IEEE TAC 25(3), 1980; the damped self-motion is that of Khatib, IEEE J-RA 3(1), 
 from __future__ import annotations
 
 from operator import mul
-from typing import Any
 
 import numpy as np
 
+from .control_law import ControlledPlant
 from .integrator import Array, Ratios, Response
 from .orientation import rotation_error
 from .pseudo_inverse import apply_pseudo_inverse, singular_ratios
 
 
-def command(plant: Any) -> tuple[Response, Ratios]:
+def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
     """Return q̈_cmd as a function of the state, and the singular values of its J; inputs held."""
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]

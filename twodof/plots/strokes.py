@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bag.downsampling import Indices, extremes
+from ..notebook import COLOURS as COLOURS
 from .closed_form import Array
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Colours of Okabe & Ito, "Color universal design", 2008, without their yellow, too pale on paper."""
 INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
 DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))
 """On and off, in widths of the line. With the colours, whose number this does not divide, 28

@@ -14,7 +14,7 @@ from fractions import Fraction
 from itertools import chain, pairwise
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TypedDict
 
 from ..bounds import MAX_CELLS, MAX_TABLE, MIN_STEP
 from ..errors import InputError
@@ -23,8 +23,9 @@ from ..fmu import Fmu, load_fmu
 from ..plant.variables import CONTROLS, GAINS
 from ..plant.variables import Value as Value
 
-Setting = Any
-"""A number, a Boolean, or a sequence or array of numbers; checked by ``resolve``."""
+Setting = object
+"""A number, a Boolean, or a sequence or array of numbers. ``resolve`` checks it, because type checkers infer
+``dict[str, object]`` for settings of several kinds."""
 Changes = list[tuple[float, dict[str, Value]]]
 """Times in s, ascending, and the inputs that take new values there."""
 
@@ -214,7 +215,7 @@ def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
         if not elements:
             raise InputError(_no_variable(fmu, name, "input", "parameter"))
         # arrays give their own kind of numbers
-        plain = setting.tolist() if hasattr(setting, "tolist") else setting
+        plain: object = setting.tolist() if hasattr(setting, "tolist") else setting
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
         if len(given) != len(elements):
             raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")

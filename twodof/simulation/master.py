@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import InputError, SimulationError, diverged, step_failure
 from ..fmu import Fmu, Instance, Values, instantiate
+from ..notebook import card, picture
 from ..signatures import check_keywords, ignore, never, with_keywords_of
 from .experiments import (
     NANOSECONDS,
@@ -214,6 +215,22 @@ class Summary:
     wall_time: float
     stopped: bool
     beyond_limits: tuple[Excess, ...]
+
+    def _repr_html_(self) -> str:
+        errors = {
+            "distance from the target": (self.error, "m"),
+            "angle from the target orientation": (self.turn_error, "rad"),
+            "largest joint error": (self.joint_error, "rad or m"),
+        }
+        facts: dict[str, object] = {name: f"{e:.3g} {unit}" for name, (e, unit) in errors.items() if e is not None}
+        for joint, quantity, peak, limit, unit in self.beyond_limits:
+            facts[f"{quantity} of {joint}"] = f"{peak:.4g} {unit} exceeds its limit {limit:.4g}"
+        facts["wall time"] = f"{self.wall_time:.3g} s"
+        joints = [*range(1, len(self.last.q) + 1)]
+        curves = [(joints, values) for values in (self.last.q, self.last.joint_target) if values]
+        positions = picture(curves, "joint", "q at the end, and its target, in rad or m", dots=True)
+        end = "stopped" if self.stopped else "ended"
+        return card(f"Run, {end} at t = {self.last.t:g} s after {self.last.k} steps", facts, positions)
 
     @property
     def error(self) -> float | None:

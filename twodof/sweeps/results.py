@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from ..bounds import MAX_RUNS, MAX_SWEEP
 from ..errors import SweepError
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
+from ..notebook import card, picture
 from ..version import install
 from .metrics import METRICS
+from .ranking import RANKED, candidates
 from .runner import Row
 
 try:
@@ -164,6 +166,18 @@ class Results:
             file.unlink()
 
 
+class SweepTable(pandas.DataFrame):  # type: ignore[misc]
+    """The table of a sweep, which a notebook shows with a picture of its runs."""
+
+    def _repr_html_(self) -> str:
+        varied, runs = self.columns[1], candidates(self)
+        metric = next((name for name in RANKED if runs[name].notna().any()), "end_time")
+        title = METRICS[metric].title if metric in METRICS else metric
+        plot = picture([(runs[varied], runs[metric])], varied, title, dots=True)
+        outcomes = self["outcome"].value_counts().to_dict()
+        return card(f"Sweep of {len(self)} runs", outcomes, plot) + (super()._repr_html_() or "")
+
+
 def read_sweep(path: str | Path) -> pandas.DataFrame:
     """Return a sweep's table in the order of the runs, also if unfinished.
 
@@ -179,7 +193,7 @@ def read_sweep(path: str | Path) -> pandas.DataFrame:
     if not files:
         raise SweepError(f"'{path}' is no sweep: it has no {WHOLE} and no parts")
     table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")
-    rows = table.to_pandas()
+    rows = SweepTable(table.to_pandas())
     said = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}
     rows.attrs["units"] = {name: unit.decode("utf-8", "replace") for name, unit in said.items()}
     rows.attrs["provenance"] = _provenance(files[0], table.schema)
