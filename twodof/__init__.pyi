@@ -23,11 +23,11 @@ from .ros.realtime import publish_together as publish_together
 from .ros.viewer_layouts import layouts as layouts
 from .simulation.experiments import Experiment as Experiment
 from .simulation.experiments import experiment as experiment
-from .simulation.master import Summary as Summary
 from .simulation.master import run as run
 from .simulation.master import samples as samples
 from .simulation.master import simulate as simulate
 from .simulation.pace import RealTime as RealTime
+from .simulation.run_summary import Summary as Summary
 from .simulation.sample import Sample as Sample
 from .simulation.sample import Sink as Sink
 from .sweeps.coordinator import sweep as sweep

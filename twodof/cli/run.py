@@ -16,8 +16,8 @@ from .signals import INTERRUPTED, asked_to_stop
 if TYPE_CHECKING:
     from ..bag.writer import Bag
     from ..simulation.experiments import Experiment
-    from ..simulation.master import Summary
     from ..simulation.pace import RealTime
+    from ..simulation.run_summary import Summary
     from ..simulation.sample import Sample, Sink
 
 

@@ -29,7 +29,6 @@ from ..geometry.kinematics import Kinematics, Placement
 from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
 from ..simulation.experiments import Experiment, Setting, experiment
-from ..version import versions
 
 FIRST, LAST = "samples.js", "main.js"
 """Scripts whose class others extend, and that starts the page; of the others the order does not matter."""
@@ -101,7 +100,8 @@ def page(
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
     module = compile_web_module(files, ["page.c"])  # a page asks for no derivatives
-    provenance = {**provenance_of(run, ""), "versions": versions()}  # no other package is at work
+    provenance = provenance_of(run, "")
+    provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # no other package is at work
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
     content = arm_page(arm.robot or arm.name, arm, engine, allowed, provenance=provenance)
     with refusing(PageError, f"write '{path}'"):

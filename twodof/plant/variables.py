@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .robot import Robot
 
 Value = float | bool
+EXACT = 1e-9  # relative: a saturated effort is at its limit, not beyond it
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..files import shown
-from ..simulation.peaks import EXACT
+from ..plant.variables import EXACT
 from .settings import number
 from .track import JointTrack, Track
 

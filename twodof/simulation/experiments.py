@@ -24,8 +24,7 @@ from ..plant.variables import CONTROLS, GAINS
 from ..plant.variables import Value as Value
 
 Setting = object
-"""A number, a Boolean, or a sequence or array of numbers. ``resolve`` checks it, because type checkers infer
-``dict[str, object]`` for settings of several kinds."""
+"""A number, a Boolean, or a sequence or array of them; a dict of several kinds is ``dict[str, object]``."""
 Changes = list[tuple[float, dict[str, Value]]]
 """Times in s, ascending, and the inputs that take new values there."""
 

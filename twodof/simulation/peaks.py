@@ -10,9 +10,9 @@ import numpy as np
 
 from ..fmu import Fmu, Values
 from ..plant.urdf import RobotError, read_urdf
+from ..plant.variables import EXACT as EXACT
 
 BLOCK = 4096  # samples that are compared at a time
-EXACT = 1e-9  # relative: a saturated effort is at its limit, not beyond it
 
 
 class Limits(NamedTuple):
