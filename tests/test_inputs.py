@@ -12,7 +12,7 @@ import twodof
 from twodof.cli.options import parse_settings
 from twodof.errors import InputError
 from twodof.fmu import Fmu
-from twodof.simulation.experiments import Setting, read_changes, resolve
+from twodof.simulation.input_values import Setting, read_changes, resolve
 from twodof.simulation.sample import Sample
 
 
@@ -192,9 +192,9 @@ def test_table_that_is_not_text_is_refused(fmu: Fmu, tmp_path: Path, content: by
         read_changes(fmu, tmp_path / "inputs.csv")
 
 
-@pytest.mark.parametrize(("name", "reason"), [("none.csv", "No such file"), ("", "Is a directory")])
+@pytest.mark.parametrize(("name", "reason"), [("none.csv", ""), ("", "Is a directory")])
 def test_table_that_is_no_file_is_refused(fmu: Fmu, tmp_path: Path, name: str, reason: str) -> None:
-    with pytest.raises(InputError, match=f"{tmp_path / name}.*{reason}"):
+    with pytest.raises(InputError, match=f"'{tmp_path / name}.*{reason}"):
         read_changes(fmu, tmp_path / name)
 
 

@@ -44,7 +44,7 @@ from twodof.cli.main import main
 from twodof.errors import BagError, PageError
 from twodof.fmu import instantiate
 from twodof.plots.track import read_tracks
-from twodof.simulation.experiments import resolve
+from twodof.simulation.input_values import resolve
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "fmu_src" / "page"

@@ -164,8 +164,8 @@ LONG = "x" * 300
 Case = tuple[Callable[[Path], None], list[str], str]
 BAD: dict[str, Case] = {
     # build
-    "URDF missing": (nothing, BUILD, "arm.urdf': No such file"),
-    "URDF a folder": (nothing, [*BUILD[:-1], "."], "'.': Is a directory"),
+    "URDF missing": (nothing, BUILD, "no URDF 'arm.urdf'"),
+    "URDF a folder": (nothing, [*BUILD[:-1], "."], "'.' is no URDF: it is a folder"),
     "URDF no XML": (text("arm.urdf", "a: 1"), BUILD, "arm.urdf: the URDF is not XML"),
     "URDF no text": (text("arm.urdf", b"\xff\x00"), BUILD, "'arm.urdf' is not UTF-8"),
     "URDF with NUL": (text("arm.urdf", urdf(mesh="a\0b.stl")), BUILD, "mesh 'a.*b.stl'|the URDF is not XML"),
@@ -189,8 +189,8 @@ BAD: dict[str, Case] = {
     "output below a file": (text("file", "x"), ["build", "-o", "file/x.fmu"], "cannot write 'file/x.fmu': Not a direc"),
     "output a folder": (nothing, ["build", "-o", "."], "cannot write '.'"),
     # an FMU
-    "FMU missing": (nothing, RUN_BAD, "no FMU 'bad.fmu'; build one with 'twodof build'"),
-    "FMU a folder": (nothing, ["run", ".", "-o", "out"], "cannot read '.': Is a directory"),
+    "FMU missing": (nothing, RUN_BAD, "no FMU 'bad.fmu'; make one with 'twodof build'"),
+    "FMU a folder": (nothing, ["run", ".", "-o", "out"], "'.' is no FMU: it is a folder"),
     "FMU no zip": (text("bad.fmu", "FMU"), RUN_BAD, "'bad.fmu' is no FMU: .*not a zip"),
     "FMU empty zip": (text("bad.fmu", EMPTY_ZIP), RUN_BAD, "'bad.fmu' .*no modelDescription.xml"),
     "FMU damaged": (fmu(description(), change=damaged), RUN_BAD, "'bad.fmu'"),
@@ -238,7 +238,7 @@ BAD: dict[str, Case] = {
     "--set of an unknown name": (nothing, [*RUN, "--set", "Kpp=1"], "'Kpp'; did you mean 'Kp'"),
     "--set with a line break": (nothing, [*RUN, "--set", "K\np=1"], "no variable 'K.*p'"),
     # inputs over time
-    "CSV a folder": (nothing, [*CSV[:-1], "."], "cannot read the bag '.': it has no"),
+    "CSV a folder": (nothing, [*CSV[:-1], "."], "'.' is no bag: it is a folder"),
     "CSV with words": (text("in.csv", "time,Kn\n1,high"), CSV, "'in.csv' row 2: Kn = 'high'"),
     "CSV with a line break": (text("in.csv", 'time,Kn\n1,"a\nb"'), CSV, "'in.csv' row 2: Kn = 'a"),
     # times
@@ -256,7 +256,7 @@ BAD: dict[str, Case] = {
     "bag with too long a name": (nothing, [*RUN, "-o", LONG], f"'{LONG}'.*too long"),
     "symbolic link to a bag, --overwrite": (a_linked_bag, [*RUN, "-o", "link", "--overwrite"], "'link'"),
     "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "stamp_start = -1 s"),
-    "info of a folder": (nothing, ["info", "."], r"cannot read the bag '\.'"),
+    "info of a folder": (nothing, ["info", "."], r"'\.' is no bag: it is a folder"),
     "info of a bag's file": (text("a.db3", "x"), ["info", "a.db3"], "give the bag's folder"),
     "info of a file that is no bag": (text("a.mcap", "x"), ["info", "a.mcap"], "cannot read the bag 'a.mcap'"),
     "info of too long a name": (nothing, ["info", LONG], f"'{LONG}'.*too long"),

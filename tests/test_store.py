@@ -290,7 +290,7 @@ def test_a_robots_bag_is_recovered_by_its_folder(three: Path, tmp_path: Path) ->
     bag = three
     with pytest.raises(BagError, match=rf"there is no bag '.*:left'; 'twodof recover {bag}' is of"):
         recover(f"{bag}:left")
-    with pytest.raises(BagError, match=r"there is no bag '[^']*none'$"):
+    with pytest.raises(BagError, match=r"there is no bag '[^']*none'; make one with 'twodof run'$"):
         recover(tmp_path / "none")
 
 

@@ -31,9 +31,9 @@ def run(*arguments: str | bytes, cwd: Path, shell: str = '"$@"', **variables: st
 @pytest.mark.parametrize("arguments", [["build", "-o--"], ["plot", "bag", "-o--"], ["run", "--set=--"]])
 def test_a_value_that_argparse_loses_is_refused(arguments: list[str], tmp_path: Path) -> None:
     done = run(*arguments, cwd=tmp_path)
-    usage, line = done.stderr.splitlines()
+    (line,) = done.stderr.splitlines()
     option = arguments[-1][:-2].rstrip("=")
-    assert (done.returncode, usage[:6]) == (2, "usage:")
+    assert done.returncode == 2
     assert line == f"twodof: error: argument {option}: '--' is no value"
 
 

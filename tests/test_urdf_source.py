@@ -100,7 +100,7 @@ def test_a_lock_that_cannot_be_is_refused(locks: dict[str, float], message: str)
 
 def test_of_several_last_links_one_must_be_named(panda_file: Path) -> None:
     with pytest.raises(RobotError, match=r"`frame`; at the ends are: panda_.*; and there are: "):
-        end_effector(read_urdf(panda_file.read_text()))
+        end_effector(read_urdf(panda_file.read_text()), None)
 
 
 def test_a_mesh_that_is_not_there_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,10 +1,33 @@
-"""Exceptions of the package: one root, named leaves; each message is one clear line."""
+"""Exceptions of the package, one root and named leaves, and the remedies that their messages name.
+
+Each message is one clear line.
+"""
 
 from __future__ import annotations
 
+import shlex
 import zipfile
 import zlib
+from collections.abc import Iterable
+from contextlib import suppress
+from difflib import get_close_matches
+from itertools import islice
+from os import scandir
+from pathlib import Path
 
+MOST_NEIGHBOURS = 1000  # of a file, among which the nearest name is looked for
+KINDS = {
+    "bag": ("a bag", "twodof view"),
+    "sweep": ("a sweep", "twodof plot"),
+    "FMU": ("an FMU", "twodof run"),
+    "URDF": ("a robot description", "twodof build"),
+    "page": ("a page", "xdg-open"),
+    "CSV": ("a CSV file", "twodof run --input"),
+    "folder": ("a folder without a bag or a sweep", ""),
+}
+"""Kinds of paths: their words, and the command that takes one."""
+SUFFIXES = {".fmu": "FMU", ".urdf": "URDF", ".xacro": "URDF", ".mcap": "bag", ".html": "page", ".csv": "CSV"}
+MAKERS = {"FMU": "twodof build", "bag": "twodof run", "sweep": "twodof sweep"}
 ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
 """Exceptions of a damaged, encrypted or foreign zip archive."""
 
@@ -67,6 +90,57 @@ def diverged(k: int, t: float) -> SimulationError:
     return SimulationError(f"the FMU gave a value that is not finite at t = {t:g} s", k, "diverged")
 
 
-def step_failure(k: int, t: float, error: SimulationError) -> SimulationError:
+def step_failure(k: int, t: float, error: SimulationError, remark: str = "") -> SimulationError:
     """Return the error of a failed step, after k steps, at a time."""
-    return SimulationError(f"step {k + 1} at t = {t:g} s: {error}", k, error.outcome)
+    return SimulationError(f"step {k + 1} at t = {t:g} s: {error}{remark}", k, error.outcome)
+
+
+def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """Return the most similar of known names, whatever its case; None where there is none."""
+    by_lower = {candidate.lower(): candidate for candidate in reversed([*known])}
+    near = get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
+    return by_lower[near[0]] if near else None
+
+
+def choice(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return the end of a message about an unknown name: the nearest known one, or all."""
+    names = [*known]
+    near = nearest(name, names, cutoff)
+    return f"; there are: {', '.join(names)}" if near is None else f"; did you mean '{near}'?"
+
+
+def kind_of(path: Path) -> str:
+    """Return what a path is, a key of ``KINDS``; "" for another file, or none."""
+    if not path.is_dir():
+        return SUFFIXES.get(path.suffix, "") if path.is_file() else ""
+    suffixes = {Path(name).suffix for name in _names(path)}
+    if ".parquet" in suffixes:
+        return "sweep"
+    return "bag" if suffixes & {".mcap", ".db3"} or (path / "metadata.yaml").exists() else "folder"
+
+
+def no_such(wanted: str, path: Path) -> str:
+    """Return the message about a path that is no FMU, bag, sweep or URDF: what it is, or what is near it."""
+    words, command = KINDS.get(kind_of(path), ("", ""))
+    if words:
+        use = f"; '{command} {shlex.quote(str(path))}' takes it" if command else ""
+        return f"'{path}' is no {wanted}: it is {words}{use}"
+    if not path.parent.is_dir():
+        return f"there is no {wanted} '{path}': there is no folder '{path.parent}'"
+    near = neighbour(path, wanted)
+    made = f"; make one with '{MAKERS[wanted]}'" if wanted in MAKERS else ""
+    return f"there is no {wanted} '{path}'" + (f"; did you mean '{near}'?" if near else made)
+
+
+def neighbour(path: Path, *kinds: str) -> Path | None:
+    """Return the path in the same folder whose name is nearest, of some kinds; None where there is none."""
+    others = (path.parent / name for name in _names(path.parent))
+    stems = {other.stem: other for other in others if kind_of(other) in kinds}
+    near = nearest(path.stem, stems)
+    return stems[near] if near else None
+
+
+def _names(folder: Path) -> list[str]:
+    with suppress(OSError), scandir(folder) as entries:
+        return sorted(entry.name for entry in islice(entries, MOST_NEIGHBOURS))
+    return []

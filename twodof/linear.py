@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError, SimulationError
+from .errors import InputError, SimulationError, choice
 from .fmu import Fmu, Instance, instantiate, load_fmu
 from .notebook import card, picture
-from .simulation.experiments import Setting, Value, resolve
+from .simulation.input_values import Setting, Value, resolve
 from .simulation.peaks import limits_of
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ def _chosen(fmu: Fmu, causality: str, wanted: Sequence[str] | None, argument: st
     groups = fmu.groups(causality)
     for group in wanted or ():
         if group not in groups:
-            raise InputError(f"`{argument}`: there is no '{group}'; there are {', '.join(groups)}")
+            raise InputError(f"`{argument}`: there is no '{group}'{choice(group, groups)}")
     return [name for group in (groups if wanted is None else wanted) for name in groups[group]]
 
 

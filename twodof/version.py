@@ -15,19 +15,29 @@ def versions(*packages: str) -> dict[str, str]:
 
 
 def install(extra: str) -> str:
-    """Return the remedy for a missing extra: pip with the folder that this package comes from."""
+    """Return the remedy for a missing extra: pip with the source of this package, or with the extra's requirements.
+
+    The package may be on no index: where its source is gone, the requirements are named one by one.
+    """
     import importlib.metadata as metadata
     import json
+    import re
     import shlex
     import sys
+    from pathlib import Path
     from urllib.parse import unquote
 
-    source = "."
+    wanted: list[str] = []
     with suppress(metadata.PackageNotFoundError):
-        said = metadata.distribution("twodof").read_text("direct_url.json") or "{}"
-        source = unquote(json.loads(said).get("url", "")).removeprefix("file://") or source
-    words = shlex.join([sys.executable, "-m", "pip", "install", f"{source}[{extra}]"])
-    return f"install the extra '{extra}': {words}{' in the checkout' * (source == '.')}"
+        own = metadata.distribution("twodof")
+        source = unquote(json.loads(own.read_text("direct_url.json") or "{}").get("url", "")).removeprefix("file://")
+        if source and Path(source).exists():
+            wanted = [f"{source}[{extra}]"]
+        else:
+            of_extra = re.compile(rf"(.+?)\s*;.*extra == ['\"]{extra}['\"]")
+            wanted = [match[1] for line in own.requires or () if (match := of_extra.fullmatch(line))]
+    words = shlex.join([sys.executable, "-m", "pip", "install", *(wanted or [f".[{extra}]"])])
+    return f"install the extra '{extra}': {words}{'' if wanted else ' in the checkout'}"
 
 
 @cache

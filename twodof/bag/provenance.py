@@ -14,7 +14,8 @@ from urllib.parse import quote, unquote
 from ..bounds import MAX_PROVENANCE
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
-from ..simulation.experiments import Changes, Experiment, Value
+from ..simulation.experiments import Experiment
+from ..simulation.input_values import Changes, Value
 from ..version import versions
 from .mcap import read_metadata
 from .records import DamageError

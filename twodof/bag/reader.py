@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BagError
+from ..errors import BagError, no_such
 from ..files import is_being_written, shown
 from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
@@ -102,6 +102,8 @@ def _refusing(path: Path) -> Iterator[None]:
     """Name the bag in errors of its files."""
     try:
         yield
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise BagError(no_such("bag", path)) from error
     except OSError as error:
         raise BagError(f"cannot read the bag '{path}': {error.strerror}") from error
     except DamageError as error:
@@ -188,9 +190,8 @@ def whole_bag(path: Path) -> list[Path]:
     """Return the files of a closed bag; raise BagError for an unfinished one or none."""
     files = storage_files(path)
     if not files:
-        packed = [*path.glob("*.zstd")]
-        what = "it is compressed as a whole" if packed else "it has no .mcap or .db3 file"
-        raise BagError(f"cannot read the bag '{path}': {what}")
+        packed = f"cannot read the bag '{path}': it is compressed as a whole"
+        raise BagError(packed if [*path.glob("*.zstd")] else no_such("bag", path))
     if files != [path] and not (path / "metadata.yaml").is_file():
         if is_being_written(path):
             raise BagError(f"the bag '{path}' is still being written")

@@ -19,7 +19,8 @@ from ..plant.variables import CONTROLS
 from ..ros.commands import LONGEST_NAME, Command, CommandError, Commands
 from ..ros.messages import END_EFFECTOR, JOINT_STATE, JOINT_STATES, JOINT_TRAJECTORY
 from ..ros.trajectories import Trajectory, follow, read_trajectory
-from ..simulation.experiments import NANOSECONDS, Changes, Setting, Value, default, resolve
+from ..simulation.experiments import NANOSECONDS, default
+from ..simulation.input_values import Changes, Setting, Value, resolve
 from .contents import read_messages
 from .provenance import KNOWN_UNTIL, read_provenance, robot_in
 from .reader import whole_bag

@@ -18,7 +18,8 @@ from ..errors import BagError
 from ..files import shown
 from ..notebook import card, picture
 from ..plant.urdf import RobotError, Urdf, read_urdf
-from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE, Value
+from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE
+from ..simulation.input_values import Value
 from .provenance import KNOWN_UNTIL, Provenance
 from .records import Stamps
 

@@ -18,7 +18,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..bounds import MAX_DEFINITION, MAX_PROFILES, MAX_PROVENANCE
-from ..errors import BagError
+from ..errors import BagError, no_such
 from ..files import lock, read_file, sync
 from . import provenance
 from .contents import read_messages, stated_count, storage_files
@@ -63,7 +63,7 @@ def recover(path: str | Path) -> Recovered:
         with _held(bag, folder, original, work):
             files = storage_files(folder)
             if not files:
-                raise BagError(f"'{bag}' has no .mcap or .db3 file to recover")
+                raise BagError(no_such("bag", bag))
             if len({file.suffix for file in files}) > 1:
                 raise BagError(f"'{bag}' has .mcap and .db3 files; leave those of one kind in it")
             counts = _counts_if_whole(folder, files)
@@ -96,8 +96,9 @@ def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]
     between = not folder.exists() and (work / folder.name).is_dir()
     if not between and not folder.is_dir():
         whole, _, robot = str(bag).rpartition(":")
-        of_all = f"; 'twodof recover {whole}' is of all its robots" if Path(whole).is_dir() else ""
-        raise BagError(f"there is no bag '{bag}'{of_all if whole and robot else ''}")
+        if whole and robot and Path(whole).is_dir():
+            raise BagError(f"there is no bag '{bag}'; 'twodof recover {whole}' is of all its robots")
+        raise BagError(no_such("bag", bag))
     held = lock(original if between else folder)
     try:
         _undo(folder, original, work)

@@ -11,7 +11,8 @@ from ..errors import BagError
 from ..files import sync
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, Messages, check_name
-from ..simulation.experiments import Experiment, Value
+from ..simulation.experiments import Experiment
+from ..simulation.input_values import Value
 from ..simulation.sample import Sample, Sink
 from .provenance import ProvenanceFile
 from .storage import BATCH_SIZE, OVERHEAD, Stamps

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from .completion import joints, links
 from .info import controlled
-from .options import CommandLineError, add_output, check_company, not_empty, said
-from .printing import print_next, print_table, quote
+from .options import CommandLineError, add_output, check_company, completed, not_empty, said
+from .printing import busy, print_next, print_table, quote, say
 
 
 def add(build: argparse.ArgumentParser) -> None:
@@ -21,8 +22,9 @@ def add(build: argparse.ArgumentParser) -> None:
     option("--urdf", type=Path, metavar="U", help="the same")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="leave the URDF's meshes out of the FMU")
-    option("--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)")
-    option(
+    frame = option("--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)")
+    completed(frame, links)
+    lock = option(
         "--lock",
         dest="locks",
         action="append",
@@ -30,6 +32,7 @@ def add(build: argparse.ArgumentParser) -> None:
         metavar="JOINT[=VALUE]",
         help="fix joints, names or shell patterns, at a position (0), rad or m",
     )
+    completed(lock, joints)
     option("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
     option(
         "--gravity",
@@ -72,6 +75,27 @@ def call(options: argparse.Namespace) -> int:
         raise CommandLineError(f"--orientation goes with --control task, not {options.control}")
     if options.scalars and options.fmi != 3:
         raise CommandLineError("--scalars goes with --native --fmi 3")
+    with busy("building", silent=True):
+        path = _build(options)
+    if not path.is_file():  # a pipe, from which nothing is read back
+        return 0
+    from ..fmu import load_fmu
+
+    fmu = load_fmu(path)
+    print_table(
+        ("FMU", f"{path} ({path.stat().st_size / 1024:.0f} KB, {', '.join(fmu.platforms)})"),
+        ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
+        ("controlled", controlled(fmu)),
+    )
+    if path.suffix != ".fmu":
+        say("note: most FMI tools open only files whose name ends in .fmu", error=True)
+    here = fmu.platform in fmu.platforms
+    print_next(f"twodof run {quote(path)}" if here else "twodof build --native", f"twodof info {quote(path)}")
+    return 0
+
+
+def _build(options: argparse.Namespace) -> Path:
+    """Build the FMU of the options; return its path."""
     from ..export.compiler import PLATFORMS
     from ..export.fmu_options import FmuOptions
     from ..export.package import build_fmu
@@ -90,20 +114,7 @@ def call(options: argparse.Namespace) -> int:
         **said(options, "mesh_dir", "frame", "axes", "link_environment", "native", "fmi"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
-    path = build_fmu(options.output, chosen, overwrite=options.overwrite)
-    if not path.is_file():  # a pipe, from which nothing is read back
-        return 0
-    from ..fmu import load_fmu
-
-    fmu = load_fmu(path)
-    print_table(
-        ("FMU", f"{path} ({path.stat().st_size / 1024:.0f} KB, {', '.join(fmu.platforms)})"),
-        ("robot", f"{fmu.robot}: {', '.join(fmu.joints)}"),
-        ("controlled", controlled(fmu)),
-    )
-    here = fmu.platform in fmu.platforms
-    print_next(f"twodof run {quote(path)}" if here else "twodof build --native", f"twodof info {quote(path)}")
-    return 0
+    return build_fmu(options.output, chosen, overwrite=options.overwrite)
 
 
 def _locks(texts: Sequence[str]) -> dict[str, float]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..errors import BuildError
 from .options import CommandLineError
-from .printing import quote, say
+from .printing import busy, quote, say
 
 
 def is_robot(path: str | None) -> bool:
@@ -67,7 +67,9 @@ def _default_arm(verb: str, *, native: bool = False) -> Path:
 
 
 def _built(overwrite: bool = False, **what: Any) -> Path:
-    from ..export.fmu_options import FmuOptions
-    from ..export.package import build_fmu
+    robot = what["urdf"].name if what.get("urdf") else "the default arm"
+    with busy(f"building the FMU of {robot}, which a compiler may take a minute for"):
+        from ..export.fmu_options import FmuOptions
+        from ..export.package import build_fmu
 
-    return build_fmu(None, FmuOptions(**what), overwrite=overwrite)
+        return build_fmu(None, FmuOptions(**what), overwrite=overwrite)

@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import InputError, kind_of, neighbour, no_such
 from .options import add_options
 from .printing import print_json, print_table, say
 from .sweep import best_facts, print_best
@@ -29,6 +29,8 @@ def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     path = options.path
     folder = Path(str(path).rpartition(":")[0] or path)
+    if not path.exists() and not folder.exists() and (near := neighbour(path, "FMU", "bag", "sweep")):
+        raise InputError(f"there is no '{path}'; did you mean '{near}'?")
     if path.is_dir() and any(path.glob("*.parquet")):
         from ..sweeps.results import read_sweep
 
@@ -39,7 +41,8 @@ def call(options: argparse.Namespace) -> int:
         what = "sweep" if path.suffix == ".parquet" else "bag"
         raise InputError(f"'{path}' is a {what}'s file; give the {what}'s folder, '{path.parent}'")
     elif path.suffix != ".fmu" and path.is_file() and not zipfile.is_zipfile(path):
-        raise InputError(f"'{path}' is neither an FMU nor the folder of a bag or a sweep")
+        other = f"'{path}' is neither an FMU nor the folder of a bag or a sweep"
+        raise InputError(no_such("FMU", path) if kind_of(path) else other)
     else:
         from ..fmu import load_fmu
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from .options import add_options, parse_settings
+from .completion import variables
+from .options import add_options, completed, parse_settings
 from .printing import print_json, print_table, say
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 def add(linearise: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     linearise.add_argument("fmu", metavar="FMU")
-    linearise.add_argument(
+    point = linearise.add_argument(
         "--at",
         action="append",
         default=[],
@@ -23,6 +24,7 @@ def add(linearise: argparse.ArgumentParser) -> None:
         help="of the point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
         " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
     )
+    completed(point, variables())
     add_options(linearise, "--json")
 
 

@@ -16,13 +16,13 @@ import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from itertools import takewhile
-from typing import Any, NoReturn
 
 from ..errors import TwoDofError
 from ..version import __version__
 from . import build, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
+from .help import Parser, check_arguments, check_verb
 from .options import CommandLineError
-from .printing import in_options, plain, say
+from .printing import CLEAR, in_options, say
 from .signals import INTERRUPTED, is_interrupt
 
 VERBS = {
@@ -42,26 +42,9 @@ VERBS = {
 LONGEST_LINE = 2000
 
 
-class _Parser(argparse.ArgumentParser):
-    """Parser that accepts no abbreviations: a short form may become ambiguous later."""
-
-    def __init__(self, **named: Any) -> None:
-        super().__init__(allow_abbrev=False, **named)
-
-    def error(self, message: str) -> NoReturn:
-        """Exit with a usage error."""
-        super().error(plain(message))
-
-    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """Write out the help before the process ends, where a closed pipe can still be caught."""
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        super().exit(status, message)
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser; it sets the verb's name as ``verb`` and its function as ``call``."""
-    program = _Parser(
+def parser() -> tuple[Parser, dict[str, Parser]]:
+    """Return the parser, which sets ``verb`` and its function ``call``, and the parsers of the verbs."""
+    program = Parser(
         prog="twodof",
         description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
         epilog="'twodof run' alone builds the default arm's FMU, runs it for 5 s and leaves a bag.",
@@ -73,21 +56,23 @@ def parser() -> argparse.ArgumentParser:
         added.set_defaults(call=verb.call)
         verb.add(added)
     helped = verbs.add_parser("help", help="show this, or the options of a verb")
-    helped.add_argument("about", nargs="?", metavar="VERB", choices=[*verbs.choices])
+    helped.add_argument("about", nargs="?", metavar="VERB")
 
     def call(options: argparse.Namespace) -> int:
+        check_verb(program, verbs.choices, [options.about or "help"])
         verbs.choices.get(options.about, program).print_help()
         return 0
 
     helped.set_defaults(call=call)
-    return program
+    return program, verbs.choices
 
 
 class _Words(logging.Formatter):
     """Formatter that replaces arguments by options in messages of the library."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return in_options(super().format(record))
+        line = in_options(super().format(record))
+        return f"{CLEAR}{line}" if sys.stderr.isatty() else line  # over a line of progress
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -125,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments, and configure output and messages."""
-    program = parser()
+    program, verbs = parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
 
@@ -133,7 +118,9 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     for argument in takewhile("--".__ne__, arguments):  # argparse would take it for an empty list
         if re.fullmatch(r"(-\w|--[\w-]+=)--", argument):
             program.error(f"argument {argument[:-2].rstrip('=')}: '--' is no value")
-    options = program.parse_args(arguments)
+    check_verb(program, verbs, arguments)
+    options, unknown = program.parse_known_args(arguments)
+    check_arguments(verbs[options.verb], unknown)
     options.command_line = shlex.join(["twodof", *arguments])
     if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from . import completion
 
 if TYPE_CHECKING:
-    from ..simulation.experiments import Setting
+    from ..simulation.input_values import Setting
 
 
 class CommandLineError(InputError):
@@ -69,6 +70,8 @@ OPTIONS: Table = {
     **OF_A_PAGE,
 }
 
+COMPLETERS = {"--set": completion.variables(), "--frame": completion.links}
+
 SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "urdf"), "--range": ("ranges",)}
 """Names of options in the namespace, where these differ."""
 
@@ -76,7 +79,13 @@ SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "ur
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add options of the table."""
     for name in names:
-        parser.add_argument(name, **OPTIONS[name])
+        completed(parser.add_argument(name, **OPTIONS[name]), COMPLETERS.get(name))
+
+
+def completed(option: argparse.Action, completer: completion.Completer | None) -> None:
+    """Let the shell complete the values of an option."""
+    if completer is not None:
+        option.completer = completer  # type: ignore[attr-defined]  # of argcomplete
 
 
 def add_fmu(parser: argparse.ArgumentParser, default: str, metavar: str = "FMU|URDF") -> None:
@@ -92,7 +101,8 @@ def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for the robot of a third-party bag."""
     parser.add_argument("--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none")
-    parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
+    frame = parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
+    completed(frame, completion.links)
 
 
 def said(options: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -138,7 +148,9 @@ def _parse_value(name: str, text: str) -> Setting:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise CommandLineError(f"{name}={text}: '{text}' is not a number") from None
+        raise CommandLineError(
+            f"{name}={text}: '{text}' is not a number; write numbers as 0.2,0.1 without units, or true or false"
+        ) from None
     return numbers[0] if len(numbers) == 1 else numbers
 
 

@@ -6,7 +6,7 @@ import argparse
 
 from .fmus import chosen_fmu, is_robot
 from .options import add_fmu, add_options, output_file, parse_settings
-from .printing import print_table
+from .printing import busy, print_table
 
 
 def add(page: argparse.ArgumentParser) -> None:
@@ -35,7 +35,8 @@ def call(options: argparse.Namespace) -> int:
     options.native = not options.fmu or is_robot(options.fmu)
     fmu = chosen_fmu(options)
     output = options.output or free_name(fmu.stem, ".html", is_page)
-    path = page(fmu, output, step=options.step, settings=settings)
+    with busy(f"compiling {fmu} for the browser"):
+        path = page(fmu, output, step=options.step, settings=settings)
     size = path.stat().st_size / 1024
     print_table(("FMU", str(fmu)), ("page", f"{path} ({size:.0f} KB); it needs no network"))
     return 0

@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .options import CommandLineError, add_robot_options, output_file
+from .completion import joints
+from .options import CommandLineError, add_robot_options, completed, output_file
 from .printing import print_table
 from .sweep import print_best
 
@@ -29,7 +30,8 @@ def add(plot: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=".png, .svg, .pdf or .html; - is the standard output, as PNG (a window)",
     )
-    plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
+    chosen = plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
+    completed(chosen, joints)
     add_robot_options(plot)
 
 

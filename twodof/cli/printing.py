@@ -7,9 +7,12 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Event, Thread
+from time import perf_counter
 
 ARGUMENT = re.compile(r"`(\w+)(?:=True)?`")
 OPTIONS = {
@@ -25,6 +28,11 @@ NEEDS = {"plot": "matplotlib", "view": "websockets"}
 """Modules that verbs need, of the extra 'view'."""
 POSE = "control 'pose'"
 """An argument of the library that is two options here."""
+
+MOMENT, TICK = 0.4, 0.5
+"""Seconds of silence before a task is named, and between two updates of its time."""
+CLEAR = "\r\x1b[K"
+"""Terminal's order to go to the line's start and clear it."""
 
 
 def in_options(text: str) -> str:
@@ -63,12 +71,13 @@ def print_next(*commands: str) -> None:
     from ..version import install
 
     missing = {verb for verb, module in NEEDS.items() if find_spec(module) is None}
-    shown = [command for command in commands if not {*command.split()[1:2]} & missing]
+    here = [command for command in commands if shutil.which(command.split()[0]) or command.startswith("twodof ")]
+    shown = [command for command in here if not {*command.split()[1:2]} & missing]
     program = _program()
     lines = [re.sub("^twodof ", lambda _: f"{program} ", command) for command in shown]
     if lines:
         say("\n  ".join(["\nnext", *lines]))
-    if len(shown) < len(commands):
+    if len(shown) < len(here):
         say(f"\nto plot and view: {install('view')}")
 
 
@@ -82,6 +91,31 @@ def _program() -> str:
     inside = own.is_relative_to(Path.cwd())
     path = quote(own.relative_to(Path.cwd()) if inside else own)
     return path if own.name == "twodof" else f"{path} -m twodof"
+
+
+@contextmanager
+def busy(what: str, *, silent: bool = False) -> Iterator[None]:
+    """Print what takes longer than a moment; on a terminal with its seconds, elsewhere unless it is to be silent."""
+    done, begin, live = Event(), perf_counter(), sys.stderr is not None and sys.stderr.isatty()
+
+    def show() -> None:
+        if done.wait(MOMENT) or (silent and not live):
+            return
+        while True:
+            line = f"{plain(what)}: {perf_counter() - begin:.0f} s" if live else f"{plain(what)} …"
+            print(f"{CLEAR}{line}" if live else line, end="" if live else "\n", file=sys.stderr, flush=True)
+            if done.wait(TICK if live else None):
+                break
+        if live:
+            print(end=CLEAR, file=sys.stderr, flush=True)
+
+    thread = Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 def print_json(**facts: object) -> None:

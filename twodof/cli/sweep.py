@@ -10,8 +10,19 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .completion import variables
 from .fmus import fast_fmu
-from .options import CommandLineError, add_fmu, add_options, add_output, check_company, dated, parse_settings, said
+from .options import (
+    CommandLineError,
+    add_fmu,
+    add_options,
+    add_output,
+    check_company,
+    completed,
+    dated,
+    parse_settings,
+    said,
+)
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 
@@ -27,7 +38,7 @@ def add(sweep: argparse.ArgumentParser) -> None:
     )
     option, flag = sweep.add_argument, partial(sweep.add_argument, action="store_true")
     add_fmu(sweep, "the default arm's", "FMU")
-    option(
+    grid = option(
         "--grid",
         dest="grids",
         action="append",
@@ -35,11 +46,13 @@ def add(sweep: argparse.ArgumentParser) -> None:
         metavar="NAME=LOW:HIGH:COUNT",
         help="values evenly spaced; all combinations of several",
     )
+    completed(grid, variables())
     option("--random", type=int, metavar="N", help="draws of each --range")
     option("--seed", type=int, metavar="S", help="of the draws (0)")
-    option(
+    drawn = option(
         "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH", help="values drawn uniformly"
     )
+    completed(drawn, variables())
     add_options(sweep, "--stop-time", "--step", "--set")
     add_output(sweep, "OUT", "default: sweep_<date and time>")
     flag("--resume", help="go on with OUT; what is done is not repeated")
@@ -173,7 +186,8 @@ def _parse(option: str, text: str, form: str, before: Iterable[str]) -> tuple[st
     except ValueError:
         numbers = []
     if not equals or not name or len(numbers) != form.count(":") + 1:
-        raise CommandLineError(f"{option} {text}: expected {form}")
+        example = f"{name or 'Kp'}=20:200{':10' * (option == '--grid')}"
+        raise CommandLineError(f"{option} {text}: expected {form}, as in {option} {example}")
     if not all(map(isfinite, numbers)):
         raise CommandLineError(f"{option} {text}: its numbers must be finite")
     if name in before:

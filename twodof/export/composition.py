@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import BuildError
+from ..errors import BuildError, choice
 from ..files import data_file
 from ..plant.plant import Plant
 from ..plant.robot import Robot, load_robot
@@ -48,8 +48,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     mesh_dir = data_file("meshes") if options.urdf is None else mesh_dir
     text = read_text(path, mesh_dir)
     text = lock_joints(text, options.lock) if options.lock else text
-    if options.frame is None:
-        options = replace(options, frame=end_effector(read_urdf(text)))
+    options = replace(options, frame=end_effector(read_urdf(text), options.frame))
     if not options.meshes:
         text = without_meshes(text)
     robot, table, starts = _model(options, text)
@@ -95,9 +94,8 @@ def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str
         raise BuildError(f"FMI {fmi}.0 has no name for this machine; choose one with `platforms`{other}")
     for platform in platforms:
         if platform not in PLATFORMS[fmi]:
-            names = ", ".join(PLATFORMS[fmi])
-            other = f"; `fmi` {5 - fmi} has it" if platform in TARGETS else ""
-            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'; there are {names}{other}")
+            other = f"; `fmi` {5 - fmi} has it" if platform in TARGETS else choice(platform, PLATFORMS[fmi])
+            raise BuildError(f"FMI {fmi}.0 has no platform '{platform}'{other}")
     if fmi == 2 and not options.arrays:
         raise BuildError("FMI 2.0 has no arrays to leave out; `arrays=False` goes with `fmi=3`")
     return native_flavour(options, robot, table, fmi, platforms)

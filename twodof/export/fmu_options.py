@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..errors import BuildError
+from ..errors import BuildError, choice
 from ..plant.variables import CONTROLS
 
 DEFAULT_NAME = "TwoDof"
@@ -62,9 +61,7 @@ class FmuOptions:
             name = identifier(self.urdf) if self.urdf is not None else DEFAULT_NAME
             object.__setattr__(self, "name", name)
         if self.control not in CONTROLS:
-            near = difflib.get_close_matches(self.control, CONTROLS, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise BuildError(f"`control` '{self.control}' is none of {', '.join(CONTROLS)}{hint}")
+            raise BuildError(f"`control` '{self.control}' is unknown{choice(self.control, CONTROLS)}")
 
     @property
     def is_default_arm(self) -> bool:

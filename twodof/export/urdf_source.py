@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..bounds import MAX_URDF
-from ..errors import BuildError
+from ..errors import BuildError, choice, kind_of, no_such
 from ..files import read_file, refusing
 from ..plant.urdf import RobotError, Urdf, read_urdf
 from .mesh_files import places_of
@@ -24,12 +24,15 @@ def read_text(path: Path, mesh_dir: Path | None) -> str:
     """Return the text of a URDF, or of an expanded xacro file; raise BuildError where there is none."""
     if path.suffix == ".xacro":
         return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
+    if path.is_dir() or not path.exists():
+        raise BuildError(no_such("URDF", path))
     with refusing(BuildError, f"read the URDF '{path}'"):
         content = read_file(path, MAX_URDF)
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise BuildError(f"the URDF '{path}' is not UTF-8 text") from error
+        other = kind_of(path) not in ("", "URDF")
+        raise BuildError(no_such("URDF", path) if other else f"the URDF '{path}' is not UTF-8 text") from error
 
 
 def last_links(urdf: Urdf) -> list[str]:
@@ -39,8 +42,12 @@ def last_links(urdf: Urdf) -> list[str]:
     return [link for link in ends if any(joint.moves for joint in urdf.chain(link))]
 
 
-def end_effector(urdf: Urdf) -> str:
-    """Return the default controlled link."""
+def end_effector(urdf: Urdf, frame: str | None) -> str:
+    """Return the controlled link: the given one, or the default."""
+    if frame is not None and frame not in urdf.links:
+        raise RobotError(f"no frame '{frame}' in the URDF{choice(frame, urdf.links)}")
+    if frame is not None:
+        return frame
     leaves = last_links(urdf)
     if DEFAULT_FRAME in urdf.links:
         return DEFAULT_FRAME
@@ -81,7 +88,7 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
     for pattern, value in locks.items():
         matches = fnmatch.filter(moving, pattern)
         if not matches:
-            raise RobotError(f"no joint '{pattern}' to lock; there are: {', '.join(moving)}")
+            raise RobotError(f"no joint '{pattern}' to lock{choice(pattern, moving)}")
         positions |= dict.fromkeys(matches, value)
     elements = {str(e.get("name")): e for e in urdf.tree.findall("joint")}
     for name, joint in moving.items():

@@ -20,7 +20,7 @@ import numpy as np
 from fmpy.model_description import ModelDescription, ModelVariable
 
 from ..bounds import MAX_DESCRIPTION, MAX_ELEMENTS, MAX_RESOURCE
-from ..errors import ZIP_ERRORS, FmuError
+from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
 from ..export.compiler import host_platform
 from ..files import UnsafeArchiveError, check_archive, read_member, shown
 from ..notebook import card, picture
@@ -261,8 +261,8 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
             xml = read_member(archive, "modelDescription.xml", MAX_DESCRIPTION)
-    except FileNotFoundError as error:
-        raise FmuError(f"there is no FMU '{path}'; build one with 'twodof build'") from error
+    except (FileNotFoundError, IsADirectoryError) as error:
+        raise FmuError(no_such("FMU", path)) from error
     except OSError as error:
         raise FmuError(f"cannot read '{path}': {error.strerror}") from error
     except KeyError as error:
@@ -270,7 +270,9 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
     except UnsafeArchiveError as error:
         raise FmuError(f"'{path}': {error}") from error
     except ZIP_ERRORS as error:
-        raise FmuError(f"'{path}' is no FMU: it is not a sound zip archive ({error})") from error
+        other = kind_of(path) not in ("", "FMU")
+        why = f"'{path}' is no FMU: it is not a sound zip archive ({error})"
+        raise FmuError(no_such("FMU", path) if other else why) from error
     if not _is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, _checksums(archive)

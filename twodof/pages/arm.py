@@ -28,7 +28,8 @@ from ..fmu import Fmu, opened, read_resource
 from ..geometry.kinematics import Kinematics, Placement
 from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
-from ..simulation.experiments import Experiment, Setting, experiment
+from ..simulation.experiments import Experiment, experiment
+from ..simulation.input_values import Setting
 
 FIRST, LAST = "samples.js", "main.js"
 """Scripts whose class others extend, and that starts the page; of the others the order does not matter."""

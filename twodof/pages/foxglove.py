@@ -19,7 +19,8 @@ from ..ros.cdr import Rows
 from ..ros.commands import warner
 from ..ros.messages import Messages, store_of
 from ..signatures import ignore, never
-from ..simulation.experiments import Experiment, Value, check_going_on, resolve
+from ..simulation.experiments import Experiment
+from ..simulation.input_values import Value, check_going_on, resolve
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
 from .serving import HOST, Server, relay

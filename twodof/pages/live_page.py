@@ -12,7 +12,8 @@ from pathlib import Path
 from ..errors import InputError
 from ..fmu import Fmu
 from ..signatures import ignore, never
-from ..simulation.experiments import Experiment, Setting, experiment
+from ..simulation.experiments import Experiment, experiment
+from ..simulation.input_values import Setting
 from .arm import arm_of, arm_page
 from .loop import Loop
 from .serving import HOST, PORT, Connection, Server, user_token

@@ -18,7 +18,8 @@ from typing import Any
 from ..bag.writer import Bag
 from ..errors import BagError, PageError, SimulationError
 from ..files import free_name
-from ..simulation.experiments import Experiment, Setting, Value, check_going_on, resolve
+from ..simulation.experiments import Experiment
+from ..simulation.input_values import Setting, Value, check_going_on, resolve
 from ..simulation.master import at_rest, samples
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..errors import choice
 from ..export.urdf_source import DEFAULT_FRAME
 from ..geometry.kinematics import Array, Kinematics, rotated
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
@@ -129,7 +130,7 @@ def load_linkage(text: str, frame: str, axes: str, names: Sequence[str]) -> Link
         last = max(reversed(urdf.links), key=depths.__getitem__)
         frame = DEFAULT_FRAME if DEFAULT_FRAME in urdf.links else last
     if frame not in urdf.links:
-        raise RobotError(f"no frame '{frame}' in the URDF; there are: {', '.join(urdf.links)}")
+        raise RobotError(f"no frame '{frame}' in the URDF{choice(frame, urdf.links)}")
     kinematics = Kinematics(urdf, [joint.name for joint in moving])
     linkage = Linkage(urdf, kinematics, moving, frame, axes)
     if not linkage.chain:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import PlotError
+from ..errors import PlotError, choice
 from .closed_form import Array
 from .settings import number
 from .strokes import PALE, SMALLEST_ERROR, SMALLEST_RANGE, Look, Stroke
@@ -70,7 +70,7 @@ def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
     known = joint_names(tracks)
     for name in names:
         if name not in known:
-            raise PlotError(f"no joint '{name}'; there are: {', '.join(known)}")
+            raise PlotError(f"no joint '{name}'{choice(name, known)}")
     chosen = ([joint for joint in track.joints if joint.name in names] for track in tracks)
     ordered = (sorted(joints, key=lambda joint: names.index(joint.name)) for joints in chosen)
     return [replace(track, joints=tuple(joints)) for track, joints in zip(tracks, ordered)]

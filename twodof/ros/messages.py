@@ -17,7 +17,8 @@ from rosbags.typesys.store import Typestore
 from ..errors import BagError, InputError
 from ..fmu import read_resource
 from ..plant.urdf import Joint, RobotError
-from ..simulation.experiments import Experiment, Value
+from ..simulation.experiments import Experiment
+from ..simulation.input_values import Value
 from ..simulation.sample import Sample
 from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
 

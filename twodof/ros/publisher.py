@@ -9,7 +9,8 @@ from math import inf
 
 from ..errors import InputError, PublishError, SimulationError
 from ..signatures import ignore, never
-from ..simulation.experiments import NANOSECONDS, Experiment, Setting
+from ..simulation.experiments import NANOSECONDS, Experiment
+from ..simulation.input_values import Setting
 from ..simulation.master import at_rest
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import csv
-import difflib
 import logging
 import math
 import time
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from itertools import chain, pairwise
+from itertools import pairwise
 from math import inf, isfinite
 from pathlib import Path
 from typing import TypedDict
 
-from ..bounds import MAX_CELLS, MAX_TABLE, MIN_STEP
+from ..bounds import MIN_STEP
 from ..errors import InputError
-from ..files import check_file
 from ..fmu import Fmu, load_fmu
-from ..plant.variables import CONTROLS, GAINS
-from ..plant.variables import Value as Value
-
-Setting = object
-"""A number, a Boolean, or a sequence or array of them; a dict of several kinds is ``dict[str, object]``."""
-Changes = list[tuple[float, dict[str, Value]]]
-"""Times in s, ascending, and the inputs that take new values there."""
+from .input_values import Changes, Setting, Value, read_changes, resolve
 
 TIME_TOLERANCE = 1e-9  # of a communication step
 NANOSECONDS = 1_000_000_000
@@ -192,7 +183,9 @@ def _steps(start: float, stop: float, h: float) -> float:
         raise InputError(f"step {h!r} s is too small for a run of {stop - start:g} s")
     steps = round((stop - start) / h)
     if abs(steps * h - (stop - start)) > TIME_TOLERANCE * h * max(1, steps):
-        raise InputError(f"the run of {stop - start:g} s is no whole number of steps of {h:g} s")
+        fitting, last = (stop - start) / max(1, steps), start + max(1, steps) * h
+        remedy = f"take steps of {fitting:.9g} s, or end at {last:.9g} s"
+        raise InputError(f"the run of {stop - start:g} s is no whole number of steps of {h:g} s; {remedy}")
     return steps
 
 
@@ -200,151 +193,3 @@ def default(fmu: Fmu, name: str, fallback: float) -> float:
     """Return a number of the FMU's default experiment."""
     number = getattr(fmu.description.defaultExperiment, name, None)
     return fallback if number is None else float(number)
-
-
-def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
-    """Return values by variable name; a group's name sets all of its elements.
-
-    Raises:
-        InputError: an unknown name (with the nearest one), an output, or a value of wrong count or kind, or not finite.
-    """
-    values: dict[str, Value] = {}
-    for name, setting in settings.items():
-        elements = [name] if name in fmu.variables else fmu.vector(name)
-        if not elements:
-            raise InputError(_no_variable(fmu, name, "input", "parameter"))
-        # arrays give their own kind of numbers
-        plain: object = setting.tolist() if hasattr(setting, "tolist") else setting
-        given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
-        if len(given) != len(elements):
-            raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
-        for element, value in zip(elements, given, strict=True):
-            values[element] = _checked(fmu, element, value)
-    return values
-
-
-def _checked(fmu: Fmu, name: str, value: object) -> Value:
-    variable = fmu.variables[name]
-    if variable.causality not in ("input", "parameter"):
-        raise InputError(f"{name} is of causality '{variable.causality}' and cannot be set")
-    if variable.type == "Boolean":
-        if not isinstance(value, bool):
-            raise InputError(f"{name} = {value!r}: expected true or false")
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{name} = {value!r}: expected a number")
-    try:
-        number = float(value)
-    except OverflowError:  # of a whole number
-        number = inf if value > 0 else -inf
-    if not isfinite(number):
-        raise InputError(f"{name} = {number} is not finite")
-    return number
-
-
-def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
-    """Refuse inputs that would end a run and may arrive at any time.
-
-    Raises:
-        InputError: a gain below 0, or with the others that are held a quaternion of zeros.
-    """
-    for name, value in asked.items():
-        if name.partition("[")[0] in GAINS and value < 0.0:
-            raise InputError(f"{name} = {value:g} is less than 0")
-    turn = fmu.vector("quat_des")
-    if turn and not any({**held, **asked}[name] for name in turn):
-        raise InputError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing")
-
-
-def _of_another(fmu: Fmu, name: str) -> str:
-    """Return a vector's length, or the controls that have a variable; "" where there is none."""
-    group = name.partition("[")[0]
-    having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
-    elements = fmu.vector(group)
-    if elements and fmu.variables[elements[0]].causality in ("input", "parameter"):
-        return f": {group} has {len(elements)} elements"
-    if not fmu.control or not having:
-        return ""
-    quoted = " or ".join(f"control '{control}'" for control in having)
-    return f": it is of {quoted}; this FMU has control '{fmu.control}'"
-
-
-def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
-    """Return the message for an unknown name: its control law, or the nearest names."""
-    groups = {g: names for causality in causalities for g, names in fmu.groups(causality).items()}
-    known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
-    by_lower = {candidate.lower(): candidate for candidate in reversed(known)}
-    near = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.4)
-    like = f"; did you mean '{by_lower[near[0]]}'?" if near else f"; there are: {', '.join(known)}"
-    return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"
-
-
-def read_changes(fmu: Fmu, path: str | Path) -> Changes:
-    """Read inputs over time from a CSV in FMPy's form: a column ``time``, and one for each input.
-
-    Columns are named as in settings. A row holds until the next row; before the first, start values hold.
-
-    Raises:
-        InputError: naming the file, and the row or column at fault.
-    """
-    rows = _rows(path)
-    _, names = next(rows, (0, None))
-    if names is None:
-        raise InputError(f"'{path}' is empty")
-    header = [cell.strip() for cell in names]
-    if "time" not in header:
-        raise InputError(f"'{path}' has no column 'time'")
-    elements = {name: _inputs(fmu, path, name) for name in header if name != "time"}
-    columns = [element for name in header for element in elements.get(name, ["time"])]
-    twice = next((element for element, n in Counter(columns).items() if n > 1), None)
-    if twice is not None:
-        raise InputError(f"'{path}' has two columns for '{twice:.50}'")
-    changes: Changes = []
-    for number, row in rows:
-        if len(row) != len(header):
-            raise InputError(f"'{path}' row {number}: {len(row)} cells, expected {len(header)}")
-        values: dict[str, Value] = {}
-        for name, cell in zip(header, row, strict=True):
-            try:
-                values[name] = float(cell)
-            except ValueError:
-                raise InputError(f"'{path}' row {number}: {name} = '{cell:.50}' is not a number") from None
-            if not isfinite(values[name]):
-                raise InputError(f"'{path}' row {number}: {name} = {cell:.50} is not finite")
-        time = values.pop("time")
-        if changes and time < changes[-1][0]:
-            raise InputError(f"'{path}' row {number}: time {time:g} is before the row above")
-        spread = {element: v for name, v in values.items() for element in elements[name]}
-        changes.append((time, spread))
-    if not changes:
-        raise InputError(f"'{path}' has no rows")
-    return changes
-
-
-def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
-    """Return the inputs that a column sets: one, or all elements of a vector."""
-    elements = [name] if name in fmu.variables else fmu.vector(name)
-    if not elements:
-        raise InputError(f"'{path}': {_no_variable(fmu, name, 'input')}")
-    if any(fmu.variables[element].causality != "input" for element in elements):
-        raise InputError(f"'{path}': {name} is not an input")
-    return elements
-
-
-def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield non-empty rows with their line numbers; quotes do not span lines."""
-    cells = 0
-    try:
-        check_file(path, MAX_TABLE)
-        with open(path, encoding="utf-8-sig") as file:
-            for number, line in enumerate(file, start=1):
-                cells += 1 + line.count(",")
-                if cells > MAX_CELLS:
-                    raise InputError(f"'{path}' has more than {MAX_CELLS} cells")
-                for row in csv.reader([line]):
-                    if any(map(str.strip, row)):
-                        yield number, row
-    except OSError as error:
-        raise InputError(f"cannot read '{path}': {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"'{path}' is not a CSV file: {error}") from error

@@ -21,17 +21,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..errors import InputError, SimulationError, diverged, step_failure
 from ..fmu import Fmu, Instance, Values, instantiate
 from ..signatures import check_keywords, ignore, never, with_keywords_of
-from .experiments import (
-    NANOSECONDS,
-    TIME_TOLERANCE,
-    Experiment,
-    ExperimentOptions,
-    Setting,
-    Value,
-    experiment,
-    pop_until,
-    resolve,
-)
+from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
+from .input_values import Setting, Value, resolve
 from .pace import RealTime
 from .peaks import Peaks, limits_of
 from .run_summary import Summary
@@ -41,6 +32,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 OUTPUTS = ("q", "v", "x", "tau", "quat")
+LARGE = 1e5  # in a setting's unit: a robot's run hardly means more
 
 
 Stop = Callable[[], bool]
@@ -172,11 +164,20 @@ def _sampler(
 
 def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Resume) -> dict[str, Value]:
     """Return start values with which a run continues after a failed step; raise where there are none."""
-    failure = step_failure(sample.k, sample.t, error)
+    failure = step_failure(sample.k, sample.t, error, _too_large(run, sample))
     settings = resume(sample, failure) if error.outcome == "discarded" else None
     if settings is None:
         raise failure from error
     return resolve(run.fmu, settings)
+
+
+def _too_large(run: Experiment, sample: Sample) -> str:
+    """Return the settings so large that they may have caused a failure, as the end of its message."""
+    given = {**run.given, **sample.inputs}
+    usual, kinds = run.fmu.start_values, run.fmu.variables
+    large = [name for name, value in given.items() if abs(value) > LARGE and value != usual.get(name)]
+    named = ", ".join(f"{name} = {given[name]:g} {kinds[name].unit or ''}".strip() for name in large[:3])
+    return f"; a setting may be too large: {named}" if large else ""
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:

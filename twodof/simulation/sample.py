@@ -7,7 +7,8 @@ from math import asin, dist, hypot
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import SimulationError
-from .experiments import Experiment, Setting, Value
+from .experiments import Experiment
+from .input_values import Setting, Value
 from .pace import RealTime
 
 if TYPE_CHECKING:

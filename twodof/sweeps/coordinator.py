@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ..files import temporary_folder
 from ..fmu import Fmu, opened
 from ..signatures import ignore, never
-from ..simulation.experiments import Setting, experiment
+from ..simulation.experiments import experiment
+from ..simulation.input_values import Setting
 from ..version import versions
 from .batches import Batches
 from .design import Design, make_design

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..bounds import MAX_RUNS
 from ..errors import InputError
 from ..fmu import Fmu
-from ..simulation.experiments import Setting, resolve
+from ..simulation.input_values import Setting, resolve
 
 
 @dataclass(frozen=True)

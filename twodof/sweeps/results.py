@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bounds import MAX_RUNS, MAX_SWEEP
-from ..errors import SweepError
+from ..errors import SweepError, no_such
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
 from ..version import install
@@ -189,9 +189,9 @@ def read_sweep(path: str | Path) -> pandas.DataFrame:
     """
     path = Path(path)
     with refusing(SweepError, f"read '{path}'"):
-        files = _files(path)
+        files = _files(path) if path.is_dir() else []
     if not files:
-        raise SweepError(f"'{path}' is no sweep: it has no {WHOLE} and no parts")
+        raise SweepError(no_such("sweep", path))
     table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")
     rows = SweepTable(table.to_pandas())
     said = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}

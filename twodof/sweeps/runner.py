@@ -16,7 +16,8 @@ import numpy as np
 from ..errors import SimulationError, diverged, step_failure
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
-from ..simulation.experiments import Experiment, Value, experiment, resolve
+from ..simulation.experiments import Experiment, experiment
+from ..simulation.input_values import Value, resolve
 from ..simulation.master import OUTPUTS, simulate
 from ..simulation.peaks import limits_of
 from ..simulation.sample import Sample, Sink

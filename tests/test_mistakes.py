@@ -1,0 +1,145 @@
+"""Mistakes as people make them: each message names the culprit and a remedy that works."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import twodof
+from twodof.cli.main import main
+
+RUN = "run arm.fmu -o out --stop-time 0.02"
+MISTAKES: dict[str, str] = {
+    # options and verbs
+    f"{RUN} --stoptime 3": "no option '--stoptime'; did you mean '--stop-time'",
+    f"{RUN} --stop_time 3": "'--stop_time'; did you mean '--stop-time'",
+    f"{RUN} --stop 3": "'--stop'; did you mean '--stop-time'",
+    f"{RUN} --duration 3": "'--duration'; did you mean '--stop-time'",
+    f"{RUN} --dt=0.001": "'--dt'; did you mean '--step'",
+    f"{RUN} -s Kp=3": "'-s'; did you mean '--set'",
+    f"{RUN} --output b": "'--output'; did you mean '-o'",
+    f"{RUN} --force": "'--force'; did you mean '--overwrite'",
+    f"{RUN} --Set Kp=3": "'--Set'; did you mean '--set'",
+    f"{RUN} --xyzzy": "no option '--xyzzy'; 'twodof run --help' lists",
+    f"{RUN} --set Kp=80 Kd=20": "'Kd=20' belongs to no option: .*--set Kd=20",
+    f"{RUN} other.fmu": "'other.fmu' is one argument too many; 'twodof run --help'",
+    f"{RUN} --step 10ms": "'10ms' is not a number; leave units out",
+    f"{RUN} --storage db3": "'db3' .*'sqlite3'",
+    "simulate arm.fmu": "no verb 'simulate'; did you mean 'run'",
+    "bild": "no verb 'bild'; did you mean 'build'",
+    "linearize arm.fmu": "'linearize'; did you mean 'linearise'",
+    "show bag": "'show'; did you mean 'info'",
+    "xyzzy": "no verb 'xyzzy'; there are: build, run, ",
+    "help simulate": "'simulate'; did you mean 'run'",
+    "--versoin": "no option '--versoin'; did you mean '--version'",
+    "-v": "no option '-v'",
+    # paths
+    "run bag": "'bag' is no FMU: it is a bag; 'twodof view bag' takes it",
+    "run bag/bag.mcap": "'bag/bag.mcap' is no FMU: it is a bag; 'twodof view bag/bag.mcap'",
+    "run gains": "'gains' is no FMU: it is a sweep; 'twodof plot gains'",
+    "run folder": "'folder' is no FMU: it is a folder without a bag",
+    "run arn.fmu": "no FMU 'arn.fmu'; did you mean 'arm.fmu'",
+    "run x.fmu": "no FMU 'x.fmu'; make one with 'twodof build'",
+    "run missing/arm.fmu": "no FMU 'missing/arm.fmu': there is no folder 'missing'",
+    "run notes.txt": "'notes.txt' is no FMU",
+    "live bag": "'bag' is no FMU: it is a bag",
+    "page bag": "'bag' is no FMU: it is a bag",
+    "layouts bag": "'bag' is no FMU: it is a bag",
+    "linearise bag": "'bag' is no FMU: it is a bag",
+    "sweep bag --grid Kp=1:2:3 -o s": "'bag' is no FMU: it is a bag",
+    "build bag": "'bag' is no URDF: it is a bag",
+    "build arm.fmu": "'arm.fmu' is no URDF: it is an FMU; 'twodof run arm.fmu'",
+    "build robt.urdf": "no URDF 'robt.urdf'; did you mean 'robot.urdf'",
+    "plot arm.fmu": "'arm.fmu' is no bag: it is an FMU; 'twodof run arm.fmu'",
+    "plot nowhere": "no bag 'nowhere'; make one with 'twodof run'",
+    "plot bga": "no bag 'bga'; did you mean 'bag'",
+    "view gains": "'gains' is no bag: it is a sweep; 'twodof plot gains'",
+    "recover gains": "'gains' is no bag: it is a sweep",
+    "recover nowhere": "no bag 'nowhere'",
+    "info gain": "no 'gain'; did you mean 'gains'",
+    "info bagg": "no 'bagg'; did you mean 'bag'",
+    "info robot.urdf": "'robot.urdf' is no FMU: .*; 'twodof build robot.urdf'",
+    "info table.csv": "'table.csv' is no FMU: it is a CSV file",
+    "info notes.txt": "'notes.txt' is neither an FMU nor the folder of a bag or a sweep",
+    f"{RUN} --input gains": "'gains' is no bag: it is a sweep",
+    f"{RUN} --input tabel.csv": "no CSV 'tabel.csv'; did you mean 'table.csv'",
+    # tables
+    f"{RUN} --input semicolons.csv": "no column 'time'; it has semicolons between its cells: write commas",
+    f"{RUN} --input tabs.csv": "no column 'time'; it has tabs between",
+    f"{RUN} --input capital.csv": "no column 'time'; rename the column 'Time'",
+    f"{RUN} --input headless.csv": "no column 'time'; its first line is '0,50'",
+    f"{RUN} --input lower.csv": "no variable 'kp'; did you mean 'Kp'",
+    # settings
+    f"{RUN} --set x_des_1=0.2": r"'x_des_1'; did you mean 'x_des\[1\]'",
+    f"{RUN} --set x_des2=0.2": r"'x_des2'; did you mean 'x_des\[2\]'",
+    f"{RUN} --set x_des[0]=0.2": "x_des has 2 elements",
+    f"{RUN} --set x_des=0.2;0.1": "'0.2;0.1' is not a number; write numbers as 0.2,0.1",
+    f"{RUN} --set x_des=[0.2,0.1]": "is not a number; write numbers as",
+    f"{RUN} --set limit_effort=yes": "'yes' is not a number; .* true or false",
+    f"{RUN} --set q=1,1": r"q\[1\] is of causality 'output' .*; set q_start\[1\]",
+    f"{RUN} --set q_des=1,1": "'q_des': it is of control 'joint'",
+    f"{RUN} --set x_des=1e30": r"a setting may be too large: x_des\[1\] = 1e\+30 m",
+    f"{RUN} --step 0.015": "no whole number of steps of 0.015 s; take steps of 0.02 s, or end at 0.015 s",
+    "run arm.fmu -o out --stop-time 5 --step 0.03": "steps of 0.0299401198 s, or end at 5.01 s",
+    # robots
+    "build robot.urdf --frame end_effector": "no frame 'end_effector' .*; did you mean 'EndEffector'",
+    "build robot.urdf --frame tool0": "no frame 'tool0' .*; there are: world, link1",
+    "build robot.urdf --lock Joint1": "no joint 'Joint1' to lock; did you mean 'joint1'",
+    "build robot.urdf --lock joint1=90deg": "'90deg' is not a number",
+    "build robot.urdf --q-start 1": "q_start has 1 values, the robot has 2 joints",
+    "build robot.urdf --control torque": "'torque' .*'effort'",
+    "build robot.urdf --native --platform linux --no-meshes": "no platform 'linux'; did you mean 'linux64'",
+    "build robot.xml": "<mujoco>, expected <robot>",
+    "plot bag --joints Joint1 -o x.png": "no joint 'Joint1'; did you mean 'joint1'",
+    "plot bag --frame endeffector -o x.png": "did you mean 'EndEffector'",
+    "plot bag -o x.jpg": "'x.jpg': the name of a plot ends in .png",
+    # sweeps
+    "sweep arm.fmu -o s": "nothing to vary; give a grid",
+    "sweep arm.fmu --grid Kp=50:100 -o s": "expected NAME=LOW:HIGH:COUNT, as in --grid Kp=20:200:10",
+    "sweep arm.fmu --grid Kp=50,60 -o s": "expected NAME=LOW:HIGH:COUNT, as in",
+    "sweep arm.fmu --range Kp=50 -o s": "expected NAME=LOW:HIGH, as in --range Kp=20:200$",
+    "sweep arm.fmu --grid q=1:2:3 -o s": r"set q_start\[1\]",
+}
+
+
+@pytest.fixture(scope="module")
+def things(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as of somebody who has worked for an hour."""
+    folder = tmp_path_factory.mktemp("hour")
+    shutil.copy(native_path, folder / "arm.fmu")
+    shutil.copy(Path(__file__).parents[1] / "urdf/2dof.urdf", folder / "robot.urdf")
+    twodof.simulate(native_path, twodof.Bag(folder / "bag", scene=True), stop_time=0.05)
+    twodof.sweep(native_path, grid={"Kp": [50.0, 60.0]}, stop_time=0.05, output=folder / "gains")
+    (folder / "folder").mkdir()
+    for name, text in {
+        "notes.txt": "hello",
+        "robot.xml": "<mujoco/>",
+        "table.csv": "time,Kp\n0,50\n",
+        "semicolons.csv": "time;Kp\n0,0;50,5\n",
+        "tabs.csv": "time\tKp\n0\t50\n",
+        "capital.csv": "Time,Kp\n0,50\n",
+        "headless.csv": "0,50\n1,60\n",
+        "lower.csv": "time,kp\n0,50\n",
+    }.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_mistake_gets_its_remedy(
+    line: str, things: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(things)
+    before = sorted(things.iterdir())
+    try:
+        status = main(line.split())
+    except SystemExit as end:
+        status = int(str(end.code))
+    error = [text for text in capsys.readouterr().err.splitlines() if "error: " in text]
+    assert status in (1, 2)
+    assert len(error) == 1 and re.search(MISTAKES[line], error[0])
+    shutil.rmtree("out", ignore_errors=True)  # the bag of a run that failed on the way
+    assert sorted(things.iterdir()) == before

@@ -1,0 +1,132 @@
+"""Help texts: the verbs, examples of each, and what a mistyped command line means."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any, NoReturn
+
+from ..errors import choice, nearest
+from .printing import plain
+
+EXAMPLES = {
+    "": ["twodof build", "twodof run", "twodof help run"],
+    "build": [
+        "twodof build",
+        "twodof build my_robot.urdf --mesh-dir my_packages --frame tool0",
+        "twodof build my_robot.urdf --control joint --native --platform all",
+    ],
+    "run": [
+        "twodof run",
+        "twodof run my_robot.fmu -o my_bag --set x_des=0.4,0.1,0.5 --set Kp=100 --scene",
+        "twodof run my_robot.fmu --input targets.csv --stop-time 20 --step 0.005",
+    ],
+    "publish": [
+        "twodof publish my_robot.fmu --scene --effort",
+        "twodof publish left=my_robot.fmu right=my_robot.fmu --clock -o my_bag",
+    ],
+    "layouts": ["twodof layouts my_robot.fmu -o layouts"],
+    "info": ["twodof info my_robot.fmu", "twodof info my_bag", "twodof info my_sweep --json"],
+    "linearise": ["twodof linearise TwoDof-native.fmu", "twodof linearise my_robot.fmu --at q=0.5,0.35 --at Kp=100"],
+    "plot": [
+        "twodof plot my_bag",
+        "twodof plot my_bag other_bag -o comparison.png --joints joint1,joint2",
+        "twodof plot my_sweep -o map.html",
+    ],
+    "view": ["twodof view my_bag", "twodof view my_bag --export my_bag.html"],
+    "live": ["twodof live", "twodof live my_robot.fmu --set Kp=100"],
+    "page": ["twodof page", "twodof page my_robot.fmu -o my_robot.html"],
+    "sweep": [
+        "twodof sweep --grid Kp=20:200:10 --grid Kd=5:40:8",
+        "twodof sweep my_robot.fmu --range Kp=20:200 --random 500 -o my_sweep",
+    ],
+    "recover": ["twodof recover my_bag"],
+}
+MEANT = {
+    "simulate": "run",
+    "show": "info",
+    "list": "info",
+    "replay": "view",
+    "render": "view",
+    "new": "build",
+    "make": "build",
+    "create": "build",
+    "tune": "sweep",
+    "html": "page",
+    "repair": "recover",
+    "ros": "publish",
+    "--dt": "--step",
+    "--timestep": "--step",
+    "--duration": "--stop-time",
+    "--time": "--stop-time",
+    "--stop": "--stop-time",
+    "--end": "--stop-time",
+    "--out": "-o",
+    "--output": "-o",
+    "--force": "--overwrite",
+    "-f": "--overwrite",
+    "-y": "--overwrite",
+    "-s": "--set",
+    "--param": "--set",
+    "--target": "--set",
+    "--csv": "--input",
+    "--format": "--storage",
+}
+"""Words of other tools for verbs and options of this one."""
+COMPLETION = 'completion in bash and zsh: eval "$(register-python-argcomplete twodof)"'
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser that accepts no abbreviations, prints errors in a line, and ends its help with examples."""
+
+    def __init__(self, **named: Any) -> None:
+        super().__init__(allow_abbrev=False, **named)
+
+    def format_help(self) -> str:
+        """Return the help with its examples."""
+        verb = self.prog.removeprefix("twodof").strip()
+        shown = "".join(f"  {line}\n" for line in EXAMPLES.get(verb, ()))
+        last = "" if verb else f"\n{COMPLETION}\n"
+        return super().format_help() + (f"\nexamples:\n{shown}" if shown else "") + last
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with one line."""
+        message = re.sub(r"invalid (float|int) value: ('.*')$", r"\2 is not a number; leave units out", message)
+        self.exit(2, f"{self.prog}: error: {plain(message)}\n")
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """Write out the help before the process ends, where a closed pipe can still be caught."""
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        super().exit(status, message)
+
+
+def check_verb(program: Parser, verbs: Iterable[str], arguments: Sequence[str]) -> None:
+    """Refuse a verb, or an option before it, that does not exist; name the one that is meant."""
+    word, named = next(iter(arguments), ""), [*verbs]
+    if word[:1] == "-" and word not in program._option_string_actions:
+        check_arguments(program, arguments)
+    if word and word[0] != "-" and word not in named:
+        program.error(f"there is no verb '{word}'{_meant(word, named) or choice(word, named)}")
+
+
+def check_arguments(parser: Parser, unknown: Sequence[str]) -> None:
+    """Refuse arguments that a verb does not take; name the option that is meant."""
+    if not unknown:
+        return
+    known, lists = [*parser._option_string_actions], f"; '{parser.prog} --help' lists them"
+    word = unknown[0].partition("=")[0]
+    if word[:1] == "-":
+        parser.error(f"there is no option '{word}'{_meant(word, known) or lists}")
+    if "=" in unknown[0] and "--set" in known:
+        parser.error(f"'{unknown[0]}' belongs to no option: repeat --set, as in --set {unknown[0]}")
+    parser.error(f"'{unknown[0]}' is one argument too many{lists}")
+
+
+def _meant(word: str, known: Sequence[str]) -> str:
+    meant = MEANT.get(word)
+    if meant not in known:
+        meant = nearest(word.replace("_", "-"), known)
+    return f"; did you mean '{meant}'?" if meant else ""
