@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -208,3 +209,19 @@ def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert 'id="twodof.simulate"' in api
     assert '<iframe src="arm.html"' in (tmp_path / "index.html").read_text("utf-8")
     assert b'id="arm-engine"' in (tmp_path / "arm.html").read_bytes()
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")) + PAGES[1:], ids=lambda page: page.name)
+def test_lines_of_running_text_have_at_most_120_characters(page: Path) -> None:
+    """Rows of tables and lines of programs cannot be broken."""
+    text = page.read_text("utf-8").splitlines()
+    code = {block.line + i - 1 for block in blocks(page.read_text("utf-8")) for i in range(len(block.lines))}
+    assert not [i + 1 for i, line in enumerate(text) if len(line) > 120 and i not in code and line[:1] != "|"]
+
+
+def test_diagrams_of_the_architecture_are_current() -> None:
+    """Otherwise run docs/make_diagrams.py."""
+    page = (DOCS / "architecture.md").read_text("utf-8")
+    for path, content in runpy.run_path(str(DOCS / "make_diagrams.py"))["diagrams"]().items():
+        assert path.read_text("utf-8") == content
+        assert f"]({path.name})" in page
