@@ -225,3 +225,10 @@ def test_diagrams_of_the_architecture_are_current() -> None:
     for path, content in runpy.run_path(str(DOCS / "make_diagrams.py"))["diagrams"]().items():
         assert path.read_text("utf-8") == content
         assert f"]({path.name})" in page
+
+
+def test_invariants_name_the_tests_that_hold_them() -> None:
+    lines = re.findall(r"^Invariant: .*", (DOCS / "architecture.md").read_text("utf-8"), re.MULTILINE)
+    tests = [re.search(r"\(`(test_\w+\.py)`\)\.$", line) for line in lines]
+    assert len(lines) >= 8
+    assert all(match and (ROOT / "tests" / match[1]).exists() for match in tests)
