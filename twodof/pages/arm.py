@@ -11,11 +11,10 @@ import hashlib
 import html
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,32 +40,25 @@ CONTAINER = b'<div class="arm" id="arm"'
 """Mark that identifies a page with an arm."""
 
 
-@dataclass(frozen=True)
-class Arm:
+class Arm(NamedTuple):
     """Contents of a robot's page.
 
     Attributes:
-        name: of the FMU.
-        robot: name of the robot; frame, axes, control, joints as in ``Fmu``.
-        variables: one for each of the FMU's, elements of vectors by themselves: name, value
-            reference, causality, unit, start and description.
-        step: communication step, s.
+        facts: of its FMU, by name: name, robot, joints, frame, axes and control as in ``Fmu``; step,
+            s; variables, elements of vectors by themselves: name, place among all, causality, unit,
+            start and description; remarks, what is not as it should be.
         urdf: text of resources/robot.urdf.
         shapes: of its links.
-        remarks: what is not as it should be.
     """
 
-    name: str
-    robot: str
-    joints: Sequence[str]
-    frame: str
-    axes: str
-    control: str
-    variables: Sequence[Mapping[str, Any]]
-    step: float
+    facts: dict[str, Any]
     urdf: str
     shapes: Sequence[Shape]
-    remarks: Sequence[str] = ()
+
+    @property
+    def title(self) -> str:
+        """Title of the page of an FMU."""
+        return str(self.facts["robot"] or self.facts["name"])
 
 
 def page(
@@ -104,7 +96,7 @@ def page(
     provenance = provenance_of(run, "")
     provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # no other package is at work
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
-    content = arm_page(arm.robot or arm.name, arm, engine, allowed, provenance=provenance)
+    content = arm_page(arm.title, arm, engine, allowed, provenance=provenance)
     with refusing(PageError, f"write '{path}'"):
         write_file(path, content)
     return path
@@ -142,18 +134,8 @@ def arm_of(run: Experiment) -> Arm:
         for place, (name, variable) in enumerate(fmu.variables.items())
         if variable.causality != "local"
     ]
-    return Arm(
-        name=fmu.name,
-        robot=fmu.robot,
-        joints=fmu.joints,
-        frame=fmu.frame,
-        axes=fmu.axes,
-        control=fmu.control,
-        variables=variables,
-        step=run.step,
-        urdf=urdf,
-        shapes=shapes,
-    )
+    known = {key: getattr(fmu, key) for key in ("name", "robot", "joints", "frame", "axes", "control")}
+    return Arm({**known, "variables": variables, "step": run.step, "remarks": []}, urdf, shapes)
 
 
 def _sources(fmu: Fmu) -> dict[str, bytes]:
@@ -206,15 +188,13 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
     urdf = read_urdf(arm.urdf)
     ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
     packed = [_mesh(shape) for shape in [ball, *arm.shapes]]
-    links, number = _links(urdf, arm.joints)
+    links, number = _links(urdf, arm.facts["joints"])
     facts = {
-        **{key: getattr(arm, key) for key in ("name", "robot", "frame", "axes", "control", "step")},
-        "joints": [_joint(name, urdf.joints.get(name)) for name in arm.joints],
+        **arm.facts,
+        "joints": [_joint(name, urdf.joints.get(name)) for name in arm.facts["joints"]],
         "recorded": RECORDED,
-        "remarks": list(arm.remarks),
-        "variables": list(arm.variables),
         "links": links,
-        "frameLink": number[arm.frame],
+        "frameLink": number[arm.facts["frame"]],
         "shapes": [{"link": number[s.link], "place": _matrix(s.transform), "colour": s.colour} for s in arm.shapes],
         "meshes": [facts for facts, _ in packed],
     }

@@ -60,7 +60,7 @@ def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Server:
         PageError: it cannot be shown.
     """
     arm = arm_of(run)
-    page = arm_page(arm.robot or arm.name, arm, {}, "; connect-src 'self'")
+    page = arm_page(arm.title, arm, {}, "; connect-src 'self'")
     return Server(page, host, port, partial(_talk, loop), token=user_token())
 
 

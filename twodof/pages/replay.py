@@ -85,22 +85,20 @@ def replay(
     groups, shown = _groups(track), len(track.t)
     count = track.recording.count
     thinned = [f"{shown} of {count} samples, extremes among them"] if shown < count else []
-    arm = Arm(
-        name=track.name,
-        robot=motion.robot if motion else "",
-        joints=[joint.name for joint in track.joints],
-        frame=motion.frame if motion else "base",
-        axes=track.task.axes if track.task else track.recording.axes,
-        control="",
-        variables=[*_variables(track, groups)],
-        step=float(track.t[-1]) / max(1, len(track.t) - 1),
-        urdf=text,
-        shapes=shapes,
-        remarks=[*remarks, *thinned],
-    )
+    facts = {
+        "name": track.name,
+        "robot": motion.robot if motion else "",
+        "joints": [joint.name for joint in track.joints],
+        "frame": motion.frame if motion else "base",
+        "axes": track.task.axes if track.task else track.recording.axes,
+        "control": "",
+        "variables": [*_variables(track, groups)],
+        "step": float(track.t[-1]) / max(1, len(track.t) - 1),
+        "remarks": [*remarks, *thinned],
+    }
     samples = np.column_stack([track.t, *(groups[name] for name in RECORDED if name in groups)])
-    title = " - ".join(filter(None, (arm.robot, arm.name)))
-    return arm_page(title, arm, {"samples": packed(samples.astype("<f8").tobytes())}), remarks
+    title = " - ".join(filter(None, (motion.robot if motion else "", track.name)))
+    return arm_page(title, Arm(facts, text, shapes), {"samples": packed(samples.astype("<f8").tobytes())}), remarks
 
 
 def _groups(track: Track) -> dict[str, Array]:
