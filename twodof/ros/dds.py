@@ -20,27 +20,17 @@ except ImportError as missing:
     raise PublishError(f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')") from missing
 
 
-class Carrier:
-    """Base of every DDS type: it carries messages already serialised.
+def _keep(self: Any, cdr: bytes) -> None:
+    self.cdr = cdr
 
-    What the bytes mean is rosbags' business.
-    """
 
-    def __init__(self, cdr: bytes) -> None:
-        self.cdr = cdr
-
-    def serialize(self, **_options: object) -> bytes:
-        """Return the bytes for Cyclone DDS."""
-        return self.cdr
-
-    @classmethod
-    def deserialize(cls, cdr: bytes) -> Carrier:
-        """Return a received message."""
-        return cls(cdr)
-
-    @classmethod
-    def deserialize_key(cls, _key: bytes) -> None:
-        """Return a notice without a message: a writer has left."""
+CARRIER = {
+    "__init__": _keep,
+    "serialize": lambda self, **_options: self.cdr,
+    "deserialize": classmethod(lambda cls, cdr: cls(cdr)),
+    "deserialize_key": classmethod(lambda cls, _key: None),  # a notice without a message: a writer has left
+}
+"""Methods of every DDS type: it carries messages already serialised, whose meaning is rosbags' business."""
 
 
 @functools.cache
@@ -49,8 +39,8 @@ def dds_type(name: str) -> Any:
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
     struct = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
-    for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
-        setattr(struct, method, vars(Carrier)[method])  # a base would be part of the type
+    for name, method in CARRIER.items():  # a base would be part of the type
+        setattr(struct, name, method)
     return struct
 
 
