@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 
 __version__ = "0.1.0"
@@ -38,6 +39,15 @@ def install(extra: str) -> str:
             wanted = [match[1] for line in own.requires or () if (match := of_extra.fullmatch(line))]
     words = shlex.join([sys.executable, "-m", "pip", "install", *(wanted or [f".[{extra}]"])])
     return f"install the extra '{extra}': {words}{'' if wanted else ' in the checkout'}"
+
+
+@contextmanager
+def needing(kind: type[Exception], task: str, extra: str) -> Iterator[None]:
+    """Raise ``kind``, with the remedy, where a package of an extra is missing that a task needs."""
+    try:
+        yield
+    except ImportError as missing:
+        raise kind(f"cannot {task}: {missing}; {install(extra)}") from missing
 
 
 @cache

@@ -23,15 +23,12 @@ from ..simulation.experiments import Experiment
 from ..simulation.input_values import Value, check_going_on, resolve
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample, Sink
+from ..version import needing
 from .serving import HOST, Server, relay
 
-try:
+with needing(PublishError, "serve Foxglove", "foxglove"):
     from foxglove import Channel, Context, Parameter, Schema, start_server
     from foxglove.websocket import Capability, ServerListener
-except ImportError as missing:
-    raise PublishError(
-        f"cannot serve Foxglove: {missing}; install the package 'foxglove-sdk' (the extra 'foxglove')"
-    ) from missing
 
 LOG = logging.getLogger(__name__)
 PORT = 8765

@@ -24,16 +24,15 @@ from threading import Event, Thread
 from typing import Any
 
 from ..errors import PageError
+from ..version import needing
 
-try:
+with needing(PageError, "show a page", "view"):
     from websockets.asyncio.client import connect
     from websockets.asyncio.server import ServerConnection, serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
     from websockets.http11 import Request, Response
     from websockets.typing import Subprotocol
-except ImportError as missing:
-    raise PageError(f"cannot show a page: {missing}; install the package 'websockets' (the extra 'view')") from missing
 
 HOST, PORT = "127.0.0.1", 8080
 SLOW = 60.0  # s that a page may take to a browser

@@ -16,15 +16,13 @@ from typing import Any, NamedTuple
 
 from ..errors import PlotError
 from ..files import data_file, descriptor_of, free_name, head_of, refusing, write_file
-from ..version import __version__
+from ..version import __version__, needing
 from .strokes import GREY, HAIR, INK
 
-try:
+with needing(PlotError, "plot", "view"):
     import matplotlib.style
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.lines import Line2D
-except ImportError as missing:
-    raise PlotError(f"cannot plot: {missing}; install the package 'matplotlib' (the extra 'view')") from missing
 
 STYLE = {
     "font.size": 8.0,

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import PlotError
 from ..files import data_file, packed
+from ..version import needing
 from .closed_form import Array
 from .panels import CURVE, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
 from .strokes import GREY, HAIR, INK, Stroke, looks
@@ -53,12 +54,8 @@ def body(tracks: Sequence[Track]) -> str:
     Raises:
         PlotError: plotly is missing.
     """
-    try:
+    with needing(PlotError, "plot into a page", "view"):
         from plotly.offline import get_plotlyjs
-    except ImportError as missing:
-        raise PlotError(
-            f"cannot plot into a page: {missing}; install the package 'plotly' (the extra 'view')"
-        ) from missing
     over = over_time(tracks)
     content = {"figures": [over, *in_workspace(tracks)], "rows": _rows(tracks)}
     script = data_file("plots", "interactive.js").read_text("utf-8")

@@ -12,12 +12,11 @@ from typing import Any
 from rosbags.interfaces import Nodetype, Qos, QosDurability
 
 from ..errors import PublishError
+from ..version import needing
 from .messages import store_of
 
-try:
+with needing(PublishError, "publish", "ros"):
     from cyclonedds import idl, qos, topic
-except ImportError as missing:
-    raise PublishError(f"cannot publish: {missing}; install the package 'cyclonedds' (the extra 'ros')") from missing
 
 
 def _keep(self: Any, cdr: bytes) -> None:

@@ -15,14 +15,12 @@ from queue import Empty, SimpleQueue
 from threading import Event, Lock, Thread
 
 from ..errors import SweepError, TwoDofError
-from ..version import __version__, install
+from ..version import __version__, needing
 from .batches import LOOK, Batches
 from .runner import Job, Point, Row, Runner
 
-try:
+with needing(SweepError, "use a cluster", "cluster"):
     from distributed import Client, Future, KilledWorker, Worker, WorkerPlugin, get_worker, wait
-except ImportError as missing:
-    raise SweepError(f"cannot use a cluster: {missing}; {install('cluster')}") from missing
 
 PATIENCE = 5.0  # s for a scheduler to answer
 NO_WORKER = 60.0  # s after which nobody hopes for another

@@ -22,18 +22,16 @@ from ..bounds import MAX_RUNS, MAX_SWEEP
 from ..errors import SweepError, no_such
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
-from ..version import install
+from ..version import needing
 from .metrics import METRICS
 from .ranking import RANKED, candidates
 from .runner import Row
 
-try:
+with needing(SweepError, "store a table", "sweep"):
     import pandas
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.parquet as pq
-except ImportError as missing:
-    raise SweepError(f"cannot store a table: {missing}; {install('sweep')}") from missing
 
 WHOLE = "runs.parquet"
 PART = re.compile(r"part-(\d{6})\.parquet")
