@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,9 +82,6 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
     """
     from scipy.spatial.transform import Rotation  # which takes half a second to import
 
-    from ..geometry.kinematics import Placement
-    from ..geometry.shapes import origin, place
-
     urdf = read_urdf(text)
     moving = {name: joint for name, joint in urdf.joints.items() if joint.moves}
     positions: dict[str, float] = {}
@@ -104,13 +102,18 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
             raise RobotError(
                 f"joint '{name}' cannot be locked at {value:g}: its limits are {joint.low:g} and {joint.high:g}"
             )
-        along, still = np.array(joint.axis) * value, Placement(np.zeros(3), np.eye(3))
-        turn = Rotation.from_rotvec(along).as_matrix()
-        moved = still._replace(translation=along) if joint.prismatic else still._replace(rotation=turn)
-        transform = origin(element.find("origin")) * moved
-        for tag in ("mimic", "limit", "dynamics"):
+        rotated = Rotation.from_euler("xyz", joint.rpy)
+        place = np.array(joint.xyz)
+        if joint.prismatic:
+            place = place + rotated.apply(np.array(joint.axis) * value)
+        else:
+            rotated = rotated * Rotation.from_rotvec(np.array(joint.axis) * value)
+        for tag in ("origin", "mimic", "limit", "dynamics"):
             for child in element.findall(tag):
                 element.remove(child)
         element.set("type", "fixed")
-        place(element, transform)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # where roll and yaw turn about one axis, any pair does
+            rpy = rotated.as_euler("xyz")
+        ET.SubElement(element, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
     return ET.tostring(urdf.tree, encoding="unicode")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -164,22 +164,3 @@ def origin(element: ET.Element | None) -> Placement:
     """Return the rotation and position of URDF's xyz and rpy, about the fixed axes x, y and z."""
     rotation = Rotation.from_euler("xyz", floats(element, "rpy", "0 0 0")).as_matrix()
     return Placement(floats(element, "xyz", "0 0 0"), rotation)
-
-
-def place(part: ET.Element, transform: Placement) -> None:
-    """Set URDF's origin of an element, exact too where roll and yaw turn about one axis, as SciPy's is not."""
-    element = part.find("origin")
-    if element is None:
-        element = ET.SubElement(part, "origin")
-    r = transform.rotation
-    yaw = math.atan2(r[1, 0], r[0, 0])
-    sin, cos = math.sin(yaw), math.cos(yaw)
-    pitch = math.atan2(-r[2, 0], cos * r[0, 0] + sin * r[1, 0])
-    roll = math.atan2(sin * r[0, 2] - cos * r[1, 2], cos * r[1, 1] - sin * r[0, 1])  # from what yaw leaves
-    element.set("xyz", words(transform.translation))
-    element.set("rpy", words((roll, pitch, yaw)))
-
-
-def words(values: Iterable[float]) -> str:
-    """Return numbers as an attribute's text."""
-    return " ".join(repr(float(value)) for value in values)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..geometry.kinematics import Array, Kinematics, Placement
 from ..geometry.meshes import Meshes, ReadMesh
-from ..geometry.shapes import floats, origin, place, words
+from ..geometry.shapes import floats, origin
 from ..plant.urdf import Joint, RobotError, read_urdf
 
 LARGEST = 1e6  # m
@@ -84,7 +84,7 @@ def _replace_meshes(tree: ET.Element, meshes: Meshes) -> None:
             shape, placement = fit
             geometry.remove(mesh)
             geometry.append(shape)
-            place(part, origin(part.find("origin")) * placement)
+            _place(part, origin(part.find("origin")) * placement)
 
 
 def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement] | None:
@@ -109,7 +109,7 @@ def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement]
     _, kind, size, rotation, centre = min(candidates, key=lambda candidate: candidate[0])
     placement = Placement(rotation @ centre, rotation)
     if kind == "box":
-        return ET.Element("box", size=words(size)), placement
+        return ET.Element("box", size=_text(size)), placement
     radius, length = (repr(float(value)) for value in size)
     return ET.Element("cylinder", radius=radius, length=length), placement
 
@@ -132,3 +132,21 @@ def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
     except ValueError as error:
         logger.warning("mesh '%s' is left out of the scene: %s", uri, error)
         return None
+
+
+def _place(part: ET.Element, transform: Placement) -> None:
+    origin = part.find("origin")
+    if origin is None:
+        origin = ET.SubElement(part, "origin")
+    r = transform.rotation
+    # roll from what yaw leaves: exact too where the two turn about one axis, as SciPy's are not
+    yaw = math.atan2(r[1, 0], r[0, 0])
+    sin, cos = math.sin(yaw), math.cos(yaw)
+    pitch = math.atan2(-r[2, 0], cos * r[0, 0] + sin * r[1, 0])
+    roll = math.atan2(sin * r[0, 2] - cos * r[1, 2], cos * r[1, 1] - sin * r[0, 1])
+    origin.set("xyz", _text(transform.translation))
+    origin.set("rpy", _text((roll, pitch, yaw)))
+
+
+def _text(values: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
