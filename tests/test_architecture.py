@@ -58,8 +58,8 @@ LIBRARIES = {
     "xacro": {"export"},
 }
 
-FOR_ALL = ("bounds", "notebook", "signatures")
-MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 75
+FOR_ALL = ("bounds", "notebook", "signatures", "version")
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 70
 
 
 def imported(path: Path) -> set[str]:
