@@ -1,5 +1,6 @@
 """The public names, and where each is."""
 
+from .bag.exports import export_bag as export_bag
 from .bag.reader import read_bag as read_bag
 from .bag.recorded_commands import read_commands as read_commands
 from .bag.recording import Recording as Recording

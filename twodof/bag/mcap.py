@@ -18,9 +18,9 @@ from ..ros.cdr import Rows
 from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, refusing_damage
 
 if sys.version_info >= (3, 14):
-    from compression import zstd
+    from compression import zstd as zstd
 else:
-    from backports import zstd
+    from backports import zstd as zstd
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, FOOTER = 3, 4, 5, 6, 12, 2  # opcodes

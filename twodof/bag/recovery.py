@@ -23,7 +23,7 @@ from ..files import lock, read_file, sync
 from . import provenance
 from .contents import read_messages, stated_count, storage_files
 from .records import Channel, DamageError, ReadBudget
-from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, check_path
+from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, McapStorage, check_path
 from .summary import read_summary
 
 NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
@@ -73,7 +73,7 @@ def recover(path: str | Path) -> Recovered:
             if original.exists():
                 raise BagError(f"'{original}', where the old bag would go, exists; move it away")
             work.mkdir()
-            counts, damage = _copy(folder, files, work / folder.name)
+            counts, damage = copy_messages(folder, files, work / folder.name, KINDS[files[0].suffix])
             if damage and not any(counts.values()):
                 raise BagError(f"no message of the bag '{bag}' can be read: {damage}")
             folder.rename(original)
@@ -132,13 +132,13 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
     return dict(counts) if totals == {counts.total()} else None
 
 
-def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int], str]:
+def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) -> tuple[dict[str, int], str]:
     """Write readable messages into a new bag; return messages by topic, and the reason why reading ended."""
     damage = []
     budget = ReadBudget()
     robots = provenance.robots_of(folder)
     others = set()
-    writer = BagWriter(new, KINDS[files[0].suffix])
+    writer = BagWriter(new, storage)
     kept: dict[str, bytes] = {}
     for robot in robots:
         name = provenance.file_of(robot)
@@ -167,6 +167,10 @@ def _copy(folder: Path, files: Sequence[Path], new: Path) -> tuple[dict[str, int
                             pending = 0
             except DamageError as error:
                 damage.append(str(error))
+        for name, content in kept.items():
+            if isinstance(writer.storage, McapStorage):  # a file that is copied alone says where it is from
+                writer.flush()
+                writer.storage.describe(provenance.KEY, name, content.decode("utf-8", "replace"))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
     for name, content in kept.items():

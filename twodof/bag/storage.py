@@ -28,7 +28,8 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from ..errors import BagError
 from ..files import sync
 from ..ros.cdr import Rows
-from .mcap import CHUNK, HEAD, MAGIC, MESSAGE
+from .mcap import CHUNK, HEAD, MAGIC, MESSAGE, METADATA
+from .mcap import zstd as zstd
 from .records import Stamps as Stamps
 
 METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
@@ -49,6 +50,7 @@ class McapStorage(McapWriter):
     """MCAP storage that closes its chunk at each flush."""
 
     durable = False  # wait for the disk at the end
+    packing = b""  # of chunks: b"zstd", or none
 
     _end = 0  # of the last chunk that got through
 
@@ -75,9 +77,11 @@ class McapStorage(McapWriter):
 
     def close_chunk(self) -> None:
         """Write the pending chunk and its index in one piece, faster than rosbags does."""
-        chunk, data, begin = self.chunk, self.chunk.bio.getvalue(), self.bio.tell()
+        chunk, plain, begin = self.chunk, self.chunk.bio.getvalue(), self.bio.tell()
+        data, kind = zstd.compress(plain) if self.packing else plain, self.packing
+        kind = struct.pack("<I", len(kind)) + kind
         times = struct.pack("<QQ", chunk.message_start_time, chunk.message_end_time)
-        self._write(CHUNK, times + struct.pack("<QIIQ", len(data), 0, 0, len(data)), data)
+        self._write(CHUNK, times + struct.pack("<QI", len(plain), 0) + kind + struct.pack("<Q", len(data)), data)
         end, positions = self.bio.tell(), b""
         for channel, messages in chunk.msgs.items():
             positions += struct.pack("<HQ", channel, self.bio.tell())
@@ -85,12 +89,17 @@ class McapStorage(McapWriter):
             self._write(MESSAGE_INDEX, struct.pack("<HI", channel, len(index)), index)
         self.chunks.append(record := BytesIO())
         record.write(times + struct.pack("<QQI", begin, end - begin, len(positions)) + positions)
-        record.write(struct.pack("<QIQQ", self.bio.tell() - end, 0, len(data), len(data)))
+        record.write(struct.pack("<Q", self.bio.tell() - end) + kind + struct.pack("<QQ", len(data), len(plain)))
         self.chunk = PendingChunk(2**63 - 1, 0, BytesIO(), defaultdict(list))
         self._end = self.bio.tell()
 
     def _write(self, opcode: int, *parts: bytes) -> None:
         self.bio.writelines((HEAD.pack(opcode, sum(map(len, parts))), *parts))
+
+    def describe(self, title: str, key: str, value: str) -> None:
+        """Write one entry of the file's own metadata."""
+        name, *entry = (struct.pack("<I", len(text)) + text for text in map(str.encode, (title, key, value)))
+        self._write(METADATA, name, struct.pack("<I", sum(map(len, entry))), *entry)
 
     def flush(self, sync: bool) -> None:
         """Pass all messages to the operating system, and with ``sync`` to the disk."""
@@ -167,15 +176,17 @@ class BagWriter(Writer):
     STORAGE_PLUGINS = MappingProxyType({StoragePlugin.MCAP: McapStorage, StoragePlugin.SQLITE3: Sqlite3Storage})
     storage: McapStorage | Sqlite3Storage | None
 
-    def __init__(self, path: Path, storage: str, *, fsync: bool = False) -> None:
+    def __init__(self, path: Path, storage: str, *, fsync: bool = False, compress: str = "") -> None:
         super().__init__(path, version=METADATA_VERSION, storage_plugin=STORAGES[storage])
-        self._fsync = fsync
+        self._fsync, self._packing = fsync, compress.encode()
 
     def open(self) -> None:
         """Create the folder and its files."""
         super().open()
         assert self.storage is not None
         self.storage.durable = self._fsync
+        if isinstance(self.storage, McapStorage):
+            self.storage.packing = self._packing
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
         """Write messages, one of each connection for each of N stamps, at the next flush."""

@@ -53,12 +53,16 @@ class Store:
     Arguments and errors are those of ``Bag``. ``writer`` takes messages while it is open.
     """
 
-    def __init__(self, path: Path, storage: str, *, overwrite: bool, fsync: bool) -> None:
+    def __init__(self, path: Path, storage: str, *, overwrite: bool, fsync: bool, compress: str) -> None:
         if storage not in STORAGES:
             raise BagError(f"storage '{storage}' is not one of {', '.join(STORAGES)}")
+        if compress not in ("", "zstd"):
+            raise BagError(f"`compress` '{compress}' is unknown; there is: zstd")
+        if compress and storage != "mcap":
+            raise BagError(f"`compress` is of mcap; a {storage} bag is not compressed")
         check_path(path, storage)
         self.path, self.fsync = path, fsync
-        self._storage, self._overwrite = storage, overwrite
+        self._storage, self._overwrite, self._compress = storage, overwrite, compress
         self._parts: list[Part] = []
         self._entered = 0  # of them have not left
         self._turn = Lock()  # of threads, as each robot may have its own
@@ -149,7 +153,7 @@ class Store:
 
     def _create(self) -> None:
         """Create the bag's folder, or leave nothing behind."""
-        self.writer = BagWriter(self.path, self._storage, fsync=self.fsync)
+        self.writer = BagWriter(self.path, self._storage, fsync=self.fsync, compress=self._compress)
         self._lock = -1  # no descriptor yet
         self._due: SimpleQueue[None] = SimpleQueue()
         self._stores = 0

@@ -34,6 +34,7 @@ class Bag(Sink):
         effort: put the control effort into JointState.effort.
         overwrite: replace an existing bag.
         fsync: wait for the disk at each flush, so that the machine may lose its power too.
+        compress: "zstd" compresses the chunks of an MCAP file.
         command_line: for the provenance.
 
     Attributes:
@@ -55,10 +56,11 @@ class Bag(Sink):
         effort: bool = False,
         overwrite: bool = False,
         fsync: bool = False,
+        compress: str = "",
         command_line: str = "",
     ) -> None:
         self.path, self.namespace = Path(path), ""
-        self._store = Store(self.path, storage, overwrite=overwrite, fsync=fsync)
+        self._store = Store(self.path, storage, overwrite=overwrite, fsync=fsync, compress=compress)
         self._scene, self._effort = scene, effort
         self._command_line = command_line
         self._run: Experiment | None = None

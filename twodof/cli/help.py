@@ -42,6 +42,7 @@ EXAMPLES = {
         "twodof sweep --grid Kp=20:200:10 --grid Kd=5:40:8",
         "twodof sweep my_robot.fmu --range Kp=20:200 --random 500 -o my_sweep",
     ],
+    "export": ["twodof export my_bag -o my_bag.csv", "twodof export my_bag -o my_bag.mcap"],
     "recover": ["twodof recover my_bag"],
 }
 MEANT = {
@@ -55,6 +56,8 @@ MEANT = {
     "create": "build",
     "tune": "sweep",
     "html": "page",
+    "convert": "export",
+    "csv": "export",
     "repair": "recover",
     "ros": "publish",
     "--dt": "--step",

@@ -19,7 +19,7 @@ from itertools import takewhile
 
 from ..errors import TwoDofError
 from ..version import __version__
-from . import build, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
+from . import build, export, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
 from .help import Parser, check_arguments, check_verb
 from .options import CommandLineError
 from .printing import CLEAR, in_options, say
@@ -37,6 +37,7 @@ VERBS = {
     live: "drive an FMU in the browser",
     page: "write a robot as one HTML file that runs",
     sweep: "run an FMU over many gains, and map what comes out",
+    export: "write a bag as a table, or as one MCAP file",
     recover: "make a bag whose writer died complete",
 }
 LONGEST_LINE = 2000

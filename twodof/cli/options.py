@@ -48,6 +48,7 @@ OF_A_RUN: Table = {
         metavar="CSV|BAG[:TOPIC]", help="inputs over time: a column 'time' and one for each input; or a bag's commands"
     ),
     "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)"),
+    "--compress": dict(choices=("zstd",), default="", help="compress the chunks of an MCAP bag"),
     "--scene": dict(action="store_true", help="add robot description, tf, target and end effector"),
     "--effort": dict(action="store_true", help="add the control effort"),
     "--stamp-start": dict(type=float, metavar="S", help="first stamp, s since the epoch (now)"),

@@ -1,0 +1,99 @@
+"""Bags for other programs: tables and single files, as other readers find them; and chunks that are compressed."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pandas
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader
+
+import twodof
+from twodof.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def bag_path(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "bag"
+    changes = [(0.25, {"x_des": (0.1, 0.2)})]
+    twodof.simulate(native_path, twodof.Bag(path, scene=True, effort=True), stop_time=0.5, changes=changes)
+    return path
+
+
+NAMES = [
+    *("time", "joint1.position", "joint1.velocity", "joint1.effort"),
+    *("joint2.position", "joint2.velocity", "joint2.effort", "x.x", "x.y", "x_des.x", "x_des.y"),
+]
+UNITS = ["s", *("rad", "rad/s", "N·m") * 2, *["m"] * 4]
+
+
+def columns(bag: twodof.Recording) -> np.ndarray:
+    joints = [part[:, i] for i in range(2) for part in (bag.q, bag.v, bag.tau)]
+    return np.column_stack([bag.t, *joints, bag.x, bag.target])
+
+
+def test_a_csv_has_each_value_to_the_last_bit(bag_path: Path, tmp_path: Path) -> None:
+    assert main(["export", str(bag_path), "-o", str(tmp_path / "out.csv")]) == 0
+    with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header == [f"{name} [{unit}]" for name, unit in zip(NAMES, UNITS)]
+    assert np.array_equal(np.array(rows, float), columns(twodof.read_bag(bag_path)))
+
+
+def test_a_parquet_file_is_read_by_another_program(bag_path: Path, tmp_path: Path) -> None:
+    path = twodof.export_bag(bag_path, tmp_path / "out.parquet")
+    found = duckdb.read_parquet(str(path))
+    assert found.columns == NAMES
+    assert np.array_equal(np.array(found.fetchall()), columns(twodof.read_bag(bag_path)))
+    assert pandas.read_parquet(path).attrs["units"] == dict(zip(NAMES, UNITS))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_one_mcap_file_has_all_messages(storage: str, native_path: Path, tmp_path: Path) -> None:
+    twodof.simulate(native_path, twodof.Bag(tmp_path / "bag", storage=storage, scene=True), stop_time=0.3)
+    path = twodof.export_bag(tmp_path / "bag", tmp_path / "out.mcap")
+    with path.open("rb") as file:
+        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        found = sorted((channel.topic, message.log_time) for _, channel, message, _ in decoded)
+    with Reader(tmp_path / "bag") as reader:
+        assert found == sorted((c.topic, stamp) for c, stamp, _ in reader.messages())
+    single, whole = twodof.read_bag(path), twodof.read_bag(tmp_path / "bag")
+    assert np.array_equal(single.q, whole.q) and single.provenance["urdf"] == whole.provenance["urdf"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("out.xlsx", "ends in .csv, .parquet or .mcap"), ("none/out.csv", "cannot write '.*none/out.csv'")],
+)
+def test_what_cannot_be_exported_is_refused(name: str, message: str, bag_path: Path, tmp_path: Path) -> None:
+    with pytest.raises(twodof.TwoDofError, match=message):
+        twodof.export_bag(bag_path, tmp_path / name)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_compressed_bag_is_smaller_and_equal_to_all_readers(native_path: Path, tmp_path: Path) -> None:
+    """A robot at rest too, whose messages compress a thousandfold."""
+    for name, step in {"moving": 0.01, "resting": 0.001}.items():
+        bags = [tmp_path / name, tmp_path / f"{name}.zstd"]
+        for path, compress in zip(bags, ("", "zstd")):
+            run = twodof.experiment(native_path, stop_time=10.0, stamp_start=1.0, step=step)
+            twodof.simulate(run, twodof.Bag(path, scene=True, compress=compress))
+        plain, packed = (path / f"{path.name}.mcap" for path in bags)
+        assert packed.stat().st_size < 0.4 * plain.stat().st_size
+        messages = []
+        for path in (plain, packed):
+            with path.open("rb") as file:
+                found = make_reader(file).iter_messages()
+                messages.append([(channel.topic, message.log_time, message.data) for _, channel, message in found])
+        assert messages[0] == messages[1] and len(messages[0]) > 4000
+        with Reader(bags[1]) as reader:
+            assert sorted(data for _, _, data in reader.messages()) == sorted(data for _, _, data in messages[0])
+        assert np.array_equal(twodof.read_bag(bags[1]).q, twodof.read_bag(bags[0]).q)
+        assert twodof.recover(bags[1]).original is None
+    with pytest.raises(twodof.TwoDofError, match="`compress` is of mcap"):
+        twodof.Bag(tmp_path / "new", storage="sqlite3", compress="zstd")

@@ -1,0 +1,92 @@
+"""Bags as tables, or as one MCAP file, for tools that open no rosbag2 folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import BagError
+from ..files import refusing, temporary_folder, write_file
+from ..plant.urdf import RobotError, read_urdf
+from ..version import install
+from .contents import storage_files
+from .provenance import robot_in
+from .reader import read_bag, whole_bag
+from .recording import Array, Recording
+from .recovery import copy_messages
+
+ENDINGS = (".csv", ".parquet", ".mcap")
+
+
+def export_bag(bag: str | Path, output: str | Path) -> Path:
+    """Write a bag as a table, or as one MCAP file, as the output's ending says; return its path.
+
+    A table has a row a sample, and named columns: "time", then of each joint "elbow.position", "elbow.velocity" and
+    "elbow.effort", then "x.y" and "x_des.y" of each task axis; what the bag does not know has no column. Units are
+    in the header of a CSV file, "elbow.position [rad]", and in the pandas attributes of a Parquet file. Values in
+    SI units are written in full precision. An MCAP file has all messages, with the provenance as metadata.
+
+    Raises:
+        BagError: it is no whole bag, the ending is unknown, pandas or pyarrow is missing, or it cannot be written.
+    """
+    bag, path = Path(bag), Path(output)
+    if path.suffix not in ENDINGS:
+        raise BagError(f"'{path}': the name of an export ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if path.suffix == ".mcap":
+        content = _mcap(bag)
+    else:
+        columns = _columns(read_bag(bag))
+        content = _csv(columns) if path.suffix == ".csv" else _parquet(columns)
+    with refusing(BagError, f"write '{path}'"):
+        write_file(path, content)
+    return path
+
+
+def _columns(run: Recording) -> dict[str, tuple[str, Array]]:
+    """Return columns by name: unit, "" where no robot tells it, and N values."""
+    try:
+        known = read_urdf(run.provenance.get("urdf") or "").joints
+    except RobotError:
+        known = {}
+    columns = {"time": ("s", run.t)}
+    for i, name in enumerate(run.joints):
+        joint = known.get(name)
+        units = ("m", "m/s", "N") if joint and joint.prismatic else ("rad", "rad/s", "N·m") if joint else ("", "", "")
+        parts = zip(("position", "velocity", "effort"), units, (run.q, run.v, run.tau))
+        columns |= {f"{name}.{part}": (unit, values[:, i]) for part, unit, values in parts if values.size}
+    for group, values in (("x", run.x), ("x_des", run.target)):
+        columns |= {f"{group}.{axis}": ("m", values[:, i]) for i, axis in enumerate(run.axes or "xyz") if values.size}
+    return columns
+
+
+def _csv(columns: dict[str, tuple[str, Array]]) -> bytes:
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(f"{name} [{unit}]" if unit else name for name, (unit, _) in columns.items())
+    writer.writerows(np.column_stack([values for _, values in columns.values()]).tolist())  # the shortest exact text
+    return file.getvalue().encode()
+
+
+def _parquet(columns: dict[str, tuple[str, Array]]) -> bytes:
+    try:
+        import pandas as pd
+
+        table = pd.DataFrame({name: values for name, (_, values) in columns.items()})
+        table.attrs["units"] = {name: unit for name, (unit, _) in columns.items()}
+        return bytes(table.to_parquet(index=False))
+    except ImportError as missing:
+        raise BagError(f"{missing}; {install('sweep')}") from missing
+
+
+def _mcap(bag: Path) -> bytes:
+    folder, _ = robot_in(bag)
+    whole_bag(folder)
+    with temporary_folder() as temporary:
+        _, damage = copy_messages(folder, storage_files(folder), temporary / "bag", "mcap")
+        if damage:
+            raise BagError(f"cannot export '{bag}': {damage}; 'twodof recover {folder}' saves what can be read")
+        (file,) = storage_files(temporary / "bag")
+        return file.read_bytes()

@@ -1,0 +1,32 @@
+"""Verb export: write a bag as a table, or as one MCAP file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .options import not_empty
+from .printing import print_table
+
+
+def add(export: argparse.ArgumentParser) -> None:
+    """Add the options of the verb."""
+    export.description = "Write a bag as a table with named columns and units, or as one MCAP file of all messages."
+    export.add_argument("bag", metavar="BAG", type=Path)
+    export.add_argument(
+        "-o",
+        dest="output",
+        required=True,
+        type=not_empty,
+        metavar="FILE",
+        help=".csv, .parquet (extra 'sweep') or .mcap",
+    )
+
+
+def call(options: argparse.Namespace) -> int:
+    """Run the verb; return the exit status."""
+    from ..bag.exports import export_bag
+
+    path = export_bag(options.bag, options.output)
+    print_table(("bag", str(options.bag)), ("file", f"{path} ({path.stat().st_size / 1024:.0f} KB)"))
+    return 0
