@@ -79,7 +79,6 @@ class TwoDofSlave(fmi.Fmi2Slave):
         self._plant = self._plant_module.Plant(robot, self._table, config["control"])
         self._identity = config["identity"]
         self._phase = INSTANTIATED
-        self._time = 0.0
         self._refused = ""
         self._outputs: dict[str, list[float]] = {}
 
@@ -93,7 +92,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             return
         if tolerance is not None:
             self.log("the tolerance of the experiment is ignored: rtol and atol are parameters")
-        self._time = start_time
+        self._plant.time = start_time
 
     def enter_initialization_mode(self):
         if self._allowed("fmi2EnterInitializationMode"):
@@ -114,19 +113,19 @@ class TwoDofSlave(fmi.Fmi2Slave):
         if not self._allowed("fmi2DoStep"):
             self._refused = ""  # this discard is its answer
             return False
-        if not abs(current_time - self._time) <= TIME_TOLERANCE * max(1.0, abs(self._time)):
+        time = self._plant.time
+        if not abs(current_time - time) <= TIME_TOLERANCE * max(1.0, abs(time)):
             return self._discard(
-                f"fmi2DoStep: the communication point {current_time!r} s is not the time of the FMU, {self._time!r} s"
+                f"fmi2DoStep: the communication point {current_time!r} s is not the time of the FMU, {time!r} s"
             )
         if not (step_size > 0.0 and isfinite(step_size)):
             return self._discard(f"fmi2DoStep: the step {step_size!r} s must be finite and > 0")
         try:
-            self._plant.step(step_size)
+            self._plant.step(step_size, current_time)
         except self._plant_module.DiscardError as error:
             return self._discard(f"fmi2DoStep at {current_time!r} s: {error}")
         except KeyboardInterrupt:  # SIGINT of the process; raised on, it would be fatal
             return self._discard(f"fmi2DoStep at {current_time!r} s: interrupted")
-        self._time = current_time + step_size
         self._outputs.clear()
         return True
 
@@ -177,7 +176,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         if self._phase == INITIALIZATION:
             self._outputs.clear()
         else:
-            for group in ("tau", "der_v"):
+            for group in ("tau", "der_v", "q_meas", "v_meas"):
                 self._outputs.pop(group, None)
 
     get_real = partialmethod(_get, kind="Real", nothing=float("nan"))
@@ -231,9 +230,10 @@ class TwoDofSlave(fmi.Fmi2Slave):
         return {
             "identity": self._identity,
             "phase": self._phase,
-            "time": self._time,
+            "time": self._plant.time,
             "refused": self._refused,
             "plant": deepcopy(values),
+            "sampling": deepcopy(vars(self._plant.sampling)),
         }
 
     def _set_fmu_state(self, state):
@@ -244,7 +244,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             self._refuse(f"fmi2SetFMUstate: {reason}")
             return
         self._plant = plant
-        self._phase, self._time, self._refused = state["phase"], state["time"], state["refused"]
+        self._phase, self._refused = state["phase"], state["refused"]
         self._outputs.clear()
 
     def _plant_in(self, state):
@@ -254,14 +254,16 @@ class TwoDofSlave(fmi.Fmi2Slave):
         if not (alike(state, self._get_fmu_state()) and state["phase"] in PHASES):
             raise ValueError(UNSOUND)
         plant = self._plant_module.Plant(self._plant.robot, self._table, self._plant.control)
-        vars(plant).update(deepcopy(state["plant"]))
+        vars(plant).update(deepcopy(state["plant"]), time=state["time"])
         plant.prepare()
+        sampling = type(plant.sampling)(**deepcopy(state["sampling"]))
         if state["phase"] in (STEP, TERMINATED):  # before, it is checked when the run begins
             plant.initialise()
             plant.q, plant.v = list(state["plant"]["q"]), list(state["plant"]["v"])
             limits = zip(plant.q, plant.q_min, plant.q_max)
-            if not all(low <= q <= high for q, low, high in limits):
+            if not (all(low <= q <= high for q, low, high in limits) and sampling.is_sound(plant)):
                 raise ValueError(UNSOUND)
+            plant.sampling = sampling
         return plant
 
     @staticmethod

@@ -46,8 +46,8 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
         ("input", "1/s"): {"Kd[1]": "40.0", "Kd[2]": "40.0", "Kn": "0.0"},
         ("input", "N.m"): {"tau_ext[1]": "0.0", "tau_ext[2]": "0.0"},
         ("input", "N"): {"f_ext[1]": "0.0", "f_ext[2]": "0.0", "f_ext[3]": "0.0"},
-        ("output", "rad"): {"q[1]": "0.5", "q[2]": "0.35"},
-        ("output", "rad/s"): {"v[1]": "0.0", "v[2]": "0.0"},
+        ("output", "rad"): {"q[1]": "0.5", "q[2]": "0.35", "q_meas[1]": None, "q_meas[2]": None},
+        ("output", "rad/s"): {"v[1]": "0.0", "v[2]": "0.0", "v_meas[1]": None, "v_meas[2]": None},
         ("output", "m"): {"x[1]": None, "x[2]": None},
         ("output", "m/s"): {"xd[1]": None, "xd[2]": None},
         ("output", "N.m"): {"tau[1]": None, "tau[2]": None},
@@ -60,16 +60,19 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
             "q_min[2]": f"-{pi}",
             "q_max[1]": pi,
             "q_max[2]": pi,
+            **{f"q_{what}[{i}]": "0.0" for what in ("resolution", "noise") for i in (1, 2)},
         },
-        ("parameter", "rad/s"): {"v_start[1]": "0.0", "v_start[2]": "0.0"},
+        ("parameter", "rad/s"): {f"v_{what}[{i}]": "0.0" for what in ("start", "noise") for i in (1, 2)},
         ("parameter", "m/s2"): {"gravity[1]": "0.0", "gravity[2]": "-9.81", "gravity[3]": "0.0"},
-        ("parameter", "s"): {"max_step": "0.001"},
+        ("parameter", "s"): {"max_step": "0.001", "control_period": "0.0", "control_delay": "0.0"},
         ("parameter", "kg"): {"payload": "0.0"},
         ("parameter", "m"): {f"payload_com[{i}]": "0.0" for i in (1, 2, 3)},
         ("parameter", None): {
             "rcond": "0.01",
             "rtol": "0.001",
             "atol": "1e-06",
+            "seed": "0",
+            "v_from_q": "false",
             "limit_effort": "false",
             "rigid_stops": "false",
             "payload_known": "false",
@@ -360,7 +363,14 @@ PERTURBATION = {
     "f_ext": 0.3,
     "payload": 0.05,
     "payload_com": 0.02,
+    "control_period": 0.01,
+    "control_delay": 0.002,
+    "q_resolution": 0.03,
+    "q_noise": 0.01,
+    "v_noise": 0.01,
+    "seed": 1,
 }
+NEEDS_A_PERIOD = ("control_delay", "q_resolution", "q_noise", "v_noise", "v_from_q")
 
 
 def declared(description, element):
@@ -377,20 +387,21 @@ def moved(before, after):
 
 
 def outputs(driver):
-    names = [n for n in driver.vr if re.match(r"(q|v|x|xd|tau)\[|der", n)]
+    names = [n for n in driver.vr if re.match(r"(q|v|x|xd|tau|q_meas|v_meas)\[|der", n)]
     return dict(zip(names, driver.call("getReal", [driver.vr[n] for n in names])))
 
 
 def start_values(driver):
     return {
-        v.name: v.start == "true" if v.type == "Boolean" else float(v.start)
+        v.name: v.start == "true" if v.type == "Boolean" else int(v.start) if v.type == "Integer" else float(v.start)
         for v in driver.description.modelVariables
         if v.start is not None and v.causality != "output"
     }
 
 
 def put(driver, name, value):
-    driver.call("setBoolean" if isinstance(value, bool) else "setReal", [driver.vr[name]], [value])
+    kind = {bool: "Boolean", int: "Integer", float: "Real"}[type(value)]
+    driver.call(f"set{kind}", [driver.vr[name]], [value])
 
 
 @in_child_process
@@ -411,10 +422,13 @@ def test_initial_unknowns_depend_on_exactly_what_is_declared(fmu_path):
         {**back, "q_min[1]": 0.5},
     ]
     rigid = [{**base, "rigid_stops": True} for base in into]
-    for base in (generic, back, *stopped, *rigid):
+    noise = {f"{kind}_noise[{i}]": 0.01 for kind in "qv" for i in (1, 2)}
+    for k, base in enumerate((generic, back, *stopped, *rigid)):
         for saturated in (False, True):
             driver = Driver(fmu_path)
             start = {**start_values(driver), **base, "limit_effort": saturated, "Kp[1]": 60.0}
+            if not saturated:
+                start |= {"control_period": 0.01, **(noise if k % 2 else {})}
             if saturated:
                 start["xdd_des[1]"] = 40000.0
             for name, value in start.items():
@@ -443,15 +457,22 @@ def candidates(name, start):
     """Other values of a variable that the plant accepts."""
     group, _, index = name.partition("[")
     value = start[name]
+    if group in NEEDS_A_PERIOD and not start["control_period"]:
+        return []
+    if group in ("v_from_q", "v_noise") and start["v_noise[1]"] * (group == "v_from_q") + start["v_from_q"]:
+        return []
     if isinstance(value, bool):
         return [not value]
+    if group == "control_period":
+        return [0.02] if start["q_noise[1]"] else [0.02, 0.0] if value else [0.01]
     if group in ("q_min", "q_max"):  # on either side of the start
         near = [start[f"q_start[{index}"] + step for step in (-0.02, 0.02)]
         low, high = start[f"q_min[{index}"], start[f"q_max[{index}"]
         return [x for x in near if (x <= high if group == "q_min" else x >= low)]
     if group == "rcond":
         return [0.9]
-    return [value + PERTURBATION[group], value - PERTURBATION[group]]
+    lower = [] if value < PERTURBATION[group] and group in (*NEEDS_A_PERIOD, "seed") else [value - PERTURBATION[group]]
+    return [value + PERTURBATION[group], *lower]
 
 
 @in_child_process
@@ -517,9 +538,10 @@ def test_what_the_description_excludes_is_refused_and_nothing_else(flavour, fmu_
         for side in ((float(v.min or -np.inf), -np.inf), (float(v.max or np.inf), np.inf))
         if np.isfinite(side[0]) and v.causality != "output"
     }
-    assert len(ranged) == 10
+    assert len(ranged) == 19
     for name, (end, beyond) in ranged.items():
-        for value in (end, float(np.nextafter(end, beyond))):
+        whole = name == "seed"  # its upper end is the type's
+        for value in (int(end), -1) if whole else (end, float(np.nextafter(end, beyond))):
             driver.log.clear()
             driver.initialise(**{name: value})
             driver.call("reset")

@@ -311,12 +311,14 @@ def forged(arm, field, value):
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
     joints = len(arm.of.robot.joints)
-    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{2 * joints + 3}i6i4xQ")
+    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}di4x{2 * joints + 3}i6i4xQ")
     fields = list(layout.unpack(blob))
     names = ["time", "stop_time", "step_start"]
     names += [f"step_{kind}[{i + 1}]" for kind in ("q", "v", "a") for i in range(joints)]
     names += [f"reached_{state}[{i + 1}]" for state in "qv" for i in range(joints)]
-    names += ["reached_at", "passed_by", "step_begun"]
+    names += ["reached_at", "passed_by", "step_begun", "first_sample", "last_sample", "samples"]
+    names += [f"sample[{i + 1}]" for i in range(joints)]
+    names += [f"pending{k}[{i + 1}]" for k in range(11) for i in range(joints)] + ["waiting"]
     names += [f"{what}[{i + 1}]" for what in ("held", "watched") for i in range(joints)]
     names += ["any_held", "any_watched", "rank", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
@@ -347,7 +349,14 @@ FORGERIES = {
     "reached_at": ((np.nan, np.inf), UNSOUND),
     "passed_by": ((-1, 3), UNSOUND),
     "step_begun": ((-1, 2), UNSOUND),
+    "first_sample": ((np.nan, np.inf), UNSOUND),
+    "samples": ((np.nan, -1.0, 0.5, 1e16), UNSOUND),
+    "sample[2]": ((np.nan, np.inf), UNSOUND),
+    "pending10[1]": ((np.nan, np.inf), UNSOUND),
+    "waiting": ((1, -1, 11, 2**31 - 1), UNSOUND),  # where no controller is sampled
     "x_des[1]": ((np.nan, np.inf), UNSOUND),
+    "seed": ((0.5, np.nan), UNSOUND),
+    "control_delay": ((0.01,), "control_delay = 0.01 needs a control_period > 0"),
     "Kn": ((-np.inf,), UNSOUND),
     "q[1]": ((np.nan, np.inf, 3.2, -3.2), UNSOUND),
     "v[2]": ((np.nan, np.inf), UNSOUND),

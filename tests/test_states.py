@@ -31,7 +31,7 @@ from twodof.plant.robot import Robot, load_robot
 
 OK, DISCARD, ERROR = 0, 2, 3
 ESCAPED = "gave a value that is not finite"
-OUTPUTS = ("q", "v", "x", "xd", "quat", "omega", "tau")
+OUTPUTS = ("q", "v", "x", "xd", "quat", "omega", "tau", "q_meas", "v_meas")
 INPUTS = (
     "x_des",
     "xd_des",
@@ -51,7 +51,7 @@ INPUTS = (
     "tau_ext",
     "f_ext",
 )
-BOOLEANS = ("limit_effort", "rigid_stops", "payload_known")
+BOOLEANS = ("v_from_q", "limit_effort", "rigid_stops", "payload_known")
 PARAMETERS = (
     "q_start",
     "v_start",
@@ -64,6 +64,11 @@ PARAMETERS = (
     "rtol",
     "atol",
     "max_step",
+    "control_period",
+    "control_delay",
+    "q_resolution",
+    "q_noise",
+    "v_noise",
     *BOOLEANS,
 )
 """Of all controls; an FMU has those of its own."""
@@ -548,6 +553,22 @@ def programs(arm):
             "rigid_stops": st.booleans(),
         }
     )
+    sampled = phrase(
+        one("set", st.just("control_period"), st.sampled_from([0.002, 0.003])),
+        some(
+            setting(
+                {
+                    "control_delay": st.sampled_from([0.0005, 0.003, 0.02]),
+                    "q_resolution": near((0.0007,) * n, 0.0006),
+                    "q_noise": near((0.001,) * n, 0.001),
+                    "seed": st.integers(0, 2**31 - 1),
+                }
+            ),
+            0,
+            3,
+        ),
+        choice(setting({"v_from_q": st.just(True)}), setting({"v_noise": near((0.01,) * n, 0.01)}), st.just([])),
+    )
     value = choice(inputs, parameters, limits)
     slot = st.sampled_from("abc")
     save, restore, reset = one("save", slot), one("restore", slot), one("reset")
@@ -555,6 +576,7 @@ def programs(arm):
     step = choice(one("step", h), one("step", h, st.just(1e-10)))
     go = phrase(some(inputs, 0, 2), some(step, 1, 3))
     begin = phrase(
+        some(sampled, 0, 1),
         some(limits, 0, 2),
         some(value, 0, 3),
         some(save, 0, 1),
@@ -631,6 +653,10 @@ CONTAINED = (
     "parameter after a reset",
     "set tau_ext",
     "set limit_effort",
+    "set control_period",
+    "set control_delay",
+    "set v_from_q",
+    "set v_noise",
     "two states alive",
     "save at a limit",
     "save before a discard",

@@ -91,6 +91,12 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], int rank, int wante
         compute_position(plant);
     if (wanted & WANTS_TAU)
         compute_effort(plant, rank);
+    for (int i = 0; i < N_JOINTS && wanted & WANTS_SAMPLE && plant->value[CONTROL_PERIOD] == 0.0; i++) {
+        if (plant->value[Q_RESOLUTION + i] == 0.0) /* noise changes with no state */
+            plant->value[Q_MEAS + i] = plant->value[Q + i];
+        if (plant->value[V_FROM_Q] == 0.0)
+            plant->value[V_MEAS + i] = plant->value[V + i];
+    }
     if (wanted & WANTS_RATES) {
         Stops stops = {.rank = rank};
         for (int i = 0; i < N_JOINTS; i++)

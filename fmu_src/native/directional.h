@@ -6,7 +6,7 @@
 #include "internal.h"
 
 /* Requested computed variables. */
-enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4 };
+enum { WANTS_X = 1, WANTS_TAU = 2, WANTS_RATES = 4, WANTS_SAMPLE = 8 };
 
 /* Changes of all variables at value, by index, given those of inputs and states in change.
    Those that hold are the joints at rest at a limit, which stay there; the rank is that of J⁺. */

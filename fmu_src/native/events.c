@@ -59,7 +59,7 @@ void event_indicators(const Plant *plant, const Stops *stops, double indicator[N
     double ratio[N_ROWS];
     conditioning(q, ratio);
     for (int k = 2 * N_JOINTS; k < N_INDICATORS; k++)
-        indicator[k] = ratio[k - 2 * N_JOINTS + 1] - plant->value[RCOND];
+        indicator[k] = plant->value[CONTROL_PERIOD] == 0.0 ? ratio[k - 2 * N_JOINTS + 1] - plant->value[RCOND] : 1.0;
 #endif
 }
 

@@ -20,17 +20,25 @@ static Instance *enter_with(void *component, Call call, const void *values, size
     if (instance->state.phase == INITIALIZATION && !instance->state.initialised
         && initialise(instance, 0) != OK)
         return NULL;
-    if (instance->state.phase != INSTANTIATED && check_inputs(instance) != OK)
+    if (instance->state.phase == INSTANTIATED)
+        return instance;
+    if (check_inputs(instance) != OK)
         return NULL;
+    if (!update_held(instance)) {
+        refuse(instance, call, NO_EFFORT);
+        return NULL;
+    }
     return instance;
 }
 
-Status update_discrete_states(void *component, Boolean *states_changed)
+Status update_discrete_states(void *component, Boolean *states_changed, double *next_event)
 {
     Instance *instance = enter_with(component, NEW_DISCRETE_STATES, states_changed, 1, 1);
     if (!instance)
         return ERROR;
     State draft = instance->state;
+    if (!settle(&draft.sampling, &draft.plant, draft.time))
+        return refuse(instance, NEW_DISCRETE_STATES, NO_EFFORT);
     update_stops(&draft);
     const int taken = take_passed_stop(&draft.passage, &draft.plant, &draft.stops, draft.time);
     const int changed = handle_event(&draft.plant, &draft.stops) || taken;
@@ -40,6 +48,7 @@ Status update_discrete_states(void *component, Boolean *states_changed)
                           call_name(NEW_DISCRETE_STATES), VARIABLE_NAME[Q + i]);
     draft.has_x = draft.has_tau = draft.has_rates = 0;
     instance->state = draft;
+    *next_event = next_sampling_event(&draft.sampling, &draft.plant);
     *states_changed = changed;
     return OK;
 }
@@ -92,6 +101,7 @@ Status STANDARD(SetTime)(void *component, double time)
     if (!isfinite(time))
         return refuse(instance, SET_TIME, "the time is not finite");
     instance->state.time = time;
+    instance->state.has_tau = 0;
     return OK;
 }
 

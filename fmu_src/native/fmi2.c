@@ -1,4 +1,6 @@
 /* The functions of FMI 2.0 that 3.0 has not, or with other arguments. */
+#include <math.h>
+
 #include "instance.h"
 
 void hand_over(const Instance *instance, Status status, const char *category, const char *text)
@@ -65,7 +67,7 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component component)
     }
 VARIABLES(Real, get_reals, set_reals)
 VARIABLES(Boolean, get_booleans, set_booleans)
-VARIABLES(Integer, get_others, set_others)
+VARIABLES(Integer, get_integers, set_integers)
 VARIABLES(String, get_others, set_others)
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component component,
@@ -141,9 +143,12 @@ fmi2Status fmi2GetStringStatus(fmi2Component component, const fmi2StatusKind kin
 fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
 {
     fmi2Boolean changed;
-    const fmi2Status status = update_discrete_states(component, info ? &changed : NULL);
+    fmi2Real next;
+    const fmi2Status status = update_discrete_states(component, info ? &changed : NULL, &next);
     if (status == fmi2OK)
-        *info = (fmi2EventInfo){.valuesOfContinuousStatesChanged = changed};
+        *info = (fmi2EventInfo){.valuesOfContinuousStatesChanged = changed,
+                                .nextEventTimeDefined = isfinite(next) != 0,
+                                .nextEventTime = isfinite(next) ? next : 0.0};
     return status;
 }
 

@@ -1,4 +1,6 @@
 /* The functions of FMI 3.0 that 2.0 has not, or with other arguments. */
+#include <math.h>
+
 #include "instance.h"
 
 void hand_over(const Instance *instance, Status status, const char *category, const char *text)
@@ -64,7 +66,7 @@ VARIABLES(Int8, get_others, set_others)
 VARIABLES(UInt8, get_others, set_others)
 VARIABLES(Int16, get_others, set_others)
 VARIABLES(UInt16, get_others, set_others)
-VARIABLES(Int32, get_others, set_others)
+VARIABLES(Int32, get_integers, set_integers)
 VARIABLES(UInt32, get_others, set_others)
 VARIABLES(Int64, get_others, set_others)
 VARIABLES(UInt64, get_others, set_others)
@@ -127,10 +129,12 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *needs_up
 {
     if (!needs_update || !terminates || !nominals_changed || !next_event_defined || !next_event)
         states_changed = NULL;
-    const fmi3Status status = update_discrete_states(instance, states_changed);
+    fmi3Float64 next;
+    const fmi3Status status = update_discrete_states(instance, states_changed, &next);
     if (status == fmi3OK) {
-        *needs_update = *terminates = *nominals_changed = *next_event_defined = false;
-        *next_event = 0.0;
+        *needs_update = *terminates = *nominals_changed = false;
+        *next_event_defined = isfinite(next) != 0;
+        *next_event = *next_event_defined ? next : 0.0;
     }
     return status;
 }

@@ -3,6 +3,8 @@
 #include "dormand_prince.c"
 #include "event_search.c"
 #include "integrator.c"
+#include "noise.c"
+#include "sampling.c"
 #include "events.c"
 #include "passed_stops.c"
 #include "calls.c"

@@ -159,14 +159,43 @@ Status check_inputs(Instance *instance)
     return OK;
 }
 
-Status check_limits(Instance *instance)
+/* Whether the period of the controller is one that its delay and its sensors can have. */
+static Status check_sampling(Instance *instance)
+{
+    const double *value = instance->state.plant.value;
+    const double period = value[CONTROL_PERIOD], delay = value[CONTROL_DELAY];
+    const int of_points = !COMMANDS_ACCELERATION && instance->kind == CO_SIMULATION;
+    const int group[] = {Q_RESOLUTION, Q_NOISE, V_NOISE, V_FROM_Q};
+    if (delay != 0.0 && period == 0.0)
+        return report(instance, ERROR, "control_delay = %g needs a control_period > 0; set that, or leave"
+                      " it out", delay);
+    if (delay > MOST_PERIODS * period)
+        return report(instance, ERROR, "control_delay = %g must be at most %d times control_period = %g; lessen it,"
+                      " or enlarge control_period", delay, MOST_PERIODS, period);
+    for (int i = N_JOINTS; i-- > 0 && value[V_FROM_Q] != 0.0;)
+        if (value[V_NOISE + i] != 0.0)
+            return report(instance, ERROR, "%s = %g has no effect with v_from_q = true; leave one of them out",
+                          VARIABLE_NAME[V_NOISE + i], value[V_NOISE + i]);
+    for (size_t k = 0; k < sizeof group / sizeof *group && period == 0.0 && !of_points; k++)
+        for (int i = group[k]; i < group[k] + (group[k] == V_FROM_Q ? 1 : N_JOINTS); i++)
+            if (value[i] != 0.0) {
+                char text[24] = "true";
+                if (i != V_FROM_Q)
+                    snprintf(text, sizeof text, "%g", value[i]);
+                return report(instance, ERROR, "%s = %s needs a control_period > 0; set that, or leave it out",
+                              VARIABLE_NAME[i], text);
+            }
+    return OK;
+}
+
+Status check_parameters(Instance *instance)
 {
     const double *value = instance->state.plant.value;
     for (int i = 0; i < N_JOINTS; i++)
         if (value[Q_MIN + i] > value[Q_MAX + i])
             return report(instance, ERROR, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
                           i + 1, value[Q_MIN + i], i + 1, value[Q_MAX + i], JOINT_NAME[i]);
-    return OK;
+    return check_sampling(instance);
 }
 
 Status initialise(Instance *instance, int warn)
@@ -174,7 +203,7 @@ Status initialise(Instance *instance, int warn)
     State *state = &instance->state;
     double *value = state->plant.value;
     const int anti_chatter[N_JOINTS] = {0};
-    if (check_limits(instance) != OK || check_inputs(instance) != OK)
+    if (check_parameters(instance) != OK || check_inputs(instance) != OK)
         return ERROR;
     for (int i = 0; i < N_JOINTS; i++) {
         const double start = value[Q_START + i];
@@ -188,9 +217,33 @@ Status initialise(Instance *instance, int warn)
         value[V + i] = value[V_START + i];
     }
     impact(&state->plant, &value[Q], anti_chatter);
+    state->sampling = (Sampling){.start = state->time, .time = state->time};
+    for (int i = 0; i < N_JOINTS && value[CONTROL_PERIOD] != 0.0; i++)
+        value[TAU + i] = 0.0;
     state->initialised = 1;
     state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
     return OK;
+}
+
+int update_control(Instance *instance)
+{
+    State *state = &instance->state;
+    Sampling draft = state->sampling;
+    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
+    if (state->has_tau)
+        return 1;
+    if (!(held && state->phase == CONTINUOUS_TIME) && !settle(&draft, &state->plant, state->time))
+        return 0;
+    if (!held && instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
+        update_stops(state);
+    compute_effort(&state->plant, instance->kind == MODEL_EXCHANGE ? state->stops.rank : ANY_RANK);
+    state->has_tau = 1;
+    return 1;
+}
+
+int update_held(Instance *instance)
+{
+    return instance->state.plant.value[CONTROL_PERIOD] == 0.0 || update_control(instance);
 }
 
 void update_stops(State *state)

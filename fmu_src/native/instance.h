@@ -12,6 +12,7 @@
 #include "internal.h"
 #include "passed_stops.h"
 #include "plant.h"
+#include "sampling.h"
 #include "stops.h"
 
 #if FMI == 3
@@ -19,6 +20,7 @@
 #define OF_VERSION(name) fmi3##name
 #define TEXT_OF_VERSION(name) "fmi3" #name
 #define REAL_NAME "Float64"
+#define INTEGER_NAME "Int32"
 #define OTHER_NAME "another type"
 #define TOKEN "instantiation token"
 /* The same names in another spelling. */
@@ -35,7 +37,8 @@
 #define OF_VERSION(name) fmi2##name
 #define TEXT_OF_VERSION(name) "fmi2" #name
 #define REAL_NAME "Real"
-#define OTHER_NAME "an Integer or String"
+#define INTEGER_NAME "Integer"
+#define OTHER_NAME "a String"
 #define TOKEN "GUID"
 #ifdef PREFIX /* FMPy's copy of the header was changed to ignore it */
 #undef fmi2FullName
@@ -49,6 +52,11 @@
 
 typedef STANDARD(Status) Status;
 typedef STANDARD(Boolean) Boolean;
+#if FMI == 3
+typedef fmi3Int32 Integer;
+#else
+typedef fmi2Integer Integer;
+#endif
 typedef STANDARD(ValueReference) Reference;
 #define OK STANDARD(OK)
 #define WARNING STANDARD(Warning)
@@ -75,11 +83,12 @@ typedef struct {
     double time;      /* s */
     double stop_time; /* s, HUGE_VAL where there is none */
     Passage passage;  /* in Model Exchange: the importer's step */
+    Sampling sampling;
     Stops stops;      /* in Model Exchange a discrete state, which events alone change */
     int phase;
     int initialised;  /* the outputs q and v are those of the parameters and the state */
     int has_x;        /* the output x is computed */
-    int has_tau;      /* the output tau is computed */
+    int has_tau;      /* the outputs tau, q_meas and v_meas are computed */
     int has_stops;    /* the joints that rest are found */
     int has_rates;    /* the derivatives are computed */
 } State;
@@ -96,13 +105,16 @@ typedef struct {
 /* The calls; setting variables has three rows, by what they are. */
 typedef enum {
     INSTANTIATE, SET_DEBUG_LOGGING, SETUP_EXPERIMENT, ENTER_INITIALIZATION, EXIT_INITIALIZATION,
-    TERMINATE, RESET, DO_STEP, CANCEL_STEP, GET_STATUS, GET_REAL, GET_BOOLEAN, GET_OTHER, SET_REAL,
-    SET_BOOLEAN, SET_OTHER, SET_INPUT, SET_PARAMETER, SET_Q_V, GET_STATE, SET_STATE, FREE_STATE,
+    TERMINATE, RESET, DO_STEP, CANCEL_STEP, GET_STATUS, GET_REAL, GET_BOOLEAN, GET_INTEGER,
+    GET_OTHER, SET_REAL, SET_BOOLEAN, SET_INTEGER, SET_OTHER, SET_INPUT, SET_PARAMETER, SET_Q_V, GET_STATE, SET_STATE, FREE_STATE,
     SIZE_OF_STATE, SERIALIZE, DESERIALIZE, ENTER_EVENT_MODE, NEW_DISCRETE_STATES,
     ENTER_CONTINUOUS_TIME_MODE, COMPLETED_INTEGRATOR_STEP, SET_TIME, SET_CONTINUOUS_STATES,
     GET_DERIVATIVES, GET_EVENT_INDICATORS, GET_CONTINUOUS_STATES, GET_NOMINALS,
     GET_DIRECTIONAL_DERIVATIVE, GET_ADJOINT_DERIVATIVE, COUNT_STATES, N_CALLS
 } Call;
+
+static const char NO_EFFORT[] = "the control law gave an effort that is not finite: inputs, payload or speeds are too"
+                                " large";
 
 /* --- what a face has --- */
 
@@ -152,12 +164,20 @@ INTERNAL Status check_range(Instance *instance, int variable, double value);
 /* Whether the control law can follow the inputs; a refusal is logged. */
 INTERNAL Status check_inputs(Instance *instance);
 
-/* Whether the joints' limits make ranges; a refusal is logged. */
-INTERNAL Status check_limits(Instance *instance);
+/* Whether the joints' limits make ranges, and parameters of sampling go together; a refusal is logged. */
+INTERNAL Status check_parameters(Instance *instance);
 
 /* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
    clamped is logged too. */
 INTERNAL Status initialise(Instance *instance, int warn);
+
+/* Compute the outputs tau, q_meas and v_meas, where that is yet to be done. A sample that is due is taken for them
+   alone, for inputs may still change; in continuous-time mode an event alone takes one. False where an effort is not
+   finite. */
+INTERNAL int update_control(Instance *instance);
+
+/* The same where these are what acts: of a sampled controller. */
+INTERNAL int update_held(Instance *instance);
 
 /* Find the joints that rest, where that is yet to be done. */
 INTERNAL void update_stops(State *state);
@@ -171,8 +191,8 @@ INTERNAL Status do_step(void *component, double point, double h);
 
 /* --- exchange.c --- */
 
-/* Reports whether the states q and v have changed. */
-INTERNAL Status update_discrete_states(void *component, Boolean *states_changed);
+/* Reports whether the states q and v have changed, and the time of the next event, HUGE_VAL where none is known. */
+INTERNAL Status update_discrete_states(void *component, Boolean *states_changed, double *next_event);
 
 /* --- variables.c: each reference is of so many values as PLACE says, in all n_values --- */
 
@@ -187,6 +207,12 @@ INTERNAL Status get_booleans(void *component, const Reference vr[], size_t count
 
 INTERNAL Status set_booleans(void *component, const Reference vr[], size_t count,
                              const Boolean value[], size_t n_values);
+
+INTERNAL Status get_integers(void *component, const Reference vr[], size_t count, Integer value[],
+                             size_t n_values);
+
+INTERNAL Status set_integers(void *component, const Reference vr[], size_t count,
+                             const Integer value[], size_t n_values);
 
 /* Variables of a type that the FMU does not have: any reference is refused, none is fine. */
 INTERNAL Status get_others(void *component, const Reference vr[], size_t count, const void *value,

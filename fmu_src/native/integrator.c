@@ -145,7 +145,7 @@ static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *
         anti_chatter[i] = all ? is_at_limit(step, i) : chattering[i];
 }
 
-int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Failure *failure)
+int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N_JOINTS], Failure *failure)
 {
     const double chatter_time = CHATTER_TIME * fmin(plant->value[MAX_STEP], h);
     double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
@@ -154,12 +154,8 @@ int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Failure *
     Event event = {{0}, {0}};
     Step step;
     double t = 0.0;
-    if (STAGES * h > BUDGET * plant->value[MAX_STEP]) {
-        failure->reason = MANY_STEPS;
-        return 0;
-    }
     step.plant = plant;
-    step.evaluations = 0;
+    step.evaluations = *evaluations;
     step.stops.rank = N_ROWS;
     memcpy(step.y, &plant->value[Q], sizeof step.y);
     for (int i = 0; i < N_JOINTS; i++) {
@@ -197,6 +193,7 @@ int advance_plant(Plant *plant, double h, double stopped_at[N_JOINTS], Failure *
                 stopped_at[i] = fmin(stopped_at[i], t);
         }
     }
+    *evaluations = step.evaluations;
     if (isnan(t))
         return 0;
     if (!(joints.until > h))

@@ -73,10 +73,12 @@ int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, d
     Plant again = *plant;
     Stops at_start = *stops;
     Failure failure;
+    long evaluations = 0;
     double stopped_at[N_JOINTS], first = HUGE_VAL;
     memcpy(&again.value[Q], start.y, sizeof start.y);
     handle_event(&again, &at_start); /* a solver's rounding is no motion */
-    if (!advance_plant(&again, h, stopped_at, &failure))
+    if (!(STAGES * h <= BUDGET * plant->value[MAX_STEP])
+        || !advance_plant(&again, h, &evaluations, stopped_at, &failure))
         return any;
     for (int i = 0; i < N_JOINTS; i++)
         if (turned[i] && stopped_at[i] < first) {

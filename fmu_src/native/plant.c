@@ -35,11 +35,17 @@ static void body(const double value[N_VARIABLES], int as_known, Carrier *carrier
     load_carrier(payload, &value[PAYLOAD_COM], carrier);
 }
 
+/* Whether the effort that acts is the output tau, held until a sampled controller commands another. */
+static int is_held(const double value[N_VARIABLES])
+{
+    return value[CONTROL_PERIOD] != 0.0;
+}
+
 /* Whether the law knows the robot as it is, so that what it wants is what comes. */
 static int knows_all(const double value[N_VARIABLES])
 {
 #if COMMANDS_ACCELERATION
-    return value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0;
+    return !is_held(value) && (value[PAYLOAD] == 0.0 || value[PAYLOAD_KNOWN] != 0.0);
 #else
     (void)value;
     return 0;
@@ -88,7 +94,10 @@ static void add_excess(const double value[N_VARIABLES], const JointPosition join
                        const double a[N_JOINTS], double sum[N_JOINTS])
 {
     double tau[N_JOINTS], needed[N_JOINTS];
-    wanted_effort(value, joint, v, given, tau);
+    if (is_held(value))
+        memcpy(tau, given, sizeof tau);
+    else
+        wanted_effort(value, joint, v, given, tau);
     memcpy(needed, tau, sizeof needed);
     if (!knows_all(value)) {
         Carrier carrier;
@@ -106,12 +115,20 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     const double *value = plant->value, *force = &value[F_EXT];
     JointPosition joint[N_BODIES];
     double effort[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
-    double *given = COMMANDS_ACCELERATION ? a : effort;
+    const int accelerates = COMMANDS_ACCELERATION && !is_held(value);
+    double *given = accelerates ? a : effort;
     int acts = 0;
     place_joints(q, joint);
-    rank = command(value, joint, q, v, rank, given, margin);
+    if (is_held(value)) {
+        memcpy(given, &value[TAU], sizeof effort);
+        rank = 0;
+        if (margin)
+            *margin = HUGE_VAL;
+    } else {
+        rank = command(value, joint, q, v, rank, given, margin);
+    }
     for (int i = 0; i < N_JOINTS; i++) {
-        if (!COMMANDS_ACCELERATION)
+        if (!accelerates)
             a[i] = 0.0;
         excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
     }
@@ -176,12 +193,20 @@ void compute_position(Plant *plant)
 #endif
 }
 
+void control_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS], int rank,
+                    double tau[N_JOINTS])
+{
+    const double *value = plant->value;
+    double given[N_JOINTS];
+    JointPosition joint[N_BODIES];
+    place_joints(q, joint);
+    command(value, joint, q, v, rank, given, NULL);
+    wanted_effort(value, joint, v, given, tau);
+    limit_effort(value, tau);
+}
+
 void compute_effort(Plant *plant, int rank)
 {
-    double *value = plant->value, given[N_JOINTS];
-    JointPosition joint[N_BODIES];
-    place_joints(&value[Q], joint);
-    command(value, joint, &value[Q], &value[V], rank, given, NULL);
-    wanted_effort(value, joint, &value[V], given, &value[TAU]);
-    limit_effort(value, &value[TAU]);
+    if (!is_held(plant->value))
+        control_effort(plant, &plant->value[Q], &plant->value[V], rank, &plant->value[TAU]);
 }

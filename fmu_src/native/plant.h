@@ -32,7 +32,12 @@ INTERNAL void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const 
                             double reaction[N_JOINTS]);
 #endif
 
-/* The output tau, the control effort applied, at the plant's state and inputs, J⁺ being of this rank. */
+/* τ of the control law for a measured state, within limits where there are, J⁺ being of this rank. */
+INTERNAL void control_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                             int rank, double tau[N_JOINTS]);
+
+/* The output tau, the control effort applied, at the plant's state and inputs, J⁺ being of this rank. That of a
+   sampled controller is held: it is what acts. */
 INTERNAL void compute_effort(Plant *plant, int rank);
 
 #endif

@@ -38,6 +38,15 @@ static int are_booleans(const double value[])
     return 1;
 }
 
+/* Whether all integers are whole; the table has their range. */
+static int are_integers(const double value[])
+{
+    for (int i = FIRST_INTEGER; i < FIRST_BOOLEAN; i++)
+        if (!(value[i] == floor(value[i])))
+            return 0;
+    return 1;
+}
+
 /* Check that held and watched flags are 0 or 1; recompute any_*. */
 static int are_stops(Stops *stops)
 {
@@ -71,9 +80,10 @@ static Status take_over(Instance *instance, const void *bytes)
     const double *value = state->plant.value;
     memcpy(state, bytes, sizeof *state);
     int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
-                && state->stop_time > -HUGE_VAL && are_booleans(&value[FIRST_BOOLEAN])
+                && state->stop_time > -HUGE_VAL && are_integers(value) && are_booleans(&value[FIRST_BOOLEAN])
                 && are_stops(&state->stops) && is_passage(&state->passage);
     const int runs = state->phase >= STEP; /* before, initialisation reports errors */
+    sound = sound && (!runs || is_sampling(&state->sampling, &state->plant, state->time));
     const int steps = runs && instance->kind == CO_SIMULATION; /* solvers try what they like */
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));
@@ -87,7 +97,7 @@ static Status take_over(Instance *instance, const void *bytes)
     for (int i = 0; i < N_VARIABLES; i++)
         if (check_range(instance, i, value[i]) != OK)
             return ERROR;
-    return runs ? check_limits(instance) : OK;
+    return runs ? check_parameters(instance) : OK;
 }
 
 /* Save a state over what was saved before, or in memory of its own. */

@@ -21,10 +21,12 @@ static Status discard(Instance *instance, double point, double h, const Failure 
     if (failure->reason == NOT_FINITE)
         return report(instance, DISCARD, "%s at %.12g s: the equations of motion gave a value"
                       " that is not finite: inputs, payload or speeds are too large", call, point);
-    if (failure->reason == MANY_STEPS)
-        return report(instance, DISCARD, "%s at %.12g s: max_step = %g s divides a step"
-                      " of %g s into more than %d integration steps; enlarge max_step or shorten"
-                      " the step", call, point, value[MAX_STEP], h, BUDGET / STAGES);
+    if (failure->reason == MANY_STEPS || failure->reason == SHORT_PERIOD) {
+        const int limit = failure->reason == MANY_STEPS ? MAX_STEP : CONTROL_PERIOD;
+        return report(instance, DISCARD, "%s at %.12g s: %s = %g s divides a step of %g s into more than %d"
+                      " integration steps; enlarge %s or shorten the step", call, point, VARIABLE_NAME[limit],
+                      value[limit], h, BUDGET / STAGES, VARIABLE_NAME[limit]);
+    }
     char need[80] = "integration steps below the resolution of time";
     if (failure->reason == MANY_EVALUATIONS)
         snprintf(need, sizeof need, "more than %d evaluations for the step of %g s", BUDGET, h);
@@ -53,7 +55,7 @@ Status do_step(void *component, double point, double h)
     if (check_inputs(instance) != OK)
         return ERROR;
     Failure failure;
-    if (!advance_plant(&state->plant, h, NULL, &failure)) {
+    if (!advance_sampled(&state->sampling, &state->plant, point, h, &failure)) {
         state->phase = AFTER_DISCARD;
         return discard(instance, point, h, &failure);
     }

@@ -7,8 +7,8 @@
 #include "events.h"
 #include "instance.h"
 
-typedef enum { REAL, BOOLEAN, OTHER } Type;
-static const char *const TYPE_NAME[] = {REAL_NAME, "Boolean"};
+typedef enum { REAL, INTEGER, BOOLEAN, OTHER } Type;
+static const char *const TYPE_NAME[] = {REAL_NAME, INTEGER_NAME, "Boolean"};
 
 static size_t size_of(Reference vr)
 {
@@ -30,7 +30,8 @@ static int known(Instance *instance, Call call, Type type, const Reference vr[],
                    call_name(call), (unsigned long)vr[i]);
             return 0;
         }
-        const Type actual = PLACE[vr[i]] >= FIRST_BOOLEAN ? BOOLEAN : REAL;
+        const int place = PLACE[vr[i]];
+        const Type actual = place >= FIRST_BOOLEAN ? BOOLEAN : place >= FIRST_INTEGER ? INTEGER : REAL;
         if (actual != type) {
             report(instance, ERROR, "%s: %s is of type %s", call_name(call),
                    VARIABLE_NAME[PLACE[vr[i]]], TYPE_NAME[actual]);
@@ -115,6 +116,8 @@ static Status update(Instance *instance, int variable)
         return ERROR;
     if (variable >= TAU && check_inputs(instance) != OK)
         return ERROR;
+    if (variable >= TAU && !(variable < DER_Q ? update_control : update_held)(instance))
+        return report(instance, DISCARD, "%s: %s", call_name(GET_REAL), NO_EFFORT);
     if (variable >= END_OF_RATES) {
         update_others(state);
     } else if (variable >= DER_Q) {
@@ -122,12 +125,6 @@ static Status update(Instance *instance, int variable)
     } else if (variable >= X && variable < TAU && !state->has_x) {
         compute_position(&state->plant);
         state->has_x = 1;
-    } else if (variable >= TAU && !state->has_tau) {
-        if (instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
-            update_stops(state);
-        compute_effort(&state->plant,
-                       instance->kind == MODEL_EXCHANGE ? state->stops.rank : ANY_RANK);
-        state->has_tau = 1;
     }
     if (!isfinite(state->plant.value[variable]))
         return report(instance, DISCARD, "%s: %s is not finite", call_name(GET_REAL),
@@ -177,30 +174,33 @@ Status set_reals(void *component, const Reference vr[], size_t count, const doub
     return OK;
 }
 
-Status get_booleans(void *component, const Reference vr[], size_t count, Boolean value[],
-                    size_t n_values)
-{
-    Instance *instance = enter(component, GET_BOOLEAN, 1);
-    if (!instance || !known(instance, GET_BOOLEAN, BOOLEAN, vr, count, value, n_values))
-        return ERROR;
-    for (size_t i = 0; i < count; i++)
-        value[i] = instance->state.plant.value[PLACE[vr[i]]] != 0.0;
-    return OK;
-}
-
-Status set_booleans(void *component, const Reference vr[], size_t count, const Boolean value[],
-                    size_t n_values)
-{
-    Instance *instance = enter(component, SET_BOOLEAN, 1);
-    if (!instance || !known(instance, SET_BOOLEAN, BOOLEAN, vr, count, value, n_values))
-        return ERROR;
-    for (size_t i = 0; i < count; i++)
-        if (!settable(instance, SET_BOOLEAN, PLACE[vr[i]]))
-            return ERROR;
-    for (size_t i = 0; i < count; i++)
-        set(instance, PLACE[vr[i]], value[i] ? 1.0 : 0.0);
-    return OK;
-}
+/* Variables of a type without fractions, by the values' conversions. */
+#define WHOLE_NUMBERS(names, Type, TYPE, OF_VALUE, TO_VALUE)                                                        \
+    Status get_##names(void *component, const Reference vr[], size_t count, Type value[], size_t n_values)          \
+    {                                                                                                               \
+        Instance *instance = enter(component, GET_##TYPE, 1);                                                       \
+        if (!instance || !known(instance, GET_##TYPE, TYPE, vr, count, value, n_values))                            \
+            return ERROR;                                                                                           \
+        for (size_t i = 0; i < count; i++)                                                                          \
+            value[i] = OF_VALUE(instance->state.plant.value[PLACE[vr[i]]]);                                         \
+        return OK;                                                                                                  \
+    }                                                                                                               \
+    Status set_##names(void *component, const Reference vr[], size_t count, const Type value[], size_t n_values)    \
+    {                                                                                                               \
+        Instance *instance = enter(component, SET_##TYPE, 1);                                                       \
+        if (!instance || !known(instance, SET_##TYPE, TYPE, vr, count, value, n_values))                            \
+            return ERROR;                                                                                           \
+        for (size_t i = 0; i < count; i++)                                                                          \
+            if (!settable(instance, SET_##TYPE, PLACE[vr[i]])                                                       \
+                || check_range(instance, PLACE[vr[i]], TO_VALUE(value[i])) != OK)                                   \
+                return ERROR;                                                                                       \
+        for (size_t i = 0; i < count; i++)                                                                          \
+            set(instance, PLACE[vr[i]], TO_VALUE(value[i]));                                                        \
+        return OK;                                                                                                  \
+    }
+#define IS_TRUE(value) ((value) != 0)
+WHOLE_NUMBERS(booleans, Boolean, BOOLEAN, IS_TRUE, IS_TRUE)
+WHOLE_NUMBERS(integers, Integer, INTEGER, (Integer), (double))
 
 Status get_others(void *component, const Reference vr[], size_t count, const void *value,
                   size_t n_values)
@@ -229,7 +229,7 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
                    VARIABLE_NAME[k]);
             return -1;
         }
-        wants |= k >= DER_Q ? WANTS_RATES : k >= TAU ? WANTS_TAU : k >= X ? WANTS_X : 0;
+        wants |= k >= DER_Q ? WANTS_RATES : k >= Q_MEAS ? WANTS_SAMPLE : k >= TAU ? WANTS_TAU : k >= X ? WANTS_X : 0;
     }
     for (size_t i = 0; i < n_given; i++)
         if (PLACE[given[i]] >= X) {
@@ -239,6 +239,10 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
         }
     if (!instance->state.initialised && initialise(instance, 0) != OK)
         return -1;
+    if (!update_held(instance)) {
+        refuse(instance, call, NO_EFFORT);
+        return -1;
+    }
     update_stops(&instance->state);
     return wants;
 }

@@ -97,7 +97,8 @@ static Failure failure;
 
 FMI2_Export int probe_advance(double value[], double h)
 {
-    return advance_plant((Plant *)value, h, NULL, &failure);
+    long evaluations = 0;
+    return advance_plant((Plant *)value, h, &evaluations, NULL, &failure);
 }
 
 FMI2_Export void probe_failure(double result[])

@@ -10,7 +10,16 @@ from pathlib import Path
 
 from .completion import joints, links
 from .info import controlled
-from .options import CommandLineError, add_output, check_company, completed, not_empty, said
+from .options import (
+    CommandLineError,
+    add_options,
+    add_output,
+    check_company,
+    completed,
+    not_empty,
+    parse_settings,
+    said,
+)
 from .printing import busy, print_next, print_table, quote, say
 
 
@@ -49,6 +58,7 @@ def add(build: argparse.ArgumentParser) -> None:
         help="what drives the robot: a target of the frame, one for each joint, or efforts (%(default)s)",
     )
     flag("--orientation", help="of the frame too: a target orientation beside the position")
+    add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
     flag("--overwrite", help="replace an existing file that is not the default arm's FMU")
     flag("--link-environment", help="remember in the FMU where this Python's packages are")
@@ -109,6 +119,7 @@ def _build(options: argparse.Namespace) -> Path:
         gravity=options.gravity and tuple(options.gravity),
         q_start=options.q_start and tuple(options.q_start),
         control="pose" if options.orientation else options.control,
+        settings=parse_settings(options.settings),
         arrays=not options.scalars,
         platforms=tuple(dict.fromkeys(platforms)),
         **said(options, "mesh_dir", "frame", "axes", "link_environment", "native", "fmi"),

@@ -5,17 +5,17 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import BuildError, choice
+from ..errors import BuildError, InputError, choice
 from ..files import data_file
-from ..plant.plant import Plant
+from ..plant.plant import ParameterError, Plant
 from ..plant.robot import Robot, load_robot
 from ..plant.urdf import read_urdf
-from ..plant.variables import CONTROLS, Variable, variable_table
+from ..plant.variables import CONTROLS, Starts, Value, Variable, variable_table
 from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
@@ -23,12 +23,17 @@ from .fmu_options import FmuOptions
 from .mesh_files import collect_meshes
 from .model_description import model_description
 from .native import engine_variables
+from .start_values import resolve
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
+PLACEHOLDERS: Starts = {"x_des": (0.0,) * 3, "quat_des": (0.0, 0.0, 0.0, 1.0)}
+"""Of a table whose targets are not known yet."""
+POSE = ("q_start", "v_start", "q_min", "q_max", "gravity")
+"""Start values on which the pose at the start depends, or that have an option of their own."""
 ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
 """Icon files by version of FMI."""
 
@@ -134,14 +139,50 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         )
     if shipped and axes != "xy":
         raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
-    at_rest = {"x_des": (0.0,) * len(axes), "quat_des": (0.0, 0.0, 0.0, 1.0), **starts}
-    plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
-    for warning in plant.initialise():
-        logger.warning("%s", warning)
-    if "x_des" not in CONTROLS[options.control].inputs:
-        starts.pop("x_des", None)
-    else:
-        starts.setdefault("x_des", tuple(plant.x))
-        if options.control == "pose":
-            starts["quat_des"] = tuple(plant.quat)
-    return robot, variable_table(robot, starts, options.control), starts
+    try:
+        values = resolve(_Variables(robot, {**PLACEHOLDERS, **starts}, options.control), options.settings)
+        _refuse_twice(options, values)
+        _set(robot, starts, options.control, values, POSE)
+        at_rest = {**PLACEHOLDERS, **{group: starts[group] for group in POSE if group in starts}}
+        plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
+        for warning in plant.initialise():
+            logger.warning("%s", warning)
+        if "x_des" not in CONTROLS[options.control].inputs:
+            starts.pop("x_des", None)
+        else:
+            starts.setdefault("x_des", tuple(plant.x))
+            if options.control == "pose":
+                starts["quat_des"] = tuple(plant.quat)
+        _set(robot, starts, options.control, values, {name.partition("[")[0] for name in values})
+        table = variable_table(robot, starts, options.control)
+        if refusal := next(filter(None, (v.refusal(v.start) for v in table if v.start is not None)), ""):
+            raise ParameterError(refusal)
+        Plant(robot, table, options.control).initialise()
+    except (InputError, ParameterError) as error:
+        raise BuildError(str(error)) from error
+    return robot, table, starts
+
+
+class _Variables:
+    """The variables of an FMU that is yet to be built."""
+
+    def __init__(self, robot: Robot, starts: Starts, control: str) -> None:
+        self.control = control
+        self.variables = {variable.name: variable for variable in variable_table(robot, starts, control)}
+
+
+def _refuse_twice(options: FmuOptions, values: Mapping[str, Value]) -> None:
+    """Refuse start values that are given by an option of their own too."""
+    for group in {name.partition("[")[0] for name in values} & {"gravity", "q_start"}:
+        if getattr(options, group) is not None:
+            raise InputError(f"{group} is given twice, by `{group}` and as a start value")
+
+
+def _set(
+    robot: Robot, starts: dict[str, Any], control: str, values: Mapping[str, Value], groups: Collection[str]
+) -> None:
+    """Put values by name into the start values of their groups."""
+    table = variable_table(robot, {**PLACEHOLDERS, **starts}, control)
+    for group in {variable.group for variable in table if variable.name in values} & {*groups}:
+        elements = [values.get(v.name, v.start) for v in table if v.group == group]
+        starts[group] = elements[0] if group in values else tuple(elements)

@@ -27,6 +27,7 @@ class FmuOptions:
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else (0, 0, −9.81).
         q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
             else 0 where the limits allow and their middle where not.
+        settings: start values of variables by name, as in ``experiment``.
         control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
             frame's orientation), "joint" or "effort".
         name: model name and identifier; "": that of the URDF's file, "TwoDof" for the shipped arm.
@@ -49,6 +50,7 @@ class FmuOptions:
     gravity: tuple[float, float, float] | None = None
     q_start: tuple[float, ...] | None = None
     control: str = "task"
+    settings: Mapping[str, object] = field(default_factory=dict)
     name: str = ""
     link_environment: bool = False
     native: bool = False
@@ -66,7 +68,7 @@ class FmuOptions:
     @property
     def is_default_arm(self) -> bool:
         """Whether this is the shipped arm with its default settings, in any flavour."""
-        model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "name")
+        model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "settings", "name")
         return all(getattr(self, key) == getattr(FmuOptions(), key) for key in model)
 
 

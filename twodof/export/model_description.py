@@ -62,6 +62,8 @@ AUTHOR = "the twodof developers"
 
 UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "InitialUnknowns": "InitialUnknown"}
 """Elements of 3.0 by the parts of 2.0's ModelStructure."""
+FMI3_TYPES = {"Real": "Float64", "Integer": "Int32"}
+"""Types of 3.0 whose names differ from those of 2.0."""
 SCALAR = ("name", "valueReference", "description", "causality", "variability", "initial")
 """Attributes of 2.0's ScalarVariable; others are its type's."""
 STATES = ("q", "v")
@@ -72,6 +74,11 @@ START = ("q_start", "q_min", "q_max")
 """Variables on which q depends at the start."""
 IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
 """Variables on which v depends at the start, where it may point into a stop."""
+OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
+Dependencies = tuple[Sequence[str], str] | tuple[Sequence[str], str, Sequence[str]]
+"""Groups, which of their elements, and further groups of which it is the own element."""
+SENSORS = ("q_resolution", "q_noise", "v_noise", "seed", "v_from_q")
+"""Variables on which the first sample depends."""
 
 
 def model_description(
@@ -225,7 +232,7 @@ def _variables(
             own = {key: attributes.pop(key) for key in SCALAR if key in attributes}
             ET.SubElement(ET.SubElement(variables, "ScalarVariable", own), first.type, attributes)
             continue
-        element = ET.SubElement(variables, "Float64" if first.type == "Real" else first.type, attributes)
+        element = ET.SubElement(variables, FMI3_TYPES.get(first.type, first.type), attributes)
         if name != first.name:
             ET.SubElement(element, "Dimension", start=str(len(indices)))
 
@@ -276,44 +283,53 @@ def _description(elements: Sequence[dict[str, str]]) -> str:
     return f"{common}: {'; '.join(owners)}"
 
 
+def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, Dependencies]]:
+    """Return on which groups each computed group depends, during a run and at its start, and on whose elements."""
+    inputs = (*control.inputs, *DISTURBANCES)
+    law = ("gravity", *control.parameters, "limit_effort", *SENSORS, "control_delay")
+    during: dict[str, Dependencies] = {
+        "q": (("q",), OWN),
+        "v": (("v",), OWN),
+        "der_q": (("v",), OWN),
+        "x": (("q",), FRAME),
+        "quat": (("q",), FRAME),
+        "xd": (STATES, FRAME),
+        "omega": (STATES, FRAME),
+        "tau": ((*STATES, *control.inputs), EVERY),
+        "q_meas": (("q",), OWN),
+        "v_meas": (STATES, OWN),
+        "der_v": ((*STATES, *inputs), EVERY),
+    }
+    at_the_start: dict[str, Dependencies] = {
+        "q": (START, OWN),
+        "x": (START, FRAME),
+        "quat": (START, FRAME),
+        **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, EVERY)),
+        "tau": ((*IMPACT, *law, *control.inputs), EVERY),
+        "q_meas": ((*START, "q_resolution", "q_noise", "seed"), OWN),
+        "v_meas": (IMPACT, EVERY, ("v_noise", "seed", "v_from_q")),
+        "der_v": ((*IMPACT, *law, "control_period", *inputs), EVERY),
+    }
+    if control.commands == "effort":
+        during["tau"] = (control.inputs, OWN)
+        at_the_start["tau"] = (("limit_effort", "control_delay", *control.inputs), OWN)
+    return during, at_the_start
+
+
 def _structure(
     root: ET.Element, robot: Robot, table: Sequence[Variable], references: Sequence[str], control: Control, fmi: int
 ) -> None:
     moves = robot.moves_frame()
-    inputs = (*control.inputs, *DISTURBANCES)
-    law = ("gravity", *control.parameters, "limit_effort")
-    own, frame, every = "that joint's", "those of joints that move the frame", "all"
-    during = {
-        "q": (("q",), own),
-        "v": (("v",), own),
-        "der_q": (("v",), own),
-        "x": (("q",), frame),
-        "quat": (("q",), frame),
-        "xd": (STATES, frame),
-        "omega": (STATES, frame),
-        "tau": ((*STATES, *control.inputs), every),
-        "der_v": ((*STATES, *inputs), every),
-    }
-    at_the_start = {
-        "q": (START, own),
-        "x": (START, frame),
-        "quat": (START, frame),
-        **dict.fromkeys(("v", "xd", "omega", "der_q"), (IMPACT, every)),
-        "tau": ((*IMPACT, *law, *control.inputs), every),
-        "der_v": ((*IMPACT, *law, *inputs), every),
-    }
-    if control.commands == "effort":
-        during["tau"] = (control.inputs, own)
-        at_the_start["tau"] = (("limit_effort", *control.inputs), own)
+    during, at_the_start = _dependencies(control)
 
-    def known(unknown: Variable, groups: Sequence[str], whose: str) -> dict[str, None]:
+    def known(unknown: Variable, groups: Sequence[str], whose: str, own: Sequence[str] = ()) -> dict[str, None]:
         """Return references of the variables on which an unknown depends, in order."""
         return {
             reference: None
             for variable, reference in zip(table, references)
-            if variable.group in groups
-            and (whose != own or variable.index in (unknown.index, None))
-            and (whose != frame or (variable.index is not None and moves[variable.index]))
+            if (variable.group in (*groups, *own))
+            and ((whose != OWN and variable.group not in own) or variable.index in (unknown.index, None))
+            and (whose != FRAME or (variable.index is not None and moves[variable.index]))
         }
 
     unknowns: dict[str, dict[str, dict[str, None]]] = {part: {} for part in UNKNOWNS_3}

@@ -13,8 +13,8 @@ import numpy as np
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
-FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_BOOLEAN": "limit_effort"}
-"""Where the table's parts begin: inputs, outputs, parameters, truth values among these."""
+FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_INTEGER": "seed", "FIRST_BOOLEAN": "v_from_q"}
+"""Where the table's parts begin: outputs, parameters, integers and truth values among these."""
 INDICATORS = "event_indicators"
 SIGNS = "change their sign where a joint meets or leaves a stop, or J⁺ its rank"
 

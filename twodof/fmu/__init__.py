@@ -5,7 +5,19 @@ from contextlib import redirect_stdout
 with redirect_stdout(None):  # where FMPy says that for aarch64-linux it has no logger of FMI 2.0
     import fmpy  # noqa: F401
 
+from ..export.start_values import Setting, no_variable, resolve
 from .description import Fmu, load_fmu, opened, read_resource
 from .instance import Instance, Values, instantiate
 
-__all__ = ["Fmu", "Instance", "Values", "instantiate", "load_fmu", "opened", "read_resource"]
+__all__ = [
+    "Fmu",
+    "Instance",
+    "Setting",
+    "Values",
+    "instantiate",
+    "load_fmu",
+    "no_variable",
+    "opened",
+    "read_resource",
+    "resolve",
+]

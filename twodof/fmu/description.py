@@ -6,10 +6,10 @@ import codecs
 import math
 import re
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import count, product, takewhile
+from itertools import product
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,13 @@ from fmpy.model_description import ModelDescription, ModelVariable
 from ..bounds import MAX_DESCRIPTION, MAX_ELEMENTS, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
 from ..export.compiler import host_platform
+from ..export.start_values import groups_of, vector
 from ..files import UnsafeArchiveError, check_archive, read_member, shown
 from ..notebook import card, picture
 from ..plant.urdf import RobotError, read_urdf
+
+NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": ("true", "1").__contains__}
+"""Types of variables that have values here, and how their texts are read."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Scalar:
     Attributes:
         name: of an element with its 1-based indices, e.g. "q[1]", "der(q[1])".
         causality, unit: as the description has them.
-        type: "Real" for Float64 too, "Boolean", or another as the description has it.
+        type: "Real" for Float64 too, "Integer" for Int32, "Boolean", or another as the description has it.
         start: text of the start value; None where there is none.
         description: of the scalar, or of the array as a whole.
         reference: value reference.
@@ -53,9 +57,8 @@ class Scalar:
     @property
     def start_value(self) -> float | bool | None:
         """Start value of a number or Boolean that has one."""
-        if self.start is None or self.type not in ("Real", "Boolean"):
-            return None
-        return float(self.start) if self.type == "Real" else self.start in ("true", "1")
+        read = NUMBERS.get(self.type)
+        return None if self.start is None or read is None else read(self.start)
 
 
 @dataclass(frozen=True, repr=False)
@@ -139,18 +142,11 @@ class Fmu:
 
     def vector(self, group: str) -> list[str]:
         """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
-        if group in self.variables:
-            return [group]
-        names = (f"{group}[{i}]" for i in count(1))
-        return list(takewhile(self.variables.__contains__, names))
+        return vector(self.variables, group)
 
     def groups(self, causality: str) -> dict[str, list[str]]:
         """Return vectors and scalars of one causality by group name."""
-        groups: dict[str, list[str]] = {}
-        for name, variable in self.variables.items():
-            if variable.causality == causality:
-                groups.setdefault(name.partition("[")[0], []).append(name)
-        return groups
+        return groups_of(self.variables, causality)
 
 
 def _pose(fmu: Fmu) -> str:
@@ -332,7 +328,7 @@ def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
 
 def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
     """Return a scalar variable itself, or the elements of an array."""
-    kind = "Real" if variable.type == "Float64" else variable.type
+    kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
     rest = (variable.causality, kind, variable.unit)
     text = variable.description or ""
     if not variable.dimensions:

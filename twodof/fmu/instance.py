@@ -104,7 +104,7 @@ class Instance:
         )
         addLoggerProxy(byref(self._callbacks))
         slave.instantiate(callbacks=self._callbacks, loggingOn=True)
-        self._setters = {"Real": slave.setReal, "Boolean": slave.setBoolean}
+        self._setters = {"Real": slave.setReal, "Integer": slave.setInteger, "Boolean": slave.setBoolean}
         self._do_step, self._get = slave.dll["fmi2DoStep"], slave.dll["fmi2GetReal"]
         self._rest: tuple[object, ...] = (c_int(1),)
         return slave
@@ -236,7 +236,7 @@ class Instance3(Instance):
             slave = fmi3.FMU3Slave(**what)
         slave.instantiate(logMessage=partial(self._log, b""), loggingOn=True)
         results = byref(c_bool()), byref(self._ends), byref(c_bool()), byref(c_double())
-        self._setters = {"Real": slave.setFloat64, "Boolean": slave.setBoolean}
+        self._setters = {"Real": slave.setFloat64, "Integer": slave.setInt32, "Boolean": slave.setBoolean}
         self._do_step, self._get = slave.dll["fmi3DoStep"], slave.dll["fmi3GetFloat64"]
         self._rest = (c_bool(True), *results)
         return slave

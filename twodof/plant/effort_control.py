@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 
 from .control_law import ControlledPlant
@@ -13,7 +14,12 @@ from .integrator import Array, Ratios, Response
 
 def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
     """Return τ as a function of the state, n values, inputs held; this law has no J⁺."""
-    tau = list(plant.tau_cmd)
+    return given_effort(plant.tau_cmd)
+
+
+def given_effort(tau: Sequence[float]) -> tuple[Response, Ratios]:
+    """Return a law that gives an effort, n values, at any state."""
+    tau = list(tau)
 
     def effort(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:
         del q, v

@@ -66,6 +66,13 @@ MOST_ROWS = 6
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
 
 
+@dataclass
+class Budget:
+    """Evaluations of the right-hand side that parts of a communication step have in common."""
+
+    spent: int = 0
+
+
 class StepError(ArithmeticError):
     """A communication step that fails the tolerances or exceeds the budget.
 
@@ -277,8 +284,9 @@ def advance(
     rtol: float,
     atol: float,
     max_step: float,
+    budget: Budget | None = None,
 ) -> tuple[list[float], list[float]]:
-    """Integrate the state over one communication step.
+    """Integrate the state over one communication step, or a part of it.
 
     Args:
         equations: of motion; autonomous, as inputs are held over the step.
@@ -287,6 +295,7 @@ def advance(
         stops: at the joints' limits.
         rtol, atol: tolerances of the error test on the state (q, v).
         max_step: largest integration step, s.
+        budget: what the parts before have spent; None: there are none.
 
     Returns:
         q, v at the end; q within the limits to the last bit.
@@ -295,8 +304,10 @@ def advance(
         FloatingPointError: the equations gave a value that is not finite.
         StepError: they change too fast.
     """
-    n = len(q)
-    y = _regimes(_Motion(equations, stops, rtol, atol, max_step), [*q, *v], h)
+    n, budget, motion = len(q), budget or Budget(), _Motion(equations, stops, rtol, atol, max_step)
+    motion.evaluations = budget.spent
+    y = _regimes(motion, [*q, *v], h)
+    budget.spent = motion.evaluations
     return y[:n], y[n:]
 
 

@@ -13,17 +13,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from operator import mul
+from math import inf
+from operator import itemgetter, mul
 
 import numpy as np
 
 from . import effort_control, joint_control, task_control
 from .control_law import ControlLaw, ControlledPlant
 from .dormand_prince import STAGES
-from .integrator import BUDGET, Array, Equations, Response, StepError, advance
+from .integrator import BUDGET, Array, Equations, Response, StepError
 from .mechanism import Mechanism
 from .orientation import quaternion
 from .robot import Robot
+from .sampling import Sampling, advance_sampled, sampling_refusal
 from .stops import Stops
 from .variables import CONTROLS, RANGES, Variable
 
@@ -45,9 +47,11 @@ class DiscardError(ArithmeticError):
 
 @contextlib.contextmanager
 def refusing(kind: type[Exception]) -> Iterator[None]:
-    """Convert a failure of linear algebra into an exception of the given kind."""
+    """Convert a failure of arithmetic into an exception of the given kind."""
     try:
         yield
+    except FloatingPointError as error:
+        raise kind(str(error)) from error
     except np.linalg.LinAlgError as error:
         raise kind(
             "a matrix of the equations of motion is singular or not finite: inputs, payload or speeds are too large"
@@ -68,6 +72,8 @@ class Plant(ControlledPlant):
 
     Attributes:
         known: the robot as its control law knows it.
+        time: of the state, s.
+        sampling: discrete state of the sampled controller and its sensors.
     """
 
     tau_ext: list[float]
@@ -83,12 +89,20 @@ class Plant(ControlledPlant):
     rtol: float
     atol: float
     max_step: float
+    control_period: float
+    control_delay: float
+    q_resolution: list[float]
+    q_noise: list[float]
+    v_noise: list[float]
+    seed: int
+    v_from_q: bool
     limit_effort: bool
     rigid_stops: bool
 
     def __init__(self, robot: Robot, table: Sequence[Variable], control: str = "task") -> None:
         self.robot, self.control, self._table = robot, control, table
         self._law, self._commands = LAWS[control].command, CONTROLS[control].commands
+        self.time = 0.0
         for variable in table:
             if variable.causality in ("output", "local"):
                 continue
@@ -100,6 +114,7 @@ class Plant(ControlledPlant):
                 getattr(self, variable.group).append(variable.start)
         self.q = list(self.q_start)
         self.v = list(self.v_start)
+        self.sampling = Sampling.begin(len(self.q), self.time)
         self._axes = ["xyz".index(axis) for axis in robot.axes]
         self._swing = robot.swing()
         self.prepare()
@@ -129,6 +144,7 @@ class Plant(ControlledPlant):
         with refusing(ParameterError):
             self.stops().impact(y, [False] * len(self.q))
         self.v = y[len(self.q) :]
+        self.sampling = Sampling.begin(len(self.q), self.time)
         return warnings
 
     def prepare(self) -> None:
@@ -138,29 +154,35 @@ class Plant(ControlledPlant):
         if self.payload and not getattr(self, "payload_known", False):
             self.known = Mechanism(self.robot, self.gravity, 0.0, offset)
 
-    def step(self, h: float) -> None:
+    def step(self, h: float, time: float | None = None) -> None:
         """Advance the state by one communication step of h seconds, inputs held.
+
+        Args:
+            h: the step, s.
+            time: of the communication point at which it begins, s; None: the plant's own.
 
         Raises:
             DiscardError: the motion is too fast for the integrator, its values would no longer be finite, or an input
                 is none that the control law can follow; the state is left as it was.
         """
         self._check_target()
-        if STAGES * h > BUDGET * self.max_step:
+        limits = {"max_step": self.max_step, "control_period": self.control_period or inf}
+        name, shortest = min(limits.items(), key=itemgetter(1))
+        if STAGES * h > BUDGET * shortest:
             raise DiscardError(
-                f"max_step = {self.max_step:g} s divides a step of {h:g} s into more than"
-                f" {BUDGET // STAGES} integration steps; enlarge max_step or shorten the step"
+                f"{name} = {shortest:g} s divides a step of {h:g} s into more than"
+                f" {BUDGET // STAGES} integration steps; enlarge {name} or shorten the step"
             )
-        stops = self.stops()
+        before = self.q, self.v, self.sampling, self.time
+        self.time = self.time if time is None else time
         try:
             # what overflows is refused, without a warning
             with refusing(DiscardError), np.errstate(over="ignore", invalid="ignore"):
-                self.q, self.v = advance(
-                    self.equations_of_motion(), self.q, self.v, h, stops, self.rtol, self.atol, self.max_step
-                )
-        except FloatingPointError as error:
-            raise DiscardError(str(error)) from error
-        except StepError as error:
+                advance_sampled(self, h)
+        except BaseException as error:
+            self.q, self.v, self.sampling, self.time = before
+            if not isinstance(error, StepError):
+                raise
             need = f"more than {BUDGET} evaluations for the step of {h:g} s"
             if error.too_fine:
                 need = "integration steps below the resolution of time"
@@ -169,6 +191,7 @@ class Plant(ControlledPlant):
                 f" '{self.robot.joints[error.joint]}' changes at a rate of {error.rate:.3g} 1/s;"
                 " shorten the step, lessen damping or gains, or enlarge rtol and atol"
             ) from error
+        self.time += h
 
     @property
     def x(self) -> list[float]:
@@ -201,10 +224,28 @@ class Plant(ControlledPlant):
             DiscardError: an input that the control law cannot follow.
         """
         self._check_target()
+        return self._settled().effort if self.control_period else self.commanded_effort(self.q, self.v)
+
+    @property
+    def q_meas(self) -> list[float]:
+        """Positions that the controller saw at its latest sample, n values, rad or m."""
+        return self._settled().q_meas
+
+    @property
+    def v_meas(self) -> list[float]:
+        """Velocities that the controller saw at its latest sample, n values, rad/s or m/s."""
+        return self._settled().v_meas
+
+    def commanded_effort(self, q: Sequence[float], v: Sequence[float]) -> list[float]:
+        """Return the effort that the control law commands for a measured state, limits included, n values."""
         command, _ = self._law(self)
-        effort = self._control_effort(command, np.array(self.q), np.array(self.v), None)[0]
-        tau: list[float] = effort.tolist()
+        tau: list[float] = self._control_effort(command, np.array(q), np.array(v), None)[0].tolist()
         return tau
+
+    def _settled(self) -> Sampling:
+        """Return the samples as they are once all that is due at the present time has been done."""
+        with refusing(DiscardError):
+            return self.sampling.settled(self, self.time)
 
     @property
     def der_q(self) -> list[float]:
@@ -219,15 +260,20 @@ class Plant(ControlledPlant):
             DiscardError: an input that the control law cannot follow.
         """
         self._check_target()
-        with refusing(DiscardError):
-            equations = self.equations_of_motion()
-            rates = list(equations.acceleration(np.array(self.q), np.array(self.v), None)[0])
-            self.stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
+        before, self.sampling = self.sampling, self._settled()
+        try:
+            with refusing(DiscardError):
+                equations = self.equations_of_motion()
+                rates = list(equations.acceleration(np.array(self.q), np.array(self.v), None)[0])
+                self.stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
+        finally:
+            self.sampling = before
         return rates
 
     def equations_of_motion(self) -> Equations:
-        """Return the equations of motion with the present inputs held."""
-        command, ratios = self._law(self)
+        """Return the equations of motion with the present inputs held, or the effort of a sampled controller."""
+        held = effort_control.given_effort(self.sampling.effort)
+        command, ratios = held if self.control_period else self._law(self)
         acceleration = self._acceleration(command)
         rcond = self.rcond if "rcond" in CONTROLS[self.control].parameters else 0.0
         return Equations(acceleration, ratios, rcond, self._swing)
@@ -238,7 +284,7 @@ class Plant(ControlledPlant):
         force = np.array(self.f_ext)
         # q̈ = q̈_cmd + M⁻¹(…): rounding of M q̈_cmd + h − h would move joints that are at rest
         cancels = self._commands == "acceleration" and self.known is self._real
-        cancels = cancels and not self.limit_effort
+        cancels = cancels and not self.limit_effort and not self.control_period
         if cancels and not (damping.any() or external.any() or force.any()):
             return command
 
@@ -249,7 +295,11 @@ class Plant(ControlledPlant):
             if cancels:
                 given, rank, margin = command(q, v, rank)
                 return np.add(given, self._real.inverse_mass(q) @ effort).tolist(), rank, margin
-            tau, rank, margin = self._control_effort(command, q, v, rank)
+            if self.control_period:
+                given, rank, margin = command(q, v, rank)
+                tau = np.array(given)
+            else:
+                tau, rank, margin = self._control_effort(command, q, v, rank)
             return self._real.forward_dynamics(q, v, tau + effort).tolist(), rank, margin
 
         return acceleration
@@ -286,6 +336,8 @@ class Plant(ControlledPlant):
                 value = value if variable.index is None else value[variable.index]
                 if refusal := variable.refusal(value):
                     raise ParameterError(refusal)
+        if reason := sampling_refusal(self, of_points=self.control == "effort"):
+            raise ParameterError(reason)
         for i, (low, high) in enumerate(zip(self.q_min, self.q_max)):
             if low > high:
                 raise ParameterError(

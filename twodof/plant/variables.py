@@ -37,6 +37,8 @@ RANGES = {
     **dict.fromkeys((*GAINS, "payload"), NOT_NEGATIVE),
     **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),
     "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
+    **dict.fromkeys(("control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), NOT_NEGATIVE),
+    "seed": Range(0, 2**31 - 1, "in [0, 2147483647]"),
 }
 """Valid ranges by group; other variables may be any number. The FMU refuses values outside."""
 
@@ -77,7 +79,7 @@ class Variable:
     @property
     def type(self) -> str:
         """FMI type of the variable."""
-        return "Boolean" if isinstance(self.start, bool) else "Real"
+        return "Boolean" if isinstance(self.start, bool) else "Integer" if isinstance(self.start, int) else "Real"
 
     def refusal(self, value: Value) -> str:
         """Return why a value is invalid, "" where it is valid."""
@@ -133,6 +135,60 @@ CONTROLS = {
 
 DISTURBANCES = ("tau_ext", "f_ext")
 OF_A_LAW = {group for law in CONTROLS.values() for group in (*law.outputs, *law.parameters)}
+
+ROWS = (
+    ("x_des", "input", "axis", "m", "target position"),
+    ("xd_des", "input", "axis", "m/s", "target velocity"),
+    ("xdd_des", "input", "axis", "m/s2", "target acceleration"),
+    ("quat_des", "input", "quaternion", "", "target orientation of {frame}"),
+    ("omega_des", "input", "turn", "rad/s", "target angular velocity"),
+    ("alpha_des", "input", "turn", "rad/s2", "target angular acceleration"),
+    ("q_des", "input", "joint", "m|rad", "target position"),
+    ("v_des", "input", "joint", "m/s|rad/s", "target velocity"),
+    ("a_des", "input", "joint", "m/s2|rad/s2", "target acceleration"),
+    ("Kp", "input", "controlled", "1/s2", "proportional gain"),
+    ("Kd", "input", "controlled", "1/s", "derivative gain"),
+    ("Kp_rot", "input", "turn", "1/s2", "proportional gain of the orientation"),
+    ("Kd_rot", "input", "turn", "1/s", "derivative gain of the orientation"),
+    ("tau_cmd", "input", "joint", "N|N.m", "effort of the controller"),
+    ("tau_ext", "input", "joint", "N|N.m", "external effort"),
+    ("f_ext", "input", "root", "N", "external force at {frame}"),
+    ("Kn", "input", "", "1/s", "damping of the motion that does not move the end effector"),
+    ("q", "output", "joint", "m|rad", "position"),
+    ("v", "output", "joint", "m/s|rad/s", "velocity"),
+    ("x", "output", "axis", "m", "position"),
+    ("xd", "output", "axis", "m/s", "velocity"),
+    ("quat", "output", "quaternion", "", "orientation of {frame}"),
+    ("omega", "output", "turn", "rad/s", "angular velocity of {frame}"),
+    ("tau", "output", "joint", "N|N.m", "control effort applied"),
+    ("q_meas", "output", "joint", "m|rad", "position that the controller saw"),
+    ("v_meas", "output", "joint", "m/s|rad/s", "velocity that the controller saw"),
+    ("der_q", "local", "joint", "m/s|rad/s", "velocity, the position's derivative"),
+    ("der_v", "local", "joint", "m/s2|rad/s2", "acceleration"),
+    ("q_start", "parameter", "joint", "m|rad", "position at the start"),
+    ("v_start", "parameter", "joint", "m/s|rad/s", "velocity at the start"),
+    ("q_min", "parameter", "joint", "m|rad", "lower limit"),
+    ("q_max", "parameter", "joint", "m|rad", "upper limit"),
+    ("gravity", "parameter", "root", "m/s2", "gravity"),
+    ("payload", "parameter", "", "kg", "point mass at {frame}"),
+    ("payload_com", "parameter", "frame", "m", "where the payload is"),
+    ("rcond", "parameter", "", "", "singular values up to rcond times the largest are dropped"),
+    ("rtol", "parameter", "", "", "relative tolerance of the integrator"),
+    ("atol", "parameter", "", "", "absolute tolerance of the integrator"),
+    ("max_step", "parameter", "", "s", "largest step of the integrator"),
+    ("control_period", "parameter", "", "s", "sampling period of the controller, 0 for a continuous one"),
+    ("control_delay", "parameter", "", "s", "time from a sample to the effort that it commands"),
+    ("q_resolution", "parameter", "joint", "m|rad", "resolution of the position sensor"),
+    ("q_noise", "parameter", "joint", "m|rad", "standard deviation of the position sensor's noise"),
+    ("v_noise", "parameter", "joint", "m/s|rad/s", "standard deviation of the velocity sensor's noise"),
+    ("seed", "parameter", "", "", "seed of the sensors' noise"),
+    ("v_from_q", "parameter", "", "", "the controller's velocities are differences of its positions"),
+    ("limit_effort", "parameter", "", "", "limit the control effort to the URDF's effort limits"),
+    ("rigid_stops", "parameter", "", "", "joint stops act on the other joints too"),
+    ("payload_known", "parameter", "", "", "the controller knows the payload"),
+)
+"""Group, causality, owners of the elements (none of a scalar), unit (of a joint that slides | that turns) and
+description."""
 
 Row = tuple[str, str, list[str], list[str], str]
 Starts = Mapping[str, Value | tuple[float, ...]]
@@ -195,6 +251,13 @@ def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]
         "rtol": 1e-3,
         "atol": 1e-6,
         "max_step": 1e-3,
+        "control_period": 0.0,
+        "control_delay": 0.0,
+        "q_resolution": (0.0,) * n,
+        "q_noise": (0.0,) * n,
+        "v_noise": (0.0,) * n,
+        "seed": 0,
+        "v_from_q": False,
         "limit_effort": False,
         "rigid_stops": CONTROLS[control].rigid_stops,
         "payload_known": False,
@@ -205,60 +268,23 @@ def _rows(robot: Robot, control: str) -> list[Row]:
     """Return group, causality, owners of elements (none of a scalar), units and description."""
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
-    root = [f"axis {letter} of {robot.root}" for letter in "xyz"]
-    frame = [f"axis {letter} of {robot.frame}" for letter in "xyz"]
-    turn = [f"about axis {letter} of {robot.root}" for letter in "xyz"]
-    gained = axis if "x_des" in CONTROLS[control].inputs else joint
-
-    def units(sliding: str, turning: str) -> list[str]:
-        return [sliding if prismatic else turning for prismatic in robot.prismatic]
-
-    position, velocity = units("m", "rad"), units("m/s", "rad/s")
-    acceleration, effort = units("m/s2", "rad/s2"), units("N", "N.m")
-    dropped = "singular values up to rcond times the largest are dropped"
-    limited = "limit the control effort to the URDF's effort limits"
-    return [
-        ("x_des", "input", axis, ["m"] * 3, "target position"),
-        ("xd_des", "input", axis, ["m/s"] * 3, "target velocity"),
-        ("xdd_des", "input", axis, ["m/s2"] * 3, "target acceleration"),
-        ("quat_des", "input", list("xyzw"), [""] * 4, f"target orientation of {robot.frame}"),
-        ("omega_des", "input", turn, ["rad/s"] * 3, "target angular velocity"),
-        ("alpha_des", "input", turn, ["rad/s2"] * 3, "target angular acceleration"),
-        ("q_des", "input", joint, position, "target position"),
-        ("v_des", "input", joint, velocity, "target velocity"),
-        ("a_des", "input", joint, acceleration, "target acceleration"),
-        ("Kp", "input", gained, ["1/s2"] * len(gained), "proportional gain"),
-        ("Kd", "input", gained, ["1/s"] * len(gained), "derivative gain"),
-        ("Kp_rot", "input", turn, ["1/s2"] * 3, "proportional gain of the orientation"),
-        ("Kd_rot", "input", turn, ["1/s"] * 3, "derivative gain of the orientation"),
-        ("tau_cmd", "input", joint, effort, "effort of the controller"),
-        ("tau_ext", "input", joint, effort, "external effort"),
-        ("f_ext", "input", root, ["N"] * 3, f"external force at {robot.frame}"),
-        ("Kn", "input", [], ["1/s"], "damping of the motion that does not move the end effector"),
-        ("q", "output", joint, position, "position"),
-        ("v", "output", joint, velocity, "velocity"),
-        ("x", "output", axis, ["m"] * 3, "position"),
-        ("xd", "output", axis, ["m/s"] * 3, "velocity"),
-        ("quat", "output", list("xyzw"), [""] * 4, f"orientation of {robot.frame}"),
-        ("omega", "output", turn, ["rad/s"] * 3, f"angular velocity of {robot.frame}"),
-        ("tau", "output", joint, effort, "control effort applied"),
-        ("der_q", "local", joint, velocity, "velocity, the position's derivative"),
-        ("der_v", "local", joint, acceleration, "acceleration"),
-        ("q_start", "parameter", joint, position, "position at the start"),
-        ("v_start", "parameter", joint, velocity, "velocity at the start"),
-        ("q_min", "parameter", joint, position, "lower limit"),
-        ("q_max", "parameter", joint, position, "upper limit"),
-        ("gravity", "parameter", root, ["m/s2"] * 3, "gravity"),
-        ("payload", "parameter", [], ["kg"], f"point mass at {robot.frame}"),
-        ("payload_com", "parameter", frame, ["m"] * 3, "where the payload is"),
-        ("rcond", "parameter", [], [""], dropped),
-        ("rtol", "parameter", [], [""], "relative tolerance of the integrator"),
-        ("atol", "parameter", [], [""], "absolute tolerance of the integrator"),
-        ("max_step", "parameter", [], ["s"], "largest step of the integrator"),
-        ("limit_effort", "parameter", [], [""], limited),
-        ("rigid_stops", "parameter", [], [""], "joint stops act on the other joints too"),
-        ("payload_known", "parameter", [], [""], "the controller knows the payload"),
-    ]
+    owners = {
+        "": [],
+        "joint": joint,
+        "axis": axis,
+        "controlled": axis if "x_des" in CONTROLS[control].inputs else joint,
+        "root": [f"axis {letter} of {robot.root}" for letter in "xyz"],
+        "frame": [f"axis {letter} of {robot.frame}" for letter in "xyz"],
+        "turn": [f"about axis {letter} of {robot.root}" for letter in "xyz"],
+        "quaternion": list("xyzw"),
+    }
+    rows = []
+    for group, causality, owner, unit, text in ROWS:
+        sliding, _, turning = unit.partition("|")
+        kinds = robot.prismatic if turning else [True] * max(1, len(owners[owner]))
+        units = [sliding if prismatic else turning for prismatic in kinds]
+        rows.append((group, causality, owners[owner], units, text.format(frame=robot.frame)))
+    return rows
 
 
 def count_event_indicators(robot: Robot, control: str) -> int:

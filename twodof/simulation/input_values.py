@@ -3,66 +3,22 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from itertools import chain
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 
 from ..bounds import MAX_CELLS, MAX_TABLE
-from ..errors import InputError, choice, no_such
+from ..errors import InputError, no_such
 from ..files import check_file
-from ..fmu import Fmu
-from ..plant.variables import CONTROLS, GAINS
+from ..fmu import Fmu, no_variable
+from ..fmu import Setting as Setting
+from ..fmu import resolve as resolve
+from ..plant.variables import GAINS
 from ..plant.variables import Value as Value
 
-Setting = object
-"""A number, a Boolean, or a sequence or array of them; a dict of several kinds is ``dict[str, object]``."""
 Changes = list[tuple[float, dict[str, Value]]]
 """Times in s, ascending, and the inputs that take new values there."""
-
-
-def resolve(fmu: Fmu, settings: Mapping[str, Setting]) -> dict[str, Value]:
-    """Return values by variable name; a group's name sets all of its elements.
-
-    Raises:
-        InputError: an unknown name (with the nearest one), an output, or a value of wrong count or kind, or not finite.
-    """
-    values: dict[str, Value] = {}
-    for name, setting in settings.items():
-        elements = [name] if name in fmu.variables else fmu.vector(name)
-        if not elements:
-            raise InputError(_no_variable(fmu, name, "input", "parameter"))
-        # arrays give their own kind of numbers
-        plain: object = setting.tolist() if hasattr(setting, "tolist") else setting
-        given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
-        if len(given) != len(elements):
-            raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
-        for element, value in zip(elements, given, strict=True):
-            values[element] = _checked(fmu, element, value)
-    return values
-
-
-def _checked(fmu: Fmu, name: str, value: object) -> Value:
-    variable = fmu.variables[name]
-    if variable.causality not in ("input", "parameter"):
-        start = name.replace(group := name.partition("[")[0], f"{group}_start", 1)
-        remedy = f"; set {start}" if start in fmu.variables else ""
-        raise InputError(f"{name} is of causality '{variable.causality}' and cannot be set{remedy}")
-    if variable.type == "Boolean":
-        if not isinstance(value, bool):
-            raise InputError(f"{name} = {value!r}: expected true or false")
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{name} = {value!r}: expected a number")
-    try:
-        number = float(value)
-    except OverflowError:  # of a whole number
-        number = inf if value > 0 else -inf
-    if not isfinite(number):
-        raise InputError(f"{name} = {number} is not finite")
-    return number
 
 
 def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
@@ -77,28 +33,6 @@ def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Valu
     turn = fmu.vector("quat_des")
     if turn and not any({**held, **asked}[name] for name in turn):
         raise InputError("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing")
-
-
-def _of_another(fmu: Fmu, name: str) -> str:
-    """Return a vector's length, or the controls that have a variable; "" where there is none."""
-    group = name.partition("[")[0]
-    having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
-    elements = fmu.vector(group)
-    if elements and fmu.variables[elements[0]].causality in ("input", "parameter"):
-        return f": {group} has {len(elements)} elements"
-    if not fmu.control or not having:
-        return ""
-    quoted = " or ".join(f"control '{control}'" for control in having)
-    return f": it is of {quoted}; this FMU has control '{fmu.control}'"
-
-
-def _no_variable(fmu: Fmu, name: str, *causalities: str) -> str:
-    """Return the message for an unknown name: its control law, or the nearest names."""
-    groups = {g: names for causality in causalities for g, names in fmu.groups(causality).items()}
-    indexed = re.sub(r"_?(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
-    known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
-    like = f"; did you mean '{indexed}'?" if indexed in known else choice(name, known, cutoff=0.4)
-    return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"
 
 
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
@@ -161,7 +95,7 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
     """Return the inputs that a column sets: one, or all elements of a vector."""
     elements = [name] if name in fmu.variables else fmu.vector(name)
     if not elements:
-        raise InputError(f"'{path}': {_no_variable(fmu, name, 'input')}")
+        raise InputError(f"'{path}': {no_variable(fmu, name, 'input')}")
     if any(fmu.variables[element].causality != "input" for element in elements):
         raise InputError(f"'{path}': {name} is not an input")
     return elements

@@ -1,0 +1,141 @@
+/* Sampled control by the rules of plant/sampling.py:
+
+       t_k    = start + k T                          an exact integer k, T = control_period
+       q_meas = ρ round(q/ρ) + noise                 at t_k; ρ = q_resolution, ties to even
+       v_meas = v + noise, or (q_meas(t_k) − q_meas(t_(k−1)))/T, 0 at the first sample
+       τ_k    = law(q_meas, v_meas, inputs at t_k)   acts from t_k + D until t_(k+1) + D, D = control_delay
+
+   No effort acts before the first. With T = 0 the law is continuous, and each communication point is a sample of
+   the sensors. */
+#include "sampling.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "noise.h"
+
+/* Times are equal within this part of max(1 s, |t|), and of the period. */
+static const double EQUAL_TIMES = 1e-9, PART_OF_PERIOD = 1e-3;
+static const double ALL_WHOLE = 9007199254740992.0; /* 2⁵³, from which on all numbers are whole */
+
+static double slack(const Plant *plant, double time)
+{
+    return fmin(EQUAL_TIMES * fmax(1.0, fabs(time)), PART_OF_PERIOD * plant->value[CONTROL_PERIOD]);
+}
+
+static double instant(const Sampling *sampling, const Plant *plant, double k)
+{
+    return sampling->start + k * plant->value[CONTROL_PERIOD];
+}
+
+/* When the oldest pending effort acts. */
+static double due(const Sampling *sampling, const Plant *plant)
+{
+    return sampling->count ? instant(sampling, plant, sampling->k - sampling->count) + plant->value[CONTROL_DELAY]
+                           : HUGE_VAL;
+}
+
+double next_sampling_event(const Sampling *sampling, const Plant *plant)
+{
+    return plant->value[CONTROL_PERIOD] == 0.0
+               ? HUGE_VAL
+               : fmin(instant(sampling, plant, sampling->k), due(sampling, plant));
+}
+
+static double rounded(double q, double resolution)
+{
+    const double steps = resolution != 0.0 ? q / resolution : HUGE_VAL;
+    return fabs(steps) < ALL_WHOLE ? resolution * (rint(steps) + 0.0) : q; /* +0.0: no negative zero */
+}
+
+/* Take a sample of the sensors. */
+static void measure(Sampling *sampling, Plant *plant, double time)
+{
+    double *value = plant->value, period = value[CONTROL_PERIOD];
+    const double elapsed = period != 0.0 ? period : time - sampling->time;
+    for (int i = 0; i < N_JOINTS; i++) {
+        double *q = &value[Q_MEAS + i], *v = &value[V_MEAS + i], noise[2];
+        *q = rounded(value[Q + i], value[Q_RESOLUTION + i]);
+        *v = value[V + i];
+        if (value[Q_NOISE + i] != 0.0 || value[V_NOISE + i] != 0.0) {
+            normal_pair(value[SEED], sampling->k, i, noise);
+            *q += value[Q_NOISE + i] * noise[0];
+            *v += value[V_NOISE + i] * noise[1];
+        }
+        if (value[V_FROM_Q] != 0.0)
+            *v = sampling->k > 0.0 ? (*q - sampling->q_meas[i]) / elapsed : 0.0;
+        sampling->q_meas[i] = *q;
+    }
+    sampling->time = time;
+    sampling->k += 1.0;
+}
+
+int settle(Sampling *sampling, Plant *plant, double time)
+{
+    const double period = plant->value[CONTROL_PERIOD], by = time + slack(plant, time);
+    if (period == 0.0) {
+        measure(sampling, plant, time);
+        return 1;
+    }
+    if (instant(sampling, plant, sampling->k) <= by) {
+        const Sampling before = *sampling;
+        /* those that an importer's solver passed are gone */
+        sampling->k = fmax(sampling->k, fmin(ALL_WHOLE, floor((by - sampling->start) / period)));
+        measure(sampling, plant, time);
+        double *effort = sampling->pending[sampling->count++];
+        control_effort(plant, &plant->value[Q_MEAS], &plant->value[V_MEAS], ANY_RANK, effort);
+        for (int i = 0; i < N_JOINTS; i++)
+            if (!isfinite(effort[i])) {
+                *sampling = before;
+                return 0;
+            }
+    }
+    while (sampling->count > MOST_PERIODS || due(sampling, plant) <= by) {
+        memcpy(&plant->value[TAU], sampling->pending[0], sizeof sampling->pending[0]);
+        memmove(sampling->pending[0], sampling->pending[1], MOST_PERIODS * sizeof sampling->pending[0]);
+        sampling->count--;
+    }
+    return 1;
+}
+
+int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Failure *failure)
+{
+    Sampling samples = *sampling;
+    Plant draft = *plant;
+    const double period = plant->value[CONTROL_PERIOD], max_step = plant->value[MAX_STEP], end = time + h;
+    double t = time;
+    long evaluations = 0;
+    int last = 0;
+    if (STAGES * h > BUDGET * fmin(max_step, period != 0.0 ? period : HUGE_VAL)) {
+        failure->reason = period != 0.0 && period < max_step ? SHORT_PERIOD : MANY_STEPS;
+        return 0;
+    }
+    while (!last) {
+        failure->reason = NOT_FINITE;
+        if (!settle(&samples, &draft, t))
+            return 0;
+        const double next = next_sampling_event(&samples, &draft);
+        last = !(next < end - slack(&draft, end));
+        const double length = last && t == time ? h : (last ? end : next) - t;
+        if (!advance_plant(&draft, length, &evaluations, NULL, failure))
+            return 0;
+        t = next;
+    }
+    *sampling = samples;
+    *plant = draft;
+    return 1;
+}
+
+int is_sampling(const Sampling *sampling, const Plant *plant, double time)
+{
+    const double k = sampling->k, period = plant->value[CONTROL_PERIOD];
+    int sound = isfinite(sampling->start) && isfinite(sampling->time) && k >= 0.0 && k < ALL_WHOLE && k == floor(k)
+                && sampling->count >= 0 && sampling->count <= MOST_PERIODS && sampling->count <= k;
+    for (int i = 0; i < N_JOINTS; i++) {
+        sound = sound && isfinite(sampling->q_meas[i]) && (period == 0.0 || isfinite(plant->value[TAU + i]));
+        for (int j = 0; j <= MOST_PERIODS; j++)
+            sound = sound && isfinite(sampling->pending[j][i]);
+    }
+    return sound && (period == 0.0 ? sampling->count == 0
+                                   : fabs(instant(sampling, plant, k) - time) <= 2.0 * period);
+}

@@ -1,0 +1,125 @@
+"""Start values by name, checked against the variables of an FMU, built or yet to be."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from itertools import chain, count, takewhile
+from math import inf, isfinite
+from typing import Protocol
+
+from ..errors import InputError, choice
+from ..plant.variables import CONTROLS, Value
+
+Setting = object
+"""A number, a Boolean, or a sequence or array of them; a dict of several kinds is ``dict[str, object]``."""
+LIMIT_OF_INTEGERS = 2**31
+
+
+class Settable(Protocol):
+    """The kind of a variable."""
+
+    @property
+    def causality(self) -> str:
+        """Causality, as FMI has it."""
+
+    @property
+    def type(self) -> str:
+        """The type: "Real", "Integer", "Boolean" or another."""
+
+
+class Variables(Protocol):
+    """The variables of an FMU by name, and the name of its control law."""
+
+    @property
+    def variables(self) -> Mapping[str, Settable]:
+        """All of them, in order."""
+
+    @property
+    def control(self) -> str:
+        """The control law, "" where it is not known."""
+
+
+def vector(variables: Mapping[str, Settable], group: str) -> list[str]:
+    """Return the names of a vector's elements in order, or of the scalar; empty if there is none."""
+    if group in variables:
+        return [group]
+    names = (f"{group}[{i}]" for i in count(1))
+    return list(takewhile(variables.__contains__, names))
+
+
+def groups_of(variables: Mapping[str, Settable], causality: str) -> dict[str, list[str]]:
+    """Return vectors and scalars of one causality by group name."""
+    groups: dict[str, list[str]] = {}
+    for name, variable in variables.items():
+        if variable.causality == causality:
+            groups.setdefault(name.partition("[")[0], []).append(name)
+    return groups
+
+
+def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]:
+    """Return values by variable name; a group's name sets all of its elements.
+
+    Raises:
+        InputError: an unknown name (with the nearest one), an output, or a value of wrong count or kind, or not finite.
+    """
+    values: dict[str, Value] = {}
+    for name, setting in settings.items():
+        elements = [name] if name in fmu.variables else vector(fmu.variables, name)
+        if not elements:
+            raise InputError(no_variable(fmu, name, "input", "parameter"))
+        # arrays give their own kind of numbers
+        plain: object = setting.tolist() if hasattr(setting, "tolist") else setting
+        given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
+        if len(given) != len(elements):
+            raise InputError(f"{name} has {len(elements)} elements, {len(given)} were given")
+        for element, value in zip(elements, given, strict=True):
+            values[element] = _checked(fmu, element, value)
+    return values
+
+
+def _checked(fmu: Variables, name: str, value: object) -> Value:
+    variable = fmu.variables[name]
+    if variable.causality not in ("input", "parameter"):
+        start = name.replace(group := name.partition("[")[0], f"{group}_start", 1)
+        remedy = f"; set {start}" if start in fmu.variables else ""
+        raise InputError(f"{name} is of causality '{variable.causality}' and cannot be set{remedy}")
+    if variable.type == "Boolean":
+        if not isinstance(value, bool):
+            raise InputError(f"{name} = {value!r}: expected true or false")
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{name} = {value!r}: expected a number")
+    try:
+        number = float(value)
+    except OverflowError:  # of a whole number
+        number = inf if value > 0 else -inf
+    if not isfinite(number):
+        raise InputError(f"{name} = {number} is not finite")
+    if variable.type == "Integer":
+        if not (number.is_integer() and abs(number) < LIMIT_OF_INTEGERS):
+            raise InputError(f"{name} = {value:.17g} must be a whole number of 32 bits")
+        return int(number)
+    return number
+
+
+def _of_another(fmu: Variables, name: str) -> str:
+    """Return a vector's length, or the controls that have a variable; "" where there is none."""
+    group = name.partition("[")[0]
+    having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
+    elements = vector(fmu.variables, group)
+    if elements and fmu.variables[elements[0]].causality in ("input", "parameter"):
+        return f": {group} has {len(elements)} elements"
+    if not fmu.control or not having:
+        return ""
+    quoted = " or ".join(f"control '{control}'" for control in having)
+    return f": it is of {quoted}; this FMU has control '{fmu.control}'"
+
+
+def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
+    """Return the message for an unknown name: its control law, or the nearest names."""
+    groups = {g: names for causality in causalities for g, names in groups_of(fmu.variables, causality).items()}
+    indexed = re.sub(r"_?(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
+    known = [*dict.fromkeys([*groups, *chain(*groups.values())])]
+    like = f"; did you mean '{indexed}'?" if indexed in known else choice(name, known, cutoff=0.4)
+    return f"there is no variable '{name:.50}'{_of_another(fmu, name) or like}"
