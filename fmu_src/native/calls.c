@@ -7,11 +7,17 @@ static const char *const PHASE_NAME[N_PHASES] = {
 
 static const char *const KIND_NAME[] = {"", "Model Exchange", "co-simulation"};
 
-/* Sets of phases; M is event mode. */
-enum { N = 1 << INSTANTIATED, I = 1 << INITIALIZATION, S = 1 << STEP, F = 1 << STEP_FAILED,
-       M = 1 << EVENT, C = 1 << CONTINUOUS_TIME, T = 1 << TERMINATED,
-       ANY = N | I | S | F | M | C | T, RUNS = S | F | M | C, READS = I | RUNS | T,
-       GETS = FMI == 3 ? N | READS : READS, SETS = N | I | S | M | C, SOLVES = I | M | C | T };
+#define PHASE(phase) (1 << (phase))
+
+/* Sets of phases. */
+enum {
+    RUNS = PHASE(STEP) | PHASE(STEP_FAILED) | PHASE(EVENT) | PHASE(CONTINUOUS_TIME),
+    READS = PHASE(INITIALIZATION) | RUNS | PHASE(TERMINATED),
+    ANY = PHASE(INSTANTIATED) | READS,
+    GETS = FMI == 3 ? ANY : READS,
+    SETS = PHASE(INSTANTIATED) | PHASE(INITIALIZATION) | PHASE(STEP) | PHASE(EVENT) | PHASE(CONTINUOUS_TIME),
+    SOLVES = PHASE(INITIALIZATION) | PHASE(EVENT) | PHASE(CONTINUOUS_TIME) | PHASE(TERMINATED)
+};
 
 /* A call's name, the phases in which it is allowed, and of which kind it is. A
    refused call changes nothing, so there is no error phase.
@@ -23,14 +29,14 @@ static const struct {
 } RULE[N_CALLS] = {
     [INSTANTIATE] = {CALL_NAME(Instantiate), 0, BOTH_KINDS},
     [SET_DEBUG_LOGGING] = {CALL_NAME(SetDebugLogging), ANY, BOTH_KINDS},
-    [SETUP_EXPERIMENT] = {CALL_NAME(SetupExperiment), N, BOTH_KINDS},
-    [ENTER_INITIALIZATION] = {CALL_NAME(EnterInitializationMode), N, BOTH_KINDS},
-    [EXIT_INITIALIZATION] = {CALL_NAME(ExitInitializationMode), I, BOTH_KINDS},
+    [SETUP_EXPERIMENT] = {CALL_NAME(SetupExperiment), PHASE(INSTANTIATED), BOTH_KINDS},
+    [ENTER_INITIALIZATION] = {CALL_NAME(EnterInitializationMode), PHASE(INSTANTIATED), BOTH_KINDS},
+    [EXIT_INITIALIZATION] = {CALL_NAME(ExitInitializationMode), PHASE(INITIALIZATION), BOTH_KINDS},
     [TERMINATE] = {CALL_NAME(Terminate), RUNS, BOTH_KINDS},
     [RESET] = {CALL_NAME(Reset), ANY, BOTH_KINDS},
-    [DO_STEP] = {CALL_NAME(DoStep), S, CO_SIMULATION},
+    [DO_STEP] = {CALL_NAME(DoStep), PHASE(STEP), CO_SIMULATION},
     [CANCEL_STEP] = {CALL_NAME(CancelStep), 0, CO_SIMULATION}, /* no step is ever pending */
-    [GET_STATUS] = {CALL_NAME(GetStatus), S | F | T, CO_SIMULATION},
+    [GET_STATUS] = {CALL_NAME(GetStatus), PHASE(STEP) | PHASE(STEP_FAILED) | PHASE(TERMINATED), CO_SIMULATION},
     [GET_REAL] = {CALL_NAME(Get) REAL_NAME, GETS, BOTH_KINDS},
     [GET_BOOLEAN] = {CALL_NAME(GetBoolean), GETS, BOTH_KINDS},
     [GET_INTEGER] = {CALL_NAME(Get) INTEGER_NAME, GETS, BOTH_KINDS},
@@ -40,24 +46,24 @@ static const struct {
     [SET_INTEGER] = {CALL_NAME(Set) INTEGER_NAME, SETS, BOTH_KINDS},
     [SET_OTHER] = {CALL_NAME(Set) " of " OTHER_NAME, SETS, BOTH_KINDS},
     [SET_INPUT] = {CALL_NAME(Set) " of an input", SETS, BOTH_KINDS},
-    [SET_PARAMETER] = {CALL_NAME(Set) " of a parameter", N | I, BOTH_KINDS},
-    [SET_Q_V] = {CALL_NAME(Set) " of a state", M | C, BOTH_KINDS},
+    [SET_PARAMETER] = {CALL_NAME(Set) " of a parameter", PHASE(INSTANTIATED) | PHASE(INITIALIZATION), BOTH_KINDS},
+    [SET_Q_V] = {CALL_NAME(Set) " of a state", PHASE(EVENT) | PHASE(CONTINUOUS_TIME), BOTH_KINDS},
     [GET_STATE] = {CALL_NAME(GetFMUstate), ANY, BOTH_KINDS},
     [SET_STATE] = {CALL_NAME(SetFMUstate), ANY, BOTH_KINDS},
     [FREE_STATE] = {CALL_NAME(FreeFMUstate), ANY, BOTH_KINDS},
     [SIZE_OF_STATE] = {CALL_NAME(SerializedFMUstateSize), ANY, BOTH_KINDS},
     [SERIALIZE] = {CALL_NAME(SerializeFMUstate), ANY, BOTH_KINDS},
     [DESERIALIZE] = {CALL_NAME(DeSerializeFMUstate), ANY, BOTH_KINDS},
-    [ENTER_EVENT_MODE] = {CALL_NAME(EnterEventMode), C, MODEL_EXCHANGE},
-    [NEW_DISCRETE_STATES] = {CALL_NAME(NewDiscreteStates), M, MODEL_EXCHANGE},
-    [ENTER_CONTINUOUS_TIME_MODE] = {CALL_NAME(EnterContinuousTimeMode), M, MODEL_EXCHANGE},
-    [COMPLETED_INTEGRATOR_STEP] = {CALL_NAME(CompletedIntegratorStep), C, MODEL_EXCHANGE},
-    [SET_TIME] = {CALL_NAME(SetTime), M | C, MODEL_EXCHANGE},
-    [SET_CONTINUOUS_STATES] = {CALL_NAME(SetContinuousStates), C, MODEL_EXCHANGE},
+    [ENTER_EVENT_MODE] = {CALL_NAME(EnterEventMode), PHASE(CONTINUOUS_TIME), MODEL_EXCHANGE},
+    [NEW_DISCRETE_STATES] = {CALL_NAME(NewDiscreteStates), PHASE(EVENT), MODEL_EXCHANGE},
+    [ENTER_CONTINUOUS_TIME_MODE] = {CALL_NAME(EnterContinuousTimeMode), PHASE(EVENT), MODEL_EXCHANGE},
+    [COMPLETED_INTEGRATOR_STEP] = {CALL_NAME(CompletedIntegratorStep), PHASE(CONTINUOUS_TIME), MODEL_EXCHANGE},
+    [SET_TIME] = {CALL_NAME(SetTime), PHASE(EVENT) | PHASE(CONTINUOUS_TIME), MODEL_EXCHANGE},
+    [SET_CONTINUOUS_STATES] = {CALL_NAME(SetContinuousStates), PHASE(CONTINUOUS_TIME), MODEL_EXCHANGE},
     [GET_DERIVATIVES] = {CALL_NAME(GetDerivatives), SOLVES, MODEL_EXCHANGE},
     [GET_EVENT_INDICATORS] = {CALL_NAME(GetEventIndicators), SOLVES, MODEL_EXCHANGE},
     [GET_CONTINUOUS_STATES] = {CALL_NAME(GetContinuousStates), SOLVES, MODEL_EXCHANGE},
-    [GET_NOMINALS] = {CALL_NAME(GetNominalsOfContinuousStates), N | SOLVES, MODEL_EXCHANGE},
+    [GET_NOMINALS] = {CALL_NAME(GetNominalsOfContinuousStates), PHASE(INSTANTIATED) | SOLVES, MODEL_EXCHANGE},
     [GET_DIRECTIONAL_DERIVATIVE] = {CALL_NAME(GetDirectionalDerivative), READS, BOTH_KINDS},
     [GET_ADJOINT_DERIVATIVE] = {CALL_NAME(GetAdjointDerivative), READS, BOTH_KINDS},
     [COUNT_STATES] = {CALL_NAME(GetNumberOf), ANY, MODEL_EXCHANGE},
@@ -70,7 +76,7 @@ const char *call_name(Call call)
 
 int can_be_in(Kind kind, int phase)
 {
-    const int other = kind == MODEL_EXCHANGE ? S | F : M | C;
+    const int other = kind == MODEL_EXCHANGE ? PHASE(STEP) | PHASE(STEP_FAILED) : PHASE(EVENT) | PHASE(CONTINUOUS_TIME);
     return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
 }
 
