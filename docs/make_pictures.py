@@ -1,15 +1,18 @@
-"""Make docs/arm.png, plot.png, map.png and load.png, and fmu_src/model.png, the icon of FMUs.
+"""Make the pictures of docs/ that matplotlib draws, and fmu_src/model.png, the icon of FMUs.
 
     python docs/make_pictures.py
 
-The first picture shows the default run, from the samples of the FMU itself, with the arm drawn from
-its meshes as seen from above. The second is what ``twodof plot`` makes of three runs, the others
-are what it makes of the sweeps in docs/gains.md. The icon is for FMI tools and suits the FMU of any
-robot. Needs the extras 'view', 'sweep' and 'native'.
+arm.png shows the default run, from the samples of the FMU, with the arm drawn from its meshes as seen from above.
+plot.png shows three gains; first.png, steered.png and gantry.png the runs of the tutorial, by its own commands; map.png
+and load.png the sweeps in docs/gains.md. The icon is for FMI tools and suits the FMU of any robot. Needs the extras
+'view', 'sweep' and 'native'.
 """
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
 import sys
 import tempfile
 from itertools import pairwise
@@ -47,6 +50,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         fmu = twodof.build_fmu(Path(folder) / "TwoDof.fmu")
         samples = list(twodof.samples(fmu))
+        draw_tutorial(Path(folder))
         draw_plot(fmu, ROOT / "docs" / "plot.png")
         native = twodof.build_fmu(Path(folder) / "TwoDof-native.fmu", twodof.FmuOptions(native=True))
         gains = {"Kp": np.linspace(10, 200, 20), "Kd": np.linspace(5, 80, 16)}
@@ -210,6 +214,20 @@ def draw_plot(fmu: Path, path: Path) -> None:
         twodof.simulate(run, twodof.Bag(bag))
     figure = plot(*bags)
     figure.savefig(path, dpi=135, pil_kwargs={"optimize": True}, metadata={"Software": None})
+
+
+def draw_tutorial(folder: Path) -> None:
+    """Draw the runs of the tutorial by its own commands: the first run, the steered one and the gantry."""
+    page = (ROOT / "docs" / "tutorial.md").read_text("utf-8")
+    blocks = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    wanted = [block for block in blocks if re.search("-o my_bag|-o steered|gantry.urdf", block)]
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    for block in wanted:
+        subprocess.run(["bash", "-ec", block], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+    for bag, name in (("my_bag", "first.png"), ("steered", "steered.png"), ("gantry", "gantry.png")):
+        figure = plot(folder / bag)
+        figure.savefig(ROOT / "docs" / name, dpi=90, pil_kwargs={"optimize": True}, metadata={"Software": None})
+        plt.close(figure)
 
 
 def draw_map(fmu: Path, grid: dict, settings: dict, path: Path) -> None:
