@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ..simulation.run_summary import Summary
     from ..simulation.sample import Sample, Sink
 
+BAR = "{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left"
+
 
 def add(run: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
@@ -161,22 +163,12 @@ def _progress() -> list[Sink]:
 
     class Progress(Sink):
         def begin(self, run: Experiment) -> Progress:
-            self._run = run
-            return self
-
-        def __enter__(self) -> Progress:
-            run = self._run
-            self._bar = tqdm(
-                total=run.steps * run.step,
-                unit="s",
-                leave=False,
-                desc="simulating",
-                bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left",
-            )
+            self._step = run.step
+            self._bar = tqdm(total=run.steps * run.step, unit="s", leave=False, desc="simulating", bar_format=BAR)
             return self
 
         def write(self, sample: Sample) -> None:
-            self._bar.update(self._run.step if sample.k else 0.0)
+            self._bar.update(self._step if sample.k else 0.0)
 
         def __exit__(self, *exception: object) -> None:
             self._bar.close()

@@ -81,10 +81,14 @@ def sweep(
     end = run.time(run.steps) if stop_time is None else stop_time
     options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
-    units = [_unit(run.fmu, name) for name in design.names]
+    units = [
+        " or ".join(dict.fromkeys(run.fmu.variables[e].unit or "" for e in run.fmu.vector(n))) for n in design.names
+    ]
     with temporary_folder() as spare:
         path = spare / "sweep" if output is None else Path(output)
-        job = _job(run.fmu, design.names, options, path.resolve() / "bags" if bags else None)
+        with opened(run.fmu):
+            content = run.fmu.path.read_bytes()
+        job = Job(content, run.fmu.path.name, design.names, options, path.resolve() / "bags" if bags else None)
         provenance = _provenance(run.fmu, design, job, command_line)
         results = Results(path, design.names, units, len(design), provenance, resume=resume)
         staff = _workers(job, design, ~results.done, workers, scheduler, stop)
@@ -101,11 +105,6 @@ def _collect(
         for rows in news:
             results.add(rows)
             progress(int(results.done.sum()), len(results.done))
-
-
-def _job(fmu: Fmu, names: tuple[str, ...], options: dict[str, Any], bags: Path | None) -> Job:
-    with opened(fmu):
-        return Job(fmu.path.read_bytes(), fmu.path.name, names, options, bags)
 
 
 def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
@@ -142,8 +141,3 @@ def _workers(
     from .cluster import Cluster  # Dask takes a second to import
 
     return Cluster(job, batches, scheduler, stop)
-
-
-def _unit(fmu: Fmu, name: str) -> str:
-    elements = [name] if name in fmu.variables else fmu.vector(name)
-    return " or ".join(dict.fromkeys(fmu.variables[element].unit or "" for element in elements))
