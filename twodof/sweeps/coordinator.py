@@ -81,9 +81,7 @@ def sweep(
     end = run.time(run.steps) if stop_time is None else stop_time
     options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
-    units = [
-        " or ".join(dict.fromkeys(run.fmu.variables[e].unit or "" for e in run.fmu.vector(n))) for n in design.names
-    ]
+    units = [_unit(run.fmu, name) for name in design.names]
     with temporary_folder() as spare:
         path = spare / "sweep" if output is None else Path(output)
         with opened(run.fmu):
@@ -141,3 +139,7 @@ def _workers(
     from .cluster import Cluster  # Dask takes a second to import
 
     return Cluster(job, batches, scheduler, stop)
+
+
+def _unit(fmu: Fmu, name: str) -> str:
+    return " or ".join(dict.fromkeys(fmu.variables[element].unit or "" for element in fmu.vector(name)))
