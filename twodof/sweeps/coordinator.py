@@ -84,9 +84,7 @@ def sweep(
     units = [_unit(run.fmu, name) for name in design.names]
     with temporary_folder() as spare:
         path = spare / "sweep" if output is None else Path(output)
-        with opened(run.fmu):
-            content = run.fmu.path.read_bytes()
-        job = Job(content, run.fmu.path.name, design.names, options, path.resolve() / "bags" if bags else None)
+        job = _job(run.fmu, design.names, options, path.resolve() / "bags" if bags else None)
         provenance = _provenance(run.fmu, design, job, command_line)
         results = Results(path, design.names, units, len(design), provenance, resume=resume)
         staff = _workers(job, design, ~results.done, workers, scheduler, stop)
@@ -103,6 +101,11 @@ def _collect(
         for rows in news:
             results.add(rows)
             progress(int(results.done.sum()), len(results.done))
+
+
+def _job(fmu: Fmu, names: tuple[str, ...], options: dict[str, Any], bags: Path | None) -> Job:
+    with opened(fmu):
+        return Job(fmu.path.read_bytes(), fmu.path.name, names, options, bags)
 
 
 def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
