@@ -9,7 +9,7 @@
 
 Quantities have SI units. Functions accept an FMU's path or the ``Fmu`` that ``load_fmu`` returns.
 
-Build an FMU from a URDF:       build_fmu, FmuOptions, load_fmu, Fmu
+Build an FMU from a URDF:       build_fmu, FmuOptions, stock_robot, load_fmu, Fmu
 Run it:                         run (the same as simulate), experiment, Experiment, Summary, RealTime
 Run it step by step:            samples, Sample, Sink
 Write and read bags:            Bag, read_bag, Recording, export_bag, read_commands, recover

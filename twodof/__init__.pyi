@@ -9,6 +9,7 @@ from .bag.writer import Bag as Bag
 from .errors import TwoDofError as TwoDofError
 from .export.fmu_options import FmuOptions as FmuOptions
 from .export.package import build_fmu as build_fmu
+from .export.stock_robots import stock_robot as stock_robot
 from .fmu import Fmu as Fmu
 from .fmu import load_fmu as load_fmu
 from .linear import LinearModel as LinearModel

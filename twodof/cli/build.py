@@ -28,6 +28,8 @@ def add(build: argparse.ArgumentParser) -> None:
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu")
     option("robot", nargs="?", type=Path, metavar="URDF", help="or a xacro file; default: the shipped planar 2-DoF arm")
+    option("--robot", dest="stock", type=not_empty, metavar="NAME", help="a robot of an installed package, as panda")
+    flag("--list-robots", help="print the names of these robots")
     option("--urdf", type=Path, metavar="U", help="the same")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
     flag("--no-meshes", help="leave the URDF's meshes out of the FMU")
@@ -78,6 +80,13 @@ def add(build: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
+    if options.list_robots:
+        from ..export.stock_robots import stock_robots
+
+        print_table(*((name, str(path.parent)) for name, path in stock_robots().items()))
+        return 0
+    if options.stock and (options.urdf or options.robot):
+        raise CommandLineError("--robot names an installed robot; leave out the URDF, or --robot")
     if options.urdf and options.robot:
         raise CommandLineError("a URDF is given twice, by its place and with --urdf")
     check_company(options, needs={"--mesh-dir": "a URDF"}, excludes={"--no-meshes": "--mesh-dir"})
@@ -109,20 +118,24 @@ def _build(options: argparse.Namespace) -> Path:
     from ..export.compiler import PLATFORMS
     from ..export.fmu_options import FmuOptions
     from ..export.package import build_fmu
+    from ..export.stock_robots import stock_robot
 
     platforms = PLATFORMS[options.fmi or 2] if "all" in options.platforms else options.platforms
+    stock = stock_robot(options.stock) if options.stock else FmuOptions()
     chosen = FmuOptions(
-        urdf=options.urdf or options.robot,
+        urdf=stock.urdf or options.urdf or options.robot,
         name=options.name or "",
         lock=_locks(options.locks),
         meshes=not options.no_meshes,
         gravity=options.gravity and tuple(options.gravity),
-        q_start=options.q_start and tuple(options.q_start),
+        q_start=tuple(options.q_start) if options.q_start else stock.q_start,
+        mesh_dir=options.mesh_dir or stock.mesh_dir,
+        frame=options.frame or stock.frame,
         control="pose" if options.orientation else options.control,
         settings=parse_settings(options.settings),
         arrays=not options.scalars,
         platforms=tuple(dict.fromkeys(platforms)),
-        **said(options, "mesh_dir", "frame", "axes", "link_environment", "native", "fmi"),
+        **said(options, "axes", "link_environment", "native", "fmi"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     return build_fmu(options.output, chosen, overwrite=options.overwrite)

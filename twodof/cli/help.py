@@ -16,6 +16,7 @@ EXAMPLES = {
     "build": [
         "twodof build",
         "twodof build my_robot.urdf --mesh-dir my_packages --frame tool0",
+        "twodof build --robot panda --native",
         "twodof build my_robot.urdf --control joint --native --platform all",
     ],
     "run": [

@@ -126,6 +126,10 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
     starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": rest}
     for key in ("gravity", "q_start"):
         given = getattr(options, key)
+        if isinstance(given, Mapping):
+            for name in given.keys() - {*robot.joints}:
+                raise BuildError(f"{key}: there is no joint '{name}'{choice(name, robot.joints)}")
+            given = [given.get(name, value) for name, value in zip(robot.joints, starts[key])]
         if given is not None:
             if not all(map(math.isfinite, given)):
                 raise BuildError(f"{key} {given} must be finite numbers")

@@ -25,8 +25,8 @@ class FmuOptions:
         meshes: whether to carry them.
         axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else (0, 0, −9.81).
-        q_start: start positions, rad or m, in the order of the joints; None: the shipped arm's,
-            else 0 where the limits allow and their middle where not.
+        q_start: start positions, rad or m, in the order of the joints or by their names; the others, or
+            None: the shipped arm's, else 0 where the limits allow and their middle where not.
         settings: start values of variables by name, as in ``experiment``.
         control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
             frame's orientation), "joint" or "effort".
@@ -48,7 +48,7 @@ class FmuOptions:
     meshes: bool = True
     axes: str | None = None
     gravity: tuple[float, float, float] | None = None
-    q_start: tuple[float, ...] | None = None
+    q_start: tuple[float, ...] | Mapping[str, float] | None = None
     control: str = "task"
     settings: Mapping[str, object] = field(default_factory=dict)
     name: str = ""

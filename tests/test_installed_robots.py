@@ -1,0 +1,64 @@
+"""Robots by name: of example-robot-data and of robot_descriptions' cache, with their end effector and home pose."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pinocchio as pin
+import pytest
+
+import twodof
+from twodof.cli.main import main
+from twodof.export.stock_robots import stock_robots
+
+
+@pytest.mark.parametrize(
+    ("name", "srdf", "pose", "frame"),
+    [("panda", "panda", "default", "panda_hand_tcp"), ("z1", "z1", "home", ""), ("ur5_robot", "", "", "tool0")],
+)
+def test_a_robot_has_its_home_pose_as_pinocchio_reads_it(
+    name: str, srdf: str, pose: str, frame: str, tmp_path: Path
+) -> None:
+    path = stock_robots()[name]
+    model = pin.buildModelFromUrdf(str(path), mimic=True)
+    q = pin.neutral(model)
+    if srdf:
+        pin.loadReferenceConfigurations(model, str(path.parents[1] / f"srdf/{srdf}.srdf"))
+        q = model.referenceConfigurations[pose]
+    fmu = twodof.load_fmu(twodof.build_fmu(tmp_path / "robot.fmu", replace(twodof.stock_robot(name), meshes=False)))
+    assert fmu.frame == (frame or fmu.frame) and fmu.frame in [f.name for f in model.frames]
+    starts = [fmu.start_values[name] for name in fmu.vector("q_start")]
+    for joint, start in zip(fmu.joints, starts):
+        assert start == pytest.approx(q[model.joints[model.getJointId(joint)].idx_q], abs=1e-12), joint
+
+
+def test_a_panda_by_name_has_its_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", "--robot", "panda"]) == 0
+    fmu = twodof.load_fmu("panda.fmu")
+    assert len([name for name in fmu.members if name.endswith(".dae")]) == 10
+
+
+def test_the_cache_of_robot_descriptions_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for package in ("left", "right"):
+        (tmp_path / package / "urdf").mkdir(parents=True)
+        shutil.copy(Path(__file__).parents[1] / "urdf/2dof.urdf", tmp_path / package / "urdf/arm.urdf")
+    shutil.copy(tmp_path / "left/urdf/arm.urdf", tmp_path / "left/urdf/single.urdf")
+    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path))
+    assert main(["build", "--list-robots"]) == 0
+    listed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    assert {"left/arm", "right/arm", "single", "panda"} <= {*listed} and "arm" not in listed
+    assert listed["right/arm"] == str(tmp_path / "right/urdf")
+    assert twodof.stock_robot("single").frame == "EndEffector"
+
+
+def test_a_robot_that_is_unknown_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["build", "--robot", "pandda"]) == 1
+    assert "there is no robot 'pandda'; did you mean 'panda'?" in capsys.readouterr().err
+    assert main(["build", "arm.urdf", "--robot", "panda"]) == 2
+    with pytest.raises(twodof.TwoDofError, match="q_start: there is no joint 'joint3'; did you mean 'joint2'"):
+        twodof.build_fmu("new.fmu", twodof.FmuOptions(q_start={"joint3": 1.0}))

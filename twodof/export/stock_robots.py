@@ -1,0 +1,98 @@
+"""Robots by name, of installed packages: example-robot-data, and the cache of robot_descriptions."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import xml.etree.ElementTree as ET
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+from ..bounds import MAX_URDF
+from ..errors import BuildError, choice
+from ..files import read_file, refusing
+from ..plant.urdf import RobotError, Urdf, read_urdf
+from .fmu_options import FmuOptions
+from .urdf_source import last_links, read_text
+
+PACKAGE = "example-robot-data"
+CACHE = "ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"
+"""Environment variable of robot_descriptions, and its default."""
+HOMES = ("home", "default", "standing", "half_sitting", "neutral")
+"""Names of a home pose in SRDF files, the most telling first."""
+ENDS = ("tool0", "ee_link", "end_effector", "link_tcp")
+
+
+def stock_robots() -> dict[str, Path]:
+    """Return the URDFs of installed packages, by the name of the file, and where two have one by its package too."""
+    found: list[Path] = []
+    with suppress(importlib.metadata.PackageNotFoundError):
+        files = importlib.metadata.files(PACKAGE) or []
+        found += [Path(str(file.locate())).resolve() for file in files if file.suffix == ".urdf"]
+    cache = Path(os.environ.get(CACHE[0]) or CACHE[1]).expanduser()
+    found += sorted(cache.rglob("*.urdf")) if cache.is_dir() else []
+    counts = Counter(path.stem for path in found)
+    names = (path.stem if counts[path.stem] == 1 else f"{_package(path).name}/{path.stem}" for path in found)
+    return dict(sorted(zip(names, found), key=lambda item: item[0].lower()))
+
+
+def stock_robot(name: str) -> FmuOptions:
+    """Return the options with which a robot of an installed package is built.
+
+    The controlled link and the home pose are those of the package's SRDF file, where it has one.
+
+    Args:
+        name: of ``stock_robots``, e.g. "panda".
+
+    Raises:
+        BuildError: there is no such robot, or it cannot be read.
+    """
+    known = stock_robots()
+    if name not in known:
+        source = f"pip install {PACKAGE}, or load it with robot_descriptions"
+        raise BuildError(f"there is no robot '{name}'{choice(name, known) if known else f'; {source}'}")
+    path = known[name]
+    try:
+        urdf = read_urdf(read_text(path, None))
+    except RobotError as error:
+        raise BuildError(f"{path.name}: {error}") from error
+    semantics = _semantics(path)
+    ends = [str(end.get("parent_link")) for end in semantics.iterfind("end_effector")]
+    leaves = last_links(urdf)
+    frames = [link for link in (*ends, *ENDS, *leaves) if link in leaves or (link in ends and link in urdf.links)]
+    folder = next((parent.parent for parent in path.parents if parent.name == PACKAGE), None)
+    return FmuOptions(
+        urdf=path, mesh_dir=folder, frame=frames[0] if frames else None, q_start=_home(semantics, urdf) or None
+    )
+
+
+def _package(path: Path) -> Path:
+    return path.parent.parent
+
+
+def _semantics(path: Path) -> ET.Element:
+    """Return the SRDF of a URDF: of the same name, or of one that begins like it; empty where there is none."""
+    files = sorted((_package(path) / "srdf").glob("*.srdf"), key=lambda file: -len(file.stem))
+    fitting = [file for file in files if path.stem.startswith(file.stem)]
+    if not fitting:
+        return ET.Element("robot")
+    with refusing(BuildError, f"read '{fitting[0]}'"):
+        text = read_file(fitting[0], MAX_URDF)
+    try:
+        return ET.fromstring(text)
+    except ET.ParseError as error:
+        raise BuildError(f"'{fitting[0]}' is not XML: {error}") from error
+
+
+def _home(semantics: ET.Element, urdf: Urdf) -> dict[str, float]:
+    """Return the positions of the home pose, rad or m, of joints that move on their own."""
+    states = {str(state.get("name")): state for state in reversed(semantics.findall("group_state"))}
+    state = next((states[name] for name in (*HOMES, *reversed(states)) if name in states), None)
+    home = {}
+    for element in [] if state is None else state.iterfind("joint"):
+        joint = urdf.joints.get(str(element.get("name")))
+        with suppress(ValueError):  # a floating base has several numbers
+            if joint is not None and joint.moves and joint.leader == joint.name:
+                home[joint.name] = float(str(element.get("value")))
+    return home
