@@ -24,6 +24,10 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
    never held, because its J⁺ is unbounded. */
 static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 16777216.0, HOLD_GROWTH = 8.0,
                     HOLD_OF_ALL = 1.0 / 512.0;
+/* Part of CHATTER_TIME that replaces it for the rank, and for joints whose stops have no reaction: near a
+   singularity ordinary gains whip joints to and fro within microseconds, and no impact repeats there without
+   end. */
+static const double SHORT_CHATTER_TIME = 1.0 / 4096.0;
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
 
@@ -116,10 +120,11 @@ typedef struct {
     double until, length;
 } Hold;
 
-static void hold_for_a_while(Hold *hold, double t, double chatter_time)
+/* Begin a hold at t, longer than the last one where that ended within the time `soon`. */
+static void hold_for_a_while(Hold *hold, double t, double soon, double longest)
 {
-    const int again = t - hold->until < chatter_time;
-    hold->length = again ? fmin(HOLD_GROWTH * hold->length, chatter_time) : FIRST_HOLD * chatter_time;
+    const int again = t - hold->until < soon;
+    hold->length = again ? fmin(HOLD_GROWTH * hold->length, longest) : FIRST_HOLD * longest;
     hold->until = t + hold->length;
 }
 
@@ -131,13 +136,13 @@ static int is_at_limit(const Step *step, int i)
 
 /* Hold the joints that chatter at t; long holds cover all joints at limits. */
 static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *hold, double t,
-                        double chatter_time, int anti_chatter[N_JOINTS])
+                        double joint_time, double chatter_time, int anti_chatter[N_JOINTS])
 {
     int any = 0;
     for (int i = 0; i < N_JOINTS; i++)
         any |= chattering[i];
     if (any)
-        hold_for_a_while(hold, t, chatter_time);
+        hold_for_a_while(hold, t, joint_time, chatter_time);
     else if (hold->until > t)
         return;
     const int all = any && hold->length >= HOLD_OF_ALL * chatter_time;
@@ -148,6 +153,8 @@ static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *
 int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N_JOINTS], Failure *failure)
 {
     const double chatter_time = CHATTER_TIME * fmin(plant->value[MAX_STEP], h);
+    const double short_time = SHORT_CHATTER_TIME * chatter_time;
+    const double joint_time = plant->value[RIGID_STOPS] != 0.0 ? chatter_time : short_time;
     double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
     Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0};
     int anti_chatter[N_JOINTS] = {0}, chattering[N_JOINTS] = {0};
@@ -167,7 +174,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
         const int before = step.stops.rank, rank_held = rank.until > t;
         double end = rank_held ? fmin(h, rank.until) : h;
         int again = 0;
-        hold_joints(&step, chattering, &joints, t, chatter_time, anti_chatter);
+        hold_joints(&step, chattering, &joints, t, joint_time, chatter_time, anti_chatter);
         if (joints.until > t)
             end = fmin(end, joints.until);
         set_out(&step, anti_chatter, rank_held);
@@ -182,13 +189,13 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
             continue;
         if (step.stops.rank > before)
             risen = t;
-        if (step.stops.rank < before && t - risen < chatter_time) {
-            hold_for_a_while(&rank, t, chatter_time);
+        if (step.stops.rank < before && t - risen < short_time) {
+            hold_for_a_while(&rank, t, short_time, chatter_time);
             continue;
         }
         t = until_event(&step, t, end, rank_held, &event, failure);
         for (int i = 0; i < N_JOINTS; i++) {
-            chattering[i] = event.stopped[i] && t - left[i] < chatter_time;
+            chattering[i] = event.stopped[i] && t - left[i] < joint_time;
             if (stopped_at && event.stopped[i])
                 stopped_at[i] = fmin(stopped_at[i], t);
         }

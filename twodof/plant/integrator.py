@@ -61,6 +61,9 @@ zero, or impacts that drive joints off each other's limits, would release and st
 that returns once is held for some picoseconds. The rank of J⁺ is held in the same way where it drops soon after a
 rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is never held, because
 its J⁺ is unbounded."""
+SHORT_CHATTER_TIME = 2.0**-12
+"""Part of CHATTER_TIME that replaces it for the rank, and for joints whose stops have no reaction: near a singularity
+ordinary gains whip joints to and fro within microseconds, and no impact repeats there without end."""
 MOST_ROWS = 6
 """Rows of a task's Jacobian at most: three axes and three of an orientation."""
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
@@ -268,10 +271,10 @@ class _Hold:
     until: float = -inf
     length: float = 0.0
 
-    def again(self, t: float, chatter_time: float) -> None:
-        """Begin a hold at t, longer than the last one where that ended within the anti-chatter time."""
-        repeated = t - self.until < chatter_time
-        self.length = min(HOLD_GROWTH * self.length, chatter_time) if repeated else FIRST_HOLD * chatter_time
+    def again(self, t: float, soon: float, longest: float) -> None:
+        """Begin a hold at t, longer than the last one where that ended within the time ``soon``."""
+        repeated = t - self.until < soon
+        self.length = min(HOLD_GROWTH * self.length, longest) if repeated else FIRST_HOLD * longest
         self.until = t + self.length
 
 
@@ -315,12 +318,14 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     """Return the state after h, integrated from event to event."""
     n, stops, t = motion.n, motion.stops, 0.0
     chatter_time = CHATTER_TIME * min(motion.max_step, h)
+    short_time = SHORT_CHATTER_TIME * chatter_time
+    joint_time = chatter_time if stops.rigid else short_time
     joint_hold, rank_hold = _Hold(), _Hold()
     left, risen = [-inf] * n, -inf  # when each joint left its limit, when the rank rose
     event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):
-            joint_hold.again(t, chatter_time)
+            joint_hold.again(t, joint_time, chatter_time)
             anti_chatter = chattering
             if joint_hold.length >= HOLD_OF_ALL * chatter_time:
                 anti_chatter = stops.at_limits(y)
@@ -339,11 +344,11 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
             continue
         if motion.rank > rank:
             risen = t
-        if motion.rank < rank and t - risen < chatter_time:
-            rank_hold.again(t, chatter_time)
+        if motion.rank < rank and t - risen < short_time:
+            rank_hold.again(t, short_time, chatter_time)
             continue
         t, y, event = motion.until_event(y, rates, t, min(end, h))
-        chattering = [i in event.stopped and t - left[i] < chatter_time for i in range(n)]
+        chattering = [i in event.stopped and t - left[i] < joint_time for i in range(n)]
     if joint_hold.until <= h:
         anti_chatter = [False] * n
     stops.impact(y, anti_chatter)

@@ -37,12 +37,14 @@ class Stops:
         inverse_mass: of rigid stops; None: of stops without a reaction.
 
     Attributes:
+        rigid: stops have a reaction.
         held: joints at rest at a limit.
         watched: those of them that leave it when they are no longer pressed.
     """
 
     def __init__(self, limits: Limits, inverse_mass: InverseMass | None) -> None:
         self.limits, self._inverse_mass = limits, inverse_mass
+        self.rigid = inverse_mass is not None
         self.held: list[int] = []
         self.watched: list[int] = []
 
