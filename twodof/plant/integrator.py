@@ -53,17 +53,13 @@ class Equations:
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-24, 8.0, 2.0**-9
-"""Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held
-there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
-HOLD_OF_ALL (part of CHATTER_TIME) or more covers all joints at limits. Otherwise an acceleration that grazes
-zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A joint
-that returns once is held for some picoseconds. The rank of J⁺ is held in the same way where it drops soon after a
-rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is never held, because
-its J⁺ is unbounded."""
-SHORT_CHATTER_TIME = 2.0**-12
-"""Part of CHATTER_TIME that replaces it for the rank, and for joints whose stops have no reaction: near a singularity
-ordinary gains whip joints to and fro within microseconds, and no impact repeats there without end."""
+CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-12, 2.0**-24, 8.0, 2.0**-9
+"""Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held there for
+FIRST_HOLD; each repetition lengthens the hold by HOLD_GROWTH, and one of HOLD_OF_ALL or more covers all joints at
+limits (parts of CHATTER_TIME). Otherwise an acceleration that grazes zero, or impacts that drive joints off each
+other's limits, would release and stop joints without end. The rank of J⁺ is held likewise where it drops soon after a
+rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded. Rank, and stops
+without reaction, use a SHORT_CHATTER_TIME: near a singularity ordinary gains whip joints within microseconds."""
 MOST_ROWS = 6
 """Rows of a task's Jacobian at most: three axes and three of an orientation."""
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
@@ -273,8 +269,7 @@ class _Hold:
 
     def again(self, t: float, soon: float, longest: float) -> None:
         """Begin a hold at t, longer than the last one where that ended within the time ``soon``."""
-        repeated = t - self.until < soon
-        self.length = min(HOLD_GROWTH * self.length, longest) if repeated else FIRST_HOLD * longest
+        self.length = min(HOLD_GROWTH * self.length, longest) if t - self.until < soon else FIRST_HOLD * longest
         self.until = t + self.length
 
 
