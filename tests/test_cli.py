@@ -363,3 +363,11 @@ def test_a_compiler_that_works_is_seen_working(tmp_path: Path) -> None:
     )
     assert "compiling: 0 s" in shown.stdout and "compiling: 1 s" in shown.stdout
     assert shown.stdout.endswith("\x1b[K")
+
+
+def test_help_texts_are_phrases_that_stand_alone() -> None:
+    """A default or a unit by itself tells nothing about an option."""
+    for verb, its_parser in parser()[1].items():
+        for action in its_parser._actions:
+            assert action.help, f"{verb} {action.dest}"
+            assert not re.match(r"\(|of |s |the same$|its ", action.help), f"{verb} {action.dest}: {action.help}"

@@ -27,12 +27,12 @@ def add(build: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
     add_output(build, "FILE.fmu", "default: <name>.fmu")
-    option("robot", nargs="?", type=Path, metavar="URDF", help="or a xacro file; default: the shipped planar 2-DoF arm")
-    option("--robot", dest="stock", type=not_empty, metavar="NAME", help="a robot of an installed package, as panda")
+    option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the shipped planar 2-DoF arm)")
+    option("--robot", dest="stock", type=not_empty, metavar="NAME", help="robot of an installed package, such as panda")
     flag("--list-robots", help="print the names of these robots")
-    option("--urdf", type=Path, metavar="U", help="the same")
+    option("--urdf", type=Path, metavar="U", help="another spelling of the URDF argument")
     option("--mesh-dir", type=Path, metavar="M", help="folder of the URDF's packages or meshes")
-    flag("--no-meshes", help="leave the URDF's meshes out of the FMU")
+    flag("--no-meshes", help="omit the URDF's meshes from the FMU")
     frame = option("--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)")
     completed(frame, links)
     lock = option(
@@ -50,32 +50,37 @@ def add(build: argparse.ArgumentParser) -> None:
         nargs=3,
         type=float,
         metavar=("X", "Y", "Z"),
-        help="m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)",
+        help="gravity, m/s2 in the root frame (0 -9.81 0 for the shipped arm, else 0 0 -9.81)",
     )
     option("--q-start", nargs="+", type=float, metavar="Q", help="start positions, rad or m")
     option(
         "--control",
         choices=("task", "joint", "effort"),
         default="task",
-        help="what drives the robot: a target of the frame, one for each joint, or efforts (%(default)s)",
+        help="control law: target of the frame, target of each joint, or efforts (%(default)s)",
     )
-    flag("--orientation", help="of the frame too: a target orientation beside the position")
+    flag("--orientation", help="control the frame's orientation beside its position")
     add_options(build, "--set")
     option("--name", type=not_empty, help="name of the model (the URDF's file name, TwoDof for the shipped arm)")
     flag("--overwrite", help="replace an existing file that is not the default arm's FMU")
-    flag("--link-environment", help="remember in the FMU where this Python's packages are")
-    flag("--native", help="compiled C, which needs no Python where it runs")
+    flag("--link-environment", help="store the path of this Python's packages in the FMU")
+    flag("--native", help="build the FMU as compiled C, which needs no Python")
     option(
         "--platform",
         dest="platforms",
         action="append",
         default=[],
         metavar="P",
-        help="of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
+        help="platform of a native FMU: linux64, win64, darwin64, with --fmi 3 x86_64-linux, aarch64-linux,"
         " x86_64-windows, x86_64-darwin, aarch64-darwin, or all; repeatable (this machine's)",
     )
-    option("--fmi", type=int, choices=(2, 3), help="version of a native FMU (2; 3 on machines that 2 has no name for)")
-    flag("--scalars", help="in FMI 3 each element of a vector is a variable, for tools that know no arrays")
+    option(
+        "--fmi",
+        type=int,
+        choices=(2, 3),
+        help="FMI version of a native FMU (2; 3 on machines without a name in FMI 2.0)",
+    )
+    flag("--scalars", help="make each element of a vector a variable in FMI 3, for tools without arrays")
 
 
 def call(options: argparse.Namespace) -> int:

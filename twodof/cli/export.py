@@ -12,14 +12,14 @@ from .printing import print_table
 def add(export: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     export.description = "Write a bag as a table with named columns and units, or as one MCAP file of all messages."
-    export.add_argument("bag", metavar="BAG", type=Path)
+    export.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
     export.add_argument(
         "-o",
         dest="output",
         required=True,
         type=not_empty,
         metavar="FILE",
-        help=".csv, .parquet (extra 'sweep') or .mcap",
+        help="output file: .csv, .parquet (extra 'sweep') or .mcap",
     )
 
 

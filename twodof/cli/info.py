@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def add(info: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path)
+    info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path, help="FMU, bag or sweep to describe")
     add_options(info, "--json")
 
 

@@ -17,9 +17,11 @@ def add(layouts: argparse.ArgumentParser) -> None:
     )
     add_fmu(layouts, "TwoDof.fmu, built if need be")
     add_options(layouts, "--frame")
-    layouts.add_argument("-o", dest="folder", default=".", metavar="FOLDER", help="(%(default)s)")
+    layouts.add_argument(
+        "-o", dest="folder", default=".", metavar="FOLDER", help="folder of the layout files (%(default)s)"
+    )
     add_options(layouts, "--namespace")
-    layouts.add_argument("--overwrite", action="store_true", help="replace files that differ")
+    layouts.add_argument("--overwrite", action="store_true", help="replace existing files that differ")
     layouts.set_defaults(native=False)
 
 

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 def add(linearise: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    linearise.add_argument("fmu", metavar="FMU")
+    linearise.add_argument("fmu", metavar="FMU", help="native FMU")
     point = linearise.add_argument(
         "--at",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="of the point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
+        help="operating point: q=0.5,0.35 or q[1]=0.5, v=0, and inputs and parameters, as"
         " tau_cmd=0.1,0; without q and v it is the equilibrium near q_start",
     )
     completed(point, variables())

@@ -56,8 +56,8 @@ def parser() -> tuple[Parser, dict[str, Parser]]:
         added = verbs.add_parser(verb.__name__.rpartition(".")[2], help=text)
         added.set_defaults(call=verb.call)
         verb.add(added)
-    helped = verbs.add_parser("help", help="show this, or the options of a verb")
-    helped.add_argument("about", nargs="?", metavar="VERB")
+    helped = verbs.add_parser("help", help="show this help, or the options of a command")
+    helped.add_argument("about", nargs="?", metavar="VERB", help="command to explain")
 
     def call(options: argparse.Namespace) -> int:
         check_verb(program, verbs.choices, [options.about or "help"])

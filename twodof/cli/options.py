@@ -36,7 +36,7 @@ def output_file(text: str) -> str:
 
 Table = dict[str, dict[str, Any]]
 OF_A_RUN: Table = {
-    "--native": dict(action="store_true", help="build and run a native FMU, of a URDF or none"),
+    "--native": dict(action="store_true", help="build and run a native FMU, of the URDF or the default arm"),
     "--set": dict(
         dest="settings",
         action="append",
@@ -47,26 +47,26 @@ OF_A_RUN: Table = {
     "--input": dict(
         metavar="CSV|BAG[:TOPIC]", help="inputs over time: a column 'time' and one for each input; or a bag's commands"
     ),
-    "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)"),
+    "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="storage plugin of the bag (mcap)"),
     "--compress": dict(choices=("zstd",), default="", help="compress the chunks of an MCAP bag"),
-    "--scene": dict(action="store_true", help="add robot description, tf, target and end effector"),
-    "--effort": dict(action="store_true", help="add the control effort"),
-    "--stamp-start": dict(type=float, metavar="S", help="first stamp, s since the epoch (now)"),
+    "--scene": dict(action="store_true", help="record robot description, tf, target and end effector"),
+    "--effort": dict(action="store_true", help="record the control effort"),
+    "--stamp-start": dict(type=float, metavar="S", help="time stamp of the first sample, s since the epoch (now)"),
     "--overwrite": dict(action="store_true", help="replace an existing bag, or the FMU of a URDF"),
-    "--json": dict(action="store_true", help="print the facts as JSON, SI units"),
-    "--fsync": dict(action="store_true", help="wait for the disk twice a second, for a power loss"),
+    "--json": dict(action="store_true", help="print the results as JSON, in SI units"),
+    "--fsync": dict(action="store_true", help="flush to the disk twice a second, against power loss"),
 }
 """Options of verbs that may write a bag, except the FMU to run."""
 OF_A_PAGE: Table = {
-    "--host": dict(help="address to listen on (127.0.0.1, this machine alone)"),
-    "--port": dict(type=int, help="(8080); 0: any that is free"),
-    "--no-browser": dict(action="store_true", help="open no browser"),
+    "--host": dict(help="address to listen on (127.0.0.1: this machine only)"),
+    "--port": dict(type=int, help="port (8080); 0: any free port"),
+    "--no-browser": dict(action="store_true", help="do not open a browser"),
 }
 OPTIONS: Table = {
-    "--frame": dict(type=not_empty, metavar="LINK", help="of a URDF, the controlled link (its end)"),
-    "--stop-time": dict(type=float, metavar="S", help="s (the FMU's own)"),
-    "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's own)"),
-    "--namespace": dict(default="", metavar="NS", help="of the topics"),
+    "--frame": dict(type=not_empty, metavar="LINK", help="controlled link of a URDF (its last link)"),
+    "--stop-time": dict(type=float, metavar="S", help="stop time, s (the FMU's default)"),
+    "--step": dict(type=float, metavar="S", help="communication step, s (the FMU's default)"),
+    "--namespace": dict(default="", metavar="NS", help="namespace of the topics"),
     **OF_A_RUN,
     **OF_A_PAGE,
 }
@@ -101,8 +101,8 @@ def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for the robot of a third-party bag."""
-    parser.add_argument("--urdf", type=not_empty, metavar="U", help="the robot of a bag that carries none")
-    frame = parser.add_argument("--frame", type=not_empty, metavar="LINK", help="its end effector")
+    parser.add_argument("--urdf", type=not_empty, metavar="U", help="URDF of the robot, for a bag without one")
+    frame = parser.add_argument("--frame", type=not_empty, metavar="LINK", help="end effector of that robot")
     completed(frame, completion.links)
 
 

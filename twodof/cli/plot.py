@@ -22,7 +22,7 @@ def add(plot: argparse.ArgumentParser) -> None:
         "Draw joint positions, velocities and efforts, the end effector's path and its error; of a"
         " sweep, each metric over the variables."
     )
-    plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="several bags are compared")
+    plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="bags to draw; several are compared")
     plot.add_argument(
         "-o",
         dest="output",

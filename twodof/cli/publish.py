@@ -23,7 +23,7 @@ def add(publish: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     publish.description = (
         "Step an FMU in real time and publish each step as sensor_msgs/JointState over DDS, until"
-        " Ctrl-C. Commands from others drive the robot: joint states on /joint_commands, or points"
+        " Ctrl-C. Received commands drive the robot: joint states on /joint_commands, or points"
         " on /target_command and /clicked_point, as its control takes. Honours ROS_DOMAIN_ID,"
         " ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS, ROS_LOCALHOST_ONLY and CYCLONEDDS_URI."
     )
@@ -36,29 +36,29 @@ def add(publish: argparse.ArgumentParser) -> None:
     )
     add_output(publish, "BAG", "record a bag too, one of all robots")
     add_options(publish, "--frame")
-    option("--stop-time", type=float, metavar="S", help="s (none: until Ctrl-C)")
-    option("--rate", type=float, default=100.0, metavar="HZ", help="steps a second (%(default)g)")
-    flag("--subnet", help="for other hosts too, not for this one alone")
-    flag("--foxglove", help="serve Foxglove too, on this machine alone")
-    option("--foxglove-port", type=int, metavar="PORT", help="(8765)")
-    flag("--foxglove-control", help="let Foxglove set the gains")
+    option("--stop-time", type=float, metavar="S", help="stop time, s (until Ctrl-C)")
+    option("--rate", type=float, default=100.0, metavar="HZ", help="communication steps per second (%(default)g)")
+    flag("--subnet", help="publish to other hosts too, not only to this one")
+    flag("--foxglove", help="serve Foxglove too, on this machine only")
+    option("--foxglove-port", type=int, metavar="PORT", help="port for Foxglove (8765)")
+    flag("--foxglove-control", help="allow Foxglove to set the gains")
     add_options(publish, "--namespace")
-    option("--state-topic", default="joint_states", metavar="TOPIC", help="(%(default)s)")
+    option("--state-topic", default="joint_states", metavar="TOPIC", help="topic of the joint states (%(default)s)")
     option(
         "--command-topic",
         metavar="TOPIC",
-        help="where commands are heard (joint_commands or target_command, as the control takes)",
+        help="topic of received commands (joint_commands or target_command, by the control)",
     )
-    flag("--lockstep", help="do a step when its command has come, by stamp")
+    flag("--lockstep", help="do each step when the command with its stamp has arrived")
     option(
         "--timeout",
         type=float,
         metavar="S",
-        help="s without a command until the robot is held (0.5), or in lockstep until the end (10)",
+        help="time without a command, s, until the robot is held (0.5) or a lockstep run ends (10)",
     )
     option("--on-timeout", choices=("hold", "ramp"), help="hold the last command (targets), or ramp to zero (efforts)")
-    flag("--clock", help="publish /clock, and hear /pause and /step")
-    option("--speed", type=float, metavar="FACTOR", help="of real time (1; in lockstep unlimited)")
+    flag("--clock", help="publish /clock, and subscribe to /pause and /step")
+    option("--speed", type=float, metavar="FACTOR", help="multiple of real time (1; in lockstep unlimited)")
     add_options(publish, *OF_A_RUN)
     publish.set_defaults(storage=None)
 

@@ -44,21 +44,26 @@ def add(sweep: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=LOW:HIGH:COUNT",
-        help="values evenly spaced; all combinations of several",
+        help="evenly spaced values; several variables give all combinations",
     )
     completed(grid, variables())
-    option("--random", type=int, metavar="N", help="draws of each --range")
-    option("--seed", type=int, metavar="S", help="of the draws (0)")
+    option("--random", type=int, metavar="N", help="number of random draws from the --range options")
+    option("--seed", type=int, metavar="S", help="seed of the random draws (0)")
     drawn = option(
-        "--range", dest="ranges", action="append", default=[], metavar="NAME=LOW:HIGH", help="values drawn uniformly"
+        "--range",
+        dest="ranges",
+        action="append",
+        default=[],
+        metavar="NAME=LOW:HIGH",
+        help="range of uniformly drawn values",
     )
     completed(drawn, variables())
     add_options(sweep, "--stop-time", "--step", "--set")
     add_output(sweep, "OUT", "default: sweep_<date and time>")
-    flag("--resume", help="go on with OUT; what is done is not repeated")
+    flag("--resume", help="continue the sweep in OUT without repeating finished runs")
     flag("--bags", help="keep a bag of each run in OUT/bags")
-    option("--workers", type=int, metavar="N", help="local processes (one for a core)")
-    option("--scheduler", metavar="tcp://…", help="of a Dask cluster to use instead")
+    option("--workers", type=int, metavar="N", help="number of local processes (one per core)")
+    option("--scheduler", metavar="tcp://…", help="address of a Dask scheduler, whose workers are used instead")
     add_options(sweep, "--json")
 
 

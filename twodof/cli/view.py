@@ -16,7 +16,7 @@ from .signals import asked_to_stop
 def add(view: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     view.description = "Replay a bag in the browser, or write a page that replays it offline."
-    view.add_argument("bag", metavar="BAG", type=Path)
+    view.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
     view.add_argument(
         "--export",
         type=output_file,
@@ -24,8 +24,8 @@ def add(view: argparse.ArgumentParser) -> None:
         help="write one self-contained file instead; - is the standard output",
     )
     add_robot_options(view)
-    view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of that URDF's packages or meshes")
-    view.add_argument("--fmu", metavar="FMU", help="where the robot's meshes are")
+    view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of the packages or meshes of the URDF")
+    view.add_argument("--fmu", metavar="FMU", help="FMU that contains the robot's meshes")
     add_options(view, *OF_A_PAGE)
 
 
