@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import http.client
+import os
 import socket
+import sys
 import urllib.request
 from collections.abc import Sequence
+from urllib.parse import urlsplit
 
 import browser
 import pytest
@@ -55,6 +58,45 @@ def test_page_answers_to_its_own_name_and_its_own_page_alone(
                     assert answer(served.url, *asked, ("Origin", origin)) == 403
                 assert answer(served.url, *asked, ("Host", name)) == 403
             assert answer(served.url, *rest) == 403
+
+
+NOBODY = 65534
+
+
+def connected(url: str, host: str) -> socket.socket:
+    """A connection by a program that is not root's: the owner of a socket is who makes it."""
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(NOBODY)
+    try:
+        return socket.create_connection((host, urlsplit(url).port or 0), timeout=60)
+    finally:
+        if root:
+            os.seteuid(0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not list the owners of sockets")
+@pytest.mark.parametrize(
+    ("host", "asked"),
+    [
+        ("127.0.0.1", "127.0.0.1"),
+        ("127.0.0.1", "::ffff:127.0.0.1"),
+        ("0.0.0.0", "127.0.0.1"),
+        ("::1", "::1"),
+        ("::", "::1"),
+        ("::", "127.0.0.1"),
+        ("::", "::ffff:127.0.0.1"),
+    ],
+)
+def test_a_token_is_of_no_use_to_another_user(host: str, asked: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All users of a machine can read the command line of a browser, which has the token."""
+    user = os.geteuid() or NOBODY
+    with Server(b"page", host, 0, token="secret") as server:
+        for server_user, status in ((user, b"200"), (user + 1, b"403"), (0, b"200")):
+            with connected(server.url, asked) as one, monkeypatch.context() as patch:
+                patch.setattr(os, "geteuid", lambda server_user=server_user: server_user)
+                one.sendall(b"GET /?token=secret HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                assert one.recv(100).split()[1] == status
 
 
 def test_a_server_has_one_page_and_no_socket_that_it_does_not_need() -> None:

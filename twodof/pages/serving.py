@@ -13,11 +13,12 @@ import re
 import secrets
 import socket
 import stat
+import struct
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from itertools import permutations
 from pathlib import Path
 from threading import Event, Thread
@@ -40,6 +41,7 @@ CLOSING = 1.0  # s
 LARGEST = 64 * 1024  # bytes of a message from a browser
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 REFUSED = "open this page as twodof prints it; --host gives it another address or name\n"
+OTHER_USER = "this page answers programs of the user who runs twodof\n"
 HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
     "Content-Security-Policy": "frame-ancestors 'none'",
@@ -138,6 +140,8 @@ class Server:
         path, _, query = request.path.partition("?")
         if self._query and not secrets.compare_digest(query.encode(), self._query.encode()):
             return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
+        if self._query and _is_of_another_user(connection):
+            return connection.respond(HTTPStatus.FORBIDDEN, OTHER_USER)
         path = path if self._query else request.path
         if path == "/socket" and self._talk is not None:
             return None
@@ -217,6 +221,35 @@ def _is_own(request: Request, host: str, address: str, others: Collection[str] =
     if listening.is_unspecified:
         return name in (*LOOPBACK, socket.gethostname().lower()) or _is_address(name)
     return name in (host.lower(), address) or (listening.is_loopback and name in LOOPBACK)
+
+
+def _is_of_another_user(connection: Connection) -> bool:
+    """Return whether another user of this machine sends a request, also with the right token.
+
+    A browser is started with the page's URL on its command line, which every user of the machine can read. Linux lists
+    the owner of each socket, and inode 0 after its program has closed it. Root is not told apart: a container's root
+    serves the desktop's user. Source: proc_net_tcp(5).
+    """
+    user, rows = os.geteuid(), list[list[str]]()
+    for table in ("tcp", "tcp6"):
+        with suppress(OSError):  # not Linux, or no IPv6
+            rows += [line.split() for line in Path("/proc/net", table).read_text("ascii").splitlines()[1:]]
+    if user == 0 or not rows:
+        return False
+    (peer, peers), (_, own) = (_listed(*end[:2]) for end in (connection.remote_address, connection.local_address))
+    owners = [(int(row[7]), row[9]) for row in rows if row[1] in peers and row[2] in own]
+    closed = not owners and peer.is_loopback
+    return closed or any(owner not in (0, user) or inode == "0" for owner, inode in owners)
+
+
+def _listed(host: str, port: int) -> tuple[IPv4Address | IPv6Address, Collection[str]]:
+    """Return an address without its zone, IPv4 where IPv6 stands for it, and its forms in Linux's lists of sockets."""
+    address = ip_address(host.partition("%")[0])
+    address = getattr(address, "ipv4_mapped", None) or address
+    forms = (address.packed, bytes(10) + b"\xff\xff" + address.packed)
+    return address, [
+        f"{''.join(f'{word:08X}' for (word,) in struct.iter_unpack('=I', form))}:{port:04X}" for form in forms
+    ]
 
 
 def _is_address(name: str) -> bool:
