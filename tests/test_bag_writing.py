@@ -141,17 +141,29 @@ def test_folder_that_appears_before_the_first_sample_is_kept(run: Experiment, tm
     assert [file.name for file in path.iterdir()] == ["notes.txt"]
 
 
-def test_bag_behind_a_link_is_not_lost(run: Experiment, tmp_path: Path) -> None:
-    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
-        bag.write(sample(run, 0))
-    link = tmp_path / "link"
-    link.symlink_to(tmp_path / "bag")
-    try:
-        with twodof.Bag(link, overwrite=True).begin(run) as bag:
-            bag.write(sample(run, 0))
-    except BagError:
-        pass  # refused, and fine so
-    assert len(read_with_rosbags(tmp_path / "bag")) == 1
+@both_storages
+def test_a_link_stays_and_the_bag_behind_it_is_written(run: Experiment, tmp_path: Path, storage: str) -> None:
+    """A new one, and one that is replaced."""
+    link, path = tmp_path / "link", tmp_path / "far" / "bag"
+    path.parent.mkdir()
+    link.symlink_to("far/bag")
+    for count in (1, 2):
+        with twodof.Bag(link, storage=storage, overwrite=count == 2).begin(run) as bag:
+            for k in range(count):
+                bag.write(sample(run, k))
+        assert assert_consistent(path, storage) == count
+    with pytest.raises(BagError, match="exists already"):
+        twodof.Bag(link)
+    assert link.is_symlink() and sorted(file.name for file in tmp_path.iterdir()) == ["far", "link"]
+
+
+def test_a_folder_whose_metadata_are_a_link_is_not_overwritten(run: Experiment, tmp_path: Path) -> None:
+    with twodof.Bag(tmp_path / "bag").begin(run):
+        pass
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "metadata.yaml").symlink_to(tmp_path / "bag" / "metadata.yaml")
+    with pytest.raises(BagError, match="not a bag"):
+        twodof.Bag(tmp_path / "folder", overwrite=True)
 
 
 @both_storages

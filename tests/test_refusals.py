@@ -149,9 +149,8 @@ def a_bag(folder: Path) -> None:
     (folder / "bag/metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 8\n")
 
 
-def a_linked_bag(folder: Path) -> None:
-    a_bag(folder)
-    (folder / "link").symlink_to("bag")
+def a_link_to_itself(folder: Path) -> None:
+    (folder / "link").symlink_to("link")
 
 
 BUILD = ["build", "-o", "new.fmu", "--frame", "a", "--urdf", "arm.urdf"]
@@ -254,7 +253,7 @@ BAD: dict[str, Case] = {
     "file, --overwrite": (text("bag", "x"), [*RUN, "-o", "bag", "--overwrite"], "'bag' is not a bag"),
     "bag below a file": (text("file", "x"), [*RUN, "-o", "file/bag"], "'file/bag'.*Not a dir"),
     "bag with too long a name": (nothing, [*RUN, "-o", LONG], f"'{LONG}'.*too long"),
-    "symbolic link to a bag, --overwrite": (a_linked_bag, [*RUN, "-o", "link", "--overwrite"], "'link'"),
+    "symbolic link to itself, --overwrite": (a_link_to_itself, [*RUN, "-o", "link", "--overwrite"], "link'"),
     "stamp negative": (nothing, [*RUN, "--stamp-start", "-1"], "stamp_start = -1 s"),
     "info of a folder": (nothing, ["info", "."], r"'\.' is no bag: it is a folder"),
     "info of a bag's file": (text("a.db3", "x"), ["info", "a.db3"], "give the bag's folder"),

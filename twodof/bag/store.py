@@ -60,6 +60,7 @@ class Store:
             raise BagError(f"`compress` '{compress}' is unknown; there is: zstd")
         if compress and storage != "mcap":
             raise BagError(f"`compress` is of mcap; a {storage} bag is not compressed")
+        path = Path(os.path.realpath(path)) if os.path.islink(path) else path  # the link stays
         check_path(path, storage)
         self.path, self.fsync = path, fsync
         self._storage, self._overwrite, self._compress = storage, overwrite, compress
@@ -271,7 +272,7 @@ def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
             raise BagError(f"'{path}' {reason}")
         held = lock(path)
         try:
-            if path.is_symlink() or not _is_bag(path):
+            if not _is_bag(path):
                 raise BagError(f"'{path}' is not a bag and is not overwritten")
             if clear:
                 shutil.rmtree(path)
@@ -287,7 +288,7 @@ def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
 def _is_bag(path: Path) -> bool:
     """Return whether a folder has rosbag2's metadata, or the provenance of a writer that died."""
     try:
-        metadata = read_file(path / "metadata.yaml", MAX_METADATA)
+        metadata = read_file(path / "metadata.yaml", MAX_METADATA, follow=False)
         return metadata.startswith(b"rosbag2_bagfile_information:")
     except OSError:
         return any(read_provenance(path, name) for name in robots_of(path))
