@@ -167,5 +167,6 @@ def test_a_figure_a_page_and_an_fmu_go_to_the_standard_output(bag: Path, native_
     fmu = tmp_path / "x.fmu"
     with fmu.open("w+b") as file:
         twodof_to(file, "build", "-o", "/dev/stdout")
-    assert zipfile.ZipFile(fmu).testzip() is None
+    piped = subprocess.run([sys.executable, "-m", "twodof", "build", "-o", "-"], capture_output=True, check=True)
+    assert zipfile.ZipFile(fmu).testzip() is None and fmu.read_bytes() == piped.stdout
     assert twodof.load_fmu(fmu).joints == ("joint1", "joint2")

@@ -17,6 +17,7 @@ from .options import (
     check_company,
     completed,
     not_empty,
+    output_file,
     parse_settings,
     said,
 )
@@ -26,7 +27,7 @@ from .printing import busy, print_next, print_table, quote, say
 def add(build: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     option, flag = build.add_argument, partial(build.add_argument, action="store_true")
-    add_output(build, "FILE.fmu", "default: <name>.fmu")
+    add_output(build, "FILE.fmu", "default: <name>.fmu; - is the standard output", output_file)
     option("robot", nargs="?", type=Path, metavar="URDF", help="URDF or xacro file (the shipped planar 2-DoF arm)")
     option("--robot", dest="stock", type=not_empty, metavar="NAME", help="robot of an installed package, such as panda")
     flag("--list-robots", help="print the names of these robots")

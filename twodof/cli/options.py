@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,9 +94,11 @@ def add_fmu(parser: argparse.ArgumentParser, default: str, metavar: str = "FMU|U
     parser.add_argument("fmu", nargs="?", type=not_empty, metavar=metavar, help=f"default: {default}")
 
 
-def add_output(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
-    """Add the option for the output file."""
-    parser.add_argument("-o", dest="output", type=not_empty, metavar=metavar, help=text)
+def add_output(
+    parser: argparse.ArgumentParser, metavar: str, text: str, kind: Callable[[str], str] = not_empty
+) -> None:
+    """Add the option for the output: a folder, or of kind ``output_file`` a file."""
+    parser.add_argument("-o", dest="output", type=kind, metavar=metavar, help=text)
 
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:

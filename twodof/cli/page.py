@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from .fmus import chosen_fmu, is_robot
-from .options import add_fmu, add_options, output_file, parse_settings
+from .options import add_fmu, add_options, add_output, output_file, parse_settings
 from .printing import busy, print_table
 
 
@@ -16,13 +16,7 @@ def add(page: argparse.ArgumentParser) -> None:
         " target to drag. It needs no network and no server."
     )
     add_fmu(page, "the default arm's native FMU")
-    page.add_argument(
-        "-o",
-        dest="output",
-        type=output_file,
-        metavar="FILE.html",
-        help="default: <name>.html; - is the standard output",
-    )
+    add_output(page, "FILE.html", "default: <name>.html; - is the standard output", output_file)
     add_options(page, "--frame", "--step", "--set")
 
 

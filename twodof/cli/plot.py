@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .completion import joints
-from .options import CommandLineError, add_robot_options, completed, output_file
+from .options import CommandLineError, add_output, add_robot_options, completed, output_file
 from .printing import print_table
 from .sweep import print_best
 
@@ -23,13 +23,8 @@ def add(plot: argparse.ArgumentParser) -> None:
         " sweep, each metric over the variables."
     )
     plot.add_argument("bags", nargs="+", metavar="BAG|SWEEP", help="bags to draw; several are compared")
-    plot.add_argument(
-        "-o",
-        dest="output",
-        type=output_file,
-        metavar="FILE",
-        help=".png, .svg, .pdf or .html; - is the standard output, as PNG (a window)",
-    )
+    text = ".png, .svg, .pdf or .html; - is the standard output, as PNG (a window)"
+    add_output(plot, "FILE", text, output_file)
     chosen = plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     completed(chosen, joints)
     add_robot_options(plot)
