@@ -75,8 +75,8 @@ def test_run_leaves_the_messages_that_it_promises(session: dict[str, str]) -> No
 
 
 def test_run_says_how_far_the_end_effector_is_from_its_target(session: dict[str, str]) -> None:
-    found = rows(session["run"])["end effector"]
-    promised = re.fullmatch(r"(\S+) m from its target \(0.2, 0.05\) m", found)
+    found = rows(session["run"])["verdict"]
+    promised = re.match(r"not reached: (\S+) m from the target \(0.2, 0.05\) m; the position still approaches", found)
     assert promised is not None
     (last,) = twodof.read_bag(Path(session["cwd"]) / "bag").q[-1:]
     a, b = last[0], last[0] + last[1]
@@ -277,7 +277,7 @@ def test_facts_as_json(native_path: Path, tmp_path: Path, capsys: pytest.Capture
     run = facts("run", native_path, "-o", bag, "--stop-time", 0.5, "--scene")
     (last,) = (twodof.samples(native_path, stop_time=0.5),)
     *_, sample = last
-    assert (run["joint_states"], run["q"], run["error"]) == (51, [*sample.q], sample.error)
+    assert (run["joint_states"], run["q"], run["error"]) == (51, [*sample.q], math.dist(sample.x, sample.target or ()))
     info = facts("info", bag)
     assert (info["kind"], info["joint_states"]) == ("bag", 51)
     assert {topic["name"] for topic in info["topics"]} >= {"/tf", "/target"}  # type: ignore[attr-defined]
@@ -302,7 +302,7 @@ def test_one_value_for_a_vector_says_that_it_was_spread(
 ) -> None:
     options = ["-o", str(tmp_path / "bag"), "--stop-time", "0.1", "--set", "Kp=60"]
     assert main(["run", str(native_path), *options]) == 0
-    assert "Kp            60, all 2 elements\n" in capsys.readouterr().out
+    assert "Kp       60, all 2 elements\n" in capsys.readouterr().out
     given = twodof.read_bag(tmp_path / "bag").provenance["start_values"]
     assert given["Kp[1]"] == given["Kp[2]"] == 60.0
 

@@ -280,9 +280,10 @@ def test_errors_of_a_sample_are_distance_and_angle(fmus) -> None:
     turn = Rotation.from_rotvec([0.3, -0.4, 1.2])
     goal = turn * Rotation.from_quat(starts(fmus["ur10", True], "quat_des"))
     settings = {"quat_des": tuple(-2.0 * goal.as_quat())}
-    sample = next(twodof.samples(fmus["ur10", True], settings=settings, stop_time=0.1))
-    assert sample.turn_error == pytest.approx(turn.magnitude(), abs=1e-12)
-    assert sample.error == pytest.approx(0.0, abs=1e-12)
+    run = twodof.experiment(fmus["ur10", True], settings=settings, stop_time=0.1)
+    numbers = twodof.verdict([next(twodof.samples(run))], run).numbers
+    assert numbers["final_turn_error"] == pytest.approx(turn.magnitude(), abs=1e-12)
+    assert numbers["final_error"] == pytest.approx(0.0, abs=1e-12)
 
 
 TALKER = """

@@ -193,7 +193,7 @@ def test_target_is_the_one_on_its_topic_where_the_provenance_has_none(native_pat
                 samples.append(steps.send({"x_des": TARGETS[sample.k]}))
                 sink.write(samples[-1])
     text = (tmp_path / "bag/run.json").read_text().strip()
-    expected = np.array([sample.error for sample in samples], float)
+    expected = np.array([math.dist(sample.x, sample.target or ()) for sample in samples])
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(json.loads(text)["urdf"])
     (tmp_path / "bag/run.json").write_text(f'{text[:-1]},"inputs_known_until":0.6}}')
@@ -252,6 +252,7 @@ def test_provenance_is_complete(native_path: Path, tmp_path: Path, storage: str)
 
     found = json.loads((tmp_path / "bag" / "run.json").read_text("utf-8"))
     versions = found.pop("versions")
+    assert found.pop("verdict")["samples"] == 21
     assert versions.pop("twodof") == twodof.__version__
     assert set(versions) >= {"fmpy", "numpy", "pin", "rosbags"}
     assert versions == {name: importlib.metadata.version(name) for name in versions}

@@ -25,7 +25,7 @@ from tables import COMMAND, SMALL, same, table_of
 
 import twodof
 from twodof import TwoDofError, sweep
-from twodof.sweeps.metrics import METRICS
+from twodof.simulation.verdict import METRICS
 from twodof.sweeps.results import read_sweep
 
 

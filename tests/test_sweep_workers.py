@@ -114,8 +114,8 @@ def test_workers_import_nothing_from_the_working_directory(
 def test_workers_run_the_package_that_the_program_runs(native_path: Path, tmp_path: Path) -> None:
     """Another one than is installed, in the working directory."""
     shutil.copytree(Path(twodof.__file__).parent, tmp_path / "twodof")
-    with (tmp_path / "twodof/sweeps/metrics.py").open("a") as file:
-        file.write("measure = lambda *arrays: dict.fromkeys(METRICS, 17.0)\n")
+    with (tmp_path / "twodof/simulation/judge.py").open("a") as file:
+        file.write("Judge.metrics = lambda judge: {'overshoot': 17.0}\n")
     code = "import sys, twodof; print(*twodof.sweep(sys.argv[1], grid={'Kp': [9.0]})['overshoot'])"
     done = subprocess.run(
         [sys.executable, "-c", code, str(native_path)],

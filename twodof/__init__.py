@@ -12,6 +12,7 @@ Quantities have SI units. Functions accept an FMU's path or the ``Fmu`` that ``l
 Build an FMU from a URDF:       build_fmu, FmuOptions, stock_robot, load_fmu, Fmu
 Run it:                         run (the same as simulate), experiment, Experiment, Summary, RealTime
 Run it step by step:            samples, Sample, Sink
+Judge a run:                    verdict, Verdict
 Write and read bags:            Bag, read_bag, Recording, export_bag, read_commands, recover
 Draw figures and pages:         plot, view, page, live
 Run it over many gains:         sweep, read_sweep

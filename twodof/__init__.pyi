@@ -1,6 +1,7 @@
 """The public names, and where each is."""
 
 from .bag.exports import export_bag as export_bag
+from .bag.judging import verdict as verdict
 from .bag.reader import read_bag as read_bag
 from .bag.recorded_commands import read_commands as read_commands
 from .bag.recording import Recording as Recording
@@ -32,6 +33,7 @@ from .simulation.pace import RealTime as RealTime
 from .simulation.run_summary import Summary as Summary
 from .simulation.sample import Sample as Sample
 from .simulation.sample import Sink as Sink
+from .simulation.verdict import Verdict as Verdict
 from .sweeps.coordinator import sweep as sweep
 from .sweeps.results import read_sweep as read_sweep
 from .version import __version__ as __version__

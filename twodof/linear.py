@@ -19,7 +19,7 @@ from .errors import InputError, SimulationError, choice
 from .fmu import Fmu, Instance, instantiate, load_fmu
 from .notebook import card, picture
 from .simulation.input_values import Setting, Value, resolve
-from .simulation.peaks import limits_of
+from .simulation.setup import limits_of, robot_of
 
 Array = NDArray[np.float64]
 
@@ -255,7 +255,9 @@ class _Point:
         self._instance.reset()
         self._instance.initialise(0.0, np.inf, self._values)
         remarks = []
-        for joint, tau, limit in zip(self._fmu.joints, efforts, limits_of(self._fmu).effort):
+        for joint, tau, limit in zip(
+            self._fmu.joints, efforts, limits_of(robot_of(self._fmu.urdf), self._fmu.joints).effort
+        ):
             if abs(abs(tau) - limit) <= NEAR_JUMP * limit < np.inf:
                 raise SimulationError(
                     f"joint '{joint}' is at its effort limit {limit:g}, where the model is not"

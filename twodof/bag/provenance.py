@@ -51,7 +51,8 @@ SHAPE = {
 class Provenance(TypedDict, total=False):
     """Content of run.json; empty for a third-party bag.
 
-    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` a time and facts of a third party.
+    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` a time and facts of a third
+    party; ``verdict`` is there if the writer lived to its end.
     """
 
     format: int
@@ -70,6 +71,7 @@ class Provenance(TypedDict, total=False):
     input_changes: list[list[Any]]
     inputs_known_until: float
     commanders: list[Any]
+    verdict: dict[str, Any]
 
 
 class ProvenanceFile:
@@ -91,19 +93,24 @@ class ProvenanceFile:
         self.path, self.key = folder / file_of(namespace), key_of(namespace)
         self._head = _as_json(provenance_of(run, command_line))[:-1] + b',"input_changes":['
         self._run, self._commanders = run, len(run.commanders)
+        self._verdict: dict[str, Any] | None = None
+        self._until: float | None = None
         self.path.write_bytes(self._head + self._tail())
         self._start, self._end = run.start_time, len(self._head)
         self._separator, self._full = b"", False
 
-    def add(self, changes: Changes) -> None:
-        """Append times and the inputs that changed there, up to a reader's limit."""
+    def add(self, changes: Changes, verdict: dict[str, Any] | None = None) -> None:
+        """Append times and the inputs that changed there, up to a reader's limit, and set the verdict."""
         commanders = len(self._run.commanders)
-        if self._full or (not changes and commanders == self._commanders):
+        same = commanders == self._commanders and verdict is self._verdict
+        self._verdict = verdict
+        if (self._full or not changes) and same:
             return
         text, tail = b",".join(_as_json([t, v]) for t, v in changes), self._tail()
         text = self._separator + text if text else text
-        if self._end + len(text) > MAX_PROVENANCE - MAX_TAIL:
-            text, tail = b"", self._tail(changes[0][0])
+        if self._full or self._end + len(text) > MAX_PROVENANCE - MAX_TAIL:
+            self._until = changes[0][0] if self._until is None else self._until
+            text, tail = b"", self._tail(self._until)
             self._full = True
         with self.path.open("r+b") as file:
             file.seek(self._end)
@@ -119,8 +126,10 @@ class ProvenanceFile:
         return content.decode().strip()
 
     def _tail(self, until: float | None = None) -> bytes:
-        """Return the commanders, and the time until which the changes of inputs are complete."""
+        """Return the commanders, the verdict, and the time until which the changes of inputs are complete."""
         rest: Provenance = {}
+        if self._verdict is not None and len(_as_json(self._verdict)) < MAX_TAIL // 2:  # of names without end
+            rest["verdict"] = self._verdict
         if self._run.commanders:
             rest["commanders"] = [*self._run.commanders]
         if until is not None:

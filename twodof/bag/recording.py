@@ -15,11 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BagError
-from ..files import shown
+from ..files import fits, shown
 from ..notebook import card, picture
-from ..plant.urdf import RobotError, Urdf, read_urdf
+from ..plant.urdf import Urdf
 from ..simulation.experiments import NANOSECONDS, TIME_TOLERANCE
 from ..simulation.input_values import Value
+from ..simulation.setup import Setup, robot_of
+from ..simulation.setup import setup as setup_of
+from ..simulation.verdict import SHAPE, judged, verdict_in
+from ..simulation.verdict import Verdict as Verdict
 from .provenance import KNOWN_UNTIL, Provenance
 from .records import Stamps
 
@@ -168,21 +172,56 @@ class Recording:
         # at its own communication point a change has not been at work yet
         return cast(Array, values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
 
+    @property
+    def setup(self) -> Setup:
+        """Robot and settings of the run, as far as the provenance knows them."""
+        run = self.provenance
+        return self._setup(robot_of(run.get("urdf")), run.get("frame", ""), self.axes)
+
+    def _setup(self, robot: Urdf | None, frame: str, axes: str) -> Setup:
+        starts = {} if KNOWN_UNTIL in self.provenance else self.schedule[0][1]
+        step = self.provenance.get("step") or self.t[-1] / max(1, len(self.t) - 1)
+        return setup_of(joints=self.joints, robot=robot, frame=frame, axes=axes, step=step, starts=starts)
+
+    @property
+    def stored_verdict(self) -> Verdict | None:
+        """Verdict of the run that made the bag; None where it was broken off, or samples are missing."""
+        facts = self.provenance.get("verdict")
+        if facts is None or not fits(facts, SHAPE):
+            return None
+        whole = facts["samples"] == self.count and abs(facts["duration"] - float(self.t[-1])) < TIME_TOLERANCE
+        return verdict_in(facts) if whole else None
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Verdict of the run: the one that it stored, or of its samples.
+
+        Efforts are known if the bag has them, and targets if its provenance does.
+        """
+        if (stored := self.stored_verdict) is not None:
+            return stored
+        return self._judged(self.setup, self.x, self.target if self.x.size else self.x)
+
+    def verdict_with(self, robot: Urdf, frame: str, axes: str, x: Array, target: Array) -> Verdict:
+        """Return the verdict of a third-party bag's samples with a robot, its positions and targets, N × m."""
+        return self._judged(self._setup(robot, frame, axes), x, target)
+
+    def _judged(self, setup: Setup, x: Array, target: Array) -> Verdict:
+        none, shape = np.empty((len(self.t), 0)), self.q.shape
+        targets = {"x": target, "quat": self.target_quat if x.size else none, "q": self.held("q_des", shape[1])}
+        quat = setup.orientations(self.q) if targets["quat"].size else none
+        v = self.v if self.v.shape == shape else np.gradient(self.q, self.t, axis=0)
+        values = {"q": self.q, "v": v, "x": x, "tau": self.tau if self.tau.shape == shape else none, "quat": quat}
+        return judged(setup, self.t, values, {name: each for name, each in targets.items() if each.size})
+
     @cached_property
     def x(self) -> Array:
         """End effector position along the task axes, m, N × m; N × 0 where no robot is known."""
-        text = self.provenance.get("urdf")
-        if text is None or not self.axes:
+        if self.provenance.get("urdf") is None or not self.axes:
             return np.empty((len(self.stamps), 0))
-        from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
-
-        try:
-            robot: Urdf = read_urdf(text)
-            kinematics = Kinematics(robot, self.joints)
-            path = kinematics.path(self.provenance["frame"], self.q)
-        except (RobotError, KeyError) as error:
-            raise BagError(f"the robot in '{self.path}' does not fit its samples") from error
-        return path[:, ["xyz".index(axis) for axis in self.axes]]
+        if self.setup.robot is None or self.setup.frame not in self.setup.robot.links:
+            raise BagError(f"the robot in '{self.path}' does not fit its samples")
+        return self.setup.positions(self.q)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a DataFrame with one row per sample; index t in s.

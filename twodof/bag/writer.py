@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from pathlib import Path
+from typing import Any
 
 from ..errors import BagError
 from ..files import sync
@@ -14,6 +15,7 @@ from ..ros.messages import JOINT_STATES, Messages, check_name
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Value
 from ..simulation.sample import Sample, Sink
+from ..simulation.verdict import Verdict
 from .provenance import ProvenanceFile
 from .storage import BATCH_SIZE, OVERHEAD, Stamps
 from .store import Store
@@ -104,6 +106,7 @@ class Bag(Sink):
             raise BagError("a bag is given its experiment first: 'with bag.begin(experiment):'")
         self._queue: deque[bytes] = deque()  # numbers of samples
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
+        self._verdict: dict[str, Any] | None = None
         self._taken = 0  # samples, counted by the thread
         self._store.enter(self)
         return self
@@ -117,6 +120,10 @@ class Bag(Sink):
         self.count += 1
         if self.count == 1 or self.count - self._taken > self._most:
             self._store.flush()
+
+    def conclude(self, verdict: Callable[[], Verdict]) -> None:
+        """Receive the verdict, to be stored with the provenance."""
+        self._verdict = verdict().facts()
 
     def __exit__(self, _type: object, exception: object, _traceback: object) -> None:
         self._store.leave(exception)
@@ -134,7 +141,7 @@ class Bag(Sink):
     def hand_over(self) -> None:
         """Pass the queue to the store: changes of inputs before the messages that show them."""
         samples, changes = list(self._queue), list(self._changes)
-        self._provenance.add(changes)
+        self._provenance.add(changes, self._verdict)
         for _ in changes:
             self._changes.popleft()
         if self._store.fsync and changes:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, kind_of, neighbour, no_such
 from .options import add_options
 from .printing import print_json, print_table, say
+from .run import verdict_rows
 from .sweep import best_facts, print_best
 
 if TYPE_CHECKING:
@@ -17,12 +18,17 @@ if TYPE_CHECKING:
 
     from ..bag.recording import Recording
     from ..fmu import Fmu
+    from ..simulation.expressions import Expression
+    from ..simulation.verdict import Verdict
+
+
+MOST_JUDGED = 200_000  # samples of a bag without a verdict, which are read in a second
 
 
 def add(info: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     info.add_argument("path", metavar="FMU|BAG|SWEEP", type=Path, help="FMU, bag or sweep to describe")
-    add_options(info, "--json")
+    add_options(info, "--cost", "--json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -32,9 +38,10 @@ def call(options: argparse.Namespace) -> int:
     if not path.exists() and not folder.exists() and (near := neighbour(path, "FMU", "bag", "sweep")):
         raise InputError(f"there is no '{path}'; did you mean '{near}'?")
     if path.is_dir() and any(path.glob("*.parquet")):
+        from ..sweeps.ranking import cost_of
         from ..sweeps.results import read_sweep
 
-        (_print_sweep_json if options.json else _print_sweep)(path, read_sweep(path))
+        (_print_sweep_json if options.json else _print_sweep)(path, read_sweep(path), cost_of(options.cost))
     elif path.is_dir() or path.suffix == ".mcap" or (folder.is_dir() and not path.exists()):
         _show_bags(path, options.json)
     elif path.suffix in (".db3", ".parquet") and path.is_file():
@@ -88,6 +95,7 @@ def _print_fmu_json(fmu: Fmu) -> None:
 
 
 def _bag_facts(bag: Recording) -> dict[str, Any]:
+    verdict = _verdict_of(bag)
     return dict(
         kind="bag",
         path=str(bag.path),
@@ -100,23 +108,24 @@ def _bag_facts(bag: Recording) -> dict[str, Any]:
         topics=[{"name": t.name, "type": t.type, "count": t.count} for t in bag.topics],
         fmu=bag.provenance.get("fmu"),
         command_line=bag.provenance.get("command_line"),
+        verdict=verdict and verdict.facts(),
     )
 
 
-def _print_sweep_json(path: Path, table: DataFrame) -> None:
+def _print_sweep_json(path: Path, table: DataFrame, cost: Expression | None) -> None:
     provenance = table.attrs["provenance"]
     print_json(
         kind="sweep",
         path=str(path),
         runs=len(table),
         outcomes=table["outcome"].value_counts().to_dict(),
-        **best_facts(table),
+        **best_facts(table, cost),
         **{key: provenance[key] for key in ("fmu", "design", "options")},
         command_line=provenance.get("command_line"),
     )
 
 
-def _print_sweep(path: Path, table: DataFrame) -> None:
+def _print_sweep(path: Path, table: DataFrame, cost: Expression | None) -> None:
     provenance = table.attrs["provenance"]
     counts = table["outcome"].value_counts()
     fmu, times = provenance["fmu"], provenance["options"]
@@ -129,7 +138,7 @@ def _print_sweep(path: Path, table: DataFrame) -> None:
         ("FMU", f"{fmu['file']} ({fmu['name']}, {fmu['guid']})"),
         ("made by", provenance.get("command_line") or "the Python API"),
     )
-    print_best(table)
+    print_best(table, cost)
 
 
 def _print_fmu(fmu: Fmu) -> None:
@@ -200,9 +209,19 @@ def _print_bag(run: Recording) -> None:
         fmu = run.provenance["fmu"]
         rows.append(("FMU", f"{fmu['file']} ({fmu['name']}, {fmu['guid']})"))
         rows.append(("made by", run.provenance["command_line"] or "the Python API"))
+    if (verdict := _verdict_of(run)) is not None:
+        rows += verdict_rows(verdict.lines)
     print_table(*rows)
     say()
     print_table(*((topic.name, f"{topic.count:8d}", topic.type) for topic in run.topics))
+
+
+def _verdict_of(run: Recording) -> Verdict | None:
+    """Return the verdict that a bag has, or that of its samples where these are few; None else."""
+    from ..bag.reader import read_bag
+
+    stored = run.stored_verdict
+    return read_bag(run.path).verdict if stored is None and run.count <= MOST_JUDGED else stored
 
 
 def _state(run: Recording, k: int) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .completion import joints
-from .options import CommandLineError, add_output, add_robot_options, completed, output_file
+from .options import CommandLineError, add_options, add_output, add_robot_options, completed, output_file
 from .printing import print_table
 from .sweep import print_best
 
@@ -27,6 +27,7 @@ def add(plot: argparse.ArgumentParser) -> None:
     add_output(plot, "FILE", text, output_file)
     chosen = plot.add_argument("--joints", metavar="A,B", help="joints to draw, in that order (all)")
     completed(chosen, joints)
+    add_options(plot, "--cost")
     add_robot_options(plot)
 
 
@@ -38,6 +39,8 @@ def call(options: argparse.Namespace) -> int:
         file_kind(options.output)  # before the bags are read
     sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
     if not sweeps:
+        if options.cost is not None:
+            raise CommandLineError("--cost is for a sweep, which none of these is")
         return _plot_bags(options)
     for option in ("joints", "urdf", "frame"):
         if getattr(options, option) is not None:
@@ -45,12 +48,13 @@ def call(options: argparse.Namespace) -> int:
     if len(options.bags) > 1:
         raise CommandLineError(f"'{sweeps[0]}' is a sweep; it is drawn alone")
     from ..plots.sweeps import drawing
+    from ..sweeps.ranking import cost_of
     from ..sweeps.results import read_sweep
 
-    folder = Path(sweeps[0])
+    folder, cost = Path(sweeps[0]), cost_of(options.cost)
     table = read_sweep(folder)
-    _show_or_save(drawing(table, folder.resolve().name), options.output)
-    print_best(table)
+    _show_or_save(drawing(table, folder.resolve().name, cost, folder / "bags"), options.output)
+    print_best(table, cost)
     return 0
 
 
@@ -66,8 +70,8 @@ def _plot_bags(options: argparse.Namespace) -> int:
     results = []
     for label, track in zip(labels(tracks), tracks):
         apart = difference(tracks[0], track) if track is not tracks[0] else ""
-        if text := "; ".join(filter(None, (outcome(track), apart))):
-            results.append((label, text))
+        lines = outcome(track) if len(tracks) == 1 else ["; ".join(filter(None, (track.verdict.lines[0], apart)))]
+        results += [("" if i else label, line) for i, line in enumerate(lines)]
     _show_or_save(drawing(tracks), options.output, *results)
     return 0
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .fmus import chosen_fmu
 from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_output, dated, parse_settings, said
-from .printing import print_json, print_next, print_table, quote
+from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
+
+FAILED_IF = 3
+"""Exit status after a run that a condition of --fail-if judges."""
 
 if TYPE_CHECKING:
     from ..bag.writer import Bag
@@ -31,27 +35,41 @@ def add(run: argparse.ArgumentParser) -> None:
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run, "TwoDof.fmu, built if need be")
     add_options(run, "--frame", *OF_A_RUN)
+    run.add_argument(
+        "--fail-if",
+        action="append",
+        default=[],
+        metavar="CONDITION",
+        help="condition on the verdict that ends with exit status 3, as 'error > 1e-3' or 'saturated > 0.1'",
+    )
 
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
+    from ..simulation.expressions import expression
     from ..simulation.master import simulate
     from ..simulation.pace import RealTime
+    from ..simulation.verdict import RESULTS
 
     if options.stop_time == math.inf:
         raise CommandLineError("stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C")
+    for condition in options.fail_if:
+        expression(condition, RESULTS, condition=True)  # before a run that may take hours
     run = experiment_of(options, options.stop_time, options.step)
     bag = bag_of(options, options.output or dated("rosbag2"))
     pace = RealTime() if options.realtime else None
     with asked_to_stop() as asked:
         summary = simulate(run, bag, *_progress(), pace=pace, stop=asked)
+    decided = summary.verdict.failed_by(*options.fail_if)
     if options.json:
-        print_json(**facts_of(run, bag, summary, pace))
+        print_json(**facts_of(run, bag, summary, pace), failed_by=decided or None)
     else:
         print_summary(options, run, bag, summary, pace)
         path = quote(bag.path)
         print_next(f"twodof plot {path}", f"twodof view {path}", f"ros2 bag play {path}")
-    return INTERRUPTED if summary.stopped else 0
+    if decided:
+        say(f"twodof: failed: {decided}", error=True)
+    return INTERRUPTED if summary.stopped else FAILED_IF if decided else 0
 
 
 def experiment_of(options: argparse.Namespace, stop_time: float | None, step: float | None) -> Experiment:
@@ -106,7 +124,7 @@ def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime 
         error=summary.error,
         turn_error=summary.turn_error,
         joint_error=summary.joint_error,
-        beyond_limits=[excess._asdict() for excess in summary.beyond_limits],
+        verdict=summary.verdict.facts(),
         wall_time=summary.wall_time,
         missed=None if pace is None else pace.missed,
         worst=None if pace is None else pace.worst,
@@ -126,20 +144,7 @@ def print_summary(
     if bag is not None:
         messages = f"{last.k + 1} messages on {bag.topic}, {options.storage}"
         rows.append(("bag", f"{bag.address} ({messages})"))
-    if summary.error is not None:
-        target = ", ".join(f"{value:g}" for value in last.target or ())
-        turn = summary.turn_error
-        words = "" if turn is None else f", {turn:.3g} rad from its target orientation"
-        rows.append(("end effector", f"{summary.error:.3g} m from its target ({target}) m{words}"))
-    if last.joint_target is not None:
-        off = [abs(wanted - q) for wanted, q in zip(last.joint_target, last.q)]
-        worst = off.index(max(off))
-        distance = f"{off[worst]:.3g} {run.fmu.variables[run.fmu.vector('q')[worst]].unit}"
-        rows.append(("joints", f"at most {distance} from q_des, joint '{run.fmu.joints[worst]}'"))
-    for joint, quantity, peak, limit, fmi_unit in summary.beyond_limits:
-        unit = fmi_unit.replace(".", "·")
-        beyond = f"{peak:.4g} {unit}, beyond the URDF's limit of {limit:.4g} {unit}"
-        rows.append((f"peak {quantity}", f"joint '{joint}': {beyond}"))
+    rows += verdict_rows(summary.verdict.lines)
     simulated = last.k * run.step
     speed = simulated / summary.wall_time if summary.wall_time else 0.0
     taken = f"{simulated:g} s simulated in {summary.wall_time:.2f} s, {speed:.1f} × real time"
@@ -151,6 +156,11 @@ def print_summary(
         complete = "" if bag is None else "; the bag is complete up to there"
         rows.append(("stopped", f"on request at {last.t:g} s{complete}"))
     print_table(*rows)
+
+
+def verdict_rows(lines: Sequence[str]) -> list[tuple[str, str]]:
+    """Return rows of a table with the lines of a verdict."""
+    return [("" if i else "verdict", line) for i, line in enumerate(lines)]
 
 
 def _progress() -> list[Sink]:

@@ -29,6 +29,8 @@ from .signals import INTERRUPTED, asked_to_stop
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from ..simulation.expressions import Expression
+
 
 def add(sweep: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
@@ -64,7 +66,7 @@ def add(sweep: argparse.ArgumentParser) -> None:
     flag("--bags", help="keep a bag of each run in OUT/bags")
     option("--workers", type=int, metavar="N", help="number of local processes (one per core)")
     option("--scheduler", metavar="tcp://…", help="address of a Dask scheduler, whose workers are used instead")
-    add_options(sweep, "--json")
+    add_options(sweep, "--cost", "--json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -72,10 +74,12 @@ def call(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..sweeps.coordinator import sweep
+    from ..sweeps.ranking import cost_of
 
     check_company(options, needs={"--resume": "-o", "--seed": "--random"}, excludes={"--workers": "--scheduler"})
     grid, ranges = _grids(options.grids), _ranges(options.ranges)
     settings = parse_settings(options.settings)
+    cost = cost_of(options.cost)
     fmu = fast_fmu(options)
     output = Path(options.output or dated("sweep"))
     begin = time.perf_counter()
@@ -106,7 +110,12 @@ def call(options: argparse.Namespace) -> int:
     outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
     if options.json:
         print_json(
-            fmu=str(fmu), sweep=str(output), runs=total, done=len(table), outcomes=counts.to_dict(), **best_facts(table)
+            fmu=str(fmu),
+            sweep=str(output),
+            runs=total,
+            done=len(table),
+            outcomes=counts.to_dict(),
+            **best_facts(table, cost),
         )
         return INTERRUPTED if stopped else 0
     print_table(
@@ -114,47 +123,54 @@ def call(options: argparse.Namespace) -> int:
         ("sweep", f"{output} ({len(table)} of {total} runs{outcomes and f': {outcomes}'})"),
         ("time", f"{time.perf_counter() - begin:.1f} s"),
     )
-    print_best(table)
+    print_best(table, cost)
     again = options.command_line if options.resume else f"{options.command_line} --resume"
     again += "" if options.output else f" -o {quote(output)}"
     print_next(*([again] if stopped else []), f"twodof plot {quote(output)}")
     return INTERRUPTED if stopped else 0
 
 
-def best_runs(table: DataFrame) -> DataFrame:
+def best_runs(table: DataFrame, cost: Expression | None) -> DataFrame:
     """Return the first few of the ranked runs: variables, and known metrics."""
     from ..sweeps.ranking import ranked
 
-    best = ranked(table).head(5)
+    best = ranked(table, cost).head(5)
     columns = [*best.columns]
     return best[columns[: columns.index("end_time")]].dropna(axis="columns", how="all")
 
 
-def best_facts(table: DataFrame) -> dict[str, object]:
-    """Return the best runs, and how many exceed the URDF's limits, for another program."""
+def best_facts(table: DataFrame, cost: Expression | None = None) -> dict[str, object]:
+    """Return the best runs, their cost, and how many exceed the URDF's limits, for another program."""
     from ..sweeps.ranking import beyond_limits
 
-    best = best_runs(table).to_dict("records")
-    return dict(best=best, beyond_limits=int(beyond_limits(table).sum()))
+    best = best_runs(table, cost).to_dict("records")
+    return dict(cost=None if cost is None else cost.text, best=best, beyond_limits=int(beyond_limits(table).sum()))
 
 
-def print_best(table: DataFrame) -> None:
-    """Print the best runs with units; no run is called best that equals others."""
-    from ..sweeps.metrics import METRICS
-    from ..sweeps.ranking import RANKED, equals, ranked, remark
+def print_best(table: DataFrame, cost: Expression | None = None) -> None:
+    """Print the best runs with units; no run is called best that equals others, and impossible ones are marked."""
+    from ..simulation.verdict import METRICS
+    from ..sweeps.ranking import RANKED, beyond_limits, equals, ranked, remark
 
-    best = best_runs(table)
+    best = best_runs(table, cost)
     units = [METRICS[name].unit if name in METRICS else "" for name in best.columns]
     rows = [[f"{value:.4g}" for value in row] for row in best.to_numpy()]
+    names = [*best.columns]
+    beyond = beyond_limits(table).loc[best.index]
+    if beyond.any():
+        rows = [[*row, "no" if impossible else "yes"] for row, impossible in zip(rows, beyond)]
+        names, units = [*names, "possible"], [*units, ""]
     ranks = [RANKED[name] for name in RANKED if name in best.columns][:2]
     title = f"best: {', '.join(ranks)}" if ranks else "finished; no metric ranks them"
-    if ranks and (count := equals(ranked(table))) > 1:
+    if cost is not None:
+        title = f"best: least cost, {cost.text}"
+    if (ranks or cost) and (count := equals(ranked(table, cost), cost)) > 1:
         title = f"no single best run: {count} are equal up to rounding"
     say(f"\n{title}" if rows else "\nno run was finished")
     if text := remark(table):
         say(f"note: {text}")
     if rows:
-        print_table(best.columns, units, *rows, align=str.rjust, before="  ")
+        print_table(names, units, *rows, align=str.rjust, before="  ")
 
 
 def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:

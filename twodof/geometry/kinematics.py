@@ -40,6 +40,11 @@ class Placement(NamedTuple):
         return Placement(translation, self.rotation @ inner.rotation)
 
 
+def quaternions(rotation: Array) -> Array:
+    """Return the quaternions x, y, z, w of N rotation matrices, N × 4."""
+    return np.asarray(Rotation.from_matrix(rotation).as_quat())
+
+
 def rotated(rotation: Array, vectors: ArrayLike) -> Array:
     """Return R v at N samples."""
     return np.asarray(np.einsum("...ij,...j->...i", rotation, np.asarray(vectors)))
@@ -133,12 +138,6 @@ class Kinematics:
         beside = np.cos(moved) * (point @ ((np.eye(3) - along) @ origin))
         beside += np.sin(moved) * (point @ (-across @ origin))
         return np.asarray(joint.xyz + point @ (along @ origin) + beside)
-
-    def angle(self, link: str, q: ArrayLike, quat: ArrayLike) -> float:
-        """Return the angle between a link's orientation at one sample and a quaternion x, y, z, w, rad."""
-        rotation = self.along(self.urdf.chain(link), np.asarray(q)[None])[-1].rotation
-        apart = Rotation.from_matrix(rotation[0]).inv() * Rotation.from_quat(quat)
-        return float(apart.magnitude())
 
     def jacobian(self, link: str, q: ArrayLike) -> Array:
         """Return the Jacobian of the link in the root's axes, N × 6 × joints: linear, then angular rows."""

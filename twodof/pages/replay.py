@@ -94,7 +94,7 @@ def replay(
         "control": "",
         "variables": [*_variables(track, groups)],
         "step": float(track.t[-1]) / max(1, len(track.t) - 1),
-        "remarks": [*remarks, *thinned],
+        "remarks": [*track.verdict.lines, *remarks, *thinned],
     }
     samples = np.column_stack([track.t, *(groups[name] for name in RECORDED if name in groups)])
     title = " - ".join(filter(None, (motion.robot if motion else "", track.name)))

@@ -74,6 +74,7 @@ class Drawing(NamedTuple):
         draw: draws it into an empty figure, and sets the figure's size.
         columns: of the table that stands below it on a page.
         body: makes the HTML that stands on a page in place of the figure; None: the figure does.
+        above: makes the HTML that stands on a page above that.
     """
 
     title: str
@@ -81,6 +82,7 @@ class Drawing(NamedTuple):
     draw: Callable[[Figure], None]
     columns: Sequence[Mapping[str, str]]
     body: Callable[[], str] | None = None
+    above: Callable[[], str] | None = None
 
 
 def drawn(drawing: Drawing) -> Figure:
@@ -202,10 +204,14 @@ def _html(drawing: Drawing) -> bytes:
     else:
         svg = _rendered(drawn(drawing), "svg").decode()
         body = svg[svg.index("<svg") :]
+    if drawing.above:
+        body = drawing.above() + body
     title = html.escape(drawing.title)
     rows = "\n".join(
         f"<tr><th>{html.escape(key)}</th>"
-        + "".join(f"<td>{html.escape(column.get(key, ''))}</td>" for column in drawing.columns)
+        + "".join(
+            f"<td>{'<br/>'.join(html.escape(column.get(key, '')).splitlines())}</td>" for column in drawing.columns
+        )
         + "</tr>"
         for key in dict.fromkeys(chain(*drawing.columns))
     )

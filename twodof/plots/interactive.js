@@ -9,15 +9,6 @@
 const ROUNDING = 1e-12; // what is less is not told
 const UNITS_OF = { q: "position", v: "velocity", tau: "effort", error: "distance" };
 
-/** @param {string} id @returns {Promise<string>} what was packed into the page under that name */
-async function unpackedText(id) {
-  const packed = atob(/** @type {HTMLElement} */ (document.getElementById(id)).textContent || "");
-  const bytes = new Uint8Array(packed.length);
-  for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Response(stream).text();
-}
-
 /** @param {Row} row @param {() => void} changed @returns {HTMLTableRowElement} a box, a look, a name */
 function legendRow(row, changed) {
   const line = document.createElement("tr");

@@ -58,12 +58,27 @@ def body(tracks: Sequence[Track]) -> str:
         from plotly.offline import get_plotlyjs
     over = over_time(tracks)
     content = {"figures": [over, *in_workspace(tracks)], "rows": _rows(tracks)}
-    script = data_file("plots", "interactive.js").read_text("utf-8")
     return (
-        f'<div id="plots"></div>\n{_thinned(tracks, over)}'
-        f'<script type="text/plain" id="library">{packed(get_plotlyjs().encode())}</script>\n'
+        f'{_verdicts(tracks)}<div id="plots"></div>\n{_thinned(tracks, over)}'
+        f"{scripts('interactive.js', get_plotlyjs(), content)}"
+    )
+
+
+def _verdicts(tracks: Sequence[Track]) -> str:
+    """Return the lines of a run's verdict, or the first line of each of several."""
+    lines: Sequence[str] = tracks[0].verdict.lines
+    if len(tracks) > 1:
+        lines = [f"{label}: {track.verdict.lines[0]}" for label, track in zip(labels(tracks), tracks)]
+    return f'<p class="verdict">{"<br/>".join(map(html.escape, lines))}</p>\n'
+
+
+def scripts(name: str, library: str, content: Any) -> str:
+    """Return the HTML of plotly's library and a page's content, both packed, and of the script that draws it."""
+    code = "".join(data_file("plots", file).read_text("utf-8") for file in ("unpack.js", name))
+    return (
+        f'<script type="text/plain" id="library">{packed(library.encode())}</script>\n'
         f'<script type="text/plain" id="content">{packed(json.dumps(content).encode())}</script>\n'
-        f"<script>\n{script}</script>"
+        f"<script>\n{code}</script>\n"
     )
 
 
@@ -83,6 +98,8 @@ def _trace(stroke: Stroke) -> dict[str, Any]:
     mark: dict[str, Any] = {"color": stroke.colour}
     if stroke.mark == "+":
         mark = {"symbol": "cross-thin-open", "size": 13, "color": INK, "line": {"width": 1.6}}
+    elif stroke.mark in ("v", "x"):
+        mark = {"symbol": {"v": "triangle-down", "x": "x-thin-open"}[stroke.mark], "size": 10, "color": stroke.colour}
     elif stroke.mark == "o":
         line = {"color": stroke.colour, "width": 0.35 * stroke.width}
         size = [1.4 * stroke.width + 1.5] * (len(stroke.x) - 1) + [0.0]
@@ -189,6 +206,8 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):
             hover = "none" if stroke.kind else "skip"
             place = {"xaxis": "x", "yaxis": f"y{row}", "hoverinfo": hover}
+            if stroke.mark == "v":
+                place |= {"hoverinfo": "name"}
             data.append({**_trace(stroke.thinned(most)), **place})
     return {"data": data, "layout": layout}
 

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
-from math import ceil, floor, log10
+from math import ceil, floor, inf, log10
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import PlotError, choice
 from .closed_form import Array
 from .settings import number
-from .strokes import PALE, SMALLEST_ERROR, SMALLEST_RANGE, Look, Stroke
+from .strokes import ALARM, PALE, SMALLEST_ERROR, SMALLEST_RANGE, Look, Stroke
 from .track import JointTrack, Track
 
 KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort", "error": "Distance from the target"}
@@ -24,6 +24,10 @@ SMALLEST_EFFORT = 1e-6  # N·m, N: what changes less is shown at rest
 SMALLEST_PART = 1e-4  # of a value: ticks, of six digits, differ
 CURVE, THIN, THICK = 1.4, 0.9, 4.0
 """Widths: of curves, of limits and targets, of closed forms behind curves."""
+SEEN_IN = {"limit": "q", "friction": "q", "saturation": "tau"}
+MARKS = {"limit": "at its limit", "friction": "sticks", "saturation": "saturated"}
+"""Panels in which the beginnings of some causes are marked, and the marks' names."""
+SETTLED = "within 2 % from here on"
 TARGET = "thin dashes: target"
 Looks = Mapping[tuple[int, str], Look]
 """Styles of each track's joints, and of the track itself, whose joint is ""."""
@@ -103,6 +107,7 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
         if kind == "q" and joint.target.size:
             thin = Look("target", look.colour, (3, 2))
             targets.append(_curve("target", i, track.t, joint.target, thin, THIN, 1.95, joint=name))
+        targets += _events(i, kind, joint, track)
         own_limits = _limits(kind, joint)
         for limit in own_limits:
             ends, level = np.array([0.0, duration(tracks)]), np.array([limit, limit])
@@ -123,6 +128,17 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
     unit = {"rad": turning, "m": sliding}.get(own[0][2].unit, f"{turning} or {sliding}")
     note = "; ".join(filter(None, dict.fromkeys(words)))
     return Panel(kind, name, unit, (*lines, *targets, *curves), note, (low - pad, high + pad))
+
+
+def _events(track: int, kind: str, joint: JointTrack, of: Track) -> list[Stroke]:
+    """Return a mark where a cause of the verdict begins to be seen in a joint's panel."""
+    found = []
+    for cause in of.verdict.causes:
+        if cause.joint == joint.name and cause.time is not None and SEEN_IN.get(cause.kind) == kind:
+            k = min(int(np.searchsorted(of.t, cause.time)), len(of.t) - 1)
+            at, value = of.t[k : k + 1], getattr(joint, kind)[k : k + 1]
+            found.append(Stroke(MARKS[cause.kind], track, at, value, ALARM, 0.0, mark="v", depth=6.0, joint=joint.name))
+    return found
 
 
 def _curve(
@@ -173,5 +189,10 @@ def _error_panel(tracks: Sequence[Track], looks: Looks) -> Panel | None:
         if task.closed_form is not None and task.closed_form.max() >= 10.0**low
     ]
     for i, t, task in tasks:
+        settling = tracks[i].verdict.numbers.get("settling_time", inf)
+        if 0.0 < settling < inf:
+            k = min(int(np.searchsorted(t, settling)), len(t) - 1)
+            at, dot = t[k : k + 1], task.error[k : k + 1]
+            strokes.append(Stroke(SETTLED, i, at, dot, looks[i, ""].colour, 0.0, mark="v", depth=6.0))
         strokes.append(_curve(looks[i, ""].label, i, t, task.error, looks[i, ""], kind="error"))
     return Panel("error", "", "m", tuple(strokes), note, (10.0**low, 10.0**high))

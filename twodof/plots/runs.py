@@ -88,7 +88,8 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     height = max(rows * pitch + 0.5 + (ERROR + 0.6) * bool(error), least)
     texts = [common_settings(tracks)]
     texts += [TARGET] * any(joint.target.size for track in tracks for joint in track.joints)
-    texts += [outcome(tracks[0])] * (len(tracks) == 1)
+    texts += [f"▼ {', '.join(named)}"] if (named := _marked([*panels, *([error] if error else [])])) else []
+    texts += outcome(tracks[0]) if len(tracks) == 1 else []
     size = width + BESIDE * bool(pictures), height
     handles = [Line2D([], [], label=look.label, **_line(look.colour, look.dashes)) for look in bags * (len(bags) > 1)]
     room = draw_head(figure, title(tracks), texts, size, handles)
@@ -115,6 +116,11 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
         axes = room.add_subplot(grid[rows, :])
         _draw_error(axes, error)
         _time_axis(axes, last)
+
+
+def _marked(panels: Iterable[Panel]) -> list[str]:
+    """Return the names of the marks in some panels."""
+    return [*dict.fromkeys(stroke.label for panel in panels for stroke in panel.strokes if stroke.mark == "v")]
 
 
 def _units(panels: Sequence[Panel]) -> list[list[str]]:
@@ -180,7 +186,7 @@ def _draw_error(axes: Axes, panel: Panel) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
     _draw_strokes(axes, [stroke.thinned(POINTS) for stroke in panel.strokes])
     axes.set_title(f"{KINDS[panel.kind]} in {panel.unit}")
-    if any(not stroke.kind for stroke in panel.strokes):  # one tells of all closed forms
+    if any(not stroke.kind and not stroke.mark for stroke in panel.strokes):  # one tells of all closed forms
         axes.legend(handles=axes.get_lines()[:1], loc="lower right", bbox_to_anchor=(1.0, 1.02))
     else:
         _tell(axes, panel.note)
@@ -211,6 +217,8 @@ def _draw_strokes(axes: Axes, strokes: Iterable[Stroke]) -> None:
 def _marks(stroke: Stroke) -> dict[str, Any]:
     if stroke.mark == "+":
         return {"marker": "+", "markersize": 11, "markeredgewidth": 1.3, "linestyle": "none"}
+    if stroke.mark in ("v", "x"):
+        return {"marker": stroke.mark, "markersize": 6, "markeredgewidth": 1.3, "linestyle": "none"}
     if stroke.mark == ".":
         return {"marker": "o", "markersize": 3}
     if stroke.mark:

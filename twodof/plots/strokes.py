@@ -13,6 +13,7 @@ from ..notebook import COLOURS as COLOURS
 from .closed_form import Array
 
 INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
+ALARM = "#D55E00"
 DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))
 """On and off, in widths of the line. With the colours, whose number this does not divide, 28
 curves look different."""
@@ -36,7 +37,7 @@ class Stroke(NamedTuple):
         track: whose, or None.
         x, y: across and up; empty for lines across the whole picture at the other's values.
         width: of the line in points; 0: none.
-        mark: "o" at all points but the last, "+" or "." at all, or "".
+        mark: "o" at all points but the last, "+", "v", "x" or "." at all, or "".
         depth: what is higher is drawn over what is lower.
         joint: whose of the track; "": the track's own.
         kind: the quantity whose values it has, of those that a page tells; "": of none.

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import PlotError
-from ..sweeps.metrics import METRICS
-from ..sweeps.ranking import ROUNDING, USE, beyond_limits, candidates, ranked, ranks, remark
+from ..sweeps.ranking import METRICS, ROUNDING, USE, beyond_limits, candidates, ranked, ranks, remark
 from .closed_form import Array
 from .figure import Drawing, draw_head
+from .maps import map_page
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
 # isort: split
@@ -31,6 +31,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 if TYPE_CHECKING:
     import pandas
+
+    from ..sweeps.ranking import Expression
 
 PAIRED = ("settling_time", "overshoot", "peak_effort")
 """Metrics of which maps of pairs are drawn: speed, its price in precision and in effort."""
@@ -53,8 +55,14 @@ class _Panel(NamedTuple):
     y: str | None = None
 
 
-def drawing(table: pandas.DataFrame, name: str) -> Drawing:
+def drawing(table: pandas.DataFrame, name: str, cost: Expression | None = None, bags: Path | None = None) -> Drawing:
     """Return the drawing of a sweep, given the result of ``read_sweep``.
+
+    Args:
+        table: the sweep's.
+        name: its folder's.
+        cost: by which the best runs of the page are ranked; None: by RANKED.
+        bags: folder with a bag of each run, whose curves a page shows.
 
     Raises:
         PlotError: it has no finished run.
@@ -62,7 +70,7 @@ def drawing(table: pandas.DataFrame, name: str) -> Drawing:
     provenance = table.attrs["provenance"]
     design = provenance["design"]
     varied = [*design["grids"], *design["ranges"]]
-    best = ranked(table)
+    best = ranked(table, cost)
     if best.empty:
         raise PlotError(f"'{name}' has no run that was finished")
     shown = {"run": "run", **{name: f"{name}{_in(table.attrs['units'][name])}" for name in varied}}
@@ -74,7 +82,8 @@ def drawing(table: pandas.DataFrame, name: str) -> Drawing:
     settings = [f"{options['stop_time']:g} s each in steps of {options['step']:g} s"]
     settings += [f"{name} = {value:g}" for name, value in options["settings"].items()]
     draw = partial(_draw, table, varied, {*design["grids"]}, title, ", ".join(settings))
-    return Drawing(title, Path(name).name, draw, columns)
+    page = partial(map_page, table, varied, bags, best["run"].head(1).tolist())
+    return Drawing(title, Path(name).name, draw, columns, above=page)
 
 
 def _in(unit: str) -> str:

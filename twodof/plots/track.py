@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_downsampled
-from ..bag.recording import Recording
+from ..bag.recording import Recording, Verdict
 from ..errors import BuildError, PlotError
 from ..export.urdf_source import read_text
 from ..files import shown
@@ -70,7 +70,6 @@ class Task:
             has fewer joints than the task has coordinates.
         off: distance between the two positions, m, N values; None likewise.
         disturbances: what was at work that the closed form does not have.
-        turn_error: angle from the target orientation at the end, rad; None where there is none.
     """
 
     axes: str
@@ -79,7 +78,6 @@ class Task:
     closed_form: Array | None
     off: Array | None
     disturbances: tuple[str, ...]
-    turn_error: float | None
 
 
 @dataclass(frozen=True)
@@ -91,6 +89,7 @@ class Track:
         t: time since the first sample, s, N values.
         joints: in the bag's order.
         motion, task: None where the robot is not known, or for the task the target.
+        linkage: the robot; None where none is known.
     """
 
     recording: Recording
@@ -99,6 +98,17 @@ class Track:
     joints: tuple[JointTrack, ...]
     motion: Motion | None
     task: Task | None
+    linkage: Linkage | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Verdict of the run; of a third-party bag of its samples, with the robot that was given."""
+        bag, task = self.recording, self.task
+        if bag.provenance or self.linkage is None or self.motion is None:
+            return bag.verdict
+        x = self.motion.path[:, ["xyz".index(axis) for axis in self.linkage.axes]]
+        target = np.empty((len(x), 0)) if task is None else task.target
+        return bag.verdict_with(self.linkage.urdf, self.linkage.frame, self.linkage.axes, x, target)
 
     @property
     def name(self) -> str:
@@ -179,7 +189,7 @@ def _with_robot(bag: Recording, names: Sequence[str], urdf: str | None, source: 
     if rooted and known and run.get("frame", linkage.frame) == linkage.frame:
         v = _of_linkage(bag, linkage, names, bag.v)
         task = _task(bag, linkage, joints, q, v[0], motion.path)
-    return Track(bag, settings, bag.t, joints, motion, task)
+    return Track(bag, settings, bag.t, joints, motion, task, linkage)
 
 
 def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tuple[JointTrack, ...]:
@@ -244,14 +254,11 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
             raise ValueError("positions or targets are beyond all bounds")
         first = bag.schedule[0][1]
         turns = "quat_des[1]" in first
-        quat, turn_error = bag.target_quat[-1], None
-        if quat.size:
-            turn_error = linkage.kinematics.angle(linkage.frame, q[-1], quat)
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
         dof = {joint.leader for joint in linkage.chain}
         followed = len(axes) + 3 * turns <= len(dof)  # in all task rows at once
         if not (inputs_known and followed and all(f"{g}[1]" in first for g in Held._fields)):
-            return Task(linkage.axes, target, error, None, None, (), turn_error)
+            return Task(linkage.axes, target, error, None, None, ())
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]
         xd0 = (linkage.kinematics.jacobian(linkage.frame, q[:1])[0] @ v0)[axes]
         e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
@@ -267,4 +274,4 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         "external torque": any(values[name] for _, values in bag.schedule for name in external),
     }
     disturbances = tuple(name for name, present in at_work.items() if present)
-    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances, turn_error)
+    return Task(linkage.axes, target, error, np.linalg.norm(e, axis=1), off, disturbances)

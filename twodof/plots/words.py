@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..files import shown
-from ..plant.variables import EXACT
 from .settings import number
-from .track import JointTrack, Track
+from .track import Track
 
 TOLD = {
     "x_des": "",
@@ -68,34 +67,12 @@ def _setting(key: str, text: str) -> str:
     return f"{key} {text}" if key == "step" or text == "varied" else f"{key} = {text}"
 
 
-def outcome(track: Track) -> str:
-    """Return errors at the end and exceeded URDF limits; "" if none is known."""
-    texts = []
-    if track.task is not None:
-        texts.append(f"{track.task.error[-1]:.3g} m from its target at the end")
-        if track.task.turn_error is not None:
-            texts[0] += f", {track.task.turn_error:.3g} rad from its target orientation"
-        if track.task.off is not None:
-            texts.append(f"at most {track.task.off.max():.1g} m off the closed form")
-    if driven := [joint for joint in track.joints if joint.target.size]:
-        off = [abs(float(joint.target[-1] - joint.q[-1])) for joint in driven]
-        worst = driven[off.index(max(off))]
-        far = f"{max(off):.3g} {worst.unit}".strip()
-        texts.append(f"joints at most {far} from their targets at the end, {worst.name}")
-    texts += filter(None, map(_beyond_limits, track.joints))
-    return "; ".join(texts)
-
-
-def _beyond_limits(joint: JointTrack) -> str:
-    """Return the URDF limits that a joint exceeds, and by how much; "" if none."""
-    unit = "N" if joint.unit == "m" else "N·m"
-    peaks = [("effort", joint.tau, joint.effort, unit)]
-    peaks.append(("velocity", joint.v, joint.speed, f"{joint.unit}/s"))
-    return ", ".join(
-        f"{joint.name} has {quantity} {np.abs(values).max():.4g} {unit}, beyond its limit {limit:g}"
-        for quantity, values, limit, unit in peaks
-        if limit is not None and values.size and np.abs(values).max() > limit * (1.0 + EXACT)
-    )
+def outcome(track: Track) -> list[str]:
+    """Return the lines of a run's verdict, and how far it is off the closed form."""
+    task = track.task
+    if task is None or task.off is None:
+        return [*track.verdict.lines]
+    return [*track.verdict.lines, f"at most {task.off.max():.1g} m off the closed form"]
 
 
 def difference(first: Track, other: Track) -> str:
@@ -134,8 +111,7 @@ def summary(track: Track, first: Track | None = None) -> dict[str, str]:
         **{key: track.settings[key] for key in told if key in track.settings},
         "at a limit": ", ".join(stopped) or "no joint",
     }
-    if text := outcome(track):
-        rows["result"] = text
+    rows["verdict"] = "\n".join(outcome(track))
     if first is not None:
         rows["difference"] = difference(first, track)
     return rows

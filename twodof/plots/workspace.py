@@ -9,7 +9,7 @@ import numpy as np
 
 from .closed_form import Array
 from .panels import CURVE, THIN, Looks
-from .strokes import GREY, INK, PALE, SMALLEST_RANGE, Stroke, downsampled
+from .strokes import ALARM, GREY, INK, PALE, SMALLEST_RANGE, Stroke, downsampled
 from .track import Task, Track
 
 # isort: split
@@ -101,6 +101,10 @@ def _paths(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Ite
             yield _stroke("path", i, path, look.colour, CURVE, look.dashes)
         if track.task:
             yield _target(plane, i, track.task)
+        for cause in track.verdict.causes if track.motion is not None else ():
+            if cause.point:
+                x, y = (np.array([cause.point[axis]]) for axis in plane)
+                yield Stroke("nearest reachable", i, x, y, ALARM, 0.0, mark="x", depth=5.5)
 
 
 def _target(plane: tuple[int, int], i: int, task: Task) -> Stroke:

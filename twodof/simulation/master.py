@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
+from functools import partial
 from itertools import accumulate, chain, count
 from math import isfinite
 from pathlib import Path
@@ -20,18 +21,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import InputError, SimulationError, diverged, step_failure
 from ..fmu import Fmu, Instance, Values, instantiate
+from ..plant.urdf import Urdf
 from ..signatures import check_keywords, ignore, never, with_keywords_of
 from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
 from .input_values import Setting, Value, resolve
+from .judge import BLOCK, OUTPUTS, Judge
 from .pace import RealTime
-from .peaks import Peaks, limits_of
 from .run_summary import Summary
 from .sample import Sample, Sink
+from .setup import robot_of, setup_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-OUTPUTS = ("q", "v", "x", "tau", "quat")
 LARGE = 1e5  # in a setting's unit: a robot's run hardly means more
 
 
@@ -73,27 +75,29 @@ def samples(
         SimulationError: the FMU refused or failed a call, or gave a value that is not finite.
     """
     run = as_experiment(samples, run, options)
-    yield from _stepped(run, lambda row: None, pace, stop, ready, resume, instance)
+    yield from _stepped(run, None, pace, stop, ready, resume, instance)
 
 
 def _stepped(
     run: Experiment,
-    watch: Callable[[Values], object],
+    judge: Judge | None,
     pace: RealTime | None,
     stop: Stop,
     ready: Callable[[], object],
     resume: Resume,
     instance: Instance | None,
 ) -> Samples:
-    """Yield the samples of a run; ``watch`` receives the outputs of each as a buffer."""
+    """Yield the samples of a run; the judge receives the outputs of each as a buffer."""
     kinds, due = run.fmu.variables, deque(run.changes)
     inputs = {n: v for n, v in run.start_values.items() if kinds[n].causality == "input"}
     with instantiate(run.fmu) if instance is None else nullcontext(instance) as instance:
         instance.initialise(run.start_time, run.time(run.steps), run.given)
         ready()
-        take, since = _sampler(instance, run, watch), run.start_time
+        take, since = _sampler(instance, run, ignore if judge is None else judge.rows.write), run.start_time
         for k in count():
             sample = take(k, inputs, since)
+            if judge is not None and k % BLOCK == 0:
+                judge.flush()
             if pace is not None:
                 pace.wait(sample.t - run.start_time, stop)
             answer = yield sample
@@ -107,11 +111,15 @@ def _stepped(
                     if latest:
                         instance.set(latest)
                         inputs, since = {**inputs, **latest}, sample.t
+                        if judge is not None:
+                            judge.change(latest)
                 instance.step(sample.t, run.step)
             except SimulationError as error:
                 again = _resumed(run, sample, error, resume)
                 inputs = {name: again.get(name, value) for name, value in inputs.items()}
                 since = sample.t
+                if judge is not None:
+                    judge.change(inputs)
                 instance.reset()
                 instance.initialise(since, run.time(run.steps), {**run.given, **inputs, **again})
                 instance.step(since, run.step)
@@ -227,6 +235,12 @@ def simulate(
 run = simulate  # the name of the command
 
 
+def judge_of(run: Experiment, robot: Urdf | None) -> Judge:
+    """Return a judge of a run's samples, with the robot that the FMU carries."""
+    sizes = [len(run.fmu.vector(group)) for group in OUTPUTS]
+    return Judge(setup_of(run.fmu, robot, run.step, run.start_values), sizes)
+
+
 class Member(NamedTuple):
     """One of several runs that advance together; its fields are the arguments of ``simulate``."""
 
@@ -276,14 +290,11 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
             for sink in [sink.begin(run) for run, sinks, *_ in members for sink in sinks]:
                 stack.enter_context(sink)
 
-        sources, peaks = [], []
-        limits = [limits_of(run.fmu) for run, *_ in members]
-        for member in members:
-            run = member.run
+        sources = []
+        judges = [judge_of(run, robot_of(run.fmu.urdf)) for run, *_ in members]
+        for member, judge in zip(members, judges):
             ready = begin if member is members[-1] else lambda: None
-            peaks.append(Peaks([*chain(*map(run.fmu.vector, OUTPUTS))]))
-            watch = peaks[-1].add
-            source = _stepped(run, watch, None, lambda: ended, ready, member.resumed, member.instance)
+            source = _stepped(member.run, judge, None, lambda: ended, ready, member.resumed, member.instance)
             sources.append(stack.enter_context(closing(source)))
         latest = [next(source) for source in sources]
         sends, steers = [s.send for s in sources], [m.steered(pace, stop) for m in members]
@@ -301,7 +312,8 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
             except StopIteration:
                 break
         taken = time.perf_counter() - started
-    return [
-        Summary(s, taken, s.k < run.steps, peak.beyond(limit, run.fmu))
-        for s, (run, *_), peak, limit in zip(latest, members, peaks, limits)
-    ]
+        summaries = [Summary(s, taken, s.k < run.steps, j) for s, (run, *_), j in zip(latest, members, judges)]
+        for summary, (_, sinks, *_) in zip(summaries, members):
+            for sink in sinks:
+                sink.conclude(partial(getattr, summary, "verdict"))
+    return summaries

@@ -1,12 +1,14 @@
-"""Summary of a run: its last sample, errors and exceeded limits."""
+"""Summary of a run: its last sample and its verdict."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 from ..notebook import card, picture
-from .peaks import Excess
+from .judge import Judge
 from .sample import Sample
+from .verdict import Verdict, conclude
 
 
 @dataclass(frozen=True)
@@ -17,41 +19,38 @@ class Summary:
         last: the last sample.
         wall_time: s, without loading and initialisation.
         stopped: whether a request ended it before its stop time.
-        beyond_limits: joints whose effort or velocity at a sample exceeds the URDF's limit, the worst first.
     """
 
     last: Sample
     wall_time: float
     stopped: bool
-    beyond_limits: tuple[Excess, ...]
+    judge: Judge = field(repr=False)
 
     def _repr_html_(self) -> str:
-        errors = {
-            "distance from the target": (self.error, "m"),
-            "angle from the target orientation": (self.turn_error, "rad"),
-            "largest joint error": (self.joint_error, "rad or m"),
-        }
-        facts: dict[str, object] = {name: f"{e:.3g} {unit}" for name, (e, unit) in errors.items() if e is not None}
-        for joint, quantity, peak, limit, unit in self.beyond_limits:
-            facts[f"{quantity} of {joint}"] = f"{peak:.4g} {unit} exceeds its limit {limit:.4g}"
+        facts: dict[str, object] = {"verdict": "; ".join(self.verdict.lines)}
         facts["wall time"] = f"{self.wall_time:.3g} s"
         joints = [*range(1, len(self.last.q) + 1)]
-        curves = [(joints, values) for values in (self.last.q, self.last.joint_target) if values]
+        curves = [(joints, values) for values in (self.last.q, self.judge.wanted("q")) if len(values)]
         positions = picture(curves, "joint", "q at the end, and its target, in rad or m", dots=True)
         end = "stopped" if self.stopped else "ended"
         return card(f"Run, {end} at t = {self.last.t:g} s after {self.last.k} steps", facts, positions)
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Verdict of the run: reached or not, its metrics, and why."""
+        return conclude(self.judge)
+
     @property
     def error(self) -> float | None:
         """Final distance of the end effector from its target, m; None without a target."""
-        return self.last.error
+        return self.judge.metrics().get("final_error")
 
     @property
     def turn_error(self) -> float | None:
         """Final angle of the end effector from its target orientation, rad; None without a target."""
-        return self.last.turn_error
+        return self.judge.metrics().get("final_turn_error")
 
     @property
     def joint_error(self) -> float | None:
         """Final largest distance of a joint from its target, rad or m; None without a target."""
-        return self.last.joint_error
+        return self.judge.metrics().get("final_joint_error")

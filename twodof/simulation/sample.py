@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import asin, dist, hypot
+from math import hypot
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import SimulationError
 from .experiments import Experiment
 from .input_values import Setting, Value
 from .pace import RealTime
+from .verdict import Verdict
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -57,31 +58,6 @@ class Sample(NamedTuple):
         values = [self.inputs.get(f"{group}[{k + 1}]") for k in range(size)]
         return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
 
-    @property
-    def joint_target(self) -> tuple[float, ...] | None:
-        """Target q_des, rad or m, one value a joint; None where the FMU has no such inputs."""
-        return self._given("q_des", len(self.q))
-
-    @property
-    def error(self) -> float | None:
-        """Distance of the end effector from its target, m; None where there is no target."""
-        return None if self.target is None else dist(self.x, self.target)
-
-    @property
-    def joint_error(self) -> float | None:
-        """Largest distance of a joint from its target, rad or m; None where there is no target."""
-        if self.joint_target is None:
-            return None
-        return max(abs(wanted - q) for wanted, q in zip(self.joint_target, self.q))
-
-    @property
-    def turn_error(self) -> float | None:
-        """Angle between the end effector's orientation and its target, rad; None without one."""
-        if self.target_quat is None:
-            return None
-        apart = (dist(self.quat, self.target_quat), hypot(*map(sum, zip(self.quat, self.target_quat))))
-        return 4.0 * asin(min(1.0, 0.5 * min(apart)))
-
 
 class Sink:
     """Consumer of samples: a context that receives the experiment and then each sample.
@@ -116,3 +92,6 @@ class Sink:
     def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
         """Return start values to continue after a discarded step, from the sample before it; None to fail."""
         return None
+
+    def conclude(self, verdict: Callable[[], Verdict]) -> None:
+        """Receive a function that returns the verdict, after the last sample of a run that did not fail."""

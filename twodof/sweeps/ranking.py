@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..simulation.peaks import EXACT
-from .metrics import Array
+from ..simulation.expressions import Expression as Expression
+from ..simulation.expressions import expression
+from ..simulation.judge import EXACT
+from ..simulation.setup import Array
+from ..simulation.verdict import METRICS as METRICS
 
 if TYPE_CHECKING:
     import pandas
@@ -54,16 +57,34 @@ def candidates(table: pandas.DataFrame) -> pandas.DataFrame:
     return finished if possible.empty else possible
 
 
-def ranked(table: pandas.DataFrame) -> pandas.DataFrame:
-    """Return the candidates, the best first: by settling time, effort and errors at the end."""
+def cost_of(text: str | None) -> Expression | None:
+    """Return the expression of a cost of metrics, as "settling + 0.1*peak_effort"; None for None.
+
+    Raises:
+        InputError: it is none.
+    """
+    return None if text is None else expression(text, METRICS, condition=False)
+
+
+def _keys(runs: pandas.DataFrame, cost: Expression | None) -> list[NDArray[np.int64]]:
+    """Return the ranks of runs by a cost, or by each of RANKED."""
+    if cost is not None:
+        return [ranks(np.broadcast_to(cost.value(runs), len(runs)))]
+    return [ranks(runs[name].to_numpy(dtype=float)) for name in RANKED]
+
+
+def ranked(table: pandas.DataFrame, cost: Expression | None = None) -> pandas.DataFrame:
+    """Return the candidates, the best first: by a cost, or by settling time, effort and errors at the end."""
     runs = candidates(table)
-    keys = [ranks(runs[name].to_numpy(dtype=float)) for name in RANKED]
-    return runs.iloc[np.lexsort(keys[::-1])] if len(runs) else runs
+    if cost is not None and len(runs):
+        value = np.broadcast_to(cost.value(runs), len(runs))
+        runs = runs.assign(cost=value)[["run", "cost", *runs.columns[1:]]] if "cost" not in runs else runs
+    return runs.iloc[np.lexsort(_keys(runs, cost)[::-1])] if len(runs) else runs
 
 
-def equals(runs: pandas.DataFrame) -> int:
+def equals(runs: pandas.DataFrame, cost: Expression | None = None) -> int:
     """Count the ranked runs that equal the first, up to rounding."""
-    keys = np.array([ranks(runs[name].to_numpy(dtype=float)) for name in RANKED])
+    keys = np.array(_keys(runs, cost))
     return int((keys == keys[:, :1]).all(axis=0).sum()) if len(runs) else 0
 
 

@@ -22,8 +22,8 @@ from ..bounds import MAX_RUNS, MAX_SWEEP
 from ..errors import SweepError, no_such
 from ..files import NUMBER, VALUES, check_file, fits, is_being_written, lock, parsed, refusing, write_file
 from ..notebook import card, picture
+from ..simulation.verdict import METRICS
 from ..version import needing
-from .metrics import METRICS
 from .ranking import RANKED, candidates
 from .runner import Row
 

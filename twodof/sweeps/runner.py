@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import accumulate, chain
-from math import nan
+from itertools import chain
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ from ..errors import SimulationError, diverged, step_failure
 from ..files import temporary_folder
 from ..fmu import Instance, instantiate
 from ..simulation.experiments import Experiment, experiment
-from ..simulation.input_values import Value, resolve
-from ..simulation.master import OUTPUTS, simulate
-from ..simulation.peaks import limits_of
-from ..simulation.sample import Sample, Sink
-from .metrics import METRICS, Array, measure
+from ..simulation.input_values import resolve
+from ..simulation.judge import OUTPUTS, Judge
+from ..simulation.master import judge_of, simulate
+from ..simulation.setup import Array, robot_of
+from ..simulation.verdict import METRICS
 
 Point = tuple[int, tuple[float, ...]]
 """Number of a run, and the values of the variables that are varied."""
@@ -64,7 +64,7 @@ class Runner:
             path = folder / job.file
             path.write_bytes(job.content)
             self._base = experiment(path, **job.options)
-            self._limits = limits_of(self._base.fmu)
+            self._robot = robot_of(self._base.fmu.urdf)
             self._folder = stack.pop_all()
 
     def __enter__(self) -> Runner:
@@ -86,31 +86,32 @@ class Runner:
         given = {**self._base.given, **settings}
         run = replace(self._base, start_values={**self._base.start_values, **given}, given=given)
         try:
-            outputs = self._outputs(run, number)
+            judge = self._judged(run, number)
         except SimulationError as error:
             self._drop()  # whatever state it is in
             return lost(point, run.time(error.k), error.outcome, str(error))
-        metrics = self._metrics(run, outputs).values()  # in the order of METRICS
-        return (number, *values, *metrics, run.time(run.steps), "finished", None)
+        found = judge.metrics()
+        metrics = (found.get(name, nan) for name in METRICS)
+        return (
+            number,
+            *values,
+            *(value if isfinite(value) else nan for value in metrics),
+            run.time(run.steps),
+            "finished",
+            None,
+        )
 
-    def _outputs(self, run: Experiment, number: int) -> Mapping[str, Array]:
-        """Simulate, with a bag where the job requests one; return the outputs at all samples."""
-        if self._job.bags is None:
-            return trace(run, self._fresh())
-        from ..bag.writer import Bag  # rosbags takes half a second to import
+    def _judged(self, run: Experiment, number: int) -> Judge:
+        """Simulate, with a bag where the job requests one; return the judge of all samples."""
+        if self._job.bags is not None:
+            from ..bag.writer import Bag  # rosbags takes half a second to import
 
-        kept = _Kept()
-        bag = Bag(self._job.bags / f"{number:06d}", overwrite=True)
-        simulate(run, kept, bag, instance=self._fresh())
-        return {name: np.array([getattr(s, name) for s in kept.samples]) for name in OUTPUTS}
-
-    def _metrics(self, run: Experiment, outputs: Mapping[str, Array]) -> dict[str, float]:
-        """Return the metrics of a run."""
-        n, m = outputs["q"].shape[1], outputs["x"].shape[1]
-        t = run.start_time + np.arange(len(outputs["q"]), dtype=np.float64) * run.step
-        sizes = {"x_des": m, "quat_des": 4, "q_des": n, "q_min": n, "q_max": n}
-        given = {name: _given(run, name, size) for name, size in sizes.items()}
-        return measure(t, {**outputs, **given}, self._limits)
+            bag = Bag(self._job.bags / f"{number:06d}", overwrite=True)
+            return simulate(run, bag, instance=self._fresh()).judge
+        judge = judge_of(run, self._robot)
+        rows = trace(run, self._fresh())
+        judge.judge(np.arange(len(rows), dtype=np.float64) * run.step, rows, judge.targets)
+        return judge
 
     def run_all(self, points: Iterable[Point]) -> tuple[list[Row], float]:
         """Return the rows of some points, and the time they took, s; errors as of ``run``."""
@@ -136,15 +137,14 @@ def lost(point: Point, end: float, outcome: str, message: str) -> Row:
     return (number, *values, *[nan] * len(METRICS), end, outcome, message)
 
 
-def trace(run: Experiment, instance: Instance) -> dict[str, Array]:
-    """Return the outputs q, v, x, tau and quat at all samples of a run without changes, N + 1 × values.
+def trace(run: Experiment, instance: Instance) -> Array:
+    """Return the outputs q, v, x, tau and quat side by side at all samples of a run without changes, N + 1 × values.
 
     For whoever needs the numbers alone, without a ``Sample`` for each; errors as of ``samples``.
     """
     instance.initialise(run.start_time, run.time(run.steps), run.given)
-    groups = [run.fmu.vector(group) for group in OUTPUTS]
-    ends = [*accumulate(map(len, groups))]
-    rows, read, step = bytearray(), instance.reader([*chain(*groups)]), instance.step
+    names = [*chain(*map(run.fmu.vector, OUTPUTS))]
+    rows, read, step = bytearray(), instance.reader(names), instance.step
     start, h = run.start_time, run.step
     rows += read()
     try:
@@ -152,10 +152,9 @@ def trace(run: Experiment, instance: Instance) -> dict[str, Array]:
             step(start + k * h, h)
             rows += read()
     except SimulationError as error:
-        _finite(run, rows, ends[-1])
+        _finite(run, rows, len(names))
         raise step_failure(k, run.time(k), error) from error
-    table = _finite(run, rows, ends[-1])
-    return dict(zip(OUTPUTS, np.split(table, ends[:-1], axis=1)))
+    return _finite(run, rows, len(names))
 
 
 def _finite(run: Experiment, rows: bytearray, width: int) -> Array:
@@ -164,22 +163,3 @@ def _finite(run: Experiment, rows: bytearray, width: int) -> Array:
         return table
     astray = np.flatnonzero(~np.isfinite(table).all(axis=1))
     raise diverged(int(astray[0]), run.time(int(astray[0])))
-
-
-class _Kept(Sink):
-    """A sink that keeps all samples."""
-
-    def __init__(self) -> None:
-        self.samples: list[Sample] = []
-
-    def write(self, sample: Sample) -> None:
-        self.samples.append(sample)
-
-
-def _given(run: Experiment, group: str, size: int) -> Array:
-    """Return start values of a vector; NaN where the FMU has no such vector."""
-    values: Sequence[Value | None]
-    values = [run.start_values.get(name) for name in run.fmu.vector(group)]
-    if len(values) != size or None in values:
-        return np.full(size, nan)
-    return np.array(values, dtype=float)

@@ -1,0 +1,161 @@
+"""Runs that fail on purpose, with the causes that they were made with; and runs that do well."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from native_models import robots_folder
+from scratch import run_folder
+
+import twodof
+from twodof.plant.urdf import read_urdf
+
+UR5, PANDA = "ur_description/urdf/ur5_robot.urdf", "panda_description/urdf/panda.urdf"
+AT_UR5, AT_PANDA = (0.1, -1.2, 1.4, 0.2, -1.0, 0.3), (0.0, -0.6, 0.0, -2.2, 0.0, 1.7, 0.8)
+FINGERS = {"panda_finger_joint1": 0.0}
+LARGE_STEPS = {"max_step": 0.01}
+
+
+class Failure(NamedTuple):
+    """A run, and what its verdict has to say."""
+
+    robot: str
+    control: str
+    settings: Mapping[str, Any]
+    kinds: tuple[str, ...]
+    words: str
+    stop_time: float = 5.0
+
+
+FAILURES = {
+    "out of reach": Failure("arm", "task", {"x_des": (0.5, 0.1)}, ("reach",), "out of reach by 0.2099 m"),
+    "a target in millimetres": Failure("arm", "task", {"x_des": (200.0, 50.0)}, ("reach",), "in millimetres?"),
+    "degrees": Failure("arm", "joint", {"q_des": (90.0, 0.35)}, ("degrees",), "q_des[1] = 90 rad: 90°?"),
+    "beyond a joint limit": Failure(
+        "arm", "joint", {"q_des": (0.5, 0.8), "q_max": (1.0, 0.6)}, ("reach",), "'joint2' is out of reach by 0.2 rad"
+    ),
+    "a joint in the way": Failure(
+        "arm", "task", {"q_min": (0.2, -3.0)}, ("limit",), "'joint1' stood at its lower limit"
+    ),
+    "a slow orientation": Failure(
+        "panda",
+        "pose",
+        {"quat_des": (0.3, 0.9, 0.1, 0.2), "Kp_rot": 1.0},
+        ("time",),
+        "the orientation still approaches",
+    ),
+    "a saturated motor": Failure(
+        "ur5", "joint", {"payload": 40.0, "payload_known": True, "limit_effort": True}, ("saturation",), "saturated at"
+    ),
+    "an unknown load": Failure("ur5", "joint", {"payload": 5.0, "Kp": 20.0}, ("load",), "the payload of 5 kg"),
+    "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
+    "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] = 0"),
+    "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp[1] = 20"),
+    "a singular pose": Failure(
+        "arm", "task", {"q_start": (0.0, 0.0), "x_des": (0.2, 0.0), "Kp": 20.0}, ("singularity",), "near a singularity"
+    ),
+    "an effort that the motor has not": Failure(
+        "ur5",
+        "joint",
+        {"q_des": (0.9, -1.2, 1.4, 0.2, -1.0, 0.3), "Kp": 4000.0},
+        ("effort",),
+        "beyond the URDF's limit",
+    ),
+    "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
+    "degrees and a saturated motor": Failure(
+        "ur5",
+        "joint",
+        {"q_des": (-90.0, -1.2, 1.4, 0.2, -1.0, 0.3), "limit_effort": True, "payload": 40.0, "payload_known": True},
+        ("degrees", "saturation"),
+        "-90°?",
+    ),
+    "a load and a joint at its limit": Failure(
+        "ur5",
+        "joint",
+        {"payload": 5.0, "Kp": 2.0, "q_max": (6.0, -1.1, 1.6, 6.0, 6.0, 6.0)},
+        ("limit", "load"),
+        "stood at its upper limit",
+    ),
+    "out of reach and slow": Failure(
+        "panda",
+        "pose",
+        {"x_des": (1.5, 0.0, 0.5), "Kp_rot": 1.0, "quat_des": (0.3, 0.9, 0.1, 0.2)},
+        ("reach",),
+        "out of",
+    ),
+}
+
+
+ROBOTS = {
+    "arm": ("", ""),
+    "ur5": (UR5, "ee_link"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "ee_link"),
+    "ur3": ("ur_description/urdf/ur3_robot.urdf", "ee_link"),
+    "panda": (PANDA, "panda_hand_tcp"),
+    "a1": ("a1_description/urdf/a1.urdf", "FR_foot"),
+    "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "anymal": ("anymal_c_simple_description/urdf/anymal.urdf", "LF_FOOT"),
+    "so100": ("so_arm_description/urdf/so100.urdf", "gripper"),
+    "solo": ("solo_description/robots/solo12.urdf", "FL_FOOT"),
+}
+RADIUS, PERIOD = 0.02, 2.0  # m, s: of a circle that is followed
+FIRM = {"Kp": 100.0, "Kd": 20.0, **LARGE_STEPS}
+
+
+@cache
+def fmu_of(robot: str, control: str) -> Path:
+    """Build an FMU of the Python flavour, once a process, that starts away from limits and singularities."""
+    folder = run_folder() / "verdict"
+    folder.mkdir(exist_ok=True)
+    options: dict[str, Any] = {"control": control, "meshes": False}
+    file, frame = ROBOTS[robot]
+    if file:
+        urdf = robots_folder() / file
+        start = {"ur5": AT_UR5, "panda": AT_PANDA}.get(robot) or bent(urdf.read_text("utf-8"))
+        options |= {"urdf": urdf, "frame": frame, "q_start": start, "lock": FINGERS if robot == "panda" else {}}
+    return twodof.build_fmu(folder / f"{robot}-{control}.fmu", twodof.FmuOptions(**options), overwrite=True)
+
+
+def bent(text: str) -> tuple[float, ...]:
+    """Return a position of all joints of a URDF within their limits."""
+    joints = [joint for joint in read_urdf(text).joints.values() if joint.moves and joint.leader == joint.name]
+    bends = [0.4 + 0.35 * (-1) ** k for k in range(len(joints))]
+    return tuple(
+        float(np.clip(bend if joint.low + 0.3 < bend < joint.high - 0.3 else 0.5 * (joint.low + joint.high), -3.0, 3.0))
+        for joint, bend in zip(joints, bends)
+    )
+
+
+def good_runs(robot: str) -> Iterator[twodof.Experiment]:
+    """Yield runs to a position near, to joint positions, at rest, and along a circle."""
+    task, joint = twodof.load_fmu(fmu_of(robot, "task")), twodof.load_fmu(fmu_of(robot, "joint"))
+    starts = task.start_values
+    x = np.array(next(twodof.samples(task)).x)
+    q = np.array([joint.start_values[name] for name in joint.vector("q_des")], float)
+    ahead = np.eye(len(x))[-1] * (-0.03 if robot == "arm" else 0.03)
+    near = np.array([starts[name] for name in task.vector("q_max")], float) - q > 0.2
+    yield twodof.experiment(task, settings={**FIRM, "x_des": x + ahead}, stop_time=2.0)
+    yield twodof.experiment(joint, settings={**FIRM, "q_des": q + np.where(near, 0.05, -0.05)}, stop_time=2.0)
+    yield twodof.experiment(task, settings={**LARGE_STEPS, "x_des": x}, stop_time=2.0)
+    changes = []
+    for t in np.arange(0.02, 2.0, 0.02):
+        w = 2.0 * np.pi / PERIOD
+        turn = np.zeros((2, len(x)))
+        turn[:, 0] = np.cos(w * t) - 1.0, -w * np.sin(w * t)
+        turn[:, 1] = np.sin(w * t), w * np.cos(w * t)
+        changes.append((float(t), {"x_des": x - RADIUS * turn[0], "xd_des": -RADIUS * turn[1]}))
+    if robot == "arm":  # the circle would leave its reach
+        x = x - 0.05
+        changes = [(t, {**values, "x_des": values["x_des"] - 0.05}) for t, values in changes]
+    yield twodof.experiment(task, settings={**FIRM, "x_des": x}, changes=changes, stop_time=2.0)
+
+
+def run(failure: Failure, *sinks: twodof.Sink) -> twodof.Summary:
+    """Run a failure."""
+    settings = {**LARGE_STEPS, **failure.settings}
+    fmu = fmu_of(failure.robot, failure.control)
+    return twodof.simulate(fmu, *sinks, settings=settings, stop_time=failure.stop_time)

@@ -1,0 +1,279 @@
+"""The verdict of a run against closed forms, other optimisers, and runs that were made to fail or to do well."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import failures
+import numpy as np
+import pytest
+from failures import FAILURES, ROBOTS, Failure, fmu_of, good_runs
+from scipy.optimize import brute, differential_evolution
+from sinks import Memory
+
+import twodof
+from twodof.cli.main import main
+from twodof.geometry.kinematics import Kinematics
+from twodof.geometry.reach import nearest
+from twodof.plant.urdf import read_urdf
+from twodof.simulation import master
+from twodof.simulation.judge import Judge
+from twodof.simulation.motion import motion_of, ringing
+from twodof.simulation.setup import robot_of
+
+STEP = 0.001
+
+
+@pytest.fixture(scope="module", params=list(FAILURES))
+def failed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Failure, Path, Any]:
+    failure = FAILURES[request.param]
+    bag = tmp_path_factory.mktemp("failed") / "bag"
+    return failure, bag, failures.run(failure, twodof.Bag(bag)).verdict
+
+
+def test_the_first_line_names_the_cause_of_a_failure(failed: tuple[Failure, Path, twodof.Verdict]) -> None:
+    failure, _, verdict = failed
+    assert failure.words in verdict.lines[0]
+    assert verdict.causes[0].kind == failure.kinds[0]
+    assert {*failure.kinds} <= {cause.kind for cause in verdict.causes}
+
+
+def test_a_bag_a_figure_and_a_page_say_the_same(
+    failed: tuple[Failure, Path, twodof.Verdict], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, bag, verdict = failed
+    assert twodof.read_bag(bag).verdict == verdict == twodof.verdict(bag)
+    assert main(["info", str(bag)]) == 0
+    assert f"verdict      {verdict.lines[0]}\n" in capsys.readouterr().out
+    assert main(["info", str(bag), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)["verdict"]
+    assert (facts["lines"], facts["causes"][0]["kind"]) == ([*verdict.lines], verdict.causes[0].kind)
+    assert main(["plot", str(bag), "-o", str(tmp_path / "plot.html")]) == 0
+    assert verdict.lines[0] in capsys.readouterr().out
+    assert main(["view", str(bag), "--export", str(tmp_path / "view.html")]) == 0
+
+
+@pytest.mark.parametrize("robot", list(ROBOTS))
+def test_good_runs_raise_no_alarm(robot: str) -> None:
+    count = 0
+    for run in good_runs(robot):
+        verdict = twodof.simulate(run).verdict
+        assert verdict.outcome in ("reached", "followed"), verdict.lines
+        assert not verdict.causes, verdict.lines
+        count += 1
+    assert count == 4
+
+
+# --- numbers, against closed forms ---
+
+
+def response(t: np.ndarray, Kp: float, Kd: float) -> np.ndarray:
+    """Solution of e'' + Kd e' + Kp e = 0 from e = 1 at rest, underdamped."""
+    a, w = Kd / 2, np.sqrt(Kp - Kd * Kd / 4)
+    return np.exp(-a * t) * (np.cos(w * t) + a / w * np.sin(w * t))
+
+
+@pytest.mark.parametrize("damping", [0.05, 0.2, 0.5, 0.7])
+def test_settling_overshoot_frequency_and_damping_are_those_of_second_order(native_path: Path, damping: float) -> None:
+    Kp, stop = 40.0, 8.0
+    Kd = 2.0 * damping * np.sqrt(Kp)
+    run = twodof.simulate(native_path, settings={"Kp": Kp, "Kd": Kd}, step=STEP, stop_time=stop)
+    found, w = run.verdict.numbers, np.sqrt(Kp) * np.sqrt(1.0 - damping**2)
+    assert found["overshoot"] == pytest.approx(np.exp(-np.pi * damping / np.sqrt(1.0 - damping**2)), rel=1e-3)
+    assert found["frequency"] == pytest.approx(w / (2.0 * np.pi), rel=1e-3)
+    assert found["damping"] == pytest.approx(damping, rel=1e-3)
+    t = np.linspace(0.0, stop, 800_001)
+    outside = np.flatnonzero(np.abs(response(t, Kp, Kd)) > 0.02)
+    settled = t[outside[-1]] if outside[-1] < len(t) - 1 else np.inf
+    assert found["settling_time"] == pytest.approx(settled, abs=STEP)
+    assert (run.verdict.outcome == "reached") == (damping > 0.05)
+
+
+def test_a_limit_cycle_has_its_frequency_by_its_crossings() -> None:
+    t = np.linspace(0.0, 3.999, 4000)
+    triangle = np.abs((t * 3.7) % 1.0 - 0.5) - 0.25
+    found = ringing(t, triangle)
+    assert found is not None
+    assert found.frequency == pytest.approx(3.7, rel=1e-3) and found.damping == pytest.approx(0.0, abs=1e-2)
+    assert motion_of(t, triangle[:, None], 0.5)[0] == "oscillating"
+
+
+@pytest.mark.parametrize(
+    ("rate", "motion"), [(-3.0, "steady"), (0.0, "oscillating"), (0.8, "diverging")], ids=["decays", "lasts", "grows"]
+)
+def test_motion_is_steady_oscillating_or_diverging(rate: float, motion: str) -> None:
+    t = np.linspace(0.0, 4.995, 1000)
+    y = 0.1 * np.exp(rate * t) * np.cos(2 * np.pi * 2.0 * t)
+    assert motion_of(t, y[:, None], 0.1)[0] == motion
+
+
+@pytest.mark.parametrize("target", [(0.5, 0.1), (0.02, -0.01), (-0.4, 0.3), (0.1, -0.28)])
+def test_the_nearest_point_is_that_of_another_optimiser(target: tuple[float, float]) -> None:
+    """Within limits that cut the ring of the default arm; SciPy's grid search and Nelder and Mead's simplex."""
+    urdf = read_urdf((Path(__file__).parents[1] / "urdf/2dof.urdf").read_text())
+    low, high = np.array([-0.5, 0.2]), np.array([2.0, 2.5])
+
+    def far(q: np.ndarray) -> float:
+        x = 0.15 * np.array([np.cos(q[0]) + np.cos(q[0] + q[1]), np.sin(q[0]) + np.sin(q[0] + q[1])])
+        return float(np.linalg.norm(x - target) + 10.0 * np.clip([low - q, q - high], 0.0, None).sum())
+
+    expected = far(brute(far, [*zip(low, high)], Ns=200))
+    kinematics, q = Kinematics(urdf, ("joint1", "joint2")), np.array([0.5, 0.35])
+    wanted = np.array(target)
+    found = nearest(kinematics, "EndEffector", axes=(0, 1), target=wanted, quat=np.empty(0), low=low, high=high, q=q)
+    assert found.distance == pytest.approx(expected, abs=1e-4 * 0.3) and far(found.q) == pytest.approx(found.distance)
+
+
+def test_the_nearest_point_of_a_panda_is_that_of_an_evolution() -> None:
+    fmu = twodof.load_fmu(fmu_of("panda", "pose"))
+    robot = robot_of(fmu.urdf)
+    assert robot is not None
+    kinematics, own = Kinematics(robot, fmu.joints), [robot.joints[name] for name in fmu.joints]
+    low, high = np.array([(joint.low, joint.high) for joint in own]).T
+    wanted, q, none = np.array([1.5, 0.0, 0.5]), np.array(failures.AT_PANDA), np.empty(0)
+    found = nearest(kinematics, fmu.frame, axes=(0, 1, 2), target=wanted, quat=none, low=low, high=high, q=q)
+
+    def far(q: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(kinematics.path(fmu.frame, q.T) - wanted, axis=1))
+
+    best = differential_evolution(far, [*zip(low, high)], rng=1, vectorized=True, updating="deferred", maxiter=300)
+    assert found.distance == pytest.approx(best.fun, rel=1e-3)
+
+
+# --- what it costs ---
+
+
+def test_the_verdict_takes_little_of_a_native_run(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processor time, of many runs in turn; the bound leaves room for a machine that does other things too."""
+
+    def taken(judge: Any) -> float:
+        monkeypatch.setattr(master, "judge_of", judge)
+        begin = time.process_time()
+        steps = master._stepped(run, judge(run, None), None, lambda: False, lambda: None, lambda *_: None, None)
+        assert sum(1 for _ in steps) == 20_001
+        return time.process_time() - begin
+
+    run, real = twodof.experiment(native_path, stop_time=200.0), master.judge_of
+    times = np.array([(taken(lambda *_: None), taken(real)) for _ in range(8)])
+    without, with_judge = times.min(axis=0)
+    assert with_judge < 1.1 * without
+
+
+def test_the_verdict_takes_no_more_memory_in_a_longer_run(native_path: Path) -> None:
+    memory = Memory(50_000)
+    run = twodof.simulate(native_path, memory, stop_time=4000.0)
+    assert memory.growth <= 300_000
+    assert run.verdict.samples == 400_001 and run.verdict.outcome == "reached"
+
+
+def test_blocks_change_no_number(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With targets that change within blocks and at their edges."""
+    changes = [(0.1 * k, {"x_des": (0.2 + 0.002 * k, 0.05)}) for k in range(1, 12)]
+    expected = twodof.simulate(native_path, stop_time=6.0, changes=changes, settings={"Kd": 6.0}).verdict
+    for block in (1, 7, 10, 50):
+        monkeypatch.setattr(master, "BLOCK", block)
+        found = twodof.simulate(native_path, stop_time=6.0, changes=changes, settings={"Kd": 6.0}).verdict
+        assert found.numbers == pytest.approx(expected.numbers, rel=1e-12, abs=1e-15)
+        assert found.lines == expected.lines
+    run = twodof.experiment(native_path, stop_time=6.0, changes=changes, settings={"Kd": 6.0})
+    samples = [*twodof.samples(run)]
+    e = np.array([np.subtract(s.target or (), s.x) for s in samples])
+    assert twodof.verdict(samples, run).numbers == pytest.approx(expected.numbers, rel=1e-12, abs=1e-15)
+    last = np.subtract((0.222, 0.05), [s.x for s in samples])[110:]
+    outside = np.flatnonzero(np.linalg.norm(last, axis=1) > 0.02 * np.linalg.norm(last[0]))[-1]
+    assert expected.numbers["settling_time"] == pytest.approx(0.01 * (outside + 1))
+    assert expected.numbers["final_error"] == pytest.approx(np.linalg.norm(e[-1]))
+
+
+# --- conditions, and honest answers ---
+
+
+@pytest.mark.parametrize(
+    ("conditions", "line"),
+    [
+        (["error > 1e-6"], "error > 1e-6 holds: final_error = 0.0002"),
+        (["error>1e-3", "saturated>0.1", "settling > 5"], ""),
+        (["rms >= 0.01 + 0.02"], "rms >= 0.01 + 0.02 holds: rms_error = 0.039"),
+        (["turn_error > 1"], "turn_error > 1 cannot be decided: final_turn_error is not defined"),
+        (["max(overshoot, effort_use) > 0.05"], "holds: overshoot = 0, effort_use = 0.0557"),
+    ],
+)
+def test_a_condition_fails_a_run(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], conditions: list[str], line: str
+) -> None:
+    options = [option for condition in conditions for option in ("--fail-if", condition)]
+    assert main(["run", str(native_path), "-o", str(tmp_path / "bag"), *options]) == (3 if line else 0)
+    assert line in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("condition", "reason"),
+    [
+        ("eror > 1", "there is no number 'eror'; did you mean"),
+        ("error", "is not a comparison"),
+        ("__import__('os').system('true') > 0", "is not a comparison"),
+        ("error.__class__ > 0", "is not a comparison"),
+        ("(lambda: 1)() > 0", "is not a comparison"),
+        ("peak > 1", "did you mean peak_effort or peak_velocity?"),
+        ("error > 1e-3 > 1", "is not a comparison"),
+        ("(" * 300 + "error" + ")" * 300 + " > 1", "is not a comparison"),
+    ],
+)
+def test_a_condition_is_refused_before_the_run(
+    native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], condition: str, reason: str
+) -> None:
+    assert main(["run", str(native_path), "-o", str(tmp_path / "bag"), "--fail-if", condition]) == 1
+    assert reason in capsys.readouterr().err and not (tmp_path / "bag").exists()
+
+
+def test_a_run_without_a_target_says_so() -> None:
+    run = twodof.simulate(fmu_of("arm", "effort"), settings=failures.LARGE_STEPS, stop_time=2.0)
+    assert run.verdict.outcome == "no target" and run.verdict.lines[0].startswith("no target")
+    assert not {"final_error", "final_joint_error", "settling_time", "overshoot"} & {*run.verdict.numbers}
+
+
+def test_gains_of_a_controller_outside_that_the_step_shows() -> None:
+    """A proportional and derivative controller, sampled every 10 ms, at the edge of what that step bears."""
+    run = twodof.experiment(fmu_of("arm", "effort"), step=0.01, stop_time=1.0, settings={"gravity": (0.0, 0.0, 0.0)})
+    steps, samples = twodof.samples(run), []
+    samples.append(next(steps))
+    for _ in range(100):
+        q, v = samples[-1].q, samples[-1].v
+        samples.append(steps.send({"tau_cmd": tuple(-2.0 * (a - 0.3) - 0.45 * b for a, b in zip(q, v))}))
+    verdict = twodof.verdict(samples, run)
+    assert "sampling" in {cause.kind for cause in verdict.causes}, verdict.lines
+    assert "communication steps of 0.01 s" in str(verdict)
+
+
+def test_a_bag_whose_writer_died_is_judged_by_its_samples(native_path: Path, tmp_path: Path) -> None:
+    """And one whose messages are fewer than its verdict says."""
+    run, kept = twodof.experiment(native_path, stop_time=5.0), []
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        for sample in twodof.samples(run):
+            if sample.k <= 100:
+                bag.write(sample)
+                kept.append(sample)
+    whole = twodof.simulate(run).verdict
+    found = twodof.read_bag(tmp_path / "bag").verdict
+    assert (whole.outcome, found.outcome, found.samples) == ("reached", "not reached", 101)
+    assert found.causes[0].kind == "time" and found.numbers["final_error"] == pytest.approx(
+        twodof.verdict(kept, run).numbers["final_error"], rel=1e-6
+    )
+    text = (tmp_path / "bag/run.json").read_text().strip()
+    (tmp_path / "bag/run.json").write_text(f'{text[:-1]},"verdict":{json.dumps(whole.facts())}}}')
+    assert twodof.read_bag(tmp_path / "bag").verdict.lines == found.lines
+    (tmp_path / "bag/run.json").write_text(f'{text[:-1]},"verdict":{{"samples": 101}}}}')
+    assert twodof.read_bag(tmp_path / "bag").verdict.lines == found.lines
+
+
+def test_a_judge_of_nothing_has_no_number() -> None:
+    run = twodof.experiment(fmu_of("arm", "task"))
+    judge = master.judge_of(run, None)
+    assert isinstance(judge, Judge)
+    with pytest.raises(twodof.TwoDofError, match="there are no samples"):
+        twodof.verdict([], run)
+    with pytest.raises(twodof.TwoDofError, match="experiment"):
+        twodof.verdict([])

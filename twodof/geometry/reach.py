@@ -1,0 +1,96 @@
+"""Nearest reachable position or pose of a link, within the limits of its joints.
+
+    min |p(q) − p_des|² + |log(R_des R(q)ᵀ)|²   over low ≤ q ≤ high
+
+from many starts, each improved by SciPy's bounded least squares (trust region reflective; Branch, Coleman & Li,
+"A subspace, interior, and conjugate gradient method for large-scale bound-constrained minimization problems",
+SIAM J. Sci. Comput. 21(1), 1999). A metre counts as a radian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from .kinematics import Array, Kinematics
+
+SCATTERED, IMPROVED = 2000, 6
+"""Starts that are compared, and the nearest of them that are improved."""
+LONGEST = 10.0  # m: travel of a sliding joint without limits from which starts are drawn
+EXACT = 1e-9  # m, rad: a start that ends so near to its target is not improved upon
+
+
+class Nearest(NamedTuple):
+    """Nearest reachable pose: joint positions, position in the root frame (m), and its distances (m, rad)."""
+
+    q: Array
+    point: Array
+    distance: float
+    angle: float
+
+
+def nearest(
+    kinematics: Kinematics,
+    link: str,
+    *,
+    axes: Sequence[int],
+    target: Array,
+    quat: Array,
+    low: Array,
+    high: Array,
+    q: Array,
+) -> Nearest:
+    """Return the reachable pose of a link that is nearest to a target.
+
+    Args:
+        kinematics: of the robot.
+        link: the link whose origin is compared.
+        axes: root axes, 0 to 2, along which the target is given.
+        target: position along the axes, m.
+        quat: target orientation x, y, z, w; empty for any.
+        low, high: limits of the columns of q, rad or m, infinite where there is none.
+        q: first start.
+    """
+    wanted = Rotation.from_quat(quat) if quat.size else None
+    chain, rows = kinematics.urdf.chain(link), [*axes, *((3, 4, 5) if wanted else ())]
+    sliding = np.zeros(len(q), bool)
+    for joint in chain:
+        column = kinematics.column(joint)[0]
+        if column is not None:
+            sliding[column] = joint.prismatic
+
+    def residual(at: Array) -> Array:
+        end = kinematics.along(chain, at[None])[-1]
+        off = end.translation[0][list(axes)] - target
+        if wanted is None:
+            return np.asarray(off)
+        return np.concatenate([off, (Rotation.from_matrix(end.rotation[0]) * wanted.inv()).as_rotvec()])
+
+    def slope(at: Array) -> Array:
+        return np.asarray(kinematics.jacobian(link, at[None])[0][rows])
+
+    half = np.where(sliding, LONGEST, pi)
+    ends = np.where(np.isfinite(low), low, q - half), np.where(np.isfinite(high), high, q + half)
+    starts = np.random.default_rng(0).uniform(*ends, (SCATTERED, len(q)))
+    scattered = kinematics.along(chain, starts)[-1]
+    far = np.linalg.norm(scattered.translation[:, list(axes)] - target, axis=1)
+    if wanted:
+        far = np.hypot(far, (Rotation.from_matrix(scattered.rotation) * wanted.inv()).magnitude())
+    found = []
+    margin = 1e-12 + 1e-12 * (high - low)  # the solver starts inside
+    for start in [q, *starts[np.argsort(far)[:IMPROVED]]]:
+        inside = np.clip(
+            start, np.where(np.isfinite(low), low + margin, low), high - np.where(high < np.inf, margin, 0)
+        )
+        found.append(least_squares(residual, inside, slope, (low, high), xtol=1e-13, ftol=1e-13, gtol=1e-13))
+        if found[-1].cost < 0.5 * EXACT**2:
+            break
+    best = min(found, key=lambda each: each.cost)
+    end, off = kinematics.along(chain, best.x[None])[-1], residual(best.x)
+    distance, angle = (float(np.linalg.norm(part)) for part in np.split(off, [len(axes)]))
+    return Nearest(best.x, end.translation[0], distance, angle)

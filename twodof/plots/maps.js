@@ -1,0 +1,138 @@
+// Draws a sweep: two maps side by side, a Pareto front of two metrics, and what is known of the run that is clicked.
+"use strict";
+
+/** @typedef {{varied: string[], metrics: Record<string, string>, units: Record<string, string>, columns: Record<string, (number | null)[]>, outcome: string[], beyond: boolean[], best: number[], fmu: string, settings: string[], curves: Record<string, {verdict: string, lines: Record<string, [number[], number[]]>}>}} Sweep */
+
+const dark = matchMedia("(prefers-color-scheme: dark)");
+
+/** @returns {any} what all charts have, in the page's colours */
+function layout() {
+  const [ink, hair] = dark.matches ? ["#d5dade", "#3a4046"] : ["#1f2933", "#e6e9ec"];
+  const axis = { gridcolor: hair, linecolor: hair, zeroline: false, automargin: true, exponentformat: "power" };
+  return {
+    font: { family: "sans-serif", size: 12, color: ink }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    margin: { l: 50, r: 10, t: 10, b: 44 }, height: 340, showlegend: false, hovermode: "closest", xaxis: axis, yaxis: axis,
+  };
+}
+
+class SweepPage {
+  /** @param {Sweep} sweep @param {HTMLElement} place */
+  constructor(sweep, place) {
+    this.sweep = sweep;
+    this.runs = /** @type {number[]} */ (sweep.columns.run);
+    this.chosen = Math.max(0, this.runs.indexOf(sweep.best[0] ?? -1));
+    const names = Object.keys(sweep.metrics), every = [...sweep.varied, ...names];
+    const [x, y] = [sweep.varied[0], sweep.varied[1] ?? names[0]];
+    this.charts = [
+      this.chart(place, "map", [x, y, names[0]], [sweep.varied, every, names]),
+      this.chart(place, "map", [x, y, names.includes("peak_effort") ? "peak_effort" : names[names.length - 1]], [sweep.varied, every, names]),
+      this.chart(place, "front", [names[0], names.includes("peak_effort") ? "peak_effort" : names[1] ?? names[0]], [names, names]),
+    ];
+    this.detail = place.appendChild(Object.assign(document.createElement("section"), { className: "run" }));
+    this.curve = document.createElement("div");
+    this.draw();
+    dark.addEventListener("change", () => this.draw());
+  }
+
+  /** @param {string} name @returns {string} with its unit */
+  title(name) {
+    const unit = this.sweep.units[name];
+    return (this.sweep.metrics[name] ?? name) + (unit ? `, ${unit.replace(".", "·")}` : "");
+  }
+
+  /** @param {HTMLElement} place @param {string} kind @param {string[]} shown @param {string[][]} choices */
+  chart(place, kind, shown, choices) {
+    const box = place.appendChild(document.createElement("section")), head = box.appendChild(document.createElement("p"));
+    const words = kind === "front" ? ["Pareto front of", "and"] : ["across", "up", "colour"];
+    shown.forEach((name, i) => {
+      const label = head.appendChild(document.createElement("label")), select = document.createElement("select");
+      select.append(...choices[i].map((each) => new Option(this.sweep.metrics[each] ?? each, each, each === name, each === name)));
+      select.onchange = () => { shown[i] = select.value; this.draw(); };
+      label.append(`${words[i]} `, select);
+    });
+    return { kind, shown, div: box.appendChild(document.createElement("div")) };
+  }
+
+  /** @param {string[]} names @returns {boolean[]} which runs no other is better than in both of two metrics */
+  front([first, second]) {
+    const { columns, outcome, beyond } = this.sweep, a = columns[first], b = columns[second];
+    const fit = this.runs.map((_, k) => k).filter((k) => a[k] !== null && b[k] !== null && outcome[k] === "finished" && !beyond[k]);
+    fit.sort((i, j) => Number(a[i]) - Number(a[j]) || Number(b[i]) - Number(b[j]));
+    const found = this.runs.map(() => false);
+    let least = Infinity;
+    for (const k of fit) if (Number(b[k]) < least) { found[k] = true; least = Number(b[k]); }
+    return found;
+  }
+
+  draw() {
+    for (const chart of this.charts) {
+      const { kind, shown, div } = chart, { columns, beyond } = this.sweep, base = layout();
+      const [x, y] = [columns[shown[0]], columns[shown[1]]], pick = this.chosen;
+      const at = (/** @type {boolean[]} */ on) => [x.filter((_, k) => on[k]), y.filter((_, k) => on[k])];
+      const [bx, by] = at(beyond), dense = this.runs.length > 100 ? 9 : 14;
+      const text = this.runs.map((run, k) => `run ${run}${beyond[k] ? ", not possible on this robot" : ""}`);
+      /** @type {any} */
+      const dots = { type: "scatter", mode: "markers", x, y, text, marker: { size: dense, symbol: "square" } };
+      const crosses = { type: "scatter", mode: "markers", x: bx, y: by, hoverinfo: "skip", marker: { symbol: "x-thin", size: 6, line: { width: 1.5, color: "#D55E00" } } };
+      const ring = { type: "scatter", mode: "markers", x: [x[pick]], y: [y[pick]], hoverinfo: "skip", marker: { symbol: "circle-open", size: 18, color: "#D55E00", line: { width: 3 } } };
+      const traces = [dots, crosses, ring];
+      if (kind === "map") {
+        const color = columns[shown[2]];
+        const symbol = color.map((value) => (value === null ? "square-open" : "square"));
+        Object.assign(dots.marker, { color, symbol, colorscale: "Viridis", showscale: true, colorbar: { thickness: 10, outlinewidth: 0 } });
+        dots.hovertemplate = `%{text}<br>${shown[0]} %{x}<br>${shown[1]} %{y}<br>%{marker.color:.4g}<extra></extra>`;
+      } else {
+        const on = this.front(shown), [fx, fy] = at(on), order = fx.map((_, i) => i).sort((i, j) => Number(fx[i]) - Number(fx[j]));
+        Object.assign(dots.marker, { color: "#8a97a3", symbol: "circle", size: 6 });
+        traces.splice(1, 0, { type: "scatter", mode: "lines+markers", x: order.map((i) => fx[i]), y: order.map((i) => fy[i]), hoverinfo: "skip", line: { shape: "hv", color: "#0072B2" } });
+      }
+      base.xaxis = { ...base.xaxis, title: { text: this.title(shown[0]) } };
+      base.yaxis = { ...base.yaxis, title: { text: this.title(shown[1]) } };
+      Plotly.react(div, traces, base, { responsive: true, displayModeBar: false });
+      const heard = /** @type {any} */ (div);
+      heard.removeAllListeners("plotly_click");
+      heard.on("plotly_click", (/** @type {any} */ event) => {
+        const point = event.points.find((/** @type {any} */ each) => each.curveNumber === 0);
+        if (point) this.choose(point.pointNumber);
+      });
+    }
+    this.tell();
+  }
+
+  /** @param {number} k */
+  choose(k) {
+    this.chosen = k;
+    this.draw();
+  }
+
+  /** Show the run that is chosen: its numbers, how to repeat it, and its curves where there is a bag. */
+  tell() {
+    const { columns, outcome, beyond, varied, metrics, curves, fmu, settings } = this.sweep, k = this.chosen, run = this.runs[k];
+    const number = (/** @type {string} */ name) => Number(columns[name][k]).toPrecision(4);
+    const known = Object.keys(metrics).filter((name) => columns[name][k] !== null);
+    const lines = [
+      `run ${run}: ${varied.map((name) => `${name} = ${number(name)}`).join(", ")}; ${outcome[k]}${beyond[k] ? "; not possible on this robot: beyond the URDF's limits" : ""}`,
+      known.map((name) => `${this.title(name)}: ${number(name)}`).join("; "), curves[run]?.verdict ?? "",
+    ];
+    const again = `twodof run ${fmu} ${[...settings, ...varied.map((name) => `--set '${name}=${columns[name][k]}'`)].join(" ")}`;
+    const code = Object.assign(document.createElement("code"), { textContent: again });
+    this.detail.replaceChildren(...lines.filter(Boolean).map((text) => Object.assign(document.createElement("p"), { textContent: text })), code, this.curve);
+    const drawn = Object.entries(curves[run]?.lines ?? {});
+    this.curve.hidden = !drawn.length;
+    if (!drawn.length) return;
+    const base = { ...layout(), showlegend: true, height: 420, legend: { orientation: "h", y: -0.2 } };
+    base.xaxis = { ...base.xaxis, title: { text: "time in s" } };
+    Plotly.react(this.curve, drawn.map(([name, [x, y]]) => ({ type: "scatter", mode: "lines", name, x, y })), base, { responsive: true, displayModeBar: false });
+  }
+}
+
+async function drawMaps() {
+  const script = document.createElement("script");
+  script.textContent = await unpackedText("library");
+  document.head.append(script);
+  const place = /** @type {HTMLElement} */ (document.getElementById("maps"));
+  Object.assign(window, { sweepPage: new SweepPage(JSON.parse(await unpackedText("content")), place) });
+  place.dataset.ready = "";
+}
+
+drawMaps();

@@ -1,0 +1,85 @@
+"""Interactive map of a sweep on a page: two maps side by side, a Pareto front, and the run that is clicked.
+
+``maps.js`` draws them with plotly, whose library stands packed on the page, from the columns of the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..bag.reader import read_bag
+from ..errors import BagError
+from ..sweeps.ranking import METRICS, beyond_limits
+from .interactive import scripts
+from .settings import UNITS
+from .strokes import downsampled
+
+if TYPE_CHECKING:
+    import pandas
+
+MOST_RUNS = 20_000  # that a page holds: of a larger sweep an even part
+MOST_CURVES, POINTS = 2000, 200
+"""Runs whose curves a page holds, and points of each."""
+
+
+def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, best: Sequence[int]) -> str:
+    """Return the HTML of the interactive map; "" where plotly is missing.
+
+    Args:
+        table: of the sweep.
+        varied: its variables.
+        bags: folder with a bag of each run, whose curves are shown when the run is clicked; None: none.
+        best: run that is selected at first, if any.
+    """
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        return ""
+    rows = table.iloc[:: max(1, -(-len(table) // MOST_RUNS))]
+    metrics = [name for name in METRICS if rows[name].notna().any()]
+    columns = {name: _numbers(rows[name].to_numpy(dtype=float)) for name in ("run", *varied, *metrics)}
+    options = table.attrs["provenance"]["options"]
+    content = {
+        "varied": [*varied],
+        "metrics": {name: METRICS[name].title for name in metrics},
+        "units": {**table.attrs["units"], **{name: UNITS.get(name, "") for name in varied if name in UNITS}},
+        "columns": columns,
+        "outcome": rows["outcome"].tolist(),
+        "beyond": beyond_limits(rows).tolist(),
+        "best": [int(run) for run in best],
+        "fmu": table.attrs["provenance"]["fmu"]["file"],
+        "settings": [f"--stop-time {options['stop_time']:g}", f"--step {options['step']:g}"]
+        + [f"--set '{name}={str(value).lower()}'" for name, value in options["settings"].items()],
+        "curves": _curves(rows, bags),
+    }
+    return f'<div id="maps"></div>\n{scripts("maps.js", get_plotlyjs(), content)}'
+
+
+def _numbers(values: Any) -> list[float | None]:
+    return [float(f"{value:.9g}") if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, Any]]:
+    """Return curves of each run that has a bag, by its number: the distance from the target, or the joints."""
+    curves: dict[str, dict[str, Any]] = {}
+    if bags is None or not bags.is_dir():
+        return curves
+    for run in rows["run"].tolist()[:MOST_CURVES]:
+        try:
+            bag = read_bag(bags / f"{run:06d}")
+            lines = {name: bag.q[:, i] for i, name in enumerate(bag.joints)}
+            if bag.x.size and bag.x.shape == bag.target.shape:
+                lines = {"distance from the target, m": np.linalg.norm(bag.x - bag.target, axis=1), **lines}
+            verdict = bag.verdict.lines[0]
+        except BagError:
+            continue
+        drawn = {name: downsampled(values, POINTS) for name, values in lines.items()}
+        curves[str(run)] = {
+            "verdict": verdict,
+            "lines": {name: [_numbers(bag.t[k]), _numbers(lines[name][k])] for name, k in drawn.items()},
+        }
+    return curves

@@ -1,0 +1,298 @@
+"""Causes of a run that did not do what it was asked to, the root first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from math import inf, log, pi, radians, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..plant.urdf import Joint
+from ..plant.variables import EXACT
+from .judge import AT_LIMIT, BAND, Judge
+from .setup import Array
+
+KINDS = {
+    "diverged": "a value that is not finite",
+    "degrees": "a value in degrees where radians are meant",
+    "reach": "the target is out of reach",
+    "gain": "a gain of 0",
+    "limit": "a joint at its position limit",
+    "friction": "a joint that sticks",
+    "saturation": "a motor at its effort limit",
+    "load": "a load that the controller does not know",
+    "sampling": "an oscillation as fast as the communication step",
+    "damping": "too little damping",
+    "singularity": "a singular pose",
+    "time": "gains that are too slow for the duration",
+    "drag": "damping of the joints that the controller does not know",
+    "effort": "an effort beyond the URDF's limit",
+    "velocity": "a speed beyond the URDF's limit",
+}
+"""Kinds of causes in their order: one may bring about those after it."""
+MOST = 20  # causes of a verdict
+FLOOR = 1e-4  # m, rad: an error below is that of the integrator
+MANY_CHANGES = 12  # of a target from which on it moves, and is followed
+OFTEN = 0.05  # of the samples from which on a state is a cause, and not a passing one
+NEAR_SINGULAR = 0.02  # ratio of the smallest to the largest singular value
+LEAST_TURN = 2.0 * pi  # rad: a larger target of a joint may be in degrees
+MILLIMETRES = 10.0  # m: a target farther away is not meant in metres
+FAST = 0.25  # changes of a velocity's sign a sample, from which on the step shows
+
+
+class Cause(NamedTuple):
+    """A cause in words, with its kind of KINDS.
+
+    Attributes:
+        share: of the samples, or of a limit; the larger the worse. 0 where there is none.
+        joint: whose it is, or "".
+        time: when it began to be seen, s since the first sample; None where it is of all the run.
+        point: nearest reachable position in the root frame, m; () of other kinds.
+    """
+
+    kind: str
+    text: str
+    share: float = 0.0
+    joint: str = ""
+    time: float | None = None
+    point: tuple[float, ...] = ()
+
+
+def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...]:
+    """Return the causes, the root first.
+
+    Args:
+        judge: what has all samples.
+        missed: outputs that are not at their targets: "x", "quat" or "q".
+        motion: at the end.
+    """
+    found = [*_degrees(judge), *_beyond_limits(judge)]
+    ill = bool(missed) or motion == "diverging"
+    if missed:
+        found += [*_reach(judge, missed), *_gains(judge, missed), *_load(judge), *_friction(judge, missed)]
+        found += [*_singular(judge, missed), *_slow(judge, missed)]
+    if ill or not judge.aims:
+        found += [*_at_limits(judge, missed), *_saturated(judge), *_sampled(judge)]
+    if missed and motion in ("oscillating", "diverging"):
+        found += _damping(judge, missed)
+    order = [*KINDS]
+    return tuple(sorted(found, key=lambda cause: (order.index(cause.kind), -cause.share))[:MOST])
+
+
+def _degrees(judge: Judge) -> Iterator[Cause]:
+    setup, held = judge.setup, {**judge.setup.starts, **judge.inputs}
+    for group in ("q_des", "q_start"):
+        for i, value in enumerate(setup.given(group, held)[: len(setup.joints)]):
+            meant = radians(value)
+            fits = setup.low[i] - AT_LIMIT <= meant <= setup.high[i] + AT_LIMIT
+            if setup.units[i] == "rad" and abs(value) > LEAST_TURN and fits:
+                name = f"{group}[{i + 1}]"
+                yield Cause(
+                    "degrees", f"{name} = {value:g} rad: {value:g}°? That is {meant:.4g} rad", 1.0, setup.joints[i]
+                )
+
+
+def _beyond_limits(judge: Judge) -> Iterator[Cause]:
+    setup = judge.setup
+    for kind, peaks, bounds, use in zip(("effort", "velocity"), (judge.effort, judge.speed), setup.limits, judge.use()):
+        for joint, unit, peak, limit, share in zip(setup.joints, setup.units, peaks, bounds, use):
+            if share > 1.0 + EXACT:
+                effort = {"rad": "N·m", "m": "N"}.get(unit, "")
+                of = effort if kind == "effort" else f"{unit}/s"
+                what = "effort" if kind == "effort" else "speed"
+                text = (
+                    f"joint '{joint}' has a peak {what} of {peak:.4g} {of}, beyond the URDF's limit of {limit:.4g} {of}"
+                )
+                yield Cause(kind, text, float(share), joint)
+
+
+def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    setup = judge.setup
+    told = {cause.joint for cause in _degrees(judge)}
+    for joint, unit, wanted, low, high in zip(setup.joints, setup.units, judge.wanted("q"), setup.low, setup.high):
+        by, limit = (low - wanted, low) if wanted < low else (wanted - high, high)
+        if by > AT_LIMIT and joint not in told:
+            text = f"the target {wanted:.4g} {unit} of joint '{joint}' is out of reach by {by:.4g} {unit}"
+            yield Cause("reach", f"{text}: its limit is {limit:.4g} {unit}", float(by), joint)
+    robot, target, quat = setup.robot, judge.wanted("x"), judge.wanted("quat")
+    if robot is None or setup.frame not in robot.links or not target.size or not {"x", "quat"} & {*missed}:
+        return
+    from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
+    from ..geometry.reach import nearest
+
+    kinematics, axes = Kinematics(robot, setup.joints), ["xyz".index(axis) for axis in setup.axes]
+    size = max(BAND * judge.aims["x"].first, FLOOR)
+    search = partial(nearest, kinematics, setup.frame, axes=axes, target=target)
+    best = search(quat=np.empty(0), low=setup.low, high=setup.high, q=judge.end("q"))
+    if best.distance > size:
+        free = np.full(len(setup.joints), inf)
+        text = f"the target is out of reach by {best.distance:.4g} m"
+        stops = _stops(judge, best.q)
+        if stops:
+            wide = search(quat=np.empty(0), low=-free, high=free, q=best.q)
+            text += f" within the joint limits ({', '.join(stops)})" if wide.distance < size else ""
+        if np.abs(target).max() > MILLIMETRES and np.linalg.norm(0.001 * target - best.point[axes]) < best.distance:
+            text += "; is it in millimetres?"
+        text += f"; the nearest reachable point is {point_text(best.point[axes])} m"
+        yield Cause("reach", text, best.distance, point=tuple(best.point.tolist()))
+    elif quat.size and "quat" in missed:
+        best = search(quat=quat, low=setup.low, high=setup.high, q=judge.end("q"))
+        if best.angle > max(BAND * judge.aims["quat"].first, 1e-3):
+            text = f"the target pose is out of reach by {best.angle:.4g} rad and {best.distance:.4g} m"
+            yield Cause("reach", text, best.angle, point=tuple(best.point.tolist()))
+
+
+def point_text(values: Array) -> str:
+    """Return a vector in words, without what is rounding."""
+    return f"({', '.join(f'{value:.4g}' for value in np.round(values, 9) + 0.0)})"
+
+
+def _stops(judge: Judge, q: Array) -> list[str]:
+    """Return the joints that positions hold at a limit, quoted."""
+    setup = judge.setup
+    near = (q <= setup.low + 1e-6) | (q >= setup.high - 1e-6)
+    return [f"'{name}'" for name, at in zip(setup.joints, near) if at]
+
+
+def _gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    held = {**judge.setup.starts, **judge.inputs}
+    for name in missed:
+        group = "Kp_rot" if name == "quat" else "Kp"
+        zero = [f"{group}[{i + 1}]" for i, gain in enumerate(judge.setup.given(group, held)) if gain == 0.0]
+        if zero:
+            yield Cause("gain", f"{', '.join(zero)} = 0: nothing pulls this to its target", 1.0)
+
+
+def _late(judge: Judge, inside: NDArray[np.bool_]) -> float:
+    """Return the share of the last quarter of samples, or of all with a target that moves, at which something is so."""
+    return float(inside[0 if judge.changes > MANY_CHANGES else -(len(inside) // 4 + 1) :].mean())
+
+
+def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    setup, q, t = judge.setup, judge.history("q"), judge.history()
+    taken = judge.duration / max(1, judge.count - 1)
+    moving = {joint.leader for joint in _chain(judge)} or {*setup.joints}
+    first = judge.first[: len(setup.joints)]
+    for side, bound, counts in (("lower", setup.low, judge.low), ("upper", setup.high, judge.high)):
+        inside = np.abs(q - bound) <= AT_LIMIT
+        for i, (joint, unit) in enumerate(zip(setup.joints, setup.units)):
+            rests = abs(first[i] - bound[i]) <= AT_LIMIT and counts[i] >= judge.count - 1
+            idle = (judge.wanted("q").size and abs(judge.wanted("q")[i] - bound[i]) <= AT_LIMIT) or joint not in moving
+            if counts[i] and not idle and (missed or not rests) and _late(judge, inside[:, i]) > OFTEN:
+                held = f"for {counts[i] * taken:.4g} s of {judge.duration:.4g} s"
+                text = f"joint '{joint}' stood at its {side} limit {bound[i]:.4g} {unit} {held}"
+                yield Cause("limit", text, counts[i] / judge.count, joint, float(t[inside[:, i].argmax()]))
+
+
+def _chain(judge: Judge) -> list[Joint]:
+    """Return the joints that move the end effector to its target; none where that is not known."""
+    robot, frame = judge.setup.robot, judge.setup.frame
+    return [] if robot is None or frame not in robot.links or "x" not in judge.aims else robot.chain(frame)
+
+
+def _saturated(judge: Judge) -> Iterator[Cause]:
+    setup, tau, t = judge.setup, np.abs(judge.history("tau")), judge.history()
+    if tau.shape[1] != len(setup.joints):
+        return
+    bounds = np.array(setup.limits.effort)
+    inside = tau >= bounds * (1.0 - EXACT)
+    for i, joint in enumerate(setup.joints):
+        beyond = judge.effort[i] > bounds[i] * (1.0 + EXACT)
+        if judge.share[i] > OFTEN and not beyond and _late(judge, inside[:, i]) > OFTEN:
+            unit = "N" if setup.units[i] == "m" else "N·m"
+            text = (
+                f"the motor of joint '{joint}' was saturated at {bounds[i]:.4g} {unit} for {100 * judge.share[i]:.3g} %"
+            )
+            yield Cause(
+                "saturation", f"{text} of the time", float(judge.share[i]), joint, float(t[inside[:, i].argmax()])
+            )
+
+
+def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    setup = judge.setup
+    friction = setup.given("friction")
+    for i, joint in enumerate(setup.joints[: len(friction)]):
+        off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > 0.0 if judge.wanted("q").size else bool(missed)
+        held = judge.duration - max(0.0, float(judge.moved[i]))
+        if friction[i] > 0.0 and off and held > OFTEN * judge.duration:
+            text = f"joint '{joint}' sticks: its friction of {friction[i]:.4g} holds it from {judge.moved[i]:.4g} s on"
+            yield Cause("friction", text, held / judge.duration, joint, max(0.0, float(judge.moved[i])))
+
+
+def _load(judge: Judge) -> Iterator[Cause]:
+    held = {**judge.setup.starts, **judge.inputs}
+    if held.get("payload") and not held.get("payload_known"):
+        yield Cause("load", f"the controller does not know the payload of {held['payload']:g} kg", 1.0)
+    joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
+    damped = [f"'{name}'" for name in judge.setup.joints if name in joints and joints[name].damping > 0.0]
+    if damped:
+        yield Cause("drag", f"the controller does not know the damping of joints {', '.join(damped)} in the URDF", 0.2)
+    for group, unit in (("tau_ext", ""), ("f_ext", " N")):
+        values = judge.setup.given(group, held)
+        if values.any():
+            yield Cause("load", f"{group} = {point_text(values)}{unit} acts, which the controller does not know", 0.5)
+
+
+def _sampled(judge: Judge) -> Iterator[Cause]:
+    v, setup = judge.tail("v")[-256:], judge.setup
+    if len(v) < 16:
+        return
+    turns = (np.sign(v[1:]) * np.sign(v[:-1]) < 0.0).mean(axis=0)
+    turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
+    i = int(turns.argmax())
+    if turns[i] >= FAST:
+        gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
+        text = (
+            f"joint '{setup.joints[i]}' turns round every {1.0 / turns[i]:.2g} communication steps of {setup.step:g} s"
+        )
+        yield Cause("sampling", f"{text}: the gains{gains} are too high for the step", float(turns[i]), setup.joints[i])
+
+
+def _damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    held = {**judge.setup.starts, **judge.inputs}
+    for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
+        Kp, Kd = judge.setup.given(stiff, held), judge.setup.given(damp, held)
+        ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
+        if ratios and min(ratios)[0] < 0.2:
+            ratio, i, p, d = min(ratios)
+            text = f"{damp}[{i + 1}] = {d:g} s⁻¹ damps {stiff}[{i + 1}] = {p:g} s⁻² too little"
+            yield Cause("damping", f"{text}: critical damping is {2.0 * sqrt(p):.4g} s⁻¹", 1.0 - ratio)
+
+
+def _singular(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    setup, q, t = judge.setup, judge.history("q"), judge.history()
+    if not _chain(judge) or len(setup.axes) + 3 * bool(judge.wanted("quat").size) > len(setup.joints):
+        return
+    assert setup.robot is not None
+    from ..geometry.kinematics import Kinematics
+
+    rows = [*("xyz".index(axis) for axis in setup.axes), *((3, 4, 5) if judge.wanted("quat").size else ())]
+    jacobian = Kinematics(setup.robot, setup.joints).jacobian(setup.frame, q)[:, rows]
+    sigma = np.linalg.svd(jacobian, compute_uv=False)
+    ratio = sigma[:, -1] / np.maximum(sigma[:, 0], 1e-300)
+    near = max(NEAR_SINGULAR, 2.0 * float(setup.starts.get("rcond", 0.0)))
+    k = int(ratio.argmin())
+    if _late(judge, ratio <= near) > OFTEN:
+        text = f"the arm is near a singularity: its singular values have the ratio {ratio[k]:.2g} at {t[k]:.4g} s"
+        yield Cause("singularity", text, 1.0 - float(ratio[k]), time=float(t[k]))
+
+
+def _slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+    """Say how long errors that shrink will take, by their rate at the end."""
+    t = judge.history()
+    for name in missed:
+        aim = judge.aims[name]
+        size = np.array(judge.error_history(name))
+        k = int(np.searchsorted(t, judge.changed + 0.8 * (judge.duration - judge.changed)))
+        if len(size) < 4 or k >= len(size) - 1 or not 0.0 < size[-1] < size[k] * (1.0 - 1e-6):
+            continue
+        rate = log(size[k] / size[-1]) / (t[-1] - t[k])
+        left = log(max(size[-1] / max(BAND * aim.first, FLOOR), 1.0)) / rate
+        what = {"x": "position still approaches", "quat": "orientation still approaches", "q": "joints still approach"}
+        steady = bool((np.diff(size[k:]) < 0.0).all())
+        if steady and left < 1000.0 * judge.duration:
+            text = f"the {what[name]}, with a time constant of {1.0 / rate:.3g} s"
+            yield Cause("time", f"{text}: 2 % takes about {left:.3g} s more; stop later, or raise the gains", left)

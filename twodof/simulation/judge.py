@@ -1,0 +1,338 @@
+"""The samples of a run as the numbers by which it is judged, in constant memory.
+
+With e_k = x_des − x_k, the end effector's error at t_k, or under joint control e_k = q_des − q_k, and d = e_0 / |e_0|,
+its first direction; |·| is the Euclidean norm over the task axes or joints, h the communication step, θ_k the angle
+between the end effector's orientation and its target. Nothing is interpolated: times are those of samples, and
+extremes those of samples. e_0 is the error at the last change of the target.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from math import inf, nan, sqrt
+
+import numpy as np
+
+from ..plant.variables import EXACT as EXACT
+from .setup import Array, Setup
+
+BAND = 0.02
+"""Band of the settling time, as a share of the initial error."""
+SMALLEST_MOVE = 1e-9  # m: below, a run that starts at its target has no band to settle in
+AT_LIMIT = 1e-9  # rad or m: a joint that the plant has stopped is at its limit to the last bit
+BLOCK = 4096  # samples that are judged at a time
+KEPT = 2048  # least samples of the whole run, and of its end, that are kept
+OUTPUTS = ("q", "v", "x", "tau", "quat")
+TARGETS = {"x": "x_des", "quat": "quat_des", "q": "q_des"}
+
+
+class Aim:
+    """Errors of one output from its target: position, orientation or joints."""
+
+    def __init__(self) -> None:
+        self.squares = 0.0
+        self.began, self.outside, self.first, self.last, self.past = 0.0, -inf, nan, nan, 0.0
+        self.way: Array = np.empty(0)
+
+    def begin(self, t: float, e: Array, size: float) -> None:
+        """Begin a way at a new target, from an error vector (empty for an angle) of a size."""
+        self.began, self.outside, self.first, self.last, self.past, self.way = t, t, size, size, 0.0, e
+
+    def add(self, t: Array, e: Array, size: Array) -> None:
+        """Add N samples of the way."""
+        if size.max() > BAND * self.first:
+            self.outside = t[np.flatnonzero(size > BAND * self.first)[-1]]
+        if self.way.size and self.first >= SMALLEST_MOVE:
+            self.past = max(self.past, -float((e @ self.way).min()) / self.first**2)
+        self.last = float(size[-1])
+
+
+class Judge:
+    """Accumulator of a run's samples.
+
+    A master writes each row of outputs to ``rows``, says when inputs ``change``, and calls ``flush`` every BLOCK rows.
+
+    Args:
+        setup: the run's robot and settings.
+        sizes: values of each of OUTPUTS in a row, 0 where the run has none.
+
+    Attributes:
+        count: samples so far.
+        inputs: those that differ from the start values, as they are now.
+        aims: by output that has a target.
+        effort, speed: largest magnitude of each joint's, n values; likewise what follows.
+        saturated, low, high: samples at the effort limit, and after the first at a position limit.
+        moved: time of the last sample at which the velocity is not exactly 0, s.
+        changes, changed, travel: of targets: how many, the time of the last, s, and their largest distance from the
+            first.
+    """
+
+    def __init__(self, setup: Setup, sizes: Sequence[int]) -> None:
+        n = len(setup.joints)
+        self.setup, self.inputs = setup, dict[str, float]()
+        self.count, self.changes, self.changed = 0, 0, -inf
+        self.stopped = False
+        self.aims: dict[str, Aim] = {}
+        self.effort, self.speed = np.zeros(n), np.zeros(n)
+        self.saturated, self.low, self.high = np.zeros(n, int), np.zeros(n, int), np.zeros(n, int)
+        self.moved, self.travel = np.full(n, -inf), 0.0
+        self.first, self.last = np.empty(0), np.empty(0)
+        self._ends = np.cumsum([0, *sizes])
+        self._names = [name for name, size in zip(OUTPUTS, sizes) if size]
+        self._targets: dict[str, Array] = {}
+        self._held = self._at_start()
+        self._where = {
+            f"{TARGETS[name]}[{i + 1}]": (name, i) for name, held in self._held.items() for i in range(len(held))
+        }
+        self._time = 0.0
+        self._kept, self._filled, self._stride = np.empty((2 * KEPT, 1 + len(TARGETS) + self._ends[-1])), 0, 1
+        self._recent: list[Array] = []
+        self._constant: Mapping[str, Array] = {}
+        self._same: Mapping[str, Array] = {}
+        self.rows, self._changed = io.BytesIO(), [(0, self._held)]
+        self._at_limits = 0
+
+    # --- from a master ---
+
+    def change(self, inputs: Mapping[str, float]) -> None:
+        """Receive inputs that hold from the last sample on."""
+        self.inputs |= inputs
+        held = self._changed[-1][1]
+        for variable in inputs.keys() & self._where.keys():
+            name, i = self._where[variable]
+            held = {**held, name: held[name].copy()}
+            held[name][i] = inputs[variable]
+        self._changed.append((self.count + self.rows.tell() // (8 * int(self._ends[-1])), held))
+
+    def flush(self) -> None:
+        """Judge the rows that wait."""
+        rows = np.frombuffer(self.rows.getvalue()).reshape(-1, self._ends[-1])
+        if not len(rows):
+            return
+        self.rows.seek(0)
+        self.rows.truncate()
+        t: Array = np.arange(self.count, self.count + len(rows), dtype=np.float64) * self.setup.step
+        self.judge(t, rows, self._in_effect(len(rows)))
+
+    def _in_effect(self, count: int) -> Mapping[str, Array]:
+        """Return the targets of the rows that wait: the object of the block before where none has changed."""
+        if len(self._changed) == 1 and self._constant:
+            return self._constant
+        changed = [(max(0, k - self.count), held) for k, held in self._changed]
+        lengths = np.diff([*(k for k, _ in changed), count])
+        targets = {name: np.repeat([held[name] for _, held in changed], lengths, axis=0) for name in self._held}
+        self._changed = [(0, changed[-1][1])]
+        self._constant = {name: held[None] for name, held in self._changed[0][1].items()}
+        return targets if len(changed) > 1 else self._constant
+
+    def _at_start(self) -> dict[str, Array]:
+        """Return the targets with which the run starts."""
+        known = {name: self.setup.given(group) for name, group in TARGETS.items() if name in self._names}
+        sizes = dict(zip(OUTPUTS, np.diff(self._ends).tolist()))
+        fit = {name: value for name, value in known.items() if len(value) == sizes[name]}
+        return {name: value for name, value in fit.items() if name != "quat" or value.any()}
+
+    # --- from anyone ---
+
+    @property
+    def targets(self) -> dict[str, Array]:
+        """Targets with which the run starts, by output, 1 × values."""
+        return {name: held[None] for name, held in self._held.items()}
+
+    def judge(self, t: Array, rows: Array, targets: Mapping[str, Array]) -> None:
+        """Judge N samples.
+
+        Args:
+            t: times since the first sample, s, N.
+            rows: all OUTPUTS side by side, N × values.
+            targets: by output, N rows, or one for all, in effect up to each sample.
+        """
+        rows = np.asfortranarray(rows)
+        own = {name: rows[:, a:b] for name, a, b in zip(OUTPUTS, self._ends, self._ends[1:])}
+        if not self.count:
+            self.first = self.last = rows[0]
+        start = self._change(t, targets)
+        sizes = [self._aim(n, own[n], targets[n], t, start) if n in targets else t for n in TARGETS]
+        self._watch(own, t)
+        self._keep([t, *sizes], rows)
+        self.count, self.last, self._time = self.count + len(rows), rows[-1], float(t[-1])
+
+    def _change(self, t: Array, targets: Mapping[str, Array]) -> int:
+        """Return the first row of the way to the last target: 0 where that began in an earlier block."""
+        if self.count and targets is self._same:
+            return 0
+        start, self._same = 0, targets
+        for name, target in targets.items():
+            before = self._targets.get(name, target[0])
+            new = np.flatnonzero((np.diff(target, axis=0, prepend=before[None]) != 0.0).any(axis=1))
+            if len(target) > 1 or len(new):
+                self.changes += len(new)
+                start = max(start, int(new[-1]) if len(new) else 0)
+                if len(new) and not start:
+                    self.changed = self._time
+            self.travel = max(self.travel, float(np.abs(target - self.target(name, target[0])).max()))
+            self._targets.setdefault(f"{name} at first", target[0])
+            self._targets[name] = target[-1]
+        if start or not self.count:
+            self.changed = float(t[max(0, start - 1)])
+        return start
+
+    def target(self, name: str, usual: Array | None = None) -> Array:
+        """Return the first target of an output."""
+        return self._targets.get(f"{name} at first", np.empty(0) if usual is None else usual)
+
+    def wanted(self, name: str) -> Array:
+        """Return the last target of an output; empty where there is none."""
+        return self._targets.get(name, np.empty(0))
+
+    def _aim(self, name: str, now: Array, target: Array, t: Array, start: int) -> Array:
+        """Judge an output by its target; return the sizes of its errors."""
+        e, size = errors(name, now, target)
+        aim, fresh = self.aims.get(name), start > 0 or not self.count or self.changed == self._time
+        if aim is None:
+            aim = self.aims[name] = Aim()
+        aim.squares += float(size @ size)
+        if fresh:
+            begin = max(0, start - 1)
+            at = now[begin] if start or not self.count else self._of(self.last, name)
+            e0, size0 = errors(name, at[None], target[-1:])
+            aim.begin(self.changed, e0[0] if e0.size else np.empty(0), float(size0[0]))
+        aim.add(t[start:], e[start:], size[start:])
+        return size
+
+    def _watch(self, own: Mapping[str, Array], t: Array) -> None:
+        """Count what joints and motors do."""
+        setup, n = self.setup, len(self.setup.joints)
+        self.speed = np.maximum(self.speed, _largest(own["v"]))
+        if own["tau"].shape[1] == n:
+            largest = _largest(own["tau"])
+            self.effort = np.maximum(self.effort, largest)
+            bound = np.array(setup.limits.effort) * (1.0 - EXACT)
+            if (largest >= bound).any():
+                self.saturated += (np.abs(own["tau"]) >= bound).sum(axis=0)
+        after = own["q"][0 if self.count else 1 :]
+        low, high = setup.low + AT_LIMIT, setup.high - AT_LIMIT
+        if len(after) and ((after.min(axis=0) <= low) | (after.max(axis=0) >= high)).any():
+            below, above = after <= low, after >= high
+            self.low, self.high = self.low + below.sum(axis=0), self.high + above.sum(axis=0)
+            self._at_limits += int((below | above).any(axis=1).sum())
+        for i, last in enumerate(own["v"][-1]):
+            if last:
+                self.moved[i] = t[-1]
+            elif (moves := np.flatnonzero(own["v"][:, i])).size:
+                self.moved[i] = t[moves[-1]]
+
+    def _keep(self, head: Sequence[Array], rows: Array) -> None:
+        """Keep times, errors and outputs at evenly spaced samples of the run, and all outputs of its end."""
+        self._recent = [*self._recent[-1:], rows[-KEPT:].copy()]
+        first = -self.count % self._stride
+        while self._filled + len(range(first, len(rows), self._stride)) > len(self._kept):
+            self._filled = (self._filled + 1) // 2
+            self._kept[: self._filled] = self._kept[: 2 * self._filled : 2].copy()
+            self._stride *= 2
+            first = -self.count % self._stride
+        if first < len(rows):
+            chosen = rows[first :: self._stride]
+            end = self._filled + len(chosen)
+            columns = [part[first :: self._stride] for part in head]
+            self._kept[self._filled : end] = np.column_stack([*columns, chosen])
+            self._filled = end
+
+    # --- what is known in the end ---
+
+    def _of(self, rows: Array, name: str) -> Array:
+        i = OUTPUTS.index(name)
+        return np.asarray(rows[..., self._ends[i] : self._ends[i + 1]])
+
+    def history(self, name: str = "") -> Array:
+        """Return an output at evenly spaced samples of the whole run, N × values; without a name the times, N."""
+        kept = self._kept[: self._filled]
+        return self._of(kept[:, 1 + len(TARGETS) :], name) if name else kept[:, 0]
+
+    def error_history(self, name: str) -> Array:
+        """Return the size of an output's error from its target at evenly spaced samples, N."""
+        return self._kept[: self._filled, 1 + [*TARGETS].index(name)]
+
+    def tail(self, name: str) -> Array:
+        """Return an output at the last samples, all of them, N × values."""
+        return self._of(np.concatenate(self._recent), name)
+
+    def end(self, name: str) -> Array:
+        """Return an output at the last sample."""
+        return self._of(self.last, name)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample, s."""
+        return self._time
+
+    @property
+    def share(self) -> Array:
+        """Share of the samples at which each motor is at its effort limit."""
+        return np.asarray(self.saturated / max(1, self.count))
+
+    def use(self) -> tuple[Array, Array]:
+        """Return peak efforts and speeds as shares of the URDF's limits, 0 where there is none."""
+        return self.effort / np.array(self.setup.limits.effort), self.speed / np.array(self.setup.limits.velocity)
+
+    def metrics(self) -> dict[str, float]:
+        """Return the numbers of METRICS."""
+        self.flush()
+        aims, setup = self.aims, self.setup
+        efforts = "tau" in self._names
+        found = {
+            "peak_velocity": float(self.speed.max(initial=0.0)),
+            **dict.fromkeys(("peak_effort", "saturated"), nan),
+        }
+        if efforts:
+            found["peak_effort"] = float(self.effort.max())
+        for name, use, limit in zip(("effort_use", "velocity_use"), self.use(), setup.limits):
+            known = min(limit) < inf and (efforts or name == "velocity_use")
+            found[name] = float(use.max()) if known else nan
+        if efforts and min(setup.limits.effort) < inf:
+            found["saturated"] = float(self.share.max())
+        bounded = len(setup.given("q_min")) == len(setup.joints)
+        taken = self.duration / max(1, self.count - 1)
+        found["time_at_limits"] = self._at_limits * taken if bounded else nan
+        if "x" in aims:
+            found["final_error"] = aims["x"].last
+            found["rms_error"] = sqrt(aims["x"].squares / self.count)
+        if "quat" in aims:
+            found["final_turn_error"] = aims["quat"].last
+        if "q" in aims:
+            off = np.abs(self.wanted("q") - self.end("q"))
+            found["final_joint_error"] = float(off.max())
+        moved = [aim for aim in aims.values() if aim.first >= SMALLEST_MOVE]
+        ways = [aims[name].past for name in ("x", "q") if name in aims and aims[name] in moved]
+        if ways:
+            found["overshoot"] = ways[0]
+        if moved:
+            late = [aim.last > BAND * aim.first for aim in moved]
+            ends = [self._after(aim) - aim.began for aim in moved]
+            found["settling_time"] = inf if any(late) else max(ends)
+        return found
+
+    def _after(self, aim: Aim) -> float:
+        """Return the time of the sample after the last one outside the band."""
+        return aim.outside + self.duration / max(1, self.count - 1)
+
+
+def _largest(values: Array) -> Array:
+    """Return the largest magnitude of each column."""
+    return np.asarray(np.maximum(values.max(axis=0), -values.min(axis=0)))
+
+
+def errors(name: str, now: Array, target: Array) -> tuple[Array, Array]:
+    """Return the error vectors of N samples, none of an angle, and their sizes."""
+    if name == "quat":
+        return np.empty((len(now), 0)), angles(now, target)
+    e = target - now
+    return e, np.sqrt((e * e).sum(axis=1))
+
+
+def angles(quat: Array, target: Array) -> Array:
+    """Return the angle of each unit quaternion from a target of any length but 0, rad."""
+    target = target / np.linalg.norm(target, axis=-1, keepdims=True)
+    apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
+    return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))

@@ -1,0 +1,107 @@
+"""Motion at the end of a run: steady, moving, oscillating or diverging, with frequency and damping.
+
+A response y'' + 2 ζ ω y' + ω² (y − y∞) = 0, sampled every h, obeys y_k = a y_{k−1} + b y_{k−2} + c exactly. Least
+squares give a and b, and the roots z of z² = a z + b the poles s = ln(z) / h = −ζ ω ± i ω √(1 − ζ²). Source: Prony's
+method; Hildebrand, "Introduction to Numerical Analysis", 1974, section 9.4.
+"""
+
+from __future__ import annotations
+
+from math import hypot, log, pi
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LINEAR = 0.05  # of the second differences: a larger residual is of another motion
+VISIBLE = 1e-3  # of a signal's range: swings below are not counted
+LASTING = 0.01  # of the scale: a smaller amplitude at the end is at rest
+UNEVEN = 1e-6  # of a duration: times that differ more from evenly spaced ones
+GROWTH = 1.5  # of the amplitude from the third quarter to the last one
+
+
+class Ringing(NamedTuple):
+    """Frequency of a damped oscillation, Hz, and its damping ratio; negative where it grows."""
+
+    frequency: float
+    damping: float
+
+
+def ringing(t: Array, y: Array) -> Ringing | None:
+    """Return the oscillation of a signal at evenly spaced times, s; None where it has none.
+
+    Of a motion that is not linear, by its crossings of the middle and the decrement of its swings.
+    """
+    if len(y) < 8 or not np.ptp(y) > 0.0:
+        return None
+    h = (t[-1] - t[0]) / (len(t) - 1)
+    y = (y - y[-1]) / np.ptp(y)
+    fitted = np.column_stack([y[1:-1], y[:-2], np.ones(len(y) - 2)])
+    (a, b, c), *_ = np.linalg.lstsq(fitted, y[2:], rcond=None)
+    bend = y[2:] - 2.0 * y[1:-1] + y[:-2]
+    residual = y[2:] - fitted @ (a, b, c)
+    if np.linalg.norm(residual) <= LINEAR * np.linalg.norm(bend):
+        s = np.log(np.roots([1.0, -a, -b]).astype(complex)[0]) / h
+        seen = swings(y - c / (1.0 - a - b)) if a + b != 1.0 else 0
+        return Ringing(abs(s.imag) / (2 * pi), -s.real / abs(s)) if seen >= 2 and abs(s.imag) * h > 1e-9 else None
+    return _by_crossings(t, y)
+
+
+def swings(y: Array) -> int:
+    """Count the changes of sign of a signal, without those below the visible."""
+    size = VISIBLE * float(np.abs(y).max(initial=0.0))
+    signs = np.sign(y[np.abs(y) > size])
+    return int(np.count_nonzero(np.diff(signs)))
+
+
+def _by_crossings(t: Array, y: Array) -> Ringing | None:
+    """Return frequency and damping by the crossings of the last half's mean, and its swings."""
+    half = len(y) // 2
+    t, y = t[half:], y[half:] - np.mean(y[half:])
+    k = np.flatnonzero(np.sign(y[1:]) * np.sign(y[:-1]) < 0)
+    if len(k) < 3 or swings(y) < 3:
+        return None
+    crossed = t[k] + (t[k + 1] - t[k]) * y[k] / (y[k] - y[k + 1])
+    frequency = (len(k) - 1) / (2.0 * (crossed[-1] - crossed[0]))
+    peaks = np.maximum.reduceat(np.abs(y), k + 1)[:-1]
+    decrement = log(max(peaks[0], 1e-300) / max(peaks[-1], 1e-300)) / max(1, len(peaks) - 1)
+    return Ringing(float(frequency), decrement / hypot(pi, decrement))
+
+
+def motion_of(t: Array, signals: Array, scale: float) -> tuple[str, Ringing | None, int]:
+    """Return the kind of motion at the end, its oscillation, and the signal that shows it most.
+
+    Args:
+        t: N times, s.
+        signals: N × s errors or positions.
+        scale: size of the way, in the signals' unit.
+    """
+    if len(t) < 8:
+        return "steady", None, 0
+    even = np.linspace(t[0], t[-1], len(t))
+    if np.abs(t - even).max() > UNEVEN * (t[-1] - t[0]):  # of a bag with gaps, or downsampled
+        signals = np.column_stack([np.interp(even, t, signal) for signal in signals.T])
+        t = even
+    quarter = len(t) // 4
+    third, last = signals[-2 * quarter : -quarter], signals[-quarter:]
+    before, after = (_amplitudes(part) for part in (third, last))
+    j = int(np.argmax(after if after.max() > LASTING * scale else np.ptp(signals, axis=0)))
+    found, y = ringing(t, signals[:, j]), signals[:, j]
+    if after[j] <= LASTING * scale:
+        return "steady", found, j
+    turns = swings(last[:, j] - last[:, j].mean())
+    grows = after[j] > GROWTH * before[j] and abs(y[-1]) > abs(y[-2 * quarter])
+    growing_swings = grows and turns >= 3 and after[j] > LASTING * scale
+    runs_away = (
+        grows and turns < 3 and abs(y[-1] - y[0]) > abs(scale) and np.abs(last[:, j]).min() >= np.abs(third[:, j]).max()
+    )
+    if growing_swings or runs_away:
+        return "diverging", found, j
+    return ("oscillating", found, j) if turns >= 3 or (found and found.damping < 0.2) else ("moving", found, j)
+
+
+def _amplitudes(part: Array) -> Array:
+    """Return half the range of each signal."""
+    return np.asarray(0.5 * np.ptp(part, axis=0))

@@ -1,0 +1,116 @@
+"""Constant facts of a run by which its samples are judged: robot, limits, step and settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fmu import Fmu
+from ..plant.urdf import UNBOUNDED, RobotError, Urdf, read_urdf
+
+Array = NDArray[np.float64]
+
+
+class Limits(NamedTuple):
+    """Effort (N·m, N) and velocity limits of joints, infinite where there is none."""
+
+    effort: tuple[float, ...]
+    velocity: tuple[float, ...]
+
+
+class Setup(NamedTuple):
+    """Robot and settings of a run.
+
+    Attributes:
+        joints: names of the n joints.
+        units: "rad" or "m" of each; "" where unknown.
+        low, high: position limits of the run, or else of the URDF, n values; infinite where there is none.
+        limits: of the URDF.
+        robot: None where none is known.
+        frame, axes: the end effector's link and the task axes, of "xyz"; "" where unknown.
+        step: communication step, s.
+        starts: start values of all inputs and parameters.
+    """
+
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    low: Array
+    high: Array
+    limits: Limits
+    robot: Urdf | None
+    frame: str
+    axes: str
+    step: float
+    starts: Mapping[str, float]
+
+    def given(self, group: str, values: Mapping[str, float] | None = None) -> Array:
+        """Return the elements of a vector of inputs or parameters, by its start values or others; empty if none."""
+        values = self.starts if values is None else values
+        found: list[float] = []
+        while (name := f"{group}[{len(found) + 1}]") in values:
+            found.append(float(values[name]))
+        return np.array(found)
+
+    def positions(self, q: Array) -> Array:
+        """Return positions of the end effector along the task axes at N samples, N × m."""
+        from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
+
+        assert self.robot is not None
+        path = Kinematics(self.robot, self.joints).path(self.frame, q)
+        return path[:, ["xyz".index(axis) for axis in self.axes]]
+
+    def orientations(self, q: Array) -> Array:
+        """Return orientations of the end effector at N samples, quaternions x, y, z, w, N × 4."""
+        from ..geometry.kinematics import Kinematics, quaternions
+
+        assert self.robot is not None
+        kinematics = Kinematics(self.robot, self.joints)
+        return quaternions(kinematics.along(self.robot.chain(self.frame), q)[-1].rotation)
+
+
+def limits_of(robot: Urdf | None, names: Sequence[str]) -> Limits:
+    """Return the limits of joints; a follower's velocity limit counts for its leader."""
+    joints = robot.joints if robot is not None else {}
+    if not {*names} <= joints.keys():
+        return Limits((inf,) * len(names), (inf,) * len(names))
+    speeds = dict.fromkeys(joints, inf)
+    for joint in joints.values():
+        if joint.ratio:
+            speeds[joint.leader] = min(speeds[joint.leader], joint.velocity / abs(joint.ratio))
+    return Limits(tuple(joints[n].effort for n in names), tuple(speeds[n] for n in names))
+
+
+def robot_of(text: str | None) -> Urdf | None:
+    """Return the robot of a URDF's text; None where it has none that is sound."""
+    try:
+        return None if text is None else read_urdf(text)
+    except RobotError:
+        return None
+
+
+def setup(
+    *, joints: Sequence[str], robot: Urdf | None, frame: str, axes: str, step: float, starts: Mapping[str, float]
+) -> Setup:
+    """Return the setup of a run by what its FMU, or its bag's provenance, says."""
+    known = robot.joints if robot is not None else {}
+    own = [known.get(name) for name in joints]
+    ends = []
+    for group, sign in (("q_min", -1.0), ("q_max", 1.0)):
+        values = [starts.get(f"{group}[{i + 1}]") for i in range(len(joints))]
+        limits = [None if j is None else j.low if sign < 0.0 else j.high for j in own]
+        held = [limit if value is None else value for value, limit in zip(values, limits)]
+        ends.append(np.array([sign * inf if x is None or abs(x) >= UNBOUNDED else float(x) for x in held]))
+    units = tuple("" if joint is None else "m" if joint.prismatic else "rad" for joint in own)
+    names = tuple(joints)
+    return Setup(names, units, ends[0], ends[1], limits_of(robot, names), robot, frame, axes, step, starts)
+
+
+def setup_of(fmu: Fmu, robot: Urdf | None, step: float, starts: Mapping[str, float]) -> Setup:
+    """Return the setup of a run of an FMU with a robot."""
+    found = setup(joints=fmu.joints, robot=robot, frame=fmu.frame, axes="".join(fmu.axes), step=step, starts=starts)
+    units = tuple(own or fmu.variables[name].unit or "" for own, name in zip(found.units, fmu.vector("q")))
+    return found._replace(units=units)

@@ -1,0 +1,278 @@
+"""Verdict of a run: reached or not, its motion and metrics, and the causes, in numbers and in lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from math import inf, isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..files import NUMBER
+from .causes import FLOOR, MANY_CHANGES, Cause, causes, point_text
+from .expressions import expression
+from .judge import BAND, BLOCK, OUTPUTS, Judge
+from .motion import motion_of
+from .setup import Array, Setup
+
+OF_THE_END = 0.1  # part of a run in which a target that moves still does, and in which an error stays in its band
+FOLLOWED = 0.1  # of the target's way: a larger RMS error in the second half does not follow
+
+
+class Metric(NamedTuple):
+    """One number of a run, and column of a sweep's table.
+
+    Attributes:
+        title: for people.
+        unit: FMI unit, "" for a number without one.
+        text: definition.
+    """
+
+    title: str
+    unit: str
+    text: str
+
+
+METRICS: Mapping[str, Metric] = {
+    "settling_time": Metric(
+        "settling time (2 %)",
+        "s",
+        "first t_k - t_0 from which on |e| stays within 2 % of |e_0|, and θ within 2 % of θ_0,"
+        " until the end of the run",
+    ),
+    "overshoot": Metric(
+        "overshoot", "", "largest -e_k·d / |e_0|, the part of the way by which the target is passed; 0: not passed"
+    ),
+    "final_error": Metric("final error", "m", "|e_N| of the end effector"),
+    "final_turn_error": Metric("final orientation error", "rad", "θ_N"),
+    "final_joint_error": Metric(
+        "final joint error", "rad", "largest |q_des - q_N| of any joint; m for prismatic joints"
+    ),
+    "rms_error": Metric("RMS error", "m", "root of the mean of |e_k|² of the end effector over all samples"),
+    "peak_effort": Metric("peak |τ|", "N.m", "largest |τ_i| of any joint at any sample; N for prismatic joints"),
+    "peak_velocity": Metric("peak |v|", "rad/s", "largest |v_i| of any joint at any sample; m/s for prismatic joints"),
+    "time_at_limits": Metric(
+        "time at joint limits",
+        "s",
+        "h times the number of samples after the first at which any joint is at one of its limits",
+    ),
+    "effort_use": Metric(
+        "peak |τ| / limit", "", "largest |τ_i| as a share of the URDF's effort limit; above 1 the robot cannot do it"
+    ),
+    "velocity_use": Metric("peak |v| / limit", "", "largest |v_i| as a share of the URDF's velocity limit; likewise"),
+    "saturated": Metric(
+        "saturation", "", "share of the samples at which |τ_i| is at the URDF's effort limit, of the joint with most"
+    ),
+}
+"""By name of the column. A metric is NaN where it is not defined: what a run that was not finished would have done,
+the settling and overshoot of one that starts within 1e-9 m or rad of its target, and what needs an output, target or
+limit that the FMU has not. The settling time of a run that did not settle is infinite in a verdict, and NaN in a table.
+For all of them less is better."""
+RESULTS = (*METRICS, "frequency", "damping")
+"""Names of all numbers of a verdict: the metrics, the frequency of an oscillation, Hz, and its damping ratio."""
+
+SHAPE = {
+    "outcome": str,
+    "motion": str,
+    "samples": int,
+    "duration": NUMBER,
+    "numbers": {str: NUMBER | None},
+    "causes": [{"kind": str, "text": str, "joint": str, "share": NUMBER, "time": NUMBER | None, "point": [NUMBER]}],
+    "lines": [str],
+}
+"""Shape of a stored verdict."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Verdict of a run.
+
+    Attributes:
+        outcome: "reached", "not reached", "followed" or "not followed", of a target that moves, or "no target".
+        motion: at the end: "steady", "moving", "oscillating" or "diverging".
+        samples, duration: judged, and s from the first to the last.
+        numbers: by name (``METRICS``, "frequency" in Hz and "damping"); a name is missing where its number is not
+            defined, and the settling time is infinite where the run did not settle.
+        causes: of what went wrong, the root first.
+        lines: the verdict in words; the first has the outcome and the first cause.
+    """
+
+    outcome: str
+    motion: str
+    samples: int
+    duration: float
+    numbers: Mapping[str, float]
+    causes: tuple[Cause, ...]
+    lines: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+    def failed_by(self, *conditions: str) -> str:
+        """Return a line on the first of some conditions that holds, as "error > 1e-3"; "" where none does.
+
+        A condition on a number that is not defined, as of a run without a target, counts as one that holds.
+
+        Raises:
+            InputError: a condition is no comparison of numbers of a verdict.
+        """
+        for condition in [expression(text, RESULTS, condition=True) for text in conditions]:
+            unknown = [name for name in condition.names if name not in self.numbers]
+            told = ", ".join(f"{name} = {self.numbers[name]:.6g}" for name in condition.names if name not in unknown)
+            if unknown:
+                return f"{condition.text} cannot be decided: {unknown[0]} is not defined for this run"
+            if condition.value(self.numbers):
+                return f"{condition.text} holds: {told}"
+        return ""
+
+    def facts(self) -> dict[str, object]:
+        """Return the verdict as JSON has it: of an infinite number None."""
+        numbers = {name: value if isfinite(value) else None for name, value in self.numbers.items()}
+        return {**asdict(self), "numbers": numbers, "causes": [cause._asdict() for cause in self.causes]}
+
+
+def verdict_in(facts: Mapping[str, Any]) -> Verdict:
+    """Return the verdict of ``facts`` that were stored, of SHAPE but for infinite numbers."""
+    numbers = {name: inf if value is None else float(value) for name, value in facts["numbers"].items()}
+    found = [Cause(**{**cause, "point": tuple(cause["point"])}) for cause in facts["causes"]]
+    return Verdict(**{**facts, "numbers": numbers, "causes": tuple(found), "lines": tuple(facts["lines"])})
+
+
+def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:
+    """Return the verdict of what has been judged, with causes that are known beforehand."""
+    numbers = {name: value for name, value in judge.metrics().items() if not np.isnan(value)}
+    t, signals, scale = _signals(judge)
+    motion, found, _ = motion_of(t, signals, scale)
+    if found is not None:
+        numbers |= {"frequency": found.frequency, "damping": found.damping}
+    moving = judge.changes > MANY_CHANGES and judge.changed > (1.0 - OF_THE_END) * judge.duration
+    missed = _lagging(judge) if moving else _missed(judge)
+    outcome = ("not " if missed else "") + ("followed" if moving else "reached") if judge.aims else "no target"
+    motion = "diverging" if known else motion
+    why = (*known, *causes(judge, missed, motion))
+    lines = _lines(judge, outcome, motion, numbers, why)
+    return Verdict(outcome, motion, judge.count, judge.duration, numbers, why, lines)
+
+
+def judged(setup: Setup, t: Array, values: Mapping[str, Array], targets: Mapping[str, Array]) -> Verdict:
+    """Return the verdict of N recorded samples.
+
+    Args:
+        setup: the run's robot and settings.
+        t: times since the first sample, s, N.
+        values: q, v, x, tau and quat, N rows each, or no columns where they are not known.
+        targets: of x, quat and q, N rows each, in effect up to each sample; not a number before the first.
+    """
+    rows = np.hstack([values[name] for name in OUTPUTS])
+    known = np.isfinite(np.hstack([*targets.values(), np.zeros((len(t), 1))])).all(axis=1)
+    finite = np.isfinite(rows).all(axis=1)
+    first, end = int(known.argmax()), len(t) if finite.all() else int(finite.argmin())
+    judge = Judge(setup, [values[name].shape[1] for name in OUTPUTS])
+    for k in range(first, end, BLOCK):
+        part = slice(k, min(k + BLOCK, end))
+        judge.judge(t[part], rows[part], {name: target[part] for name, target in targets.items()})
+    lost = () if finite.all() else (Cause("diverged", f"a value is not finite at {t[end]:.4g} s", time=float(t[end])),)
+    if not judge.count:
+        return Verdict("no target", "diverging", 0, 0.0, {}, lost, tuple(f"no target; {cause.text}" for cause in lost))
+    return conclude(judge, lost)
+
+
+def _signals(judge: Judge) -> tuple[Array, Array, float]:
+    """Return times, errors in the way's largest kind, or positions, and their scale."""
+    t = judge.history()
+    way = t >= judge.changed
+    aims = {name: aim for name, aim in judge.aims.items() if name != "quat"}
+    if aims:
+        name = next(iter(aims))
+        signals = judge.wanted(name) - judge.history(name)[way]
+        return t[way], signals, max(aims[name].first, judge.travel, FLOOR)
+    q = judge.history("q")[way]
+    return t[way], q, max(float(np.ptp(judge.history("q"), axis=0).max()), FLOOR)
+
+
+def _missed(judge: Judge) -> list[str]:
+    """Return the outputs that are not at their targets during the last part of the run."""
+    missed, t = [], judge.history()
+    for name, aim in judge.aims.items():
+        late = judge.error_history(name)[t >= judge.changed + (1.0 - OF_THE_END) * (judge.duration - judge.changed)]
+        if max(aim.last, late.max(initial=0.0)) > max(BAND * aim.first, FLOOR):
+            missed.append(name)
+    return missed
+
+
+def _lagging(judge: Judge) -> list[str]:
+    """Return the outputs that do not follow their moving targets, by the second half of the run."""
+    late = {name: judge.error_history(name)[len(judge.history()) // 2 :] for name in judge.aims}
+    return [name for name, e in late.items() if np.sqrt(np.mean(e * e)) > max(FOLLOWED * judge.travel, FLOOR)]
+
+
+# --- in words ---
+
+
+def _lines(
+    judge: Judge, outcome: str, motion: str, numbers: Mapping[str, float], why: tuple[Cause, ...]
+) -> tuple[str, ...]:
+    off = ", ".join(_distances(judge, numbers))
+    head = f"{outcome}: {off}" if off else f"{outcome}, {motion} at the end"
+    if why:
+        but = {"reached": "; but ", "followed": "; but "}.get(outcome, "; ")
+        head += f"{but}{why[0].text}"
+    elif outcome.startswith("not"):
+        head += "; no cause is seen in the samples"
+    lines = [head, _response(outcome, motion, numbers), _peaks(judge), *_also(why)]
+    return tuple(filter(None, lines))
+
+
+def _also(why: tuple[Cause, ...]) -> list[str]:
+    """Return lines of the causes after the first: of each kind the worst, and the joints of the others."""
+    kinds = {cause.kind: [other for other in why if other.kind == cause.kind] for cause in why}
+    lines = []
+    for worst, *others in kinds.values():
+        names = ", ".join(f"'{cause.joint}'" for cause in others if cause.joint)
+        parts = [f"also {worst.text}"] * (worst is not why[0]) + [f"likewise {names}"] * bool(names)
+        lines += ["; ".join(parts), *(f"also {cause.text}" for cause in others if not cause.joint)]
+    return lines
+
+
+def _distances(judge: Judge, numbers: Mapping[str, float]) -> list[str]:
+    """Return the errors at the end in words."""
+    texts, setup = [], judge.setup
+    if "final_error" in numbers:
+        target = point_text(judge.wanted("x"))
+        texts.append(f"{numbers['final_error']:.3g} m from the target {target} m")
+    if "final_turn_error" in numbers:
+        texts.append(f"{numbers['final_turn_error']:.3g} rad from the target orientation")
+    if "final_joint_error" in numbers:
+        off = np.abs(judge.wanted("q") - judge.end("q"))
+        worst = int(off.argmax())
+        far = f"{off[worst]:.3g} {setup.units[worst]}".strip()
+        texts.append(f"joints at most {far} from their targets, '{setup.joints[worst]}'")
+    return texts
+
+
+def _response(outcome: str, motion: str, numbers: Mapping[str, float]) -> str:
+    """Return settling, overshoot, RMS error and motion in words."""
+    parts, settling = [], numbers.get("settling_time")
+    if outcome in ("reached", "not reached") and settling is not None:
+        parts.append("does not stay within 2 %" if settling == inf else f"within 2 % after {settling:.4g} s")
+        if "overshoot" in numbers:
+            parts.append(f"overshoot {100.0 * numbers['overshoot']:.3g} %")
+    if "rms_error" in numbers:
+        parts.append(f"RMS error {numbers['rms_error']:.3g} m")
+    if not parts and outcome == "no target":
+        return ""
+    rings = (
+        f" at {numbers['frequency']:.4g} Hz, damping ratio {numbers['damping']:.3g}" if "frequency" in numbers else ""
+    )
+    return ", ".join([*parts, (motion + rings if motion in ("oscillating", "diverging") else motion) + " at the end"])
+
+
+def _peaks(judge: Judge) -> str:
+    """Return the largest uses of the URDF's limits in words."""
+    texts = []
+    for what, use in zip(("effort", "speed"), judge.use()):
+        if use.max(initial=0.0) > 0.0:
+            worst = int(use.argmax())
+            texts.append(f"peak {what} {100.0 * use[worst]:.3g} % of the limit of joint '{judge.setup.joints[worst]}'")
+    return ", ".join(texts)
