@@ -30,6 +30,7 @@ from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 import twodof
+from twodof.export.stock_robots import stock_robots
 from twodof.plant.urdf import Joint, RobotError
 from twodof.ros.scene import Scene
 from twodof.simulation.sample import Sample
@@ -501,3 +502,25 @@ def test_library_of_colours_is_not_read_with_a_mesh(tmp_path: Path) -> None:
     )
     command = [sys.executable, "-c", code, content]
     assert subprocess.check_output(command, text=True, timeout=60) == "1\n"
+
+
+def test_a_scene_with_meshes_shows_them_where_pinocchio_has_them(tmp_path: Path) -> None:
+    """By Pinocchio's reader of URDF and meshes, from the description in the bag and the files that it names."""
+    fmu = twodof.build_fmu(tmp_path / "panda.fmu", twodof.stock_robot("panda"))
+    twodof.simulate(fmu, twodof.Bag(tmp_path / "bag", meshes=True), stop_time=0.02)
+    with (tmp_path / "bag/bag.mcap").open("rb") as file:
+        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/robot_description"])
+        ((_, _, _, message),) = decoded
+    source = stock_robots()["panda"]
+    truth = pin.buildGeomFromUrdf(
+        pin.buildModelFromUrdf(str(source)), str(source), pin.GeometryType.VISUAL, package_dirs=str(source.parents[4])
+    )
+    model = pin.buildModelFromXML(message.data)
+    found = pin.buildGeomFromUrdfString(model, message.data, pin.GeometryType.VISUAL)
+    assert len(found.geometryObjects) == len(truth.geometryObjects) >= 10
+    for shown, wanted in zip(found.geometryObjects, truth.geometryObjects):
+        assert shown.name == wanted.name and shown.meshPath.startswith(str(tmp_path / "bag/meshes"))
+        np.testing.assert_allclose(shown.placement.homogeneous, wanted.placement.homogeneous, rtol=0.0, atol=1e-9)
+        corners = [geometry.geometry.vertices() for geometry in (shown, wanted)]
+        assert corners[0].size >= 954
+        np.testing.assert_allclose(corners[0], corners[1], rtol=0.0, atol=1e-9)

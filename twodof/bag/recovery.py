@@ -173,6 +173,9 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
                 writer.storage.describe(provenance.KEY, name, content.decode("utf-8", "replace"))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
+    for kept_folder in {Path(robot).parts[0] if robot else "meshes" for robot in robots}:  # of meshes
+        if (folder / kept_folder).is_dir() and not (folder / kept_folder).is_symlink():
+            shutil.copytree(folder / kept_folder, new / kept_folder, symlinks=True)
     for name, content in kept.items():
         (new / name).write_bytes(content)
     with Reader(new) as reader:  # whole is what another reader opens

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import BagError
 from ..files import sync
+from ..fmu import read_resource
 from ..ros.cdr import Rows
 from ..ros.messages import JOINT_STATES, Messages, check_name
 from ..simulation.experiments import Experiment
@@ -33,6 +34,7 @@ class Bag(Sink):
         path: folder of the bag; must not exist, unless ``overwrite`` and it is a bag.
         storage: "mcap" or "sqlite3".
         scene: add the robot description, transforms, target and end effector.
+        meshes: keep the robot's meshes in the folder, where the description of the scene names them by file URIs.
         effort: put the control effort into JointState.effort.
         overwrite: replace an existing bag.
         fsync: wait for the disk at each flush, so that the machine may lose its power too.
@@ -55,6 +57,7 @@ class Bag(Sink):
         *,
         storage: str = "mcap",
         scene: bool = False,
+        meshes: bool = False,
         effort: bool = False,
         overwrite: bool = False,
         fsync: bool = False,
@@ -63,7 +66,7 @@ class Bag(Sink):
     ) -> None:
         self.path, self.namespace = Path(path), ""
         self._store = Store(self.path, storage, overwrite=overwrite, fsync=fsync, compress=compress)
-        self._scene, self._effort = scene, effort
+        self._scene, self._meshes, self._effort = scene or meshes, meshes, effort
         self._command_line = command_line
         self._run: Experiment | None = None
         self.count = 0
@@ -97,7 +100,8 @@ class Bag(Sink):
         """
         self._run = run
         self._inputs = run.start_values
-        self._messages = Messages(run, scene=self._scene, effort=self._effort)
+        folder = f"{self._folder.as_uri()}/" if self._meshes else ""
+        self._messages = Messages(run, scene=self._scene, effort=self._effort, meshes_in=folder)
         self._most = BATCH_SIZE // (self._messages.size + OVERHEAD * len(self._messages.topics))
         return self
 
@@ -135,6 +139,10 @@ class Bag(Sink):
         self._provenance = ProvenanceFile(self.path, self.namespace, run, self._command_line)
         if self._store.fsync:
             sync(self._provenance.path)
+        for name in [name for name in run.fmu.members if self._meshes and name.startswith("resources/meshes/")]:
+            file = self._folder / name.removeprefix("resources/")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(read_resource(run.fmu, name.removeprefix("resources/")) or b"")
         topics = {self._named(name): topic for name, topic in self._messages.topics.items()}
         self._connections = dict(zip(self._messages.topics, self._store.add_topics(topics)))
 
@@ -162,6 +170,11 @@ class Bag(Sink):
     def metadata(self) -> tuple[str, str]:
         """Return key and text of the provenance; raise OSError where that was removed."""
         return self._provenance.key, self._provenance.text()
+
+    @property
+    def _folder(self) -> Path:
+        """Folder of the robot's meshes."""
+        return self.path.absolute() / self.namespace
 
     def _named(self, topic: str) -> str:
         return f"/{self.namespace}{topic}" if self.namespace else topic

@@ -50,6 +50,7 @@ OF_A_RUN: Table = {
     "--storage": dict(choices=("mcap", "sqlite3"), default="mcap", help="storage plugin of the bag (mcap)"),
     "--compress": dict(choices=("zstd",), default="", help="compress the chunks of an MCAP bag"),
     "--scene": dict(action="store_true", help="record robot description, tf, target and end effector"),
+    "--meshes": dict(action="store_true", help="record a scene with the real meshes, kept in the bag's folder"),
     "--effort": dict(action="store_true", help="record the control effort"),
     "--stamp-start": dict(type=float, metavar="S", help="time stamp of the first sample, s since the epoch (now)"),
     "--overwrite": dict(action="store_true", help="replace an existing bag, or the FMU of a URDF"),

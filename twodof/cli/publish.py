@@ -71,7 +71,7 @@ def call(options: argparse.Namespace) -> int:
 
     if not 0.0 < options.rate < math.inf:
         raise CommandLineError(f"--rate {options.rate:g}: not a number of steps a second")
-    of_a_bag = ("--overwrite", "--fsync", "--storage")
+    of_a_bag = ("--overwrite", "--fsync", "--storage", "--meshes")
     of_foxglove = dict.fromkeys(("--foxglove-port", "--foxglove-control"), "--foxglove")
     check_company(options, needs={**dict.fromkeys(of_a_bag, "-o"), **of_foxglove})
     options.storage = options.storage or "mcap"

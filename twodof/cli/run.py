@@ -104,7 +104,7 @@ def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
     """Return the bag of the options."""
     from ..bag.writer import Bag
 
-    names = ("storage", "compress", "scene", "effort", "overwrite", "fsync", "command_line")
+    names = ("storage", "compress", "scene", "meshes", "effort", "overwrite", "fsync", "command_line")
     return Bag(path, **said(options, *names))
 
 

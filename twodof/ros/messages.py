@@ -129,10 +129,10 @@ class Messages:
         BagError: the FMU lacks a requested output.
     """
 
-    def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False) -> None:
+    def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False, meshes_in: str = "") -> None:
         if effort and not run.fmu.vector("tau"):
             raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
-        self._scene = _load_scene(run) if scene else None
+        self._scene = _load_scene(run, meshes_in) if scene else None
         self._axes = ["xyz".index(axis) for axis in run.fmu.axes]
         n, m, poses = len(run.fmu.joints), 0, False
         efforts = n if effort else 0
@@ -212,14 +212,14 @@ class Messages:
         }
 
 
-def _load_scene(run: Experiment) -> Scene:
+def _load_scene(run: Experiment, meshes_in: str) -> Scene:
     urdf = run.fmu.urdf
     if urdf is None or not run.fmu.axes:
         raise BagError(f"'{run.fmu.path}' carries no robot.urdf, which a scene shows")
     from .scene import Scene  # SciPy takes half a second to import
 
     try:
-        return Scene(urdf, run.fmu.joints, run.fmu.frame, lambda name: read_resource(run.fmu, name))
+        return Scene(urdf, run.fmu.joints, run.fmu.frame, lambda name: read_resource(run.fmu, name), meshes_in)
     except RobotError as error:
         raise BagError(f"'{run.fmu.path}': resources/robot.urdf: {error}") from error
 

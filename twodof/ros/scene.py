@@ -29,17 +29,18 @@ class Scene:
         joints: names of the joints whose positions q has, in its order.
         frame: the end effector's link.
         read: gives the bytes of a mesh by its name ``meshes/…``, None where it is missing.
+        meshes_in: URI of the folder that has the meshes by these names, with a slash at its end; "": none has.
 
     Attributes:
         description: the URDF with each mesh replaced by its best-fitting box or cylinder, which
-            renders where the mesh files are not at hand.
+            renders where the mesh files are not at hand; or with the URIs of the meshes.
         fixed, moving: joints whose transforms hold for the whole run, and the others.
 
     Raises:
         RobotError: the URDF is not sound.
     """
 
-    def __init__(self, urdf: str, joints: Sequence[str], frame: str, read: ReadMesh) -> None:
+    def __init__(self, urdf: str, joints: Sequence[str], frame: str, read: ReadMesh, meshes_in: str = "") -> None:
         robot = read_urdf(urdf)
         if frame not in robot.links:
             raise RobotError(f"it has no link '{frame}'")
@@ -48,8 +49,12 @@ class Scene:
         self.moving = [joint for joint in every if self._kinematics.moves(joint)]
         self.fixed = [joint for joint in every if not self._kinematics.moves(joint)]
         try:
-            with Meshes(read) as meshes:
-                _replace_meshes(robot.tree, meshes)
+            if meshes_in:
+                for mesh in robot.tree.iter("mesh"):
+                    mesh.set("filename", meshes_in + mesh.get("filename", "").removeprefix("package://"))
+            else:
+                with Meshes(read) as meshes:
+                    _replace_meshes(robot.tree, meshes)
         except ValueError as error:
             raise RobotError(f"its meshes cannot be placed: {error}") from error
         self.description = ET.tostring(robot.tree, encoding="unicode")
