@@ -415,6 +415,33 @@ def test_a_guess_of_the_state_before_the_run_is_its_start(fmus):
     assert model.get("q") == [0.5, 0.9] and model.y[:2] == [0.5, 0.9]
 
 
+def test_sensors_need_a_period_as_there_are_no_communication_points(fmus):
+    Model(fmus["effort"], control_period=0.01, q_noise=(0.1, 0.0))
+    with pytest.raises(fmpy.fmi1.FMICallException, match="fmi2ExitInitializationMode"):
+        Model(fmus["effort"], q_noise=(0.1, 0.0))
+
+
+def test_a_time_event_is_announced_until_it_is_past(fmus):
+    """Samples at 0, 0.01, …, efforts 4 ms later; what acts changes at an event alone."""
+    model = Model(fmus["joint"], control_period=0.01, control_delay=0.004, q_des=(0.6, 0.5))
+
+    def next_event():
+        *_, defined, time = model.newDiscreteStates()
+        assert defined
+        model.enterContinuousTimeMode()
+        return time
+
+    assert next_event() == 0.004
+    for time, following in ((0.004, 0.01), (0.01, 0.014), (0.012, 0.014), (0.014, 0.02)):
+        before = model.get("tau")
+        model.setTime(time)
+        model.y = [0.5 + time, 0.35, 0.1, 0.0]
+        assert model.get("tau") == before
+        model.enterEventMode()
+        assert next_event() == pytest.approx(following, abs=1e-15)
+        assert (model.get("tau") != before) == (time in (0.004, 0.014))
+
+
 def test_what_is_out_of_turn_or_wrong_is_refused_and_changes_nothing(fmus):
     model = Model(fmus["task"])
     four = (ctypes.c_double * 4)(0.1, 0.2, np.nan, 0.0)

@@ -4,6 +4,7 @@
 
 A, B, C and D are the FMU's own directional derivatives, exact to rounding; deviations of states y, inputs u and
 outputs z from the operating point. An eigenvalue λ ≠ 0 of A has the frequency |λ| and the damping ratio −Re λ/|λ|.
+A sampled controller holds the effort that its law gives at the point, and has no part in the model.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ SETTLED, AT_REST = 1e-11, 1e-6
 """Rates, beside the largest that a change of a state by one makes: where a search ends, and below
 which a point is called an equilibrium."""
 NEAR_JUMP = 1e-6
+PERFECT = {"control_delay": 0.0, "q_resolution": 0.0, "q_noise": 0.0, "v_noise": 0.0, "v_from_q": False}
+"""Settings with which a sampled controller gives the effort of its law at once."""
 
 
 class Mode(NamedTuple):
@@ -121,10 +124,14 @@ def linearise(
     fixed = bool({name.partition("[")[0] for name in given} & {"q", "v"})
     starts = {"v_start": 0.0} if fixed else {}
     values = resolve(fmu, starts) | _values(fmu, given)
+    values |= resolve(fmu, {name: value for name, value in PERFECT.items() if fmu.vector(name)})
+    period = {**fmu.start_values, **values}.get("control_period", 0.0)
     with instantiate(fmu) as instance:
-        point = _Point(fmu, instance, values)
+        point = _Point(fmu, instance, {**values, "control_period": 0.0} if period else values)
         if not fixed:
             point.settle()
+        if period:
+            point.hold_effort(period)
         return point.model(_chosen(fmu, "input", inputs, "inputs"), _chosen(fmu, "output", outputs, "outputs"))
 
 
@@ -192,6 +199,12 @@ class _Point:
             " or the state, q"
         )
 
+    def hold_effort(self, period: float) -> None:
+        """Sample the controller from here on."""
+        self._values["control_period"] = period
+        self._instance.reset()
+        self._instance.initialise(0.0, np.inf, self._values)
+
     def model(self, inputs: list[str], outputs: list[str]) -> LinearModel:
         """Return the linear model at the point."""
         states = [*self._q, *self._v]
@@ -230,6 +243,8 @@ class _Point:
                     " it off, or widen q_min and q_max"
                 )
         remarks = self._saturated()
+        if self._values.get("control_period"):
+            remarks.append("the controller is sampled: the model is that of the plant with its effort held")
         rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # all that J⁺ is of
         if "rcond" not in self._fmu.variables or not rows:
             return remarks

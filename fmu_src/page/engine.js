@@ -5,6 +5,7 @@
  * @property {string} name
  * @property {number} place among the FMU's variables; elements of a vector are in a row
  * @property {string} causality
+ * @property {string} type "Real", "Integer" or "Boolean"
  * @property {string} unit
  * @property {number | boolean | null} start
  * @property {string} description
@@ -60,9 +61,10 @@ class Engine {
     this.call("engine_set_reals", this.places, places.length, this.values);
   }
 
-  /** @type {(place: number, value: boolean) => void} */
-  setBoolean(place, value) {
-    this.call("engine_set_boolean", place, Number(value));
+  /** Set a Boolean or an Integer. */
+  /** @type {(place: number, value: Value) => void} */
+  setWhole(place, value) {
+    this.call("engine_set_whole", place, Number(value));
   }
 
   /** @param {number[]} places */

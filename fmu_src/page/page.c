@@ -84,13 +84,16 @@ int EXPORT(engine_set_reals)(const int place[], size_t count, const double value
     return set_reals(instance, vr, vectors, whole, n_values);
 }
 
-int EXPORT(engine_set_boolean)(int place, int value)
+/* Set a Boolean or an Integer. */
+int EXPORT(engine_set_whole)(int place, int value)
 {
-    const Boolean truth = value != 0;
     Reference vr = 1;
     while (PLACE[vr] != place)
         vr++;
-    return set_booleans(instance, &vr, 1, &truth, 1);
+    const Boolean truth = value != 0;
+    const Integer number = value;
+    return place >= FIRST_BOOLEAN ? set_booleans(instance, &vr, 1, &truth, 1)
+                                  : set_integers(instance, &vr, 1, &number, 1);
 }
 
 int EXPORT(engine_get_reals)(const int place[], size_t count, double value[])

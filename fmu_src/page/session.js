@@ -41,11 +41,11 @@ class Session extends Samples {
 
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
-    const reals = pairs.filter(([, value]) => typeof value === "number");
+    const reals = pairs.filter(([name]) => this.variable(name).type === "Real");
     const places = reals.map(([name]) => this.variable(name).place);
     if (reals.length) this.engine.setReal(places, reals.map(([, value]) => Number(value)));
     for (const [name, value] of pairs)
-      if (typeof value === "boolean") this.engine.setBoolean(this.variable(name).place, value);
+      if (this.variable(name).type !== "Real") this.engine.setWhole(this.variable(name).place, value);
   }
 
   /** Set an input from the next step on; a parameter restarts the simulation. */

@@ -24,6 +24,12 @@ FMI2_Export void probe_turn(const double angle[], double count, double c[], doub
     }
 }
 
+FMI2_Export void probe_noise(double seed, double k, double channel, double count, double pairs[])
+{
+    for (int i = 0; i < count; i++)
+        normal_pair(seed, k + i, (int)channel, &pairs[2 * i]);
+}
+
 FMI2_Export void probe_effort_of_force(const double q[], const double force[], double tau[])
 {
     JointPosition joint[N_BODIES];

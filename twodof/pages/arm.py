@@ -45,8 +45,8 @@ class Arm(NamedTuple):
 
     Attributes:
         facts: of its FMU, by name: name, robot, joints, frame, axes and control as in ``Fmu``; step,
-            s; variables, elements of vectors by themselves: name, place among all, causality, unit,
-            start and description; remarks, what is not as it should be.
+            s; variables, elements of vectors by themselves: name, place among all, causality, type,
+            unit, start and description; remarks, what is not as it should be.
         urdf: text of resources/robot.urdf.
         shapes: of its links.
     """
@@ -127,6 +127,7 @@ def arm_of(run: Experiment) -> Arm:
             "name": name,
             "place": place,
             "causality": variable.causality,
+            "type": variable.type,
             "unit": variable.unit or "",
             "start": run.start_values.get(name),
             "description": variable.description,
