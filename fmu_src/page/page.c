@@ -2,6 +2,8 @@
    variables are set and read one by one, whether they are scalars or elements of vectors. */
 #include "fmu.c"
 
+#include <stdint.h>
+
 #define EXPORT(name) __attribute__((export_name(#name))) name
 
 static Instance *instance;
@@ -62,26 +64,39 @@ void *EXPORT(engine_allocate)(size_t size)
     return malloc(size);
 }
 
-/* Set Real variables, all or, where one is refused, none; other elements of their vectors stay. */
+/* Set numbers, all or, where one is refused, none; other elements of their vectors stay. */
 int EXPORT(engine_set_reals)(const int place[], size_t count, const double value[])
 {
     static double draft[N_VARIABLES], whole[N_VARIABLES];
     static Reference vr[N_REFERENCES];
+    static State before;
     size_t vectors = 0, n_values = 0;
-    memcpy(draft, instance->state.plant.value, sizeof draft);
+    Status status = OK;
+    before = instance->state;
+    memcpy(draft, before.plant.value, sizeof draft);
     for (size_t i = 0; i < count; i++)
         draft[place[i]] = value[i];
-    for (Reference own = 1; own <= N_REFERENCES; own++) {
+    for (Reference own = 1; own <= N_REFERENCES && status <= WARNING; own++) {
+        const int first = PLACE[own];
         size_t i = 0;
-        while (i < count && (place[i] < PLACE[own] || place[i] >= PLACE[own + 1]))
+        while (i < count && (place[i] < first || place[i] >= PLACE[own + 1]))
             i++;
         if (i == count)
             continue;
+        if (first >= FIRST_INTEGER && fabs(draft[first]) <= INT32_MAX && draft[first] == rint(draft[first])) {
+            const Integer integer = (Integer)draft[first];
+            status = set_integers(instance, &own, 1, &integer, 1);
+            continue;
+        }
         vr[vectors++] = own;
-        memcpy(&whole[n_values], &draft[PLACE[own]], size_of(own) * sizeof *whole);
+        memcpy(&whole[n_values], &draft[first], size_of(own) * sizeof *whole);
         n_values += size_of(own);
     }
-    return set_reals(instance, vr, vectors, whole, n_values);
+    if (status <= WARNING)
+        status = set_reals(instance, vr, vectors, whole, n_values);
+    if (status > WARNING)
+        instance->state = before;
+    return status;
 }
 
 /* Set a Boolean or an Integer. */
