@@ -26,5 +26,5 @@ def table_of(path: Path) -> pandas.DataFrame:
 
 
 def same(found: pandas.DataFrame, expected: pandas.DataFrame) -> None:
-    """Equal to the bit, row by row."""
-    pandas.testing.assert_frame_equal(found, expected, check_exact=True, check_dtype=False)
+    """Compare tables exactly, row by row; a sweep's table is a DataFrame of a class of its own."""
+    pandas.testing.assert_frame_equal(found, expected, check_exact=True, check_dtype=False, check_frame_type=False)
