@@ -11,7 +11,12 @@ import pytest
 import scipy.linalg
 import scipy.special
 import scipy.stats
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
 
+import twodof
 from twodof import FmuOptions, build_fmu, linearise, load_fmu
 from twodof.errors import TwoDofError
 from twodof.fmu import instantiate, resolve
@@ -69,6 +74,19 @@ def test_a_sampled_joint_follows_its_discrete_time_closed_form(delay):
         assert abs(plant.q[0] - q) <= 1e-10
         assert abs(plant.v[0] - v) <= 1e-10
         plant.step(T)
+
+
+@pytest.mark.parametrize(
+    "Kp, Kd, stable",
+    [(10.0, 199.0, True), (10.0, 201.0, False), (1980.0, 10.0, True), (2020.0, 10.0, False)],
+)
+def test_a_sampled_joint_is_stable_up_to_its_closed_form(Kp, Kd, stable):
+    """Kp T/2 < Kd < 2/T, by Jury's test of the discrete loop."""
+    plant = slider(control_period=0.01, Kp=[Kp], Kd=[Kd], q_des=[0.0], q_min=[-1e9], q_max=[1e9])
+    assert stable == (Kp * 0.01 / 2 < Kd < 2 / 0.01)
+    for _ in range(1000):
+        plant.step(0.01)
+    assert (abs(plant.q[0]) + abs(plant.v[0]) < 0.1) == stable
 
 
 @pytest.fixture(scope="module")
@@ -256,6 +274,41 @@ def test_the_effort_is_that_of_what_is_seen_within_the_limits(fmus):
         assert np.abs(wanted).max() > 1000.0
         expected = np.clip(wanted, -1000.0, 1000.0) if limit else wanted
         assert np.abs(rows[:, 2] - expected).max() < 1e-9
+
+
+def test_a_bag_of_what_is_measured_has_the_true_states_beside_it(fmus, tmp_path):
+    settings = {"control_period": 0.01, "x_des": (0.15, 0.1), **SEEN, **EXACT}
+    fmu, storages = fmus("twodof", "task", "fmi2"), {"mcap": read_topics_of_mcap, "sqlite3": read_topics_of_sqlite3}
+    samples = list(twodof.samples(fmu, stop_time=0.3, settings=settings))
+    for storage, read in storages.items():
+        bag = twodof.Bag(tmp_path / storage, measured=True, effort=True, storage=storage)
+        twodof.run(fmu, bag, stop_time=0.3, settings=settings)
+        topics = read(tmp_path / storage)
+        assert topics.keys() == {"/joint_states", "/joint_states_true"}
+        for sample, seen, true in zip(samples, topics["/joint_states"], topics["/joint_states_true"], strict=True):
+            assert (*seen.position, *seen.velocity) == (*sample.q_meas, *sample.v_meas) != (*sample.q, *sample.v)
+            assert (*true.position, *true.velocity) == (*sample.q, *sample.v)
+            assert (*seen.effort,) == sample.tau and not len(true.effort) and seen.header == true.header
+    with pytest.raises(TwoDofError, match="no outputs q_meas"):
+        other = replace(load_fmu(fmu), variables={n: v for n, v in load_fmu(fmu).variables.items() if "meas" not in n})
+        twodof.run(other, twodof.Bag(tmp_path / "other", measured=True), stop_time=0.1)
+
+
+def read_topics_of_mcap(folder):
+    topics: dict = {}
+    with next(folder.glob("*.mcap")).open("rb") as file:
+        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            topics.setdefault(channel.topic, []).append(message)
+    return topics
+
+
+def read_topics_of_sqlite3(folder):
+    topics: dict = {}
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Reader(folder) as reader:
+        for connection, _, data in reader.messages():
+            topics.setdefault(connection.topic, []).append(store.deserialize_cdr(data, connection.msgtype))
+    return topics
 
 
 # --- what is refused ---

@@ -36,6 +36,7 @@ class Bag(Sink):
         scene: add the robot description, transforms, target and end effector.
         meshes: keep the robot's meshes in the folder, where the description of the scene names them by file URIs.
         effort: put the control effort into JointState.effort.
+        measured: joint states are what the controller saw, and /joint_states_true the true ones.
         overwrite: replace an existing bag.
         fsync: wait for the disk at each flush, so that the machine may lose its power too.
         compress: "zstd" compresses the chunks of an MCAP file.
@@ -59,6 +60,7 @@ class Bag(Sink):
         scene: bool = False,
         meshes: bool = False,
         effort: bool = False,
+        measured: bool = False,
         overwrite: bool = False,
         fsync: bool = False,
         compress: str = "",
@@ -66,7 +68,7 @@ class Bag(Sink):
     ) -> None:
         self.path, self.namespace = Path(path), ""
         self._store = Store(self.path, storage, overwrite=overwrite, fsync=fsync, compress=compress)
-        self._scene, self._meshes, self._effort = scene or meshes, meshes, effort
+        self._scene, self._meshes, self._effort, self._measured = scene or meshes, meshes, effort, measured
         self._command_line = command_line
         self._run: Experiment | None = None
         self.count = 0
@@ -101,7 +103,9 @@ class Bag(Sink):
         self._run = run
         self._inputs = run.start_values
         folder = f"{self._folder.as_uri()}/" if self._meshes else ""
-        self._messages = Messages(run, scene=self._scene, effort=self._effort, meshes_in=folder)
+        self._messages = Messages(
+            run, scene=self._scene, effort=self._effort, meshes_in=folder, measured=self._measured
+        )
         self._most = BATCH_SIZE // (self._messages.size + OVERHEAD * len(self._messages.topics))
         return self
 

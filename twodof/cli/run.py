@@ -32,6 +32,7 @@ def add(run: argparse.ArgumentParser) -> None:
     run.description = "Simulate an FMU and write each step as sensor_msgs/JointState into a bag."
     add_output(run, "BAG", "default: rosbag2_<date and time>")
     add_options(run, "--stop-time", "--step")
+    run.add_argument("--measured", action="store_true", help="record joint states as measured, beside the true ones")
     run.add_argument("--realtime", action="store_true", help="pace the run to the wall clock")
     add_fmu(run, "TwoDof.fmu, built if need be")
     add_options(run, "--frame", *OF_A_RUN)
@@ -56,7 +57,7 @@ def call(options: argparse.Namespace) -> int:
     for condition in options.fail_if:
         expression(condition, RESULTS, condition=True)  # before a run that may take hours
     run = experiment_of(options, options.stop_time, options.step)
-    bag = bag_of(options, options.output or dated("rosbag2"))
+    bag = bag_of(options, options.output or dated("rosbag2"), measured=options.measured)
     pace = RealTime() if options.realtime else None
     with asked_to_stop() as asked:
         summary = simulate(run, bag, *_progress(), pace=pace, stop=asked)
@@ -100,12 +101,12 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
     )
 
 
-def bag_of(options: argparse.Namespace, path: str | Path) -> Bag:
+def bag_of(options: argparse.Namespace, path: str | Path, *, measured: bool = False) -> Bag:
     """Return the bag of the options."""
     from ..bag.writer import Bag
 
     names = ("storage", "compress", "scene", "meshes", "effort", "overwrite", "fsync", "command_line")
-    return Bag(path, **said(options, *names))
+    return Bag(path, measured=measured, **said(options, *names))
 
 
 def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None) -> dict[str, Any]:

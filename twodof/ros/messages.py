@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .scene import Scene
 
 JOINT_STATES = "/joint_states"
+TRUE_STATES = "/joint_states_true"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TRANSFORMS = "/tf"
 TARGET = "/target"
@@ -121,6 +122,7 @@ class Messages:
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
         clock: also the samples' stamps as the time.
+        measured: joint states are what the controller saw; the true ones have a topic of their own.
 
     Attributes:
         topics: all topics by name.
@@ -129,9 +131,20 @@ class Messages:
         BagError: the FMU lacks a requested output.
     """
 
-    def __init__(self, run: Experiment, *, scene: bool, effort: bool, clock: bool = False, meshes_in: str = "") -> None:
+    def __init__(
+        self,
+        run: Experiment,
+        *,
+        scene: bool,
+        effort: bool,
+        clock: bool = False,
+        meshes_in: str = "",
+        measured: bool = False,
+    ) -> None:
         if effort and not run.fmu.vector("tau"):
             raise BagError(f"'{run.fmu.path}' has no outputs tau[i], which efforts are")
+        if measured and not run.fmu.vector("q_meas"):
+            raise BagError(f"'{run.fmu.path}' has no outputs q_meas[i] and v_meas[i], which are what is measured")
         self._scene = _load_scene(run, meshes_in) if scene else None
         self._axes = ["xyz".index(axis) for axis in run.fmu.axes]
         n, m, poses = len(run.fmu.joints), 0, False
@@ -139,6 +152,9 @@ class Messages:
         layouts: dict[str, Layout] = {CLOCK: Layout(Stamp())} if clock else {}
         layouts[JOINT_STATES] = JointStateLayout(run.fmu.joints, "", (n, n, efforts))
         self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM)}
+        if measured:
+            layouts[TRUE_STATES] = JointStateLayout(run.fmu.joints, "", (n, n, 0))
+            self.topics[TRUE_STATES] = Topic(JOINT_STATE, STREAM)
         if self._scene is not None:
             m, poses = len(run.fmu.vector("x_des")), bool(run.fmu.vector("quat_des"))
             place = Layout(Stamp(), run.fmu.root, Numbers(7 if poses else 3))
@@ -152,7 +168,17 @@ class Messages:
         if clock:
             self.topics[CLOCK] = Topic("rosgraph_msgs/msg/Clock", STREAM)
         self._layouts, self._efforts, turns = layouts, efforts, 4 * poses
-        sizes = {"q": n, "v": n, "tau": efforts, "quat": turns, "x_des": m, "quat_des": turns}
+        self._measured, seen = measured, n if measured else 0
+        sizes = {
+            "q": n,
+            "v": n,
+            "q_meas": seen,
+            "v_meas": seen,
+            "tau": efforts,
+            "quat": turns,
+            "x_des": m,
+            "quat_des": turns,
+        }
         self._numbers = np.dtype([("stamp", "<i8"), *((k, "<f8", (c,)) for k, c in sizes.items())])
         self._pack = Struct(f"<q{sum(sizes.values())}d").pack
         self._inputs: Mapping[str, Value] = {}
@@ -169,7 +195,8 @@ class Messages:
         Raises:
             struct.error: the sample is not of this run.
         """
-        given: tuple[float, ...] = sample.tau if self._efforts else ()
+        given: tuple[float, ...] = (*sample.q_meas, *sample.v_meas) if self._measured else ()
+        given = (*given, *sample.tau) if self._efforts else given
         if self._scene is not None:
             if sample.inputs is not self._inputs:
                 self._inputs = sample.inputs
@@ -184,7 +211,9 @@ class Messages:
     def of_all(self, numbers: bytes) -> tuple[NDArray[np.int64], dict[str, Rows]]:
         """Return the stamps of N samples, ns, and their messages by topic."""
         table = np.frombuffer(numbers, self._numbers)
-        parts = {CLOCK: [], JOINT_STATES: [table["q"], table["v"], table["tau"]]}
+        seen = ("q_meas", "v_meas", "tau") if self._measured else ("q", "v", "tau")
+        parts = {CLOCK: [], JOINT_STATES: [table[key] for key in seen]}
+        parts[TRUE_STATES] = [table["q"], table["v"], table["tau"][:, :0]]
         if self._scene is not None:
             end_effector = self._scene.end_effector(table["q"])
             target = end_effector.copy()  # an axis that is not controlled is left as it is

@@ -20,7 +20,7 @@ from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import InputError, SimulationError, diverged, step_failure
-from ..fmu import Fmu, Instance, Values, instantiate
+from ..fmu import Fmu, Instance, instantiate
 from ..plant.urdf import Urdf
 from ..signatures import check_keywords, ignore, never, with_keywords_of
 from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
@@ -148,13 +148,14 @@ def as_experiment(
 
 
 def _sampler(
-    instance: Instance, run: Experiment, watch: Callable[[Values], object]
+    instance: Instance, run: Experiment, watch: Callable[[memoryview], object]
 ) -> Callable[[int, Mapping[str, Value], float], Sample]:
     """Return a function that reads the outputs after k steps, with the inputs and their start time."""
-    groups = [run.fmu.vector(group) for group in OUTPUTS]
+    groups = [run.fmu.vector(group) for group in (*OUTPUTS, "q_meas", "v_meas")]
     ends = list(accumulate(map(len, groups)))
     read, unpack = instance.reader([*chain(*groups)]), Struct(f"{ends[-1]}d").unpack
-    of_q, of_v, of_x, of_tau, of_quat = (slice(a, b) for a, b in zip([0, *ends], ends))
+    of_q, of_v, of_x, of_tau, *rest = (slice(a, b) for a, b in zip([0, *ends], ends))
+    judged = memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # of the one buffer of all reads
     start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
@@ -162,10 +163,10 @@ def _sampler(
         values = unpack(row)
         if not isfinite(sum(values)) and not all(map(isfinite, values)):
             raise diverged(k, t)
-        watch(row)
+        watch(judged)
         stamp = first_stamp + round(k * step * NANOSECONDS)
         parts = values[of_q], values[of_v], values[of_x], values[of_tau]
-        return Sample(k, t, *parts, inputs, since, stamp, values[of_quat])
+        return Sample(k, t, *parts, inputs, since, stamp, *(values[of] for of in rest))
 
     return take
 

@@ -29,6 +29,7 @@ class Sample(NamedTuple):
         since: the communication point from which on the inputs have had these values, s.
         stamp: of the messages that tell of it, ns since the epoch.
         quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has none.
+        q_meas, v_meas: what the controller saw at its latest sample, as q and v; empty if the FMU has none.
     """
 
     k: int
@@ -41,6 +42,8 @@ class Sample(NamedTuple):
     since: float
     stamp: int
     quat: tuple[float, ...] = ()
+    q_meas: tuple[float, ...] = ()
+    v_meas: tuple[float, ...] = ()
 
     @property
     def target(self) -> tuple[float, ...] | None:
