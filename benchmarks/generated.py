@@ -96,11 +96,12 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
     wanted = wanted - drift[rows] + of["Kn"][0] * xd
     a = J.T.dot(solve_by_factors(J.dot(J.T), wanted)) - of["v"] * of["Kn"][0]
     if way is not None:
+        still = np.zeros(len(robot.joints))
         effort = of["tau_ext"] - of["v"] * np.array(robot.damping)
         a = a + (
-            solve_by_factors(mass_matrix(constants, constants.body, joint), effort)
+            solve_by_factors(mass_matrix(constants, constants.body, joint, still), effort)
             if way == "factors"
-            else solve_by_recursion(constants, constants.body, joint, effort)
+            else solve_by_recursion(constants, constants.body, joint, still, effort)
         )
     result = casadi.vertcat(*(getattr(each, "sx", each) for each in a))
     given = [sx for sx, _ in vectors.values()]

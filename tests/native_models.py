@@ -134,13 +134,14 @@ def coupling(name: str, joints: Sequence[str] = ()) -> tuple[np.ndarray, np.ndar
 class Reduced:
     """Pinocchio's answers in the coordinates of the joints that move on their own."""
 
-    def __init__(self, reference: pin.Model, name: str) -> None:
+    def __init__(self, reference: pin.Model, name: str, armature: Sequence[float] | None = None) -> None:
         self.model, self.data = reference, reference.createData()
         self.G, self.c = coupling(name)
+        self.armature = np.zeros(self.G.shape[1]) if armature is None else armature
 
     def mass_matrix(self, q):
         M = pin.crba(self.model, self.data, self.G @ q + self.c)
-        return self.G.T @ (np.triu(M) + np.triu(M, 1).T) @ self.G
+        return self.G.T @ (np.triu(M) + np.triu(M, 1).T) @ self.G + np.diag(self.armature)
 
     def forward_dynamics(self, q, v, tau):
         h = self.G.T @ pin.nonLinearEffects(self.model, self.data, self.G @ q + self.c, self.G @ v)
@@ -336,4 +337,5 @@ def random_plant(name: str, control: str, rng):
     plant.q, plant.v = rng.uniform(-2, 2, n).tolist(), rng.normal(0, 2, n).tolist()
     plant.f_ext, plant.tau_ext = rng.normal(0, 5, 3).tolist(), rng.normal(0, 3, n).tolist()
     plant.payload, plant.payload_com = rng.uniform(0, 3), rng.normal(0, 0.1, 3).tolist()
+    plant.damping, plant.armature = rng.uniform(0, 3, n).tolist(), rng.uniform(0, 2, n).tolist()
     return plant

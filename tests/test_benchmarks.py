@@ -103,7 +103,7 @@ def test_the_rival_has_the_same_right_hand_side(benchmarks: SimpleNamespace) -> 
     )
     plant.initialise()
     q, v = plant.q, [0.3, -0.2, 0.1, 0.4]
-    expected = plant.equations_of_motion().acceleration(np.array(q), np.array(v), None)[0]
+    expected = plant.equations_of_motion().acceleration(np.array(q), np.array(v), None, [0] * len(q))[0]
     inputs = [getattr(plant, name) for name in benchmarks.generated.INPUTS]
     for way in benchmarks.generated.WAYS:
         rival = benchmarks.generated.right_hand_side(arm.robot, way)(q, v, *inputs)

@@ -63,17 +63,21 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
         scale = max(1.0, np.abs(theirs).max())
         np.testing.assert_allclose(np.array(ours, dtype=float), theirs, rtol=0, atol=1e-12 * scale)
 
-    tau = inverse_dynamics(constants, constants.body, joint, v, a, gravity)
-    assert_close(tau, pin.rnea(reference, data, q, v, a))
-    M = mass_matrix(constants, constants.body, joint)
+    armature = rng.uniform(0, 2, n)
+    tau = inverse_dynamics(constants, constants.body, joint, armature, v, a, gravity)
+    assert_close(tau, pin.rnea(reference, data, q, v, a) + armature * a)
+    M = mass_matrix(constants, constants.body, joint, armature)
     expected = np.triu(pin.crba(reference, data, q))
-    expected += np.triu(expected, 1).T
+    expected += np.triu(expected, 1).T + np.diag(armature)
     assert_close(M, expected)
-    for a in (solve_by_factors(M, v), solve_by_recursion(constants, constants.body, joint, v)):
+    for a in (solve_by_factors(M, v), solve_by_recursion(constants, constants.body, joint, armature, v)):
         np.testing.assert_allclose(expected @ a.astype(float), v, rtol=0, atol=1e-11)
     free = rng.integers(0, 2, n)
     split = free * v, free, (1 - free) * v  # effort of free joints, acceleration of the others
-    for a, reaction in (hybrid_by_factors(M, *split), hybrid_by_recursion(constants, constants.body, joint, *split)):
+    for a, reaction in (
+        hybrid_by_factors(M, *split),
+        hybrid_by_recursion(constants, constants.body, joint, armature, *split),
+    ):
         np.testing.assert_array_equal(a[free == 0], v[free == 0])
         assert_close(reaction * free, np.zeros(n))
         balance = expected @ a.astype(float) - reaction.astype(float)

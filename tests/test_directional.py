@@ -10,6 +10,8 @@ import pinocchio as pin
 import pytest
 from native_models import ROBOTS, Engine, Reduced, model
 
+from twodof.plant.stops import CLAMPED, STOPPED
+
 
 class Derivatives(Engine):
     """An engine with the function that gives derivatives."""
@@ -21,27 +23,27 @@ class Derivatives(Engine):
         self.computed = [i for i, v in enumerate(of.table) if v.causality in ("output", "local")]
         self.known = [i for i in range(self.count) if i < of.index("x")]
 
-    def jacobian(self, values, held=None):
+    def jacobian(self, values, held=None, slip=None):
         """∂ computed/∂ known, a row each of the variables from q on up to the parameters."""
-        held = np.zeros(self.n, dtype=np.int32) if held is None else held
+        held, slip = (np.zeros(self.n, dtype=np.int32) if x is None else x for x in (held, slip))
         columns = []
         for k in self.known:
             change, derivative = np.zeros(self.count), np.zeros(self.count)
             change[k] = 1.0
-            self.call("differentiate", values, held, change, derivative)
+            self.call("differentiate", values, held, slip, change, derivative)
             columns.append(derivative[self.computed])
         return np.array(columns).T
 
-    def differences(self, values, held=None):
+    def differences(self, values, held=None, slip=None):
         """The same by central differences, extrapolated."""
-        held = np.zeros(self.n, dtype=np.int32) if held is None else held
+        held, slip = (np.zeros(self.n, dtype=np.int32) if x is None else x for x in (held, slip))
 
         def slope(k, h):
             ends = []
             for sign in (1.0, -1.0):
                 near = values.copy()
                 near[k] += sign * h
-                self.call("compute", near, held)
+                self.call("compute", near, held, slip)
                 ends.append(near[self.computed])
             return (ends[0] - ends[1]) / (2.0 * h)
 
@@ -169,7 +171,7 @@ def test_derivatives_are_those_of_central_differences(case, complex_numbers):
 def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
     engine = Derivatives(model("ur5", "effort"))
     values = at_random(engine, np.random.default_rng(4), rigid_stops=rigid)
-    held = np.array([0, 1, 0, 0, 1, 0], dtype=np.int32)
+    held = np.array([0, 1, 0, 0, 1, 0], dtype=np.int32) * (STOPPED if rigid else CLAMPED)
     ours, theirs = engine.jacobian(values, held), engine.differences(values, held)
     assert np.abs(ours - theirs).max() <= 1e-6 * max(1.0, np.abs(theirs).max())
     rates = engine.part(ours, r"der\(v.*", r".*")
@@ -184,6 +186,6 @@ def test_a_direction_of_any_size_has_its_derivative():
     for size in (1.0, 1e-250, 1e250):
         change, derivative = np.zeros(engine.count), np.zeros(engine.count)
         change[k] = size
-        engine.call("differentiate", values, held, change, derivative)
+        engine.call("differentiate", values, held, held, change, derivative)
         results.append(derivative[engine.computed] / size)
     np.testing.assert_allclose(results[1:], [results[0]] * 2, rtol=1e-12)

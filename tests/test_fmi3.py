@@ -307,7 +307,7 @@ def test_wrong_arrays_are_refused(pair):
         [a.vr["event_indicators"]],
         [q],
         [1.0, 0.0],
-        5,
+        7,
     )
     a.refused("2 values for variables of 1", "getAdjointDerivative", [a.vr["x"]], [a.vr["Kn"]], [1.0, 0.0], 2)
     a.refused("weight of x\\[1\\] is not finite", "getAdjointDerivative", [a.vr["x"]], [q], [np.nan, 0.0], 2)
@@ -387,10 +387,10 @@ def test_call_order(pair):
         4,
     )
     b.enterContinuousTimeMode()
-    indicators = (ctypes.c_double * 5)()
-    b.getEventIndicators(indicators, 5)
+    indicators = (ctypes.c_double * 7)()
+    b.getEventIndicators(indicators, 7)
     assert b.get("event_indicators") == list(indicators)
-    assert b.getNumberOfEventIndicators() == 5 and b.getNumberOfContinuousStates() == 4
+    assert b.getNumberOfEventIndicators() == 7 and b.getNumberOfContinuousStates() == 4
     b.refused("fmi3UpdateDiscreteStates is not allowed", "updateDiscreteStates")
 
 

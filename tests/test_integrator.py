@@ -5,20 +5,25 @@ import pytest
 from scipy.integrate import RK45
 
 from twodof.plant import dormand_prince, integrator
-from twodof.plant.integrator import Equations, StepError
+from twodof.plant.equations import Equations
+from twodof.plant.integrator import StepError
 from twodof.plant.stops import Stops
 
 FREE = [(-np.inf, np.inf)]
 
 
+def without_friction(limits, W=None):
+    return Stops(limits, [0.0] * len(limits), lambda q: W, rigid=W is not None)
+
+
 def advance(acceleration, q, v, h, limits, *tolerances):
     """A step with stops that have no reaction."""
-    return integrator.advance(acceleration, q, v, h, Stops(limits, None), *tolerances)
+    return integrator.advance(acceleration, q, v, h, without_friction(limits), *tolerances)
 
 
 def smooth(acceleration):
     """Equations of motion whose J⁺ drops nothing anywhere."""
-    return Equations(lambda q, v, rank: (acceleration(q, v), 1, np.inf), lambda q: [1.0], 0.0, ())
+    return Equations(lambda q, v, rank, slip: (acceleration(q, v), 1, np.inf), lambda q: [1.0], 0.0, ())
 
 
 def jumping(acceleration, ratio):
@@ -27,7 +32,7 @@ def jumping(acceleration, ratio):
     The ratio changes with joint 1 by 1 per rad at the most.
     """
 
-    def response(q, v, rank):
+    def response(q, v, rank, slip):
         margin = ratio(q) - 0.01
         rank = rank or 1 + (margin > 0.0)
         return acceleration(q, v, rank), rank, margin if rank == 2 else -margin
@@ -264,5 +269,5 @@ def test_an_impact_that_another_undoes_leaves_its_joint_free():
     """Two joints hit their limits; the first one's impact alone throws the second back."""
     W = np.array([[1.0, 0.9], [0.9, 1.0]])
     y = [0.0, 0.0, -1.0, -0.5]
-    Stops([(0.0, 1.0)] * 2, lambda q: W).impact(y, [False, False])
+    without_friction([(0.0, 1.0)] * 2, W).impact(y, [False, False])
     assert y == pytest.approx([0.0, 0.0, 0.0, 0.4], abs=1e-15)  # -0.5 + 0.9 · 1

@@ -47,7 +47,7 @@ def test_dynamics_are_those_of_pinocchios_mimic_joints(robots: Path, name: str, 
     robot = load_robot((robots / name).read_text(), frame, "xyz")
     own = own_model(robots, name)
     own.gravity.linear = np.array(DOWN)
-    data, mechanism = own.createData(), Mechanism(robot, DOWN, 0.0, (0.0, 0.0, 0.0))
+    data, mechanism = own.createData(), Mechanism(robot, DOWN, 0.0, (0.0,) * 3, (0.0,) * len(robot.joints))
     ours = [own.joints[own.getJointId(joint)].idx_v for joint in robot.joints]
     assert len(robot.joints) == own.nv < robot.model.nv
     rng = np.random.default_rng(1)
@@ -87,7 +87,7 @@ def test_a_mimic_of_a_mimic_follows_the_joint_that_moves() -> None:
     assert (*robot.q_min, *robot.q_max) == pytest.approx((0.2, 0.6), abs=1e-15)
     assert robot.damping == pytest.approx((0.5 + 3.0,))
     q, v = 0.35, 1.7
-    mechanism = Mechanism(robot, (0.0, -9.81, 0.0), 0.0, (0.0, 0.0, 0.0))
+    mechanism = Mechanism(robot, (0.0, -9.81, 0.0), 0.0, (0.0,) * 3, (0.0,))
     place, J, drift = mechanism.observe(np.array([q]), np.array([v]))
     r, along, across = 0.5 - q, np.array([np.cos(q), np.sin(q)]), np.array([-np.sin(q), np.cos(q)])
     np.testing.assert_allclose(place[:2], r * along, atol=1e-15)
@@ -147,7 +147,7 @@ def test_geometry_of_many_samples_is_that_of_the_plant(robots: Path) -> None:
     text, frame = (robots / PANDA).read_text(), "panda_rightfinger"
     robot = load_robot(text, frame, "xyz")
     kinematics = Kinematics(read_urdf(text), robot.joints)
-    mechanism = Mechanism(robot, DOWN, 0.0, (0.0, 0.0, 0.0))
+    mechanism = Mechanism(robot, DOWN, 0.0, (0.0,) * 3, (0.0,) * len(robot.joints))
     q = np.random.default_rng(3).normal(size=(20, len(robot.joints)))
     for row, path, jacobian in zip(q, kinematics.path(frame, q), kinematics.jacobian(frame, q)):
         place, J, _ = mechanism.observe(row, np.zeros(len(row)))

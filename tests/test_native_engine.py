@@ -115,7 +115,7 @@ def test_effort_bound_is_what_holds_a_stretched_arm():
     data = reference.createData()
     angles = np.linspace(-np.pi, np.pi, 361)
     largest = max(abs(pin.rnea(reference, data, np.array([q, 0.0]), still, still)[0]) for q in angles)
-    bound = effort_bounds(constants, constants.body, np.eye(2), still, still, gravity)
+    bound = effort_bounds(constants, constants.body, np.eye(2), still, still, still, gravity)
     assert largest <= bound[0] <= 1.02 * largest  # centres of mass lie a little off the line
 
 
@@ -290,7 +290,7 @@ def test_damping_changes_the_motion():
     a = np.empty(2)
     of.call("acceleration", of.values(plant), a)
     state = np.array(plant.q), np.array(plant.v)
-    expected, *_ = plant.equations_of_motion().acceleration(*state, None)
+    expected, *_ = plant.equations_of_motion().acceleration(*state, None, [0, 0])
     assert deviation(a, np.array(expected)) <= 1e-11
 
 

@@ -336,7 +336,7 @@ def test_the_rank_after_a_passed_stop_is_that_of_the_state_there(importer, fmus)
     solver = importer(starts, control="task")
     theirs = solver.run(0.3, 0.02, parts=40)
     ours = simulated(fmus(2, "task"), "CoSimulation", starts, 0.3)
-    assert solver.indicators[4] < 0.0 and len(solver.asked) == 1
+    assert solver.indicators[6] < 0.0 and len(solver.asked) == 1
     assert 0.0 <= solver.asked[0] - turn <= 0.02
     assert np.abs(ours - theirs)[:, :2].max() <= 1e-7
 

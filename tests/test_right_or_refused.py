@@ -345,6 +345,7 @@ def test_many_joints_at_stops_need_few_evaluations(name, monkeypatch):
     plant = model(f"tiago_description/robots/{name}.urdf", "effort").plant()
     limits = list(zip(plant.q_min, plant.q_max))
     plant.q_start = [0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in limits]
+    plant.friction = [0.0] * len(limits)  # each impact would set joints that stick in motion for microseconds
     plant.initialise()
     for _ in range(30):
         plant.step(STEP)

@@ -128,6 +128,7 @@ REFUSED = {
     "inverted limits": (arm(elbow=elbow('<limit lower="1" upper="-1"/>')), "'elbow': lower limit"),
     "upper below default 0": (arm(elbow=elbow('<limit upper="-1"/>')), "'elbow': lower limit 0"),
     "negative effort": (arm(elbow=elbow('<limit effort="-1"/>')), "'elbow': negative effort"),
+    "negative friction": (arm(elbow=elbow(LIMIT + '<dynamics friction="-1"/>')), "'elbow'.* friction"),
     "negative damping": (arm(elbow=elbow(LIMIT + '<dynamics damping="-1"/>')), "'elbow'.* damping"),
     "zero axis": (arm(elbow=elbow(axis="0 0 0")), "'elbow': its axis is zero"),
     "axis of two": (arm(elbow=elbow(axis="0 1")), "'elbow': <axis xyz='0 1'>"),
@@ -316,12 +317,10 @@ def test_effort_of_zero_or_none_is_unlimited(effort: str) -> None:
     assert load_robot(arm(elbow=elbow(limit)), "tip", "xyz").effort == (3.0, math.inf)
 
 
-def test_friction_is_ignored_with_a_warning() -> None:
+def test_friction_is_read_without_a_warning() -> None:
     rough = elbow(LIMIT + '<dynamics damping="0.5" friction="0.1"/>')
     loaded = load_robot(arm(elbow=rough), "tip", "xyz")
-    assert loaded.damping == (0.0, 0.5)
-    assert len(loaded.warnings) == 1
-    assert "friction is not modelled and is ignored: joint 'elbow'" in loaded.warnings[0]
+    assert (loaded.damping, loaded.friction, loaded.warnings) == ((0.0, 0.5), (0.0, 0.1), ())
 
 
 @pytest.mark.parametrize("inside", ["", 'lower="0.5" upper="0.5"'])

@@ -234,7 +234,7 @@ class _Point:
         )
 
     def _remarks(self) -> list[str]:
-        """Return notes on a singular pose and saturated joints; raise where no linear model exists."""
+        """Return notes on a singular pose, joints that stick or saturate; raise where no linear model exists."""
         limits = [self._read(self._fmu.vector(name)) for name in ("q", "q_min", "q_max")]
         for joint, q, low, high in zip(self._fmu.joints, *limits):
             if q in (low, high):
@@ -242,7 +242,7 @@ class _Point:
                     f"joint '{joint}' is at its limit {q:g}, where the model is not linear: move"
                     " it off, or widen q_min and q_max"
                 )
-        remarks = self._saturated()
+        remarks = self._stuck() + self._saturated()
         if self._values.get("control_period"):
             remarks.append("the controller is sampled: the model is that of the plant with its effort held")
         rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # all that J⁺ is of
@@ -258,6 +258,22 @@ class _Point:
                 f"a singular pose: σ_min/σ_max = {ratio[-1]:.3g} is below rcond = {rcond:g}, so"
                 " that a direction of the frame is not controlled"
             )
+        return remarks
+
+    def _stuck(self) -> list[str]:
+        """Return notes on joints that their friction holds; raise where one begins to slip."""
+        if "friction[1]" not in self._fmu.variables:
+            return []
+        remarks = []
+        values = [self._read(names) for names in (self._v, self._accelerations, self._fmu.vector("friction"))]
+        for joint, v, a, friction in zip(self._fmu.joints, *values):
+            if friction and not v and a:
+                raise SimulationError(
+                    f"joint '{joint}' begins to slip against its friction {friction:g}, where the model is not"
+                    " linear: give it a velocity, or friction=0"
+                )
+            if friction and not v:
+                remarks.append(f"joint '{joint}' sticks by its friction {friction:g}: in the model it stays at rest")
         return remarks
 
     def _saturated(self) -> list[str]:

@@ -85,7 +85,8 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 #include "engine.c"
 
 /* Compute what is wanted. */
-static void evaluate(Plant *plant, const int held[N_JOINTS], int rank, int wanted)
+static void evaluate(Plant *plant, const int held[N_JOINTS], const int slip[N_JOINTS], int rank,
+                     int wanted)
 {
     if (wanted & WANTS_X)
         compute_position(plant);
@@ -99,14 +100,16 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], int rank, int wante
     }
     if (wanted & WANTS_RATES) {
         Stops stops = {.rank = rank};
-        for (int i = 0; i < N_JOINTS; i++)
+        for (int i = 0; i < N_JOINTS; i++) {
             stops.any_held |= stops.held[i] = held[i];
+            stops.slip[i] = slip[i];
+        }
         compute_rates(plant, &stops);
     }
 }
 
 #if COMPLEX
-void differentiate(const Real value[], const int held[], int rank, int wanted,
+void differentiate(const Real value[], const int held[], const int slip[], int rank, int wanted,
                    const Real change[], Real derivative[])
 {
     const Real largest = largest_of(change, X); /* whatever its size, a step is small */
@@ -116,7 +119,7 @@ void differentiate(const Real value[], const int held[], int rank, int wanted,
         plant.value[i] = value[i];
     for (int i = 0; i < X; i++)
         plant.value[i] += UNIT * (change[i] * inverse * STEP);
-    evaluate(&plant, held, rank, wanted);
+    evaluate(&plant, held, slip, rank, wanted);
     for (int i = 0; i < FIRST_PARAMETER; i++)
         derivative[i] = cimag(plant.value[i]) * up * largest;
 }
@@ -124,7 +127,7 @@ void differentiate(const Real value[], const int held[], int rank, int wanted,
 /* ∛ε: where the errors of truncation and rounding are alike. */
 static const Real NUDGE = 6e-6;
 
-void differentiate(const Real value[], const int held[], int rank, int wanted,
+void differentiate(const Real value[], const int held[], const int slip[], int rank, int wanted,
                    const Real change[], Real derivative[])
 {
     const Real largest = largest_of(change, X);
@@ -134,8 +137,8 @@ void differentiate(const Real value[], const int held[], int rank, int wanted,
         after.value[i] = value[i] + nudge;
         before.value[i] = value[i] - nudge;
     }
-    evaluate(&after, held, rank, wanted);
-    evaluate(&before, held, rank, wanted);
+    evaluate(&after, held, slip, rank, wanted);
+    evaluate(&before, held, slip, rank, wanted);
     for (int i = 0; i < FIRST_PARAMETER; i++)
         derivative[i] = (after.value[i] - before.value[i]) / (2.0 * NUDGE) * largest;
 }

@@ -29,13 +29,12 @@ static const double P[STAGES + 1][4] = {
     {0, 40617522.0 / 29380423, -110615467.0 / 29380423, 69997945.0 / 29380423},
 };
 
-void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double pressed[N_JOINTS],
+void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS],
               double *margin)
 {
     step->evaluations++;
-    acceleration(step->plant, y, y + N_JOINTS, step->stops.rank, a, margin);
-    if (step->stops.any_held)
-        restrain(step->plant, &step->stops, y, a, pressed);
+    acceleration(step->plant, y, y + N_JOINTS, step->stops.slip, step->stops.rank, a, margin);
+    restrain(step->plant, &step->stops, y, a, effort);
 }
 
 double dormand_prince(Step *step)
@@ -53,7 +52,7 @@ double dormand_prince(Step *step)
             y_new[i] = step->y[i] + change;
         }
         memcpy(step->K[stage], y_new + N_JOINTS, N_JOINTS * sizeof *y_new);
-        evaluate(step, y_new, step->K[stage] + N_JOINTS, step->pressed[stage],
+        evaluate(step, y_new, step->K[stage] + N_JOINTS, step->effort[stage],
                  stage == STAGES ? &step->margin_new : NULL);
     }
     for (int i = 0; i < N_STATES; i++) {

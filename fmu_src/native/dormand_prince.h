@@ -14,17 +14,17 @@ typedef struct {
     double size;                           /* s */
     double y[N_STATES], y_new[N_STATES];
     double K[STAGES + 1][N_STATES];        /* the derivatives, */
-    double pressed[STAGES + 1][N_JOINTS];  /* and how joints at rest are pressed into their limits */
+    double effort[STAGES + 1][N_JOINTS];   /* and the efforts that hold joints at rest */
     long evaluations;                      /* of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */
     double margin, margin_new;             /* of the rank at y and y_new */
     Stops stops;
 } Step;
 
-/* q̈ at a state in the regime of the step, how joints at rest are pressed into their limits, and the
-   margin of the rank, which may be NULL. */
+/* q̈ at a state in the regime of the step, the efforts that hold joints at rest, and the margin of the rank,
+   which may be NULL. */
 INTERNAL void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS],
-                       double pressed[N_JOINTS], double *margin);
+                       double effort[N_JOINTS], double *margin);
 
 /* Fill y_new and K[1…6] from y and K[0]; the norm of the error, which passes where below 1. */
 INTERNAL double dormand_prince(Step *step);

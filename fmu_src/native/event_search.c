@@ -1,14 +1,17 @@
 /* Find the first event within an integration step, on its dense output. The rules are those of
    plant/event_search.py.
 
-   An event is where a margin becomes negative: the distance of a joint to a limit, the force that presses
-   a joint at rest into its limit, or the margin of the rank of J⁺. Positions are polynomials, whose
-   turning points are known; the other margins are looked at as often as their rates of change ask for. */
+   An event is where a margin becomes negative: the distance of a joint to a limit, the velocity of one that
+   slips, the distance of the effort that holds a joint from its bounds, or the margin of the rank of J⁺.
+   Positions and velocities are polynomials, whose turning points are known; the other margins are looked at
+   as often as their rates of change ask for. */
 #include "event_search.h"
 
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
+
+#include "polynomial.h"
 
 #ifdef HAS_RCOND
 #include "control.h"
@@ -18,7 +21,7 @@
 /* Weights of the stages in Dormand and Prince's interpolant: the largest sum of
    the weights' magnitudes, and that of their rates. */
 static const double REACH = 1.66, PACE = 3.72;
-/* A force that presses a joint falls below what the stages show of it by less than its range there. It is
+/* The margin of an effort falls below what the stages show of it by less than its range there. It is
    looked at this often in a step where that may be below zero, and again at a minimum of the polynomial
    through these looks that is lower than so much of their range. */
 enum { LOOKS = 4 };
@@ -27,8 +30,9 @@ static const double DOUBT = 0.25;
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
-/* A margin, negative once a regime has ended, at a time within the step. */
-typedef double Margin(Step *step, double passed, int joint);
+/* A margin, negative once a regime has ended, at a time within the step; of a component of the state, of whom
+   there is one each. */
+typedef double Margin(Step *step, double passed, int component);
 
 static void interpolated(const Step *step, double passed, double y[N_STATES])
 {
@@ -44,29 +48,41 @@ static double limit_margin(Step *step, double passed, int joint)
     return fmin(value[Q_MAX + joint] - q, q - value[Q_MIN + joint]);
 }
 
-/* Contact forces of joints at rest. */
-static void press(Step *step, double passed, double pressed[N_JOINTS])
+/* Velocity in the direction of slip. */
+static double slip_margin(Step *step, double passed, int component)
+{
+    return step->stops.slip[component - N_JOINTS] * dense_output(step, passed, component);
+}
+
+/* Efforts that hold joints at rest. */
+static void find_efforts(Step *step, double passed, double effort[N_JOINTS])
 {
     double y[N_STATES], a[N_JOINTS];
     interpolated(step, passed, y);
-    evaluate(step, y, a, pressed, NULL);
+    evaluate(step, y, a, effort, NULL);
 }
 
-static double least_pressed(const Step *step, const double pressed[N_JOINTS])
+/* How far an effort that holds a joint is within its bound on a side. */
+static double grip_of(const Step *step, int i, double effort, int side)
+{
+    return grip(step->plant, &step->stops, i, step->y[i], effort, side);
+}
+
+static double least_grip(const Step *step, const double effort[N_JOINTS])
 {
     double least = HUGE_VAL;
     for (int i = 0; i < N_JOINTS; i++)
         if (step->stops.watched[i])
-            least = fmin(least, pressed[i]);
+            least = fmin(least, fmin(grip_of(step, i, effort[i], -1), grip_of(step, i, effort[i], 1)));
     return least;
 }
 
-static double release_margin(Step *step, double passed, int joint)
+static double release_margin(Step *step, double passed, int component)
 {
-    double pressed[N_JOINTS];
-    (void)joint;
-    press(step, passed, pressed);
-    return least_pressed(step, pressed);
+    double effort[N_JOINTS];
+    (void)component;
+    find_efforts(step, passed, effort);
+    return least_grip(step, effort);
 }
 
 /* The margin of the rank; of one that is held only that against a lower one. */
@@ -136,68 +152,41 @@ static double search(Step *step, Margin *margin, int joint, double rate, double 
     return first;
 }
 
-double polynomial(const double c[], int degree, double x)
+/* First time at which the margin of a component is negative, HUGE_VAL where it never is. */
+static double first_crossing(Step *step, Margin *margin, int component)
 {
-    double sum = c[degree];
-    for (int k = degree - 1; k >= 0; k--)
-        sum = sum * x + c[k];
-    return sum;
-}
-
-int sign_changes(const double c[], int degree, double root[])
-{
-    double slope[4], turn[5], left = 0.0;
-    int turns = 0, count = 0;
-    if (degree == 0)
-        return 0;
-    for (int k = 1; k <= degree; k++)
-        slope[k - 1] = k * c[k];
-    turns = sign_changes(slope, degree - 1, turn);
-    turn[turns] = 1.0;
-    for (int k = 0; k <= turns; left = turn[k++]) {
-        const double before = polynomial(c, degree, left);
-        if (!(before * polynomial(c, degree, turn[k]) < 0.0))
-            continue;
-        double low = left, high = turn[k];
-        while (high - low > TIME_RESOLUTION) {
-            const double middle = 0.5 * (low + high);
-            if (polynomial(c, degree, middle) * before > 0.0)
-                low = middle;
-            else
-                high = middle;
-        }
-        root[count++] = high;
-    }
-    return count;
-}
-
-/* First time at which a joint is past a limit, HUGE_VAL where it never is. */
-static double first_crossing(Step *step, int joint)
-{
-    const double *c = step->Q[joint];
+    const double *c = step->Q[component];
     const double slope[4] = {c[0], 2.0 * c[1], 3.0 * c[2], 4.0 * c[3]};
-    double turn[4], before = 0.0, at_before = limit_margin(step, 0.0, joint);
+    double turn[4], before = 0.0, at_before = margin(step, 0.0, component);
     const int turns = sign_changes(slope, 3, turn);
     for (int k = 0; k <= turns; k++) {
         const double after = k < turns ? turn[k] * step->size : step->size;
-        const double at_after = limit_margin(step, after, joint);
+        const double at_after = margin(step, after, component);
         if (at_after < 0.0)
-            return locate(step, limit_margin, joint, before, at_before, after, at_after);
+            return locate(step, margin, component, before, at_before, after, at_after);
         before = after;
         at_before = at_after;
     }
     return HUGE_VAL;
 }
 
-/* Whether a force that presses a joint may vanish within the step. */
-static int may_vanish(const Step *step, int joint)
+/* Whether the effort that holds a joint may pass its bound on a side within the step. */
+static int may_pass(const Step *step, int joint, int side)
 {
     double low = HUGE_VAL, high = -HUGE_VAL;
+    if (!step->stops.watched[joint])
+        return 0;
     for (int stage = 0; stage <= STAGES; stage++) {
-        low = fmin(low, step->pressed[stage][joint]);
-        high = fmax(high, step->pressed[stage][joint]);
+        const double margin = grip_of(step, joint, step->effort[stage][joint], side);
+        low = fmin(low, margin);
+        high = fmax(high, margin);
     }
-    return !(low >= high - low);
+    return low < HUGE_VAL && !(low >= high - low);
+}
+
+static int may_be_released(const Step *step, int joint)
+{
+    return may_pass(step, joint, -1) || may_pass(step, joint, 1);
 }
 
 /* The polynomial through five equidistant values from 0 to 1. */
@@ -213,7 +202,7 @@ static void fit(const double p[LOOKS + 1], double c[LOOKS + 1])
     c[4] = 256.0 * (fourth / 24.0);
 }
 
-/* Where the polynomial through the looks at a force has minima that may be below zero; how many. */
+/* Where the polynomial through the looks at a margin has minima that may be below zero; how many. */
 static int doubtful_minima(const double p[LOOKS + 1], double x[LOOKS])
 {
     double c[LOOKS + 1], slope[LOOKS], low = p[0], high = p[0];
@@ -231,29 +220,30 @@ static int doubtful_minima(const double p[LOOKS + 1], double x[LOOKS])
     return count;
 }
 
-/* First time before another at which a joint is no longer pressed into its limit, else HUGE_VAL. */
+/* First time before another at which a joint is no longer held, else HUGE_VAL. */
 static double first_release(Step *step, double before)
 {
-    double pressed[LOOKS + 1][N_JOINTS], look[LOOKS * N_JOINTS];
+    double effort[LOOKS + 1][N_JOINTS], look[2 * LOOKS * N_JOINTS];
     int looks = 0, doubt = 0;
     for (int i = 0; i < N_JOINTS; i++)
-        doubt |= step->stops.watched[i] && may_vanish(step, i);
+        doubt |= may_be_released(step, i);
     if (!doubt)
         return HUGE_VAL;
-    memcpy(pressed[0], step->pressed[0], sizeof *pressed);
-    memcpy(pressed[LOOKS], step->pressed[STAGES], sizeof *pressed);
+    memcpy(effort[0], step->effort[0], sizeof *effort);
+    memcpy(effort[LOOKS], step->effort[STAGES], sizeof *effort);
     for (int k = 1; k < LOOKS; k++)
-        press(step, step->size * k / LOOKS, pressed[k]);
-    for (int i = 0; i < N_JOINTS; i++) {
-        double p[LOOKS + 1];
-        for (int k = 0; k <= LOOKS; k++)
-            p[k] = pressed[k][i];
-        if (step->stops.watched[i] && may_vanish(step, i))
-            looks += doubtful_minima(p, look + looks);
-    }
+        find_efforts(step, step->size * k / LOOKS, effort[k]);
+    for (int i = 0; i < N_JOINTS; i++)
+        for (int side = -1; side <= 1; side += 2) {
+            double p[LOOKS + 1];
+            for (int k = 0; k <= LOOKS; k++)
+                p[k] = grip_of(step, i, effort[k][i], side);
+            if (may_pass(step, i, side))
+                looks += doubtful_minima(p, look + looks);
+        }
     for (int k = 1; k <= LOOKS && step->size * (k - 1) / LOOKS < before; k++) {
-        const double a = step->size * (k - 1) / LOOKS, at_a = least_pressed(step, pressed[k - 1]);
-        double b = step->size * k / LOOKS, at_b = least_pressed(step, pressed[k]);
+        const double a = step->size * (k - 1) / LOOKS, at_a = least_grip(step, effort[k - 1]);
+        double b = step->size * k / LOOKS, at_b = least_grip(step, effort[k]);
         for (int j = 0; j < looks; j++) {
             const double passed = look[j] * step->size;
             const double at_look = a < passed && passed < b ? release_margin(step, passed, 0) : 0.0;
@@ -268,19 +258,23 @@ static double first_release(Step *step, double before)
     return HUGE_VAL;
 }
 
-/* Joints that may be past a limit within the step. Returns a bound on the change of singular values. */
-static double sweep(const Step *step, int near[N_JOINTS])
+/* Positions that may be past a limit within the step, and velocities that may be past zero. Returns a bound on
+   the change of singular values. */
+static double sweep(const Step *step, int near[N_STATES])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
-    double fastest[N_JOINTS] = {0}, change = 0.0;
+    double fastest[N_STATES] = {0}, change = 0.0;
     for (int stage = 0; stage <= STAGES; stage++)
-        for (int i = 0; i < N_JOINTS; i++) { /* quicker than fmax, which minds NaN */
+        for (int i = 0; i < N_STATES; i++) { /* quicker than fmax, which minds NaN */
             const double speed = fabs(step->K[stage][i]);
             fastest[i] = speed > fastest[i] ? speed : fastest[i];
         }
     for (int i = 0; i < N_JOINTS; i++) {
         const double q = step->y[i], reach = REACH * step->size * fastest[i];
+        const int slip = step->stops.held[i] ? 0 : step->stops.slip[i];
         near[i] = !step->stops.held[i] && !(q - reach > low[i] && q + reach < high[i]);
+        near[N_JOINTS + i] =
+            slip && !(slip * step->y[N_JOINTS + i] > REACH * step->size * fastest[N_JOINTS + i]);
         change += SWING[i] * reach;
     }
     return change;
@@ -289,31 +283,35 @@ static double sweep(const Step *step, int near[N_JOINTS])
 /* Determine the event at a time within the step, with state y. */
 static void name_event(Step *step, double passed, const double y[N_STATES], Event *event)
 {
-    double a[N_JOINTS], pressed[N_JOINTS] = {0};
-    if (step->stops.any_watched)
-        evaluate(step, y, a, pressed, NULL);
+    const Stops *stops = &step->stops;
+    double a[N_JOINTS], effort[N_JOINTS] = {0};
+    if (stops->any_watched)
+        evaluate(step, y, a, effort, NULL);
     for (int i = 0; i < N_JOINTS; i++) {
-        event->stopped[i] = !step->stops.held[i] && limit_margin(step, passed, i) < 0.0;
-        event->released[i] = step->stops.watched[i] && pressed[i] < 0.0;
+        event->stopped[i] = !stops->held[i] && limit_margin(step, passed, i) < 0.0;
+        event->arrested[i] = !stops->held[i] && stops->slip[i] * y[N_JOINTS + i] < 0.0;
+        event->released[i] =
+            stops->watched[i]
+            && fmin(grip_of(step, i, effort[i], -1), grip_of(step, i, effort[i], 1)) < 0.0;
     }
 }
 
 double first_event(Step *step, int rank_held, Event *event)
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
-    int near[N_JOINTS];
+    int near[N_STATES];
     const double change = sweep(step, near);
     const int near_rank = !(fmax(step->margin, step->margin_new) > change);
     int any = near_rank;
     for (int i = 0; i < N_JOINTS; i++)
-        any |= near[i] || (step->stops.watched[i] && may_vanish(step, i));
+        any |= near[i] || near[N_JOINTS + i] || may_be_released(step, i);
     if (!any)
         return 0.0;
     interpolate(step);
     double first = HUGE_VAL;
-    for (int i = 0; i < N_JOINTS; i++)
+    for (int i = 0; i < N_STATES; i++)
         if (near[i])
-            first = fmin(first, first_crossing(step, i));
+            first = fmin(first, first_crossing(step, i < N_JOINTS ? limit_margin : slip_margin, i));
     first = fmin(first, first_release(step, first));
     if (near_rank)
         first = fmin(first, search(step, singular_margin, rank_held,
@@ -326,8 +324,11 @@ double first_event(Step *step, int rank_held, Event *event)
     interpolated(step, first, reached);
     name_event(step, first, reached, event);
     memcpy(step->y_new, reached, sizeof reached);
-    for (int i = 0; i < N_JOINTS; i++)
+    for (int i = 0; i < N_JOINTS; i++) {
         if (event->stopped[i])
             step->y_new[i] = fmin(fmax(reached[i], low[i]), high[i]);
+        if (event->arrested[i])
+            step->y_new[N_JOINTS + i] = 0.0;
+    }
     return first;
 }

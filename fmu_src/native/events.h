@@ -8,8 +8,8 @@
 /* The joints that rest at the plant's state, by the rules of stops.h. */
 INTERNAL void find_stops(const Plant *plant, Stops *stops);
 
-/* One indicator of each joint's upper limit, then of each lower one, then of the singular values that
-   J⁺ may drop, all but the largest. An event is where one changes its sign. */
+/* One indicator of each joint's upper limit, then of each lower one, of each joint's friction, then of the
+   singular values that J⁺ may drop, all but the largest. An event is where one changes its sign. */
 INTERNAL void event_indicators(const Plant *plant, const Stops *stops,
                                double indicator[N_INDICATORS]);
 

@@ -1,6 +1,7 @@
 /* All of the FMU but the derivatives: its files together, for their functions are static. */
 #include "engine.c"
 #include "dormand_prince.c"
+#include "polynomial.c"
 #include "event_search.c"
 #include "integrator.c"
 #include "noise.c"

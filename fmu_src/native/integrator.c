@@ -1,5 +1,5 @@
-/* Advance the plant over one communication step, with located joint-limit stops. The rules are those of
-   plant/integrator.py.
+/* Advance the plant over one communication step, with located events of stops and friction. The rules are
+   those of plant/integrator.py.
 
    Every communication step begins afresh with the step min(max_step, h).
 
@@ -21,7 +21,9 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
    zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A
    joint that returns once is held for some picoseconds. The rank of J⁺ is held in the same way where it drops
    soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
-   never held, because its J⁺ is unbounded. */
+   never held, because its J⁺ is unbounded. A joint whose friction holds it again at the instant in which it was
+   released, or that stops sooner than FIRST_HOLD after it, is held likewise, for a time of its own: there
+   rounding decides. */
 static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 16777216.0, HOLD_GROWTH = 8.0,
                     HOLD_OF_ALL = 1.0 / 512.0;
 /* Part of CHATTER_TIME that replaces it for the rank, and for joints whose stops have no reaction: near a
@@ -31,16 +33,23 @@ static const double SHORT_CHATTER_TIME = 1.0 / 4096.0;
 /* rad, m and per s: of the difference quotients that tell how fast a joint is. */
 static const double NUDGE = 1e-6;
 
-/* Set out at y, where joints may rest at a limit. */
-static void set_out(Step *step, const int anti_chatter[N_JOINTS], int rank_held)
+/* Set out at y, where joints may rest. */
+static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
 {
-    double *a = step->K[0] + N_JOINTS;
     impact(step->plant, step->y, anti_chatter);
     step->evaluations++;
-    step->stops.rank = acceleration(step->plant, step->y, step->y + N_JOINTS,
-                                    rank_held ? step->stops.rank : ANY_RANK, a, &step->margin);
-    hold(step->plant, step->y, a, anti_chatter, &step->stops, step->pressed[0]);
+    find_regime(step->plant, step->y, kept, rank_held ? step->stops.rank : ANY_RANK, &step->stops,
+                step->K[0] + N_JOINTS, step->effort[0], &step->margin);
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
+}
+
+/* Whether nothing changes any more: inputs are held, and all joints. */
+static int all_rest(const Step *step)
+{
+    int rest = 1;
+    for (int i = 0; i < N_JOINTS; i++)
+        rest &= step->stops.held[i] && isfinite(step->effort[0][i]);
+    return rest;
 }
 
 static int is_finite(const Step *step)
@@ -56,15 +65,15 @@ static int is_finite(const Step *step)
    the largest of |∂q̈ᵢ/∂vᵢ| and |∂q̈ᵢ/∂qᵢ|½. */
 static void find_fastest(Step *step, Failure *failure)
 {
-    double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS], pressed[N_JOINTS];
-    evaluate(step, step->y, a, pressed, NULL);
+    double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS], effort[N_JOINTS];
+    evaluate(step, step->y, a, effort, NULL);
     failure->joint = 0;
     failure->rate = -1.0;
     for (int i = 0; i < N_STATES; i++) {
         const int joint = i % N_JOINTS;
         memcpy(nudged, step->y, sizeof nudged);
         nudged[i] += NUDGE;
-        evaluate(step, nudged, answer, pressed, NULL);
+        evaluate(step, nudged, answer, effort, NULL);
         double rate = fabs(answer[joint] - a[joint]) / NUDGE;
         rate = !isfinite(rate) ? HUGE_VAL : i < N_JOINTS ? sqrt(rate) : rate;
         if (rate > failure->rate) {
@@ -81,6 +90,8 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
 {
     const double max_step = step->plant->value[MAX_STEP];
     double next = fmin(max_step, end - t), growth = MAX_FACTOR;
+    if (all_rest(step))
+        return end;
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
@@ -96,7 +107,7 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
             t += step->size;
             memcpy(step->K[0], step->K[STAGES], sizeof step->K[0]);
             if (step->stops.any_held)
-                memcpy(step->pressed[0], step->pressed[STAGES], sizeof step->pressed[0]);
+                memcpy(step->effort[0], step->effort[STAGES], sizeof step->effort[0]);
             step->margin = step->margin_new;
             next = fmin(max_step, step->size * fmax(MIN_FACTOR, fmin(growth, factor)));
             growth = MAX_FACTOR;
@@ -115,7 +126,7 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
     return NAN;
 }
 
-/* A hold of joints at their limits, or of the rank of J⁺. */
+/* A hold of joints at their limits, of one by its friction, or of the rank of J⁺. */
 typedef struct {
     double until, length;
 } Hold;
@@ -156,9 +167,10 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
     const double short_time = SHORT_CHATTER_TIME * chatter_time;
     const double joint_time = plant->value[RIGID_STOPS] != 0.0 ? chatter_time : short_time;
     double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
-    Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0};
-    int anti_chatter[N_JOINTS] = {0}, chattering[N_JOINTS] = {0};
-    Event event = {{0}, {0}};
+    double slipped[N_JOINTS]; /* when each began to slip */
+    Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0}, stuck[N_JOINTS];
+    int anti_chatter[N_JOINTS] = {0}, chattering[N_JOINTS] = {0}, kept[N_JOINTS];
+    Event event = {{0}, {0}, {0}};
     Step step;
     double t = 0.0;
     step.plant = plant;
@@ -166,7 +178,8 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
     step.stops.rank = N_ROWS;
     memcpy(step.y, &plant->value[Q], sizeof step.y);
     for (int i = 0; i < N_JOINTS; i++) {
-        left[i] = -HUGE_VAL;
+        left[i] = slipped[i] = -HUGE_VAL;
+        stuck[i] = rank;
         if (stopped_at)
             stopped_at[i] = HUGE_VAL;
     }
@@ -177,12 +190,21 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
         hold_joints(&step, chattering, &joints, t, joint_time, chatter_time, anti_chatter);
         if (joints.until > t)
             end = fmin(end, joints.until);
-        set_out(&step, anti_chatter, rank_held);
         for (int i = 0; i < N_JOINTS; i++) {
+            kept[i] = anti_chatter[i] || stuck[i].until > t;
+            end = stuck[i].until > t ? fmin(end, stuck[i].until) : end;
+        }
+        set_out(&step, anti_chatter, kept, rank_held);
+        for (int i = 0; i < N_JOINTS; i++) {
+            const int held_again = step.stops.watched[i] && event.released[i]; /* by rounding */
             if (!step.stops.held[i] && is_at_limit(&step, i))
                 left[i] = t;
-            chattering[i] = step.stops.watched[i] && event.released[i]; /* pressed again, by rounding */
-            again |= chattering[i];
+            if (!step.stops.held[i] && step.stops.slip[i] && step.y[N_JOINTS + i] == 0.0)
+                slipped[i] = t;
+            if (held_again && step.stops.held[i] == STUCK)
+                hold_for_a_while(&stuck[i], t, short_time, chatter_time);
+            chattering[i] = held_again && step.stops.held[i] != STUCK;
+            again |= held_again;
         }
         memset(&event, 0, sizeof event);
         if (again)
@@ -196,6 +218,8 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
         t = until_event(&step, t, end, rank_held, &event, failure);
         for (int i = 0; i < N_JOINTS; i++) {
             chattering[i] = event.stopped[i] && t - left[i] < joint_time;
+            if (event.arrested[i] && t - slipped[i] < FIRST_HOLD * chatter_time)
+                hold_for_a_while(&stuck[i], t, short_time, chatter_time);
             if (stopped_at && event.stopped[i])
                 stopped_at[i] = fmin(stopped_at[i], t);
         }

@@ -6,9 +6,9 @@
 #include <math.h>
 #include <string.h>
 
-#include "event_search.h"
 #include "events.h"
 #include "integrator.h"
+#include "polynomial.h"
 
 /* s: no polynomial follows a longer step. */
 static const double LONGEST_STEP = 1.0;
@@ -96,7 +96,7 @@ int take_passed_stop(Passage *passage, Plant *plant, Stops *stops, double time)
                       && memcmp(passage->y, &plant->value[Q], sizeof passage->y) == 0;
     if (takes) {
         memcpy(&plant->value[Q], passage->reached, sizeof passage->reached);
-        *stops = (Stops){.rank = stops->rank}; /* the state says which joints are at limits */
+        *stops = (Stops){.rank = stops->rank}; /* the state says how joints are */
     }
     passage->joint = 0;
     return takes;

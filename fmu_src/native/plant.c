@@ -1,11 +1,12 @@
 /* The motion that a control law causes:
 
        τ = M̂(q) q̈_cmd + ĥ(q, v), or as the law gives it
-       q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v))
-         = a + M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − (M(q) a + h(q, v)))
+       q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − F s − h(q, v))
+         = a + M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − F s − (M(q) a + h(q, v)))
 
-   for any a. With a = q̈_cmd the dynamics cancel where nothing acts but an unlimited τ, and where
-   M̂ = M and ĥ = h: a payload is in M and h, and in M̂ and ĥ where it is known. */
+   for any a, s being the directions in which joints slip against their friction F. With a = q̈_cmd the
+   dynamics cancel where nothing acts but an unlimited τ, and where M̂ = M and ĥ = h: a payload is in M and
+   h, and in M̂ and ĥ where it is known; the armature is in both. */
 #include "plant.h"
 
 #include <stddef.h>
@@ -60,7 +61,7 @@ static void wanted_effort(const double value[N_VARIABLES], const JointPosition j
 #if COMMANDS_ACCELERATION
     Carrier known;
     body(value, 1, &known);
-    inverse_dynamics(joint, &known, v, given, &value[GRAVITY], tau);
+    inverse_dynamics(joint, &known, &value[ARMATURE], v, given, &value[GRAVITY], tau);
 #else
     (void)value, (void)joint, (void)v;
     memcpy(tau, given, N_JOINTS * sizeof *tau);
@@ -81,7 +82,7 @@ static int may_saturate(const double value[N_VARIABLES], const JointPosition joi
     double bound[N_JOINTS];
     Carrier known;
     body(value, 1, &known);
-    effort_bounds(joint, &known, v, a, &value[GRAVITY], bound);
+    effort_bounds(joint, &known, &value[ARMATURE], v, a, &value[GRAVITY], bound);
     for (int i = 0; i < N_JOINTS; i++)
         if (!(RE(bound[i] * with_rounding) < RE(EFFORT[i])))
             return 1;
@@ -102,15 +103,15 @@ static void add_excess(const double value[N_VARIABLES], const JointPosition join
     if (!knows_all(value)) {
         Carrier carrier;
         body(value, 0, &carrier);
-        inverse_dynamics(joint, &carrier, v, a, &value[GRAVITY], needed);
+        inverse_dynamics(joint, &carrier, &value[ARMATURE], v, a, &value[GRAVITY], needed);
     }
     limit_effort(value, tau);
     for (int i = 0; i < N_JOINTS; i++)
         sum[i] += tau[i] - needed[i];
 }
 
-int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS], int rank,
-                 double a[N_JOINTS], double *margin)
+int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                 const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
 {
     const double *value = plant->value, *force = &value[F_EXT];
     JointPosition joint[N_BODIES];
@@ -130,7 +131,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     for (int i = 0; i < N_JOINTS; i++) {
         if (!accelerates)
             a[i] = 0.0;
-        excess[i] = value[TAU_EXT + i] - DAMPING[i] * v[i];
+        excess[i] = value[TAU_EXT + i] - value[DAMPING + i] * v[i] - value[FRICTION + i] * slip[i];
     }
     if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
         effort_of_force(joint, force, further);
@@ -144,7 +145,7 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     if (acts) {
         Carrier carrier;
         body(value, 0, &carrier);
-        acceleration_of_effort(joint, &carrier, excess, further);
+        acceleration_of_effort(joint, &carrier, &value[ARMATURE], excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
@@ -162,7 +163,7 @@ void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
     for (int k = 0; k < count; k++) {
         double unit[N_JOINTS] = {0};
         unit[joints[k]] = 1.0;
-        acceleration_of_effort(joint, &carrier, unit, columns[k]);
+        acceleration_of_effort(joint, &carrier, &plant->value[ARMATURE], unit, columns[k]);
     }
 }
 #else
@@ -173,7 +174,7 @@ void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double fr
     Carrier carrier;
     place_joints(q, joint);
     body(plant->value, 0, &carrier);
-    hybrid_dynamics(joint, &carrier, free, given, a, reaction);
+    hybrid_dynamics(joint, &carrier, &plant->value[ARMATURE], free, given, a, reaction);
 }
 #endif
 

@@ -13,10 +13,11 @@ typedef struct {
 
 enum { N_STATES = 2 * N_JOINTS }; /* q and v follow each other in the table, their derivatives too */
 
-/* q̈ of the equations of motion at a state, joint limits left out, with a J⁺ of this rank. Returns the
-   rank; the margin, which may be NULL, is negative where the singular values give another. */
+/* q̈ of the equations of motion at a state, with a J⁺ of this rank, of joints that slip in these directions
+   (−1, 1; 0: without friction), all joints at rest being free. Returns the rank; the margin, which may be
+   NULL, is negative where the singular values give another. */
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                          int rank, double a[N_JOINTS], double *margin);
+                          const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin);
 
 /* The outputs x and xd, and quat and omega where there are such, at the plant's state. */
 INTERNAL void compute_position(Plant *plant);

@@ -47,15 +47,16 @@ static int are_integers(const double value[])
     return 1;
 }
 
-/* Check that held and watched flags are 0 or 1; recompute any_*. */
+/* Check that joints rest and slip in a way that there is; recompute any_*. */
 static int are_stops(Stops *stops)
 {
     int sound = stops->rank >= 0 && stops->rank <= N_ROWS;
     stops->any_held = stops->any_watched = 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        const int held = stops->held[i], watched = stops->watched[i];
-        sound = sound && (held == 0 || held == 1) && (watched == 0 || watched == held);
-        stops->any_held |= held;
+        const int held = stops->held[i], watched = stops->watched[i], slip = stops->slip[i];
+        sound = sound && held >= FREE && held <= CLAMPED && (watched == 0 || (watched == 1 && held));
+        sound = sound && slip >= -1 && slip <= 1 && (held == FREE || held == CLAMPED || slip == 0);
+        stops->any_held |= held != FREE;
         stops->any_watched |= watched;
     }
     return sound;

@@ -1,11 +1,13 @@
-/* Joint-limit stops; the rules are those of plant/stops.py. Without a reaction a stop is a clamp: a
-   joint is pressed while its own acceleration points into the limit. Rigid stops act on all joints;
-   with E the unit vectors of joints at a limit, into the range,
+/* Joint-limit stops and friction; the rules are those of plant/stops.py. Without a reaction a stop is a
+   clamp: a joint is pressed while its own acceleration points into the limit. Rigid stops act on all joints,
+   and friction F does. With E the unit vectors of joints at a limit, into the range, and of joints at rest,
 
-       v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0          at an impact
-       q̈ = q̈_free + M⁻¹E λ,      0 ≤ λ ⟂ Eᵀq̈ ≥ 0           while at rest
+       v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0                       at an impact
+       q̈ = q̈_free + M⁻¹λ,        −F ≤ λ ≤ F, at a limit into the range without an upper bound;
+                                 q̈ > 0 only at the lower bound, q̈ < 0 only at the upper one
 
-   Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5. */
+   Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5; Pfeiffer & Glocker,
+   "Multibody Dynamics with Unilateral Contacts", 1996, chapter 5. */
 #include "stops.h"
 
 #include <math.h>
@@ -17,22 +19,25 @@ enum { MOST_PIVOTS = 10000, BLOCK_TRIES = 5 };
 static const double ROUNDING_OF_SUM = 1.0 / 1099511627776.0;
 
 #ifndef IS_COMPLEX
-/* A joint at a limit. */
+/* A joint at a limit or at rest. */
 typedef struct {
-    int there;   /* whether it is */
-    int fixed;   /* whether its stop acts both ways */
-    double side; /* the sign of the way back into the range */
+    int there;        /* whether there are bounds of what acts on it */
+    int fixed;        /* whether that has none, and the joint rests */
+    double side;      /* at a limit: the sign of the way back into the range; else 0 */
+    double low, high; /* the bounds of what acts, an effort or an impulse */
+    int at;           /* once that is known: −1 and 1 where it is at a bound, 0 where the joint rests */
 } Contact;
 
-/* The joints at limits; a joint without a range, and those in anti_chatter, have stops that act both ways. */
-static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int anti_chatter[N_JOINTS],
+/* The joints at limits; a joint without a range, and those in kept, have stops that act both ways. */
+static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int kept[N_JOINTS],
                           Contact contact[N_JOINTS])
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     for (int i = 0; i < N_JOINTS; i++) {
-        contact[i].there = q[i] >= high[i] || q[i] <= low[i];
-        contact[i].fixed = anti_chatter[i] || low[i] == high[i];
-        contact[i].side = q[i] >= high[i] ? -1.0 : 1.0;
+        const double side = q[i] >= high[i] ? -1.0 : q[i] <= low[i] ? 1.0 : 0.0;
+        const Contact own = {.there = side != 0.0, .fixed = kept[i] || low[i] == high[i], .side = side,
+                             .low = side < 0.0 ? -HUGE_VAL : 0.0, .high = side > 0.0 ? HUGE_VAL : 0.0};
+        contact[i] = own;
     }
 }
 
@@ -42,90 +47,164 @@ static int is_pressed(const Contact *contact, double rate)
     return contact->there && (contact->fixed ? rate != 0.0 : contact->side * rate < 0.0);
 }
 
-/* z of the contacts and rate + M⁻¹z: 0 ≤ E z ⟂ E (rate + M⁻¹z) ≥ 0; of those that are fixed
-   rate + M⁻¹z = 0, whichever way z points. All contacts that are wrong change sides at a time; where that
-   does not lessen their number for a while only the last one does, which ends for every positive definite
-   M. Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974. */
-static void complementary(const Plant *plant, const double q[N_JOINTS],
-                          const Contact contact[N_JOINTS], double rate[N_JOINTS],
-                          double z[N_JOINTS])
+static double bound(const Contact *contact)
 {
-    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0};
-    int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0;
-    memset(z, 0, N_JOINTS * sizeof *z);
+    return contact->at < 0 ? contact->low : contact->at > 0 ? contact->high : 0.0;
+}
+
+/* The other state of a contact where what acts, or at a bound the rate, has the wrong sign; else its own. */
+static int mended(const Contact *contact, double acts, double rate, double slack)
+{
+    if (!contact->there || contact->fixed)
+        return contact->at;
+    if (contact->at)
+        return contact->at * rate > slack ? 0 : contact->at;
+    return acts < contact->low - slack ? -1 : acts > contact->high + slack ? 1 : 0;
+}
+
+/* rate + M⁻¹z, where z is within the bounds of the contacts: above 0 only where z is at the lower one, below
+   only at the upper one. All contacts that are wrong change their state at a time; where that does not lessen
+   their number for a while only the last one does, which ends for every positive definite M. Whether it did.
+   Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974. */
+static int complementary(const Plant *plant, const double q[N_JOINTS], Contact contact[N_JOINTS],
+                         double rate[N_JOINTS])
+{
+    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS] = {0}, z[N_JOINTS];
+    int fewest = N_JOINTS + 1, tries = BLOCK_TRIES, any = 0, count = 1, finite = 1, bounded = 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        const int fixed = contact[i].there && contact[i].fixed;
-        free[i] = fixed || is_pressed(&contact[i], rate[i]) ? 0.0 : 1.0;
-        any |= free[i] == 0.0;
+        const int rubs = contact[i].there && contact[i].high > 0.0 && contact[i].low < 0.0;
+        const int rests = (contact[i].there && contact[i].fixed) || rubs || is_pressed(&contact[i], rate[i]);
+        contact[i].at = rests || !contact[i].there ? 0 : contact[i].side > 0.0 ? -1 : 1;
+        free[i] = rests ? 0.0 : 1.0;
+        any |= rests;
+        bounded |= contact[i].there;
+        finite &= isfinite(rate[i]) != 0;
     }
-    for (int pivot = 0; any && pivot < MOST_PIVOTS; pivot++) {
-        int wrong[N_JOINTS], count = 0;
+    for (int pivot = 0; any && finite && count > 0 && pivot < MOST_PIVOTS; pivot++) {
+        int wrong[N_JOINTS], next[N_JOINTS];
         double largest = 0.0;
+        count = 0;
         for (int i = 0; i < N_JOINTS; i++)
-            given[i] = free[i] == 0.0 ? -rate[i] : 0.0;
+            given[i] = free[i] == 0.0 ? -rate[i] : bound(&contact[i]);
         hybrid_motion(plant, q, free, given, change, z);
         for (int i = 0; i < N_JOINTS; i++)
             largest = fmax(largest, free[i] == 0.0 ? fabs(z[i]) : 0.0);
         for (int i = 0; i < N_JOINTS; i++) {
-            const double sign = free[i] == 0.0 ? z[i] : rate[i] + change[i];
             const double size = free[i] == 0.0 ? largest : fabs(rate[i]) + fabs(change[i]);
-            if (contact[i].there && !contact[i].fixed
-                && contact[i].side * sign < -ROUNDING_OF_SUM * size)
+            next[i] = mended(&contact[i], z[i], rate[i] + change[i], ROUNDING_OF_SUM * size);
+            if (next[i] != contact[i].at)
                 wrong[count++] = i;
         }
-        if (count == 0)
-            break;
         tries = count < fewest ? BLOCK_TRIES : tries - 1;
         fewest = count < fewest ? count : fewest;
-        for (int k = tries > 0 ? 0 : count - 1; k < count; k++)
-            free[wrong[k]] = 1.0 - free[wrong[k]];
-        if (pivot == MOST_PIVOTS - 1) /* which no step accepts */
-            change[0] = NAN;
+        for (int k = tries > 0 || count == 0 ? 0 : count - 1; k < count; k++) {
+            contact[wrong[k]].at = next[wrong[k]];
+            free[wrong[k]] = next[wrong[k]] == 0 ? 0.0 : 1.0;
+        }
     }
-    for (int i = 0; i < N_JOINTS; i++) {
+    for (int i = 0; i < N_JOINTS; i++)
         rate[i] = free[i] == 0.0 ? 0.0 : rate[i] + change[i];
-        z[i] = free[i] == 0.0 ? z[i] : 0.0;
-    }
+    return !bounded || (finite && (!any || count == 0));
 }
 
 void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS])
 {
     Contact contact[N_JOINTS];
-    double *v = y + N_JOINTS, impulse[N_JOINTS];
+    double *v = y + N_JOINTS;
     int any = 0;
     find_contacts(plant, y, anti_chatter, contact);
     for (int i = 0; i < N_JOINTS; i++)
         any |= is_pressed(&contact[i], v[i]);
-    if (any && plant->value[RIGID_STOPS] != 0.0)
-        complementary(plant, y, contact, v, impulse);
-    else
+    if (any && plant->value[RIGID_STOPS] != 0.0 && !complementary(plant, y, contact, v))
+        v[0] = NAN; /* which no step accepts */
+    else if (plant->value[RIGID_STOPS] == 0.0)
         for (int i = 0; i < N_JOINTS; i++)
             if (is_pressed(&contact[i], v[i]))
                 v[i] = 0.0;
 }
 
-void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
-          const int anti_chatter[N_JOINTS], Stops *stops, double pressed[N_JOINTS])
+/* Bound what acts on joints at rest by their friction too; that of a clamp which holds in any case, or of a
+   joint without a range, is no matter. */
+static void add_friction(const Plant *plant, const double v[N_JOINTS], Contact contact[N_JOINTS])
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
-    Contact contact[N_JOINTS];
-    double stopped[N_JOINTS], reaction[N_JOINTS] = {0};
-    *stops = (Stops){.rank = stops->rank};
-    find_contacts(plant, y, anti_chatter, contact);
-    for (int i = 0; i < N_JOINTS; i++)
-        contact[i].there &= y[N_JOINTS + i] == 0.0; /* the others move away */
-    memcpy(stopped, a, sizeof stopped);
-    if (rigid)
-        complementary(plant, y, contact, stopped, reaction);
     for (int i = 0; i < N_JOINTS; i++) {
-        const int rests = rigid ? reaction[i] != 0.0 || stopped[i] == 0.0
-                                : contact[i].side * a[i] <= 0.0;
-        stops->held[i] = contact[i].there && (contact[i].fixed || rests);
-        stops->watched[i] = stops->held[i] && !contact[i].fixed;
-        stops->any_held |= stops->held[i];
+        Contact *own = &contact[i];
+        const int clamps = own->side != 0.0 && !rigid;
+        const double friction = clamps && own->fixed ? 0.0 : plant->value[FRICTION + i];
+        own->there = v[i] == 0.0 && (friction > 0.0 || (own->there && rigid)); /* others move away */
+        own->low = (clamps ? 0.0 : own->low) - friction;
+        own->high = (clamps ? 0.0 : own->high) + friction;
+    }
+}
+
+/* Add what the friction of joints that begin to slip does to a, the accelerations without. */
+static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *stops, double a[N_JOINTS])
+{
+    double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS], none[N_JOINTS];
+    int any = 0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        free[i] = 1.0;
+        given[i] = y[N_JOINTS + i] == 0.0 ? -plant->value[FRICTION + i] * stops->slip[i] : 0.0;
+        any |= given[i] != 0.0;
+    }
+    if (any)
+        hybrid_motion(plant, y, free, given, change, none);
+    for (int i = 0; any && i < N_JOINTS; i++)
+        a[i] += change[i];
+}
+
+void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_JOINTS], int rank,
+                 Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin)
+{
+    const int rigid = plant->value[RIGID_STOPS] != 0.0;
+    const double *v = y + N_JOINTS;
+    Contact contact[N_JOINTS];
+    double stopped[N_JOINTS];
+    memset(stops, 0, sizeof *stops);
+    for (int i = 0; i < N_JOINTS; i++)
+        stops->slip[i] = plant->value[FRICTION + i] > 0.0 ? (v[i] > 0.0) - (v[i] < 0.0) : 0;
+    stops->rank = acceleration(plant, y, v, stops->slip, rank, a, margin);
+    find_contacts(plant, y, kept, contact);
+    add_friction(plant, v, contact);
+    memcpy(stopped, a, sizeof stopped);
+    if (!complementary(plant, y, contact, stopped)) {
+        for (int i = 0; i < N_JOINTS; i++)
+            a[i] = NAN; /* which no step accepts */
+        return;
+    }
+    for (int i = 0; i < N_JOINTS; i++) {
+        const Contact *own = &contact[i];
+        const int rests = own->there && stopped[i] == 0.0;
+        const int clamps = !rigid && own->side != 0.0 && v[i] == 0.0 && !rests;
+        if (clamps && (own->fixed || own->side * stopped[i] <= 0.0))
+            stops->held[i] = CLAMPED;
+        else if (rests)
+            stops->held[i] = own->side != 0.0 && rigid ? STOPPED : STUCK;
+        if (own->there && !rests && plant->value[FRICTION + i] > 0.0)
+            stops->slip[i] = -own->at;
+        stops->watched[i] = stops->held[i] && !own->fixed;
+        stops->any_held |= stops->held[i] != FREE;
         stops->any_watched |= stops->watched[i];
     }
-    restrain(plant, stops, y, a, pressed);
+    add_slip(plant, y, stops, a);
+    restrain(plant, stops, y, a, effort);
+}
+
+double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side)
+{
+    const double friction = stops->held[i] == CLAMPED ? 0.0 : plant->value[FRICTION + i];
+    if (stops->held[i] != STUCK && is_above(plant, q, i) == (side < 0))
+        return HUGE_VAL;
+    return friction - side * effort;
+}
+
+double rounding_of(const Stops *stops, const double effort[N_JOINTS])
+{
+    double largest = 0.0;
+    for (int i = 0; i < N_JOINTS; i++)
+        largest = fmax(largest, stops->held[i] ? fabs(effort[i]) : 0.0);
+    return 2.0 * ROUNDING_OF_SUM * largest;
 }
 #endif
 
@@ -134,7 +213,12 @@ int is_above(const Plant *plant, double q, int i)
     return RE(plant->value[Q_MAX + i] - q) <= RE(q - plant->value[Q_MIN + i]);
 }
 
-/* Rigid stops take the accelerations of held joints: their reactions. */
+/* What holds joints by a reaction takes their accelerations. */
+static int reacts(const Stops *stops, int i)
+{
+    return stops->held[i] == STUCK || stops->held[i] == STOPPED;
+}
+
 #ifdef IS_COMPLEX
 /* By the columns of M⁻¹, which have derivatives. */
 static void add_reactions(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
@@ -143,7 +227,7 @@ static void add_reactions(const Plant *plant, const Stops *stops, const double q
     double columns[N_JOINTS][N_JOINTS], A[N_JOINTS][N_JOINTS + 1];
     int held[N_JOINTS], n = 0;
     for (int i = 0; i < N_JOINTS; i++)
-        if (stops->held[i])
+        if (reacts(stops, i))
             held[n++] = i;
     inverse_mass(plant, q, n, held, columns);
     for (int r = 0; r < n; r++) {
@@ -172,8 +256,8 @@ static void add_reactions(const Plant *plant, const Stops *stops, const double q
 {
     double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS];
     for (int i = 0; i < N_JOINTS; i++) {
-        free[i] = stops->held[i] ? 0.0 : 1.0;
-        given[i] = stops->held[i] ? -a[i] : 0.0;
+        free[i] = reacts(stops, i) ? 0.0 : 1.0;
+        given[i] = reacts(stops, i) ? -a[i] : 0.0;
     }
     hybrid_motion(plant, q, free, given, change, reaction);
     for (int i = 0; i < N_JOINTS; i++)
@@ -182,26 +266,26 @@ static void add_reactions(const Plant *plant, const Stops *stops, const double q
 #endif
 
 void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS], double a[N_JOINTS],
-              double pressed[N_JOINTS])
+              double effort[N_JOINTS])
 {
-    const int rigid = plant->value[RIGID_STOPS] != 0.0;
-    double reaction[N_JOINTS];
+    int any = 0;
     if (!stops->any_held)
         return;
-    if (rigid)
-        add_reactions(plant, stops, q, a, reaction);
+    for (int i = 0; i < N_JOINTS; i++)
+        any |= reacts(stops, i);
+    if (any)
+        add_reactions(plant, stops, q, a, effort);
     for (int i = 0; i < N_JOINTS; i++)
         if (stops->held[i]) {
-            const double outwards = is_above(plant, q[i], i) ? 1.0 : -1.0;
-            pressed[i] = outwards * (rigid ? -reaction[i] : a[i]);
+            effort[i] = reacts(stops, i) ? effort[i] : -a[i];
             a[i] = 0.0;
         }
 }
 
 void compute_rates(Plant *plant, const Stops *stops)
 {
-    double *value = plant->value, pressed[N_JOINTS];
+    double *value = plant->value, effort[N_JOINTS];
     memcpy(&value[DER_Q], &value[V], N_JOINTS * sizeof *value);
-    acceleration(plant, &value[Q], &value[V], stops->rank, &value[DER_V], NULL);
-    restrain(plant, stops, &value[Q], &value[DER_V], pressed);
+    acceleration(plant, &value[Q], &value[V], stops->slip, stops->rank, &value[DER_V], NULL);
+    restrain(plant, stops, &value[Q], &value[DER_V], effort);
 }

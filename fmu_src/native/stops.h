@@ -5,10 +5,15 @@
 #include "internal.h"
 #include "plant.h"
 
-/* The regime of the motion, which only an event changes: joints at rest at a limit, those of them that
-   leave it when they are no longer pressed, and the rank of J⁺. */
+/* How a joint rests: by its friction, at a limit by a stop that pushes (with its friction), or at a limit by a
+   clamp, which has no reaction on the other joints. */
+typedef enum { FREE, STUCK, STOPPED, CLAMPED } Rest;
+
+/* The regime of the motion, which only an event changes: how joints rest, those of them that are free once the
+   effort that holds them is beyond its bounds, the directions (−1, 1) in which joints slip against their
+   friction, and the rank of J⁺. */
 typedef struct {
-    int held[N_JOINTS], watched[N_JOINTS];
+    int held[N_JOINTS], watched[N_JOINTS], slip[N_JOINTS];
     int any_held, any_watched;
     int rank;
 } Stops;
@@ -19,18 +24,25 @@ typedef struct {
    finite time (Zeno). */
 INTERNAL void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOINTS]);
 
-/* Find the joints that rest at y after an impact; a, q̈ without stops, becomes q̈ with them. Joints in
-   anti_chatter stay at their limits whatever the contact force. pressed is that of restrain. */
-INTERNAL void hold(const Plant *plant, const double y[N_STATES], double a[N_JOINTS],
-                   const int anti_chatter[N_JOINTS], Stops *stops, double pressed[N_JOINTS]);
+/* Find the regime at y after an impact, with a J⁺ of this rank; a is q̈ in it, effort that of restrain, margin
+   that of acceleration. Joints in kept that are at rest stay there whatever holds them. */
+INTERNAL void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_JOINTS], int rank,
+                          Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin);
+
+/* How far the effort that holds a joint is within its bounds: on the side of −1 or of 1, HUGE_VAL where that has
+   no bound; a joint that is watched is free where one is negative. */
+INTERNAL double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side);
+
+/* A bound on the rounding of these efforts. */
+INTERNAL double rounding_of(const Stops *stops, const double effort[N_JOINTS]);
 #endif
 
 /* Whether a joint is nearer to its upper limit than to its lower one. */
 INTERNAL int is_above(const Plant *plant, double q, int i);
 
-/* Make the acceleration of held joints 0; how each is pressed into its limit. */
+/* Make the acceleration of held joints 0; the effort that holds each, of a clamp the negative acceleration. */
 INTERNAL void restrain(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
-                       double a[N_JOINTS], double pressed[N_JOINTS]);
+                       double a[N_JOINTS], double effort[N_JOINTS]);
 
 /* The derivatives of the plant's state, joints that rest being held. */
 INTERNAL void compute_rates(Plant *plant, const Stops *stops);

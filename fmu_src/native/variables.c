@@ -276,8 +276,9 @@ Status directional_derivative(void *component, const Reference unknown[], size_t
     for (size_t i = 0; i < n_given; i++)
         for (int k = PLACE[given[i]]; k < PLACE[given[i] + 1]; k++)
             change[k] += *seed++;
-    differentiate(instance->state.plant.value, instance->state.stops.held,
-                  instance->state.stops.rank, wants, change, derivative);
+    const Stops *stops = &instance->state.stops;
+    differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants, change,
+                  derivative);
     for (size_t i = 0; i < n_unknown; i++)
         if ((name = culprit(&unknown[i], 1, &derivative[PLACE[unknown[i]]])))
             return report(instance, DISCARD, "%s: that of %s is not finite", call_name(call), name);
@@ -311,8 +312,9 @@ Status fmi3GetAdjointDerivative(void *component, const Reference unknown[], size
         for (int k = PLACE[given[i]]; k < PLACE[given[i] + 1]; k++) {
             double change[FIRST_PARAMETER] = {0}, derivative[FIRST_PARAMETER];
             change[k] = 1.0;
-            differentiate(instance->state.plant.value, instance->state.stops.held,
-                          instance->state.stops.rank, wants, change, derivative);
+            const Stops *stops = &instance->state.stops;
+            differentiate(instance->state.plant.value, stops->held, stops->slip, stops->rank, wants,
+                          change, derivative);
             sum[k] = 0.0;
             for (int u = FIRST_OUTPUT; u < END_OF_RATES; u++)
                 if (weight[u] != 0.0)

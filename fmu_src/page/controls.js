@@ -1,7 +1,8 @@
 /** The panel: what the FMU has to set, a readout, and buttons. All text is text. */
 
 const GAINS = ["Kp", "Kd", "Kp_rot", "Kd_rot", "Kn"];
-const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start"];
+const JOINTS = ["friction", "damping", "armature"];
+const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start", ...JOINTS];
 const PER_AXIS = ["x_des", "xd_des", "xdd_des"];
 const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["target or command", true, ["x_des", "q_des", "tau_cmd"]],
@@ -9,6 +10,7 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["disturbance and payload", false, ["f_ext", "tau_ext", "payload", "payload_com", "payload_known"]],
   ["feedforward", false, ["quat_des", "xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
   ["parameters (a change restarts the simulation)", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
+  ["joints (a change restarts the simulation)", false, JOINTS],
 ]);
 
 /** An element with text, and what it holds. */
@@ -106,6 +108,7 @@ class Controls {
     if (group === "q_des" || group === "q_start") return [joint.low ?? -Math.PI, joint.high ?? Math.PI];
     if (group === "tau_cmd" || group === "tau_ext") return [-(joint.effort ?? strongest), joint.effort ?? strongest];
     if (group === "payload") return [0, force / 9.81];
+    if (JOINTS.includes(group)) return [0, Math.max(4 * value, group === "armature" ? 1 : 0.2 * (joint.effort ?? strongest))];
     const most = { f_ext: force, payload_com: 0.3, gravity: 20, quat_des: 1 }[group] ?? 5;
     return [-most, most];
   }

@@ -3,6 +3,8 @@
 
 #include "fmu.c"
 
+static const double NO_ARMATURE[N_JOINTS] = {0};
+
 FMI2_Export void probe_task(const double q[], const double v[], double x[], double J[],
                             double drift[])
 {
@@ -44,7 +46,7 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, v, &carrier);
-    inverse_dynamics(joint, &carrier, v, a, gravity, tau);
+    inverse_dynamics(joint, &carrier, NO_ARMATURE, v, a, gravity, tau);
 }
 
 FMI2_Export void probe_effort_bounds(const double q[], const double v[], const double a[],
@@ -54,7 +56,7 @@ FMI2_Export void probe_effort_bounds(const double q[], const double v[], const d
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, v, &carrier);
-    effort_bounds(joint, &carrier, v, a, gravity, bound);
+    effort_bounds(joint, &carrier, NO_ARMATURE, v, a, gravity, bound);
 }
 
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])
@@ -63,7 +65,7 @@ FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau
     Carrier carrier;
     place_joints(q, joint);
     load_carrier(0.0, q, &carrier);
-    acceleration_of_effort(joint, &carrier, tau, a);
+    acceleration_of_effort(joint, &carrier, NO_ARMATURE, tau, a);
 }
 
 #ifdef HAS_RCOND
@@ -78,25 +80,26 @@ FMI2_Export void probe_stopped(double value[], const int anti_chatter[], double 
 {
     const Plant *plant = (Plant *)value;
     Stops stops;
-    double pressed[N_JOINTS];
+    double effort[N_JOINTS];
     impact(plant, &value[Q], anti_chatter);
-    acceleration(plant, &value[Q], &value[V], ANY_RANK, a, NULL);
-    hold(plant, &value[Q], a, anti_chatter, &stops, pressed);
+    find_regime(plant, &value[Q], anti_chatter, ANY_RANK, &stops, a, effort, NULL);
     for (int i = 0; i < N_JOINTS; i++)
-        held[i] = stops.held[i];
+        held[i] = stops.held[i] != FREE;
 }
 
 FMI2_Export void probe_acceleration(const double value[], double a[])
 {
     Plant plant;
     memcpy(plant.value, value, sizeof plant.value);
-    acceleration(&plant, &plant.value[Q], &plant.value[V], ANY_RANK, a, NULL);
+    const int slip[N_JOINTS] = {0};
+    acceleration(&plant, &plant.value[Q], &plant.value[V], slip, ANY_RANK, a, NULL);
 }
 
 static int rank_of(const double value[])
 {
     double a[N_JOINTS];
-    return acceleration((const Plant *)value, &value[Q], &value[V], ANY_RANK, a, NULL);
+    const int slip[N_JOINTS] = {0};
+    return acceleration((const Plant *)value, &value[Q], &value[V], slip, ANY_RANK, a, NULL);
 }
 
 static Failure failure;
@@ -121,10 +124,10 @@ FMI2_Export void probe_outputs(double value[])
 }
 
 /* How all computed variables change where q, v and inputs do. */
-FMI2_Export void probe_differentiate(const double value[], const int held[], const double change[],
-                                     double derivative[])
+FMI2_Export void probe_differentiate(const double value[], const int held[], const int slip[],
+                                     const double change[], double derivative[])
 {
-    differentiate(value, held, rank_of(value), WANTS_X | WANTS_TAU | WANTS_RATES, change, derivative);
+    differentiate(value, held, slip, rank_of(value), WANTS_X | WANTS_TAU | WANTS_RATES, change, derivative);
     for (int i = 0; i < N_JOINTS; i++) {
         derivative[Q + i] = change[Q + i];
         derivative[V + i] = change[V + i];
@@ -132,10 +135,11 @@ FMI2_Export void probe_differentiate(const double value[], const int held[], con
 }
 
 /* All computed variables. */
-FMI2_Export void probe_compute(double value[], const int held[])
+FMI2_Export void probe_compute(double value[], const int held[], const int slip[])
 {
     Stops stops = {.any_held = 1, .rank = rank_of(value)};
     memcpy(stops.held, held, sizeof stops.held);
+    memcpy(stops.slip, slip, sizeof stops.slip);
     compute_position((Plant *)value);
     compute_effort((Plant *)value, ANY_RANK);
     compute_rates((Plant *)value, &stops);

@@ -33,6 +33,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
         ]
     )
     v, a, force = _variables("v", n), _variables("a", n), _variables("force", 3)
+    armature, gravity = _variables("armature", n), _variables("gravity", 3)
     x, R, J, drift = task_frame(constants, joint, v)
     rows = ["xyz".index(axis) for axis in robot.axes]
     frame = _elements("task->x", x[rows])
@@ -42,13 +43,10 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     frame |= _elements("task->J", J[rows]) | _elements("task->drift", drift[rows])
     frame |= _elements("task->xd", J[rows].dot(v))
     bodies, load = _loaded(constants)
-    gravity = _variables("gravity", 3)
-    effort = inverse_dynamics(constants, bodies, joint, v, a, gravity)
-    bounds = np.abs(effort), effort_bounds(constants, bodies, joint, v, a, gravity)
+    effort = inverse_dynamics(constants, bodies, joint, armature, v, a, gravity)
+    bounds = np.abs(effort), effort_bounds(constants, bodies, joint, armature, v, a, gravity)
     in_all = "const JointPosition joint[N_BODIES]"
-    motion = (
-        f"{in_all}, const Carrier *carrier, const double v[N_JOINTS], const double a[N_JOINTS], const double gravity[3]"
-    )
+    motion = f"{in_all}, {INERTIAS}, const double v[N_JOINTS], const double a[N_JOINTS], const double gravity[3]"
     functions = {
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
         f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements("tau", J[:3].T.dot(force)),
@@ -63,11 +61,13 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     texts += [
         c_function(f"void {head}", results, varied(results.values(), held=HELD)) for head, results in functions.items()
     ]
-    texts += _forward_dynamics(constants, bodies, joint, in_all)
+    texts += _forward_dynamics(constants, bodies, joint, armature, in_all)
     return "\n".join([MECHANISM, *texts])
 
 
-def _forward_dynamics(robot: JointTree, bodies: Sequence[Body], joint: Array, in_all: str) -> list[str]:
+def _forward_dynamics(
+    robot: JointTree, bodies: Sequence[Body], joint: Array, armature: Array, in_all: str
+) -> list[str]:
     """Return forward dynamics, and those with held joints, by factors of M or by recursion.
 
     Whichever takes fewer operations.
@@ -77,20 +77,18 @@ def _forward_dynamics(robot: JointTree, bodies: Sequence[Body], joint: Array, in
     split = free * given, free, given - free * given
     ways, hybrids = [], []
     if n == len(robot.parent):
-        ways.append(solve_by_recursion(robot, bodies, joint, tau))
-        hybrids.append(hybrid_by_recursion(robot, bodies, joint, *split))
+        ways.append(solve_by_recursion(robot, bodies, joint, armature, tau))
+        hybrids.append(hybrid_by_recursion(robot, bodies, joint, armature, *split))
     if not ways or operations_of_factors(robot.parent) < operations(ways[0]):
-        M = mass_matrix(robot, bodies, joint)
+        M = mass_matrix(robot, bodies, joint, armature)
         ways.insert(0, solve_by_factors(M, tau))
         hybrids.insert(0, hybrid_by_factors(M, *split))
     solution = min(ways, key=operations)
-    inertial = inverse_dynamics(robot, bodies, joint, np.zeros(n), a, np.zeros(3))
+    inertial = inverse_dynamics(robot, bodies, joint, armature, np.zeros(n), a, np.zeros(3))
     hybrid = min(hybrids, key=lambda both: operations([*both[0], *both[1]]))
-    solve = (
-        f"void acceleration_of_effort({in_all}, const Carrier *carrier, const double tau[N_JOINTS], double a[N_JOINTS])"
-    )
+    solve = f"void acceleration_of_effort({in_all}, {INERTIAS}, const double tau[N_JOINTS], double a[N_JOINTS])"
     hold = (
-        f"void hybrid_dynamics({in_all}, const Carrier *carrier, const double free[N_JOINTS],"
+        f"void hybrid_dynamics({in_all}, {INERTIAS}, const double free[N_JOINTS],"
         " const double given[N_JOINTS], double a[N_JOINTS], double reaction[N_JOINTS])"
     )
     held = c_function(hold, _elements("a", hybrid[0]) | _elements("reaction", hybrid[1]))
@@ -107,7 +105,8 @@ MECHANISM = """\
 
 #include <math.h>
 """
-HELD = ("carrier->", "gravity[", "payload", "offset[")
+INERTIAS = "const Carrier *carrier, const double armature[N_JOINTS]"
+HELD = ("carrier->", "armature[", "gravity[", "payload", "offset[")
 """Parameters, along which there are no derivatives."""
 LOWER = np.tril_indices(3)
 

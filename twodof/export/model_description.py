@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ..plant.robot import Robot
@@ -30,25 +30,7 @@ from .flavours import Flavour
 from .fmi3_files import xml_text
 from .fmu_options import FmuOptions
 from .native import INDICATORS
-
-UNITS: dict[str, tuple[str, dict[str, int]]] = {
-    "m": ("Length", {"m": 1}),
-    "m/s": ("Velocity", {"m": 1, "s": -1}),
-    "m/s2": ("Acceleration", {"m": 1, "s": -2}),
-    "rad": ("Angle", {"rad": 1}),
-    "rad/s": ("AngularVelocity", {"rad": 1, "s": -1}),
-    "rad/s2": ("AngularAcceleration", {"rad": 1, "s": -2}),
-    "N": ("Force", {"kg": 1, "m": 1, "s": -2}),
-    "N.m": ("Torque", {"kg": 1, "m": 2, "s": -2}),
-    "s": ("Time", {"s": 1}),
-    "kg": ("Mass", {"kg": 1}),
-    "1/s": ("", {"s": -1}),
-    "1/s2": ("", {"s": -2}),
-}
-"""Quantity, by the names of Modelica's standard library, and exponents of the SI base units; all factors are 1.
-Gains are no quantity."""
-DISPLAY = {"rad": ("deg", 180.0 / math.pi)}
-"""Units for people, and how many of them are one."""
+from .units import UNITS, add_units
 
 LOG_CATEGORIES = {
     "logStatusWarning": "Warnings",
@@ -72,7 +54,7 @@ SMALL = ("rtol", "atol", "max_step")
 EFFORTS = ("tau", "tau_cmd", "tau_ext")
 START = ("q_start", "q_min", "q_max")
 """Variables on which q depends at the start."""
-IMPACT = (*START, "v_start", "payload", "payload_com", "rigid_stops")
+IMPACT = (*START, "v_start", "payload", "payload_com", "armature", "rigid_stops")
 """Variables on which v depends at the start, where it may point into a stop."""
 OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
 Dependencies = tuple[Sequence[str], str] | tuple[Sequence[str], str, Sequence[str]]
@@ -106,7 +88,7 @@ def model_description(
         attributes["numberOfEventIndicators"] = str(count_event_indicators(robot, options.control))
     root = ET.Element("fmiModelDescription", attributes)
     _interfaces(root, options.name, flavour)
-    _units(root, {variable.unit for variable in table}, fmi)
+    add_units(root, {variable.unit for variable in table}, fmi)
     categories = ET.SubElement(root, "LogCategories")
     for category, description in LOG_CATEGORIES.items():
         ET.SubElement(categories, "Category", name=category, description=description)
@@ -146,29 +128,6 @@ def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
             files = ET.SubElement(element, "SourceFiles")
             for name in COMPILED:
                 ET.SubElement(files, "File", name=name)
-
-
-def _units(root: ET.Element, used: Collection[str], fmi: int) -> None:
-    definitions = ET.SubElement(root, "UnitDefinitions")
-    for name, (_, exponents) in UNITS.items():
-        if name in used:
-            unit = ET.SubElement(definitions, "Unit", name=name)
-            base = {key: str(exponent) for key, exponent in exponents.items()}
-            ET.SubElement(unit, "BaseUnit", {**base, "factor": "1"})
-            if name in DISPLAY:
-                display, factor = DISPLAY[name]
-                ET.SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
-    definitions = ET.SubElement(root, "TypeDefinitions")
-    for name, (quantity, _) in UNITS.items():
-        if name in used and quantity:
-            attributes = {"quantity": quantity, "unit": name}
-            if name in DISPLAY:
-                attributes["displayUnit"] = DISPLAY[name][0]
-            if fmi == 2:
-                simple = ET.SubElement(definitions, "SimpleType", name=quantity)
-                ET.SubElement(simple, "Real", attributes)
-            else:
-                ET.SubElement(definitions, "Float64Type", {"name": quantity, **attributes})
 
 
 def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
@@ -308,7 +267,7 @@ def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, 
         "tau": ((*IMPACT, *law, *control.inputs), EVERY),
         "q_meas": ((*START, "q_resolution", "q_noise", "seed"), OWN),
         "v_meas": (IMPACT, EVERY, ("v_noise", "seed", "v_from_q")),
-        "der_v": ((*IMPACT, *law, "control_period", *inputs), EVERY),
+        "der_v": ((*IMPACT, "friction", "damping", *law, "control_period", *inputs), EVERY),
     }
     if control.commands == "effort":
         during["tau"] = (control.inputs, OWN)

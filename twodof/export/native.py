@@ -46,9 +46,7 @@ def model_header(
         _table("double START", (0.0 if v.start is None else float(v.start) for v in table)),
         _ranges(groups),
         _table("char *const JOINT_NAME", robot.joints),
-        "/* Effort limits, HUGE_VAL where there is none, and viscous damping of the joints. */\n"
-        + _table("double EFFORT", robot.effort),
-        _table("double DAMPING", robot.damping),
+        "/* Effort limits of the joints, HUGE_VAL where there is none. */\n" + _table("double EFFORT", robot.effort),
         "/* Bounds on the change of singular values, as parts of the largest, with each joint. */\n"
         + _table("double SWING", robot.swing()),
         "#endif\n",

@@ -66,7 +66,9 @@ def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, 
     return x, R.dot(robot.frame_R), columns.T.dot(robot.G), np.array([*a, *alpha])
 
 
-def inverse_dynamics(robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array) -> Array:
+def inverse_dynamics(
+    robot: JointTree, body: Sequence[Body], joint: Array, armature: Array, v: Array, a: Array, gravity: Array
+) -> Array:
     """Return τ = M(q) a + h(q, v): motion outwards, forces inwards.
 
         f = m a + α × d + ω × (ω × d),   n = I α + ω × I ω + d × a     with d = m c
@@ -105,11 +107,13 @@ def inverse_dynamics(robot: JointTree, body: Sequence[Body], joint: Array, v: Ar
             f = rotations[i].dot(force[i])
             force[parent] = force[parent] + f
             moment[parent] = moment[parent] + rotations[i].dot(moment[i]) + cross(origins[i], f)
-    effort: Array = robot.G.T.dot(tau)
+    effort: Array = robot.G.T.dot(tau) + armature * a
     return effort
 
 
-def effort_bounds(robot: JointTree, body: Sequence[Body], joint: Array, v: Array, a: Array, gravity: Array) -> Array:
+def effort_bounds(
+    robot: JointTree, body: Sequence[Body], joint: Array, armature: Array, v: Array, a: Array, gravity: Array
+) -> Array:
     """Return bounds of |τ| of ``inverse_dynamics``, by its recursion with norms in place of vectors.
 
     |x × y| ≤ |x| |y|, |I x| ≤ ‖I‖ |x| with Frobenius' norm, |x + y| ≤ |x| + |y|.
@@ -136,7 +140,7 @@ def effort_bounds(robot: JointTree, body: Sequence[Body], joint: Array, v: Array
             force[parent] = force[parent] + force[i]
             moment[parent] = moment[parent] + moment[i] + force[i] * reach[i]
     tau = np.where(robot.prismatic, force, moment)
-    bound: Array = np.abs(robot.G).T.dot(tau)
+    bound: Array = np.abs(robot.G).T.dot(tau) + armature * np.abs(a)
     return bound
 
 
@@ -144,8 +148,8 @@ def _length(a: Array) -> Any:
     return np.sqrt(a.dot(a))
 
 
-def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array) -> Array:
-    """Return M(q), n × n, by the composite-rigid-body algorithm.
+def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array, armature: Array) -> Array:
+    """Return M(q), n × n, with the armature on its diagonal, by the composite-rigid-body algorithm.
 
     Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2.
     """
@@ -166,10 +170,10 @@ def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array) -> Array:
             k = robot.parent[k]
         if robot.parent[i] >= 0:
             composite[robot.parent[i]] += b.moved(rotations[i], origins[i])
-    if np.array_equal(robot.G, np.eye(n)):
-        return M  # products with G are n³
-    reduced: Array = robot.G.T.dot(M).dot(robot.G)
-    return reduced
+    if not np.array_equal(robot.G, np.eye(n)):  # products with G are n³
+        M = robot.G.T.dot(M).dot(robot.G)
+    M[np.diag_indices_from(M)] += armature
+    return M
 
 
 def operations_of_factors(parent: Sequence[int]) -> int:
@@ -185,10 +189,10 @@ def solve_by_factors(M: Array, tau: Array) -> Array:
     return hybrid_by_factors(M, tau, np.ones(len(tau)), np.zeros(len(tau)))[0]
 
 
-def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, tau: Array) -> Array:
+def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, armature: Array, tau: Array) -> Array:
     """Return M⁻¹τ by articulated bodies; no joint may mimic another."""
     n = len(tau)
-    return hybrid_by_recursion(robot, body, joint, tau, np.ones(n), np.zeros(n))[0]
+    return hybrid_by_recursion(robot, body, joint, armature, tau, np.ones(n), np.zeros(n))[0]
 
 
 def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[Array, Array]:
@@ -219,12 +223,12 @@ def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[A
 
 
 def hybrid_by_recursion(
-    robot: JointTree, body: Sequence[Body], joint: Array, tau: Array, free: Array, held: Array
+    robot: JointTree, body: Sequence[Body], joint: Array, armature: Array, tau: Array, free: Array, held: Array
 ) -> tuple[Array, Array]:
     """Return a and λ as ``hybrid_by_factors`` does, by articulated bodies without mimic joints.
 
         n = A α + B a,  f = Bᵀ α + C a                    what a joint feels, inwards
-        U = I s,  D = sᵀ U,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
+        U = I s,  D = sᵀ U + armature,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
         q̈ = (u − Uᵀ a)/D                                                 outwards
 
     Without velocities and gravity. Through a joint that is not free all of I passes, and U q̈.
@@ -237,17 +241,18 @@ def hybrid_by_recursion(
     C = [np.eye(3) * b.mass for b in body]
     bias = [(np.zeros(3), np.zeros(3))] * n
     U: list[tuple[Array, Array]] = [bias[0]] * n
-    u, inverse = [0.0] * n, [0.0] * n
+    u, D, inverse = [0.0] * n, [0.0] * n, [0.0] * n
     for i in reversed(range(n)):
         slides, parent = robot.prismatic[i], robot.parent[i]
         angular, linear = (B[i][:, 2], C[i][:, 2]) if slides else (A[i][:, 2], B[i][2])
         U[i] = angular, linear
-        inverse[i] = free[i] / U[i][slides][2]
+        D[i] = U[i][slides][2] + armature[i]
+        inverse[i] = free[i] / D[i]
         u[i] = tau[i] - bias[i][slides][2]
         push = u[i] * inverse[i] + held[i]
         if parent < 0:
             continue
-        left = _passed_on((A[i], B[i], C[i]), slides, inverse[i], free[i])
+        left = _passed_on((A[i], B[i], C[i]), slides, inverse[i], 1.0 - free[i] + armature[i] * inverse[i])
         b_angular, b_linear = bias[i]
         f = rotations[i].dot(b_linear + linear * push)
         t = rotations[i].dot(b_angular + angular * push) + cross(origins[i], f)
@@ -264,14 +269,16 @@ def hybrid_by_recursion(
         alpha = rotations[i].T.dot(alpha)
         rest = u[i] - U[i][0].dot(alpha) - U[i][1].dot(linear)
         a[i] = rest * inverse[i] + held[i]
-        reaction[i] = U[i][robot.prismatic[i]][2] * a[i] - rest
+        reaction[i] = D[i] * a[i] - rest
         along = np.array([0.0, 0.0, 1.0]) * a[i]
         motion.append((alpha, linear + along) if robot.prismatic[i] else (alpha + along, linear))
     return a, reaction
 
 
-def _passed_on(blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, free: Any) -> tuple[Array, Array, Array]:
-    """Return I − U Uᵀ/D of a body; along its axis a free joint transmits nothing, another everything."""
+def _passed_on(
+    blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, passed: Any
+) -> tuple[Array, Array, Array]:
+    """Return I − U Uᵀ/D of a body; along its axis a free joint transmits its armature's part, another everything."""
     A, B, C = blocks
     angular, linear = (B[:, 2], C[:, 2]) if slides else (A[:, 2], B[2])
     left = (
@@ -279,7 +286,6 @@ def _passed_on(blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, f
         B - np.outer(angular * inverse, linear),
         C - np.outer(linear * inverse, linear),
     )
-    passed = 1.0 - free
     if slides:
         left[1][:, 2] = B[:, 2] * passed
         left[2][:, 2] = left[2][2] = C[:, 2] * passed

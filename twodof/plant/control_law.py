@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from .integrator import Ratios, Response
+from .equations import Law, Ratios
 from .mechanism import Mechanism
 from .robot import Robot
 
@@ -42,5 +42,5 @@ class ControlledPlant:
 class ControlLaw(Protocol):
     """A module with a control law."""
 
-    def command(self, plant: ControlledPlant, /) -> tuple[Response, Ratios]:
+    def command(self, plant: ControlledPlant, /) -> tuple[Law, Ratios]:
         """Return q̈_cmd or τ as a function of the state, inputs held, and the singular values of its Jacobian."""

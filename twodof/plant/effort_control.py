@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from math import inf
 
 from .control_law import ControlledPlant
-from .integrator import Array, Ratios, Response
+from .equations import Array, Law, Ratios
 
 
-def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
+def command(plant: ControlledPlant) -> tuple[Law, Ratios]:
     """Return τ as a function of the state, n values, inputs held; this law has no J⁺."""
     return given_effort(plant.tau_cmd)
 
 
-def given_effort(tau: Sequence[float]) -> tuple[Response, Ratios]:
+def given_effort(tau: Sequence[float]) -> tuple[Law, Ratios]:
     """Return a law that gives an effort, n values, at any state."""
     tau = list(tau)
 

@@ -1,8 +1,9 @@
 """Locate the first event within an integration step, on its dense output.
 
-An event is where a margin becomes negative: the distance of a joint to a limit, the force that presses a joint at
-rest into its limit, or the margin of the rank of J⁺. Positions are polynomials, whose turning points are known; the
-other margins are looked at as often as their rates of change ask for.
+An event is where a margin becomes negative: the distance of a joint to a limit, the velocity of one that slips, the
+distance of the effort that holds a joint from its bounds, or the margin of the rank of J⁺. Positions and velocities
+are polynomials, whose turning points are known; the other margins are looked at as often as their rates of change ask
+for.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ REACH, PACE = 1.66, 3.72
 """Bounds on Dormand and Prince's interpolant, which weighs the derivatives of the stages: the
 largest sum of the weights' magnitudes, and that of their rates."""
 LOOKS, DOUBT = 4, 0.25
-"""A force that presses a joint falls below what the stages show of it by less than its range there.
+"""The margin of an effort falls below what the stages show of it by less than its range there.
 It is looked at this often in a step where that may be below zero, and again at a minimum of the
 polynomial through these looks that is lower than so much of their range."""
 HALVINGS = 7
@@ -35,10 +36,12 @@ class Event:
 
     Attributes:
         stopped: joints that reached a limit.
-        released: joints that are no longer pressed into theirs.
+        arrested: joints that slipped and have no velocity left.
+        released: joints that are no longer held.
     """
 
     stopped: list[int] = field(default_factory=list)
+    arrested: list[int] = field(default_factory=list)
     released: list[int] = field(default_factory=list)
 
 
@@ -101,34 +104,20 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: f
     return b
 
 
-def first_crossing(
-    state: Callable[[float], Sequence[float]],
-    joint: int,
-    limits: tuple[float, float],
-    slope: Sequence[float],
-    step: float,
-) -> float:
-    """Return the first time at which a joint is past a limit, infinity where there is none.
+def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float:
+    """Return the first time at which a position is past a limit or a velocity past 0, infinity where there is none.
 
     Args:
-        state: the state (q, v) at a time within the step.
-        joint: index of the joint.
-        limits: of its position.
-        slope: coefficients of the velocity as a polynomial of time over the step, ascending.
+        margin: the distance to the limit or to 0.
+        slope: coefficients of its rate as a polynomial of time over the step, ascending.
         step: size of the step, s.
     """
-    low, high = limits
-
-    def distance(passed: float) -> float:
-        q = state(passed)[joint]
-        return min(high - q, q - low)
-
-    before, at_before = 0.0, distance(0.0)
+    before, at_before = 0.0, margin(0.0)
     for turn in (*sign_changes(slope), 1.0):
         after = turn * step
-        at_after = distance(after)
+        at_after = margin(after)
         if at_after < 0.0:
-            return locate(distance, before, at_before, after, at_after, step)
+            return locate(margin, before, at_before, after, at_after, step)
         before, at_before = after, at_after
     return inf
 
@@ -168,45 +157,40 @@ def _polynomial(coefficients: Sequence[float], x: float) -> float:
     return total
 
 
-def may_vanish(forces: Sequence[float]) -> bool:
-    """Return whether a contact force may vanish within a step, from its values at the stages."""
-    low, high = min(forces), max(forces)
-    return not low >= high - low
+def may_vanish(margins: Sequence[float]) -> bool:
+    """Return whether the margin of an effort may vanish within a step, from its values at the stages."""
+    low, high = min(margins), max(margins)
+    return low != inf and not low >= high - low
 
 
 def first_release(
-    press: Callable[[float], Sequence[float]],
+    grips: Callable[[float], Sequence[float]],
     at_ends: tuple[Sequence[float], Sequence[float]],
     doubtful: Sequence[int],
-    watched: Sequence[int],
     step: float,
     before: float,
 ) -> float:
-    """Return the first time before another at which a contact force vanishes, else infinity.
+    """Return the first time before another at which a joint is no longer held, else infinity.
 
     Args:
-        press: how all joints are pressed at a time within the step.
+        grips: how far the efforts that hold joints are from their bounds, at a time within the step.
         at_ends: the same at the start and the end of the step.
-        doubtful: joints that may leave their limits.
-        watched: joints that leave their limits when they are no longer pressed.
+        doubtful: those of them that may vanish.
         step: size of the step, s.
         before: a time within the step, s.
     """
 
-    def least(forces: Sequence[float]) -> float:
-        return min(forces[i] for i in watched)
-
     def margin(passed: float) -> float:
-        return least(press(passed))
+        return min(grips(passed))
 
-    inner = [press(step * k / LOOKS) for k in range(1, LOOKS)]
-    pressed = [at_ends[0], *inner, at_ends[1]]
-    looks = [x * step for i in doubtful for x in _doubtful_minima([p[i] for p in pressed])]
+    inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
+    margins = [at_ends[0], *inner, at_ends[1]]
+    looks = [x * step for i in doubtful for x in _doubtful_minima([m[i] for m in margins])]
     for k in range(1, LOOKS + 1):
         a, b = step * (k - 1) / LOOKS, step * k / LOOKS
         if a >= before:
             break
-        at_a, at_b = least(pressed[k - 1]), least(pressed[k])
+        at_a, at_b = min(margins[k - 1]), min(margins[k])
         for look in looks:
             at_look = margin(look) if a < look < b else 0.0
             if at_look < 0.0:
@@ -216,9 +200,9 @@ def first_release(
     return inf
 
 
-def _doubtful_minima(forces: Sequence[float]) -> list[float]:
-    """Return the extrema, possibly below zero, of the polynomial through sampled values of a force."""
-    c = THROUGH_LOOKS.dot(forces).tolist()
+def _doubtful_minima(margins: Sequence[float]) -> list[float]:
+    """Return the extrema, possibly below zero, of the polynomial through sampled values of a margin."""
+    c = THROUGH_LOOKS.dot(margins).tolist()
     slope = [k * coefficient for k, coefficient in enumerate(c)][1:]
-    bound = DOUBT * (max(forces) - min(forces))
+    bound = DOUBT * (max(margins) - min(margins))
     return [x for x in sign_changes(slope) if _polynomial(c, x) < bound]

@@ -3,8 +3,8 @@
 The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every
 communication step begins afresh with the step min(max_step, h), so that no integrator state outlives it.
 
-A step is integrated in one regime: the joints that rest at a limit (``stops``) and the rank of J⁺.
-What ends it is an event, located within the step (``event_search``), at which the step ends and the
+A step is integrated in one regime: the joints that rest and the directions in which others slip (``stops``), and the
+rank of J⁺. What ends it is an event, located within the step (``event_search``), at which the step ends and the
 next one begins in another regime. A step is accepted only if its error test passes.
 """
 
@@ -13,53 +13,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from math import inf, isfinite, nan, ulp
+from math import inf, isfinite, isnan, nan, ulp
 from struct import Struct
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import event_search as events
+from .anti_chatter import CHATTER_TIME, FIRST_HOLD, HOLD_OF_ALL, SHORT_CHATTER_TIME, Hold
 from .dormand_prince import P, State, dormand_prince, error_norm, interpolant
+from .equations import Equations
 from .pseudo_inverse import rank_margin
-from .stops import Stops
-
-Array = NDArray[np.float64]
-Response = Callable[[Array, Array, int | None], tuple[Sequence[float], int, float]]
-"""At (q, v), joint limits left out, with a J⁺ of a rank (None: that of its singular values): q̈ of
-the equations of motion, or what a control law gives, n values; the rank, and its margin, negative
-where the singular values give another."""
-Ratios = Callable[[Array], list[float]]
-"""σ/σ_max of the task Jacobian at q, in descending order; none of a law without J⁺."""
-
-
-@dataclass(frozen=True)
-class Equations:
-    """The equations of motion of a plant, inputs held.
-
-    Attributes:
-        acceleration: q̈.
-        ratios: singular values of J that decide its rank.
-        rcond: up to which J⁺ drops them.
-        swing: per joint, a bound on how fast it changes them, 1/rad or 1/m.
-    """
-
-    acceleration: Response
-    ratios: Ratios
-    rcond: float
-    swing: Sequence[float]
-
+from .stops import STUCK, Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 BUDGET = 1_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
-CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-12, 2.0**-24, 8.0, 2.0**-9
-"""Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held there for
-FIRST_HOLD; each repetition lengthens the hold by HOLD_GROWTH, and one of HOLD_OF_ALL or more covers all joints at
-limits (parts of CHATTER_TIME). Otherwise an acceleration that grazes zero, or impacts that drive joints off each
-other's limits, would release and stop joints without end. The rank of J⁺ is held likewise where it drops soon after a
-rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded. Rank, and stops
-without reaction, use a SHORT_CHATTER_TIME: near a singularity ordinary gains whip joints within microseconds."""
 MOST_ROWS = 6
 """Rows of a task's Jacobian at most: three axes and three of an orientation."""
 NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
@@ -93,8 +61,7 @@ class _Motion:
         rank: of J⁺ in this regime.
         rank_held: the rank does not rise in this regime.
         evaluations: of the right-hand side so far.
-        pressed, margins: how joints at rest are pressed into their limits, and the margin of the
-            rank, at each stage of the present step.
+        grips, margins: those of ``Stops.restrain``, and the margin of the rank, at each stage of the present step.
     """
 
     def __init__(self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float) -> None:
@@ -107,41 +74,41 @@ class _Motion:
         self.stops, self.rtol, self.atol, self.max_step = stops, rtol, atol, max_step
         self.rank = MOST_ROWS
         self.rank_held = False
-        self.pressed: list[list[float]] = []
+        self.grips: list[list[float]] = []
         self.margins: list[float] = []
 
-    def set_out(self, y: State, anti_chatter: Sequence[bool], rank_held: bool) -> State:
+    def set_out(self, y: State, kept: Sequence[bool], rank_held: bool) -> State:
         """Determine the regime at a state after an impact; return ẏ in it.
 
         Args:
             y: the state (q, v).
-            anti_chatter: joints that stay at their limits whatever the contact force.
+            kept: joints that stay at rest whatever holds them.
             rank_held: the rank stays what it is.
         """
         self.rank_held = rank_held
+        self.stops.slide(y[self.n :])
         a, self.rank, margin = self._acceleration(y, self.rank if rank_held else None)
-        pressed = self.stops.hold(y, a, anti_chatter)
-        self.pressed, self.margins = [pressed], [margin]
+        self.grips, self.margins = [self.stops.hold(y, a, kept)], [margin]
         return y[self.n :] + a
 
     def acceleration(self, y: State) -> tuple[list[float], list[float], float]:
-        """Return q̈ at y in the regime, the contact forces of joints at rest, and the rank's margin."""
+        """Return q̈ at y in the regime, the grips of joints at rest, and the rank's margin."""
         a, _, margin = self._acceleration(y, self.rank)
         return a, self.stops.restrain(y, a), margin
 
     def _acceleration(self, y: State, rank: int | None) -> tuple[list[float], int, float]:
         self.evaluations += 1
         self._write(self._buffer, 0, *y)
-        a, rank, margin = self._equations.acceleration(self._q, self._v, rank)
+        a, rank, margin = self._equations.acceleration(self._q, self._v, rank, self.stops.slip)
         return list(a), rank, margin
 
     def rates(self, y: State) -> State:
         """Return ẏ at a stage of a step; NaN where the equations have no solution there."""
         try:
-            a, pressed, margin = self.acceleration(y)
+            a, grips, margin = self.acceleration(y)
         except np.linalg.LinAlgError:
-            a, pressed, margin = [nan] * self.n, [nan] * self.n, nan
-        self.pressed.append(pressed)
+            a, grips, margin = [nan] * self.n, [nan] * len(self.grips[0]), nan
+        self.grips.append(grips)
         self.margins.append(margin)
         return y[self.n :] + a
 
@@ -150,13 +117,15 @@ class _Motion:
 
         rates is ẏ at y.
         """
+        if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
+            return end, y, events.Event()  # inputs are held, and all joints: nothing changes any more
         step = min(self.max_step, end - t)
         growth = MAX_FACTOR
         while True:
             last = t + step * (1 + 1e-9) >= end
             if last:
                 step = end - t
-            del self.pressed[1:], self.margins[1:]
+            del self.grips[1:], self.margins[1:]
             y_new, K = dormand_prince(self.rates, y, step, rates)
             norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
             factor = MIN_FACTOR
@@ -170,7 +139,7 @@ class _Motion:
                 if last:
                     return end, y_new, events.Event()
                 t, y, rates = t + step, y_new, K[-1]
-                self.pressed[0], self.margins[0] = self.pressed[-1], self.margins[-1]
+                self.grips[0], self.margins[0] = self.grips[-1], self.margins[-1]
                 step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
                 growth = MAX_FACTOR
             else:
@@ -211,25 +180,25 @@ class _Motion:
         ]
         sweep = sum(map(float.__mul__, self._equations.swing, reach))
         near_rank = not max(self.margins[0], self.margins[-1]) > sweep
-        doubtful = [i for i in stops.watched if events.may_vanish([p[i] for p in self.pressed])]
+        near += [n + i for i in range(n) if self._may_be_arrested(i, y, step, K)]
+        doubtful = [i for i, grips in enumerate(zip(*self.grips)) if events.may_vanish(grips)]
         if not near and not near_rank and not doubtful:
             return None
         state = interpolant(y, y_new, K, step)
         first = inf
         for i in near:
             slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(P).tolist())]
-            first = min(first, events.first_crossing(state, i, stops.limits[i], slope, step))
+            first = min(first, events.first_crossing(self._margin_of(i, state), slope, step))
 
-        def press(passed: float) -> list[float]:
+        def grips(passed: float) -> list[float]:
             return self.acceleration(state(passed))[1]
 
         def singular_margin(passed: float) -> float:
             return self._singular_margin(state(passed))
 
         if doubtful:
-            at_ends = self.pressed[0], self.pressed[-1]
-            released = events.first_release(press, at_ends, doubtful, stops.watched, step, first)
-            first = min(first, released)
+            at_ends = self.grips[0], self.grips[-1]
+            first = min(first, events.first_release(grips, at_ends, doubtful, step, first))
         if near_rank:
             a, b = singular_margin(0.0), singular_margin(step)
             pace = events.PACE / events.REACH * sweep / step
@@ -238,17 +207,42 @@ class _Motion:
             return None
         return first, *self._event(state(first))
 
+    def _may_be_arrested(self, i: int, y: State, step: float, K: list[State]) -> bool:
+        """Return whether the velocity of a joint that slips may pass 0 within a step."""
+        slip, n = self.stops.slip[i], self.n
+        if not slip or i in self.stops.held:
+            return False
+        return not slip * y[n + i] > events.REACH * step * max(abs(k[n + i]) for k in K)
+
+    def _margin_of(self, component: int, state: Callable[[float], State]) -> events.Margin:
+        """Return the distance of a position to its limits, or a velocity in the direction of slip."""
+        if component >= self.n:
+            slip = self.stops.slip[component - self.n]
+            return lambda passed: slip * state(passed)[component]
+        low, high = self.stops.limits[component]
+
+        def distance(passed: float) -> float:
+            q = state(passed)[component]
+            return min(high - q, q - low)
+
+        return distance
+
     def _event(self, y: State) -> tuple[State, events.Event]:
-        """Return a state projected onto the limits that it exceeds, and the event there."""
-        y = list(y)
+        """Return a state without what is beyond limits and velocities of 0, and the event there."""
+        y, n, stops = list(y), self.n, self.stops
         event = events.Event()
-        if self.stops.watched:
-            pressed = self.acceleration(y)[1]
-            event.released = [i for i in self.stops.watched if pressed[i] < 0.0]
-        for i, (low, high) in enumerate(self.stops.limits):
-            if i not in self.stops.held and not low <= y[i] <= high:
+        if stops.watched:
+            grips = self.acceleration(y)[1]
+            event.released = [i for k, i in enumerate(stops.watched) if min(grips[2 * k : 2 * k + 2]) < 0.0]
+        for i, (low, high) in enumerate(stops.limits):
+            if i in stops.held:
+                continue
+            if not low <= y[i] <= high:
                 event.stopped.append(i)
                 y[i] = min(max(y[i], low), high)
+            if stops.slip[i] * y[n + i] < 0.0:
+                event.arrested.append(i)
+                y[n + i] = 0.0
         return y, event
 
     def _singular_margin(self, y: State) -> float:
@@ -258,19 +252,6 @@ class _Motion:
         if self.rank_held:
             return ratios[rank - 1] - self._equations.rcond if rank else 1.0
         return rank_margin(ratios, self._equations.rcond, rank)
-
-
-@dataclass
-class _Hold:
-    """A hold of joints at their limits, or of the rank of J⁺: its end and its length, s."""
-
-    until: float = -inf
-    length: float = 0.0
-
-    def again(self, t: float, soon: float, longest: float) -> None:
-        """Begin a hold at t, longer than the last one where that ended within the time ``soon``."""
-        self.length = min(HOLD_GROWTH * self.length, longest) if t - self.until < soon else FIRST_HOLD * longest
-        self.until = t + self.length
 
 
 def advance(
@@ -290,7 +271,7 @@ def advance(
         equations: of motion; autonomous, as inputs are held over the step.
         q, v: state at the beginning, n each; q within the limits.
         h: communication step, s, > 0.
-        stops: at the joints' limits.
+        stops: at the joints' limits, and their friction.
         rtol, atol: tolerances of the error test on the state (q, v).
         max_step: largest integration step, s.
         budget: what the parts before have spent; None: there are none.
@@ -315,8 +296,8 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     chatter_time = CHATTER_TIME * min(motion.max_step, h)
     short_time = SHORT_CHATTER_TIME * chatter_time
     joint_time = chatter_time if stops.rigid else short_time
-    joint_hold, rank_hold = _Hold(), _Hold()
-    left, risen = [-inf] * n, -inf  # when each joint left its limit, when the rank rose
+    joint_hold, rank_hold, stuck = Hold(), Hold(), [Hold() for _ in range(n)]
+    left, slipped, risen = [-inf] * n, [-inf] * n, -inf  # when joints left limits or began to slip, the rank rose
     event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):
@@ -327,15 +308,22 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
         elif joint_hold.until <= t:
             anti_chatter = [False] * n
         rank, rank_held = motion.rank, rank_hold.until > t
-        end = min((hold.until for hold in (joint_hold, rank_hold) if hold.until > t), default=h)
+        end = min((hold.until for hold in (joint_hold, rank_hold, *stuck) if hold.until > t), default=h)
         stops.impact(y, anti_chatter)
-        rates = motion.set_out(y, anti_chatter, rank_held)
+        kept = [chatters or hold.until > t for chatters, hold in zip(anti_chatter, stuck)]
+        rates = motion.set_out(y, kept, rank_held)
         for i, at_limit in enumerate(stops.at_limits(y)):
             if at_limit and i not in stops.held:
                 left[i] = t
-        chattering = [i in event.released and i in stops.watched for i in range(n)]  # by rounding
+            if stops.slip[i] and y[n + i] == 0.0 and i not in stops.held:
+                slipped[i] = t
+        held_again = [i for i in event.released if i in stops.watched]  # by rounding
+        for i in held_again:
+            if stops.rest[i] == STUCK:
+                stuck[i].again(t, short_time, chatter_time)
+        chattering = [i in held_again and stops.rest[i] != STUCK for i in range(n)]
         event = events.Event()
-        if any(chattering):
+        if held_again:
             continue
         if motion.rank > rank:
             risen = t
@@ -344,6 +332,9 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
             continue
         t, y, event = motion.until_event(y, rates, t, min(end, h))
         chattering = [i in event.stopped and t - left[i] < joint_time for i in range(n)]
+        for i in event.arrested:
+            if t - slipped[i] < FIRST_HOLD * chatter_time:
+                stuck[i].again(t, short_time, chatter_time)
     if joint_hold.until <= h:
         anti_chatter = [False] * n
     stops.impact(y, anti_chatter)

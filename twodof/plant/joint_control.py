@@ -10,10 +10,10 @@ from __future__ import annotations
 from math import inf
 
 from .control_law import ControlledPlant
-from .integrator import Array, Ratios, Response
+from .equations import Array, Law, Ratios
 
 
-def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
+def command(plant: ControlledPlant) -> tuple[Law, Ratios]:
     """Return q̈_cmd as a function of the state, n values, inputs held; this law has no J⁺."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from .integrator import Array
+from .equations import Array
 from .robot import Robot
 
 # looked up once: an attribute of the module costs as much as a call's arithmetic
@@ -26,17 +26,21 @@ WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 class Mechanism:
-    """A robot with gravity and a point mass (payload) in its task frame; n independent joints.
+    """A robot with gravity, rotors and a point mass (payload) in its task frame; n independent joints.
 
     Args:
         robot: the robot.
         gravity: in the root's axes, m/s².
         payload: the point mass, kg.
         offset: its position in the task frame, m.
+        armature: inertias of the rotors, which M has on its diagonal, kg·m² or kg, n values.
     """
 
-    def __init__(self, robot: Robot, gravity: Sequence[float], payload: float, offset: Sequence[float]) -> None:
+    def __init__(
+        self, robot: Robot, gravity: Sequence[float], payload: float, offset: Sequence[float], armature: Sequence[float]
+    ) -> None:
         model = robot.model.copy()
+        model.armature[[model.getJointId(name) - 1 for name in robot.joints]] = armature
         model.gravity.linear = np.array(gravity)
         self._frame = robot.frame_id
         if payload:

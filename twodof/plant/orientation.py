@@ -7,7 +7,7 @@ from math import atan2, sqrt
 
 import pinocchio as pin
 
-from .integrator import Array
+from .equations import Array
 
 
 def quaternion(rotation: Array) -> list[float]:

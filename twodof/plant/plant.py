@@ -1,10 +1,10 @@
 """The plant: a robot under a control law, with its state, inputs, outputs and parameters.
 
     τ = M(q) q̈_cmd + h(q, v)                                    inverse dynamics (RNEA)
-    q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v))     forward dynamics (ABA)
+    q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v) + λ)     forward dynamics (ABA)
 
-or τ itself, as the law gives it. M and h of the second have the payload, those of the first where
-``payload_known``.
+or τ itself, as the law gives it. λ is the effort of friction and stops (``stops``). M and h of the second have the
+payload, those of the first where ``payload_known``; M has the armature in both.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; here Pinocchio's.
 """
@@ -21,7 +21,8 @@ import numpy as np
 from . import effort_control, joint_control, task_control
 from .control_law import ControlLaw, ControlledPlant
 from .dormand_prince import STAGES
-from .integrator import BUDGET, Array, Equations, Response, StepError
+from .equations import Answer, Array, Equations, Law, Response
+from .integrator import BUDGET, StepError
 from .mechanism import Mechanism
 from .orientation import quaternion
 from .robot import Robot
@@ -89,6 +90,9 @@ class Plant(ControlledPlant):
     rtol: float
     atol: float
     max_step: float
+    friction: list[float]
+    damping: list[float]
+    armature: list[float]
     control_period: float
     control_delay: float
     q_resolution: list[float]
@@ -149,10 +153,10 @@ class Plant(ControlledPlant):
 
     def prepare(self) -> None:
         """Apply parameters that were set directly, for example by restoring a state."""
-        offset = self.payload_com
-        self._real = self.known = Mechanism(self.robot, self.gravity, self.payload, offset)
+        offset, armature = self.payload_com, self.armature
+        self._real = self.known = Mechanism(self.robot, self.gravity, self.payload, offset, armature)
         if self.payload and not getattr(self, "payload_known", False):
-            self.known = Mechanism(self.robot, self.gravity, 0.0, offset)
+            self.known = Mechanism(self.robot, self.gravity, 0.0, offset, armature)
 
     def step(self, h: float, time: float | None = None) -> None:
         """Advance the state by one communication step of h seconds, inputs held.
@@ -254,7 +258,7 @@ class Plant(ControlledPlant):
 
     @property
     def der_v(self) -> list[float]:
-        """Derivative of v at the current state and inputs, joints that rest at a limit included.
+        """Derivative of v at the current state and inputs, joints that rest included.
 
         Raises:
             DiscardError: an input that the control law cannot follow.
@@ -263,9 +267,10 @@ class Plant(ControlledPlant):
         before, self.sampling = self.sampling, self._settled()
         try:
             with refusing(DiscardError):
-                equations = self.equations_of_motion()
-                rates = list(equations.acceleration(np.array(self.q), np.array(self.v), None)[0])
-                self.stops().hold([*self.q, *self.v], rates, [False] * len(self.q))
+                equations, stops = self.equations_of_motion(), self.stops()
+                slip = stops.slide(self.v)
+                rates = list(equations.acceleration(np.array(self.q), np.array(self.v), None, slip)[0])
+                stops.hold([*self.q, *self.v], rates, [False] * len(self.q))
         finally:
             self.sampling = before
         return rates
@@ -278,18 +283,18 @@ class Plant(ControlledPlant):
         rcond = self.rcond if "rcond" in CONTROLS[self.control].parameters else 0.0
         return Equations(acceleration, ratios, rcond, self._swing)
 
-    def _acceleration(self, command: Response) -> Response:
+    def _acceleration(self, command: Law) -> Response:
         """Return q̈ under a control law."""
-        damping, external = np.array(self.robot.damping), np.array(self.tau_ext)
-        force = np.array(self.f_ext)
+        damping, external = np.array(self.damping), np.array(self.tau_ext)
+        force, friction = np.array(self.f_ext), np.array(self.friction)
         # q̈ = q̈_cmd + M⁻¹(…): rounding of M q̈_cmd + h − h would move joints that are at rest
         cancels = self._commands == "acceleration" and self.known is self._real
         cancels = cancels and not self.limit_effort and not self.control_period
-        if cancels and not (damping.any() or external.any() or force.any()):
-            return command
+        if cancels and not (damping.any() or external.any() or force.any() or friction.any()):
+            return lambda q, v, rank, slip: command(q, v, rank)
 
-        def acceleration(q: Array, v: Array, rank: int | None) -> tuple[Sequence[float], int, float]:
-            effort = external - damping * v
+        def acceleration(q: Array, v: Array, rank: int | None, slip: Sequence[int]) -> Answer:
+            effort = external - damping * v - friction * slip
             if force.any():
                 effort += force @ np.array(self._real.observe(q, v)[1][:3])
             if cancels:
@@ -305,14 +310,14 @@ class Plant(ControlledPlant):
         return acceleration
 
     def stops(self) -> Stops:
-        """Return the joint limits as the integrator's stops, rigid or clamping."""
+        """Return friction and joint limits as the integrator's stops, rigid or clamping."""
         limits = list(zip(self.q_min, self.q_max))
-        return Stops(limits, self._real.inverse_mass if self.rigid_stops else None)
+        return Stops(limits, self.friction, self._real.inverse_mass, rigid=self.rigid_stops)
 
     def _observed(self) -> tuple[list[float], list[list[float]], list[float]]:
         return self._real.observe(np.array(self.q), np.array(self.v))
 
-    def _control_effort(self, command: Response, q: Array, v: Array, rank: int | None) -> tuple[Array, int, float]:
+    def _control_effort(self, command: Law, q: Array, v: Array, rank: int | None) -> tuple[Array, int, float]:
         given, rank, margin = command(q, v, rank)
         tau: Array = np.array(given)
         if self._commands == "acceleration":

@@ -33,6 +33,7 @@ class Robot:
         q_min, q_max: position limits, rad or m, with those of the joints that follow; ∓UNBOUNDED where there is none.
         effort: effort limits, N·m or N; infinite where the URDF has 0 or none.
         damping: viscous joint damping D, N·m·s/rad or N·s/m, with that of the joints that follow.
+        friction: Coulomb friction, N·m or N, with that of the joints that follow.
         frame: name of the task frame, and its Pinocchio index ``frame_id``.
         axes: task axes, a subset of "xyz" in the root frame, e.g. "xy"; m = len(axes).
         root: name of the URDF's root link, the frame in which positions are expressed.
@@ -49,6 +50,7 @@ class Robot:
     q_max: tuple[float, ...]
     effort: tuple[float, ...]
     damping: tuple[float, ...]
+    friction: tuple[float, ...]
     frame: str
     frame_id: int
     axes: str
@@ -125,6 +127,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
         q_max=tuple(high for _, high in limits),
         effort=tuple(joint.effort for joint in joints),
         damping=tuple(sum(j.ratio**2 * j.damping for j in moving if j.leader == joint.name) for joint in joints),
+        friction=tuple(sum(abs(j.ratio) * j.friction for j in moving if j.leader == joint.name) for joint in joints),
         frame=frame,
         frame_id=model.getFrameId(frame, pin.FrameType.BODY),
         axes=axes,

@@ -1,19 +1,25 @@
-"""Joint-limit stops: which joints rest at a limit, the reaction of a stop, and when it releases.
+"""Joints at rest: which ones rest at a limit or by their friction, what holds them, and when it lets them go.
 
 A stop is plastic and unilateral: a joint that reaches it loses its velocity there, and rests there
 while it is pressed into it. Without a reaction, as a clamp, that is all: it is pressed while its
-own acceleration points into the limit, and the other joints move as if it were not there. Rigid
-stops act on all joints. With E the unit vectors of joints at a limit, into the range,
+own acceleration points into the limit, and the other joints move as if it were not there; what its friction does to
+them is that of a joint that slips into the limit. Rigid stops act on all joints, and friction F does. With E the unit
+vectors of joints at a limit, into the range, and λ the efforts on joints at rest,
 
-    v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0          at an impact
-    q̈ = q̈_free + M⁻¹E λ,      0 ≤ λ ⟂ Eᵀq̈ ≥ 0           while at rest
+    v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0                       at an impact
+    q̈ = q̈_free + M⁻¹λ,        −F ≤ λ ≤ F, at a limit into the range without an upper bound;
+                              q̈ > 0 only at the lower bound, q̈ < 0 only at the upper one
 
-Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5.
+A joint that moves slips, λ = −F sgn(v). Finite friction has no part in an impact.
+
+Sources: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5; Pfeiffer & Glocker, "Multibody
+Dynamics with Unilateral Contacts", 1996, chapter 5.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,28 +29,36 @@ Limits = Sequence[tuple[float, float]]
 """Per joint (q_min, q_max)."""
 InverseMass = Callable[[Sequence[float]], Array]
 """M(q)⁻¹, n × n."""
+Bounds = Mapping[int, tuple[float, float]]
+"""Of efforts or impulses, by joint."""
 
 MOST_PIVOTS, BLOCK_TRIES = 10_000, 5
 ROUNDING = 2.0**-40
 """Rounding error of a sum that decides a sign, as a part of its terms."""
+FREE, STUCK, STOPPED, CLAMPED = range(4)
+"""How a joint rests: by its friction, at a limit by a stop that pushes (with its friction), or there by a clamp."""
 
 
 class Stops:
-    """Stops of a robot, and the joints that rest at them.
+    """Stops and friction of a robot, and the joints that rest by them.
 
     Args:
         limits: of the joints.
-        inverse_mass: of rigid stops; None: of stops without a reaction.
+        friction: of the joints, N·m or N, n values.
+        inverse_mass: not used without friction and rigid stops.
+        rigid: whether stops have a reaction.
 
     Attributes:
-        rigid: stops have a reaction.
-        held: joints at rest at a limit.
-        watched: those of them that leave it when they are no longer pressed.
+        rigid: whether stops have a reaction.
+        rest: how each joint rests, or FREE.
+        slip: direction in which each joint slips, −1 or 1; 0 without friction or at rest.
+        held: joints at rest.
+        watched: those of them that are free when the effort that holds them is beyond its bounds.
     """
 
-    def __init__(self, limits: Limits, inverse_mass: InverseMass | None) -> None:
-        self.limits, self._inverse_mass = limits, inverse_mass
-        self.rigid = inverse_mass is not None
+    def __init__(self, limits: Limits, friction: Sequence[float], inverse_mass: InverseMass, *, rigid: bool) -> None:
+        self.limits, self._friction, self._inverse_mass, self.rigid = limits, friction, inverse_mass, rigid
+        self.rest, self.slip = [FREE] * len(limits), [0] * len(limits)
         self.held: list[int] = []
         self.watched: list[int] = []
 
@@ -57,121 +71,153 @@ class Stops:
                 of a rocking block, would repeat for ever in finite time (Zeno).
         """
         n = len(self.limits)
-        contacts = self._contacts(y)
-        into = [
-            i
-            for i, side in contacts
-            if side * y[n + i] < 0.0 or ((anti_chatter[i] or self._has_no_range(i)) and y[n + i])
-        ]
+        sides = self._sides(y)
+        fixed = [i for i in sides if anti_chatter[i] or self._has_no_range(i)]
+        into = [i for i, side in sides.items() if side * y[n + i] < 0.0 or (i in fixed and y[n + i])]
         if not into:
             return
-        if self._inverse_mass is None:
-            stopped = into
-        else:
+        if self.rigid:
             W = self._inverse_mass(y[:n])
-            forced = [i for i, _ in contacts if anti_chatter[i]]
-            impulse = self._complementary(W, contacts, y[n:], forced)
+            bounds = {i: (0.0, inf) if side > 0.0 else (-inf, 0.0) for i, side in sides.items()}
+            impulse, _ = _complementary(W, y[n:], bounds, fixed)
             y[n:] = (np.array(y[n:]) + W @ impulse).tolist()
-            stopped = [i for i, _ in contacts if impulse[i]]
-        for i in stopped:
+            into = [i for i in sides if impulse[i]]
+        for i in into:
             y[n + i] = 0.0
 
-    def hold(self, y: Sequence[float], a: list[float], anti_chatter: Sequence[bool]) -> list[float]:
-        """Find the joints that rest at (q, v) after an impact, and make their acceleration 0.
+    def slide(self, v: Sequence[float]) -> list[int]:
+        """Set and return the directions in which joints slip that move at v."""
+        self.slip = [int(x > 0.0) - int(x < 0.0) if F else 0 for x, F in zip(v, self._friction)]
+        return self.slip
 
-        Returns the contact forces of ``restrain``.
+    def hold(self, y: Sequence[float], a: list[float], kept: Sequence[bool]) -> list[float]:
+        """Find the joints that rest at (q, v) after an impact, and the directions of those that begin to slip.
+
+        Returns what ``restrain`` does.
 
         Args:
             y: the state.
-            a: q̈ without stops; changed to that with them.
-            anti_chatter: joints that stay at their limits whatever the contact force.
+            a: q̈ of joints that move in the directions of ``slide``, those at rest being free; changed to that with
+                what holds them.
+            kept: joints that stay at rest whatever holds them.
         """
         n = len(self.limits)
-        contacts = [(i, side) for i, side in self._contacts(y) if y[n + i] == 0.0]
-        forced = [i for i, _ in contacts if anti_chatter[i]]
-        if self._inverse_mass is None:
-            self.held = [i for i, side in contacts if anti_chatter[i] or self._has_no_range(i) or side * a[i] <= 0.0]
-        elif contacts:
+        sides = self._sides(y)
+        locked = [i for i in range(n) if kept[i] or self._has_no_range(i)]
+        clamps = {i for i in sides if y[n + i] == 0.0 and not self.rigid}
+        bounds = {}
+        for i in range(n):
+            friction = 0.0 if i in clamps and i in locked else self._friction[i]
+            if y[n + i] == 0.0 and (friction or (i in sides and self.rigid)):
+                side = sides.get(i, 0.0) if self.rigid else 0.0
+                bounds[i] = -inf if side < 0.0 else -friction, inf if side > 0.0 else friction
+        stopped, at = a, dict.fromkeys(bounds, 0)
+        if bounds:
             W = self._inverse_mass(y[:n])
-            reaction = self._complementary(W, contacts, a, forced)
-            stopped = (W @ reaction + a).tolist()
-            self.held = [
-                i for i, _ in contacts if reaction[i] or anti_chatter[i] or self._has_no_range(i) or stopped[i] == 0.0
-            ]
-        else:
-            self.held = []
-        self.watched = [i for i in self.held if not anti_chatter[i] and not self._has_no_range(i)]
+            acting, at = _complementary(W, a, bounds, [i for i in bounds if i in locked])
+            stopped = (W @ acting + a).tolist()
+        resting = {i for i, state in at.items() if state == 0 or stopped[i] == 0.0}
+        for i in range(n):
+            self.rest[i] = FREE
+            if i in resting:
+                self.rest[i] = STOPPED if i in sides and self.rigid else STUCK
+            elif i in clamps and (i in locked or sides[i] * stopped[i] <= 0.0):
+                self.rest[i] = CLAMPED
+        begun = {i: -state for i, state in at.items() if i not in resting and self._friction[i]}
+        for i, direction in begun.items():
+            self.slip[i] = direction
+        if begun:
+            a[:] = (W @ [-self._friction[i] * begun.get(i, 0) for i in range(n)] + a).tolist()
+        self.held = [i for i, rest in enumerate(self.rest) if rest]
+        self.watched = [i for i in self.held if i not in locked]
         return self.restrain(y, a)
 
     def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:
-        """Make the acceleration of held joints 0; return the contact force of each."""
-        pressed = [0.0] * len(a)
+        """Make the acceleration of held joints 0.
+
+        Returns how far the effort that holds each watched joint is from its lower and its upper bound, two values
+        each, infinite where there is no bound: the joint is free where one is negative. That of a clamp is −q̈.
+        """
         if not self.held:
-            return pressed
-        if self._inverse_mass is None:
-            for i in self.held:
-                pressed[i], a[i] = a[i] * self._outwards(y, i), 0.0
-            return pressed
-        W = self._inverse_mass(y[: len(a)])[:, self.held]
-        reaction = np.linalg.solve(W[self.held], [-a[i] for i in self.held])
-        a[:] = (np.array(a) + W @ reaction).tolist()
-        for i, force in zip(self.held, reaction.tolist()):
-            pressed[i], a[i] = -force * self._outwards(y, i), 0.0
-        return pressed
+            return []
+        efforts = {i: -a[i] for i in self.held}
+        reacting = [i for i in self.held if self.rest[i] != CLAMPED]
+        if reacting:
+            W = self._inverse_mass(y[: len(a)])[:, reacting]
+            reaction = np.linalg.solve(W[reacting], [-a[i] for i in reacting])
+            a[:] = (np.array(a) + W @ reaction).tolist()
+            efforts = {i: -a[i] for i in self.held} | dict(zip(reacting, reaction.tolist()))
+        for i in self.held:
+            a[i] = 0.0
+        return [grip for i in self.watched for grip in self._grips(i, y[i], efforts[i])]
 
     def at_limits(self, y: Sequence[float]) -> list[bool]:
         """Return for each joint whether it is at a limit, in the state (q, v)."""
         return [not low < q < high for (low, high), q in zip(self.limits, y)]
 
+    def _grips(self, i: int, q: float, effort: float) -> tuple[float, float]:
+        friction = 0.0 if self.rest[i] == CLAMPED else self._friction[i]
+        above, low, high = q >= self.limits[i][1], friction + effort, friction - effort
+        if self.rest[i] == STUCK:
+            return low, high
+        return (inf, high) if above else (low, inf)
+
     def _has_no_range(self, i: int) -> bool:
         low, high = self.limits[i]
         return low == high
 
-    def _outwards(self, y: Sequence[float], i: int) -> float:
-        return 1.0 if y[i] >= self.limits[i][1] else -1.0
-
-    def _contacts(self, y: Sequence[float]) -> list[tuple[int, float]]:
-        """Return the joints at a limit, with the sign of the direction back into the range."""
-        return [
-            (i, -1.0 if q >= high else 1.0)
+    def _sides(self, y: Sequence[float]) -> dict[int, float]:
+        """Return the sign of the direction back into the range, by joint that is at a limit."""
+        return {
+            i: -1.0 if q >= high else 1.0
             for i, ((low, high), q) in enumerate(zip(self.limits, y))
             if q >= high or q <= low
-        ]
+        }
 
-    def _complementary(
-        self, W: Array, contacts: Sequence[tuple[int, float]], b: Sequence[float], both: list[int]
-    ) -> Array:
-        """Return z, n values: 0 ≤ E z ⟂ E (b + W z) ≥ 0 at the contacts, 0 elsewhere.
 
-        All contacts that are wrong change sides at a time; where that does not lessen their number
-        for a while only the last one does, which ends for every positive definite W. A joint in
-        ``both`` or without a range keeps b + W z = 0, whichever way z points. Sources: Júdice &
-        Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974.
-        """
-        fixed = {i for i, _ in contacts if i in both or self._has_no_range(i)}
-        active = {i for i, side in contacts if i in fixed or side * b[i] < 0.0}
-        z, size = np.zeros(len(b)), np.abs(b)
-        fewest, tries = len(b) + 1, BLOCK_TRIES
-        for _ in range(MOST_PIVOTS):
-            z[:] = 0.0
-            chosen = sorted(active)
-            if chosen:
-                z[chosen] = np.linalg.solve(W[np.ix_(chosen, chosen)], [-b[i] for i in chosen])
-            change = W @ z
-            largest = np.abs(z).max(initial=0.0)
-            wrong = [
-                i
-                for i, side in contacts
-                if i not in fixed
-                and (
-                    side * z[i] < -ROUNDING * largest
-                    if i in active
-                    else side * (b[i] + change[i]) < -ROUNDING * (size[i] + abs(change[i]))
-                )
-            ]
-            if not wrong:
-                return z
-            tries = BLOCK_TRIES if len(wrong) < fewest else tries - 1
-            fewest = min(fewest, len(wrong))
-            active ^= set(wrong if tries > 0 else wrong[-1:])
-        return np.full(len(b), np.nan)  # which no step accepts
+def _complementary(
+    W: Array, b: Sequence[float], bounds: Bounds, fixed: Collection[int]
+) -> tuple[Array, dict[int, int]]:
+    """Return z, n values, and whether that of each joint with bounds is at the lower (−1) or upper (1) one.
+
+    b + W z is above 0 only where z is at its lower bound, below only at the upper one; of ``fixed`` joints it is 0,
+    whatever z is. All that is wrong changes at a time; where that does not lessen its number for a while only the
+    last one does, which ends for every positive definite W. Sources: Júdice & Pires, Computers & Operations Research
+    21(5), 1994; Murty, Opsearch 11, 1974.
+    """
+    if not np.isfinite(b).all():
+        raise np.linalg.LinAlgError("not finite")
+    at = {}
+    for i, (low, high) in bounds.items():
+        pressed = b[i] < 0.0 if high == inf else b[i] > 0.0
+        at[i] = 0 if i in fixed or low < 0.0 < high or pressed else -1 if high == inf else 1
+    z, given, size = np.zeros(len(b)), np.array(b), np.abs(b)
+    fewest, tries = len(b) + 1, BLOCK_TRIES
+    for _ in range(MOST_PIVOTS):
+        z[:] = 0.0
+        for i, state in at.items():
+            z[i] = 0.0 if state == 0 else bounds[i][state > 0]
+        solved = [i for i, state in at.items() if state == 0]
+        largest = 0.0
+        if solved:
+            z[solved] = np.linalg.solve(W[np.ix_(solved, solved)], -(given + W @ z)[solved])
+            largest = np.abs(z[solved]).max()
+        change = W @ z
+        wrong = {}
+        for i, (low, high) in bounds.items():
+            state = at[i]
+            if i in fixed:
+                continue
+            if state:
+                new = 0 if state * (b[i] + change[i]) > ROUNDING * (size[i] + abs(change[i])) else state
+            else:
+                slack = ROUNDING * largest
+                new = -1 if z[i] < low - slack else int(z[i] > high + slack)
+            if new != state:
+                wrong[i] = new
+        if not wrong:
+            return z, at
+        tries = BLOCK_TRIES if len(wrong) < fewest else tries - 1
+        fewest = min(fewest, len(wrong))
+        at |= wrong if tries > 0 else dict(list(wrong.items())[-1:])
+    raise np.linalg.LinAlgError("no efforts hold the joints")

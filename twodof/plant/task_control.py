@@ -16,12 +16,12 @@ from operator import mul
 import numpy as np
 
 from .control_law import ControlledPlant
-from .integrator import Array, Ratios, Response
+from .equations import Array, Law, Ratios
 from .orientation import rotation_error
 from .pseudo_inverse import apply_pseudo_inverse, singular_ratios
 
 
-def command(plant: ControlledPlant) -> tuple[Response, Ratios]:
+def command(plant: ControlledPlant) -> tuple[Law, Ratios]:
     """Return q̈_cmd as a function of the state, and the singular values of its J; inputs held."""
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]

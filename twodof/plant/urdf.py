@@ -45,7 +45,7 @@ class Joint:
         axis: in its frame, of length 1.
         low, high: position limits, rad or m; ∓UNBOUNDED where there is none.
         effort, velocity: limits, N·m or N, rad/s or m/s; infinite where the URDF has 0 or none.
-        damping: viscous, N·m·s/rad or N·s/m.
+        damping, friction: viscous, N·m·s/rad or N·s/m, and Coulomb friction, N·m or N.
         leader: the joint that it mimics, and that mimics none: q = ratio·q_leader + offset; its
             own name where it moves on its own.
         ratio, offset: of that.
@@ -63,6 +63,7 @@ class Joint:
     effort: float
     velocity: float
     damping: float
+    friction: float
     leader: str
     ratio: float = 1.0
     offset: float = 0.0
@@ -143,10 +144,7 @@ def read_urdf(text: str) -> Urdf:
     root = _check_tree(links, elements)
     joints = {name: _joint(name, element) for name, element in elements.items()}
     joints = {name: _following(joint, joints) for name, joint in joints.items()}
-    frictional = [n for n, e in elements.items() if attribute(e, "dynamics", "friction", 0.0)]
     warnings = []
-    if frictional:
-        warnings.append(f"friction is not modelled and is ignored: {_listed('joint', frictional)}")
     if frozen := [n for n, joint in joints.items() if joint.leader == n and joint.low == joint.high]:
         warnings.append(
             "lower and upper limit are equal or missing, so that nothing moves"
@@ -195,8 +193,8 @@ def _joint(name: str, element: ET.Element) -> Joint:
             raise RobotError(f"joint '{name}': lower limit {low:g} > upper limit {high:g}")
     effort = attribute(element, "limit", "effort", 0.0)
     velocity = attribute(element, "limit", "velocity", 0.0)
-    damping = attribute(element, "dynamics", "damping", 0.0)
-    for key, value in (("effort", effort), ("damping", damping)):
+    damping, friction = (attribute(element, "dynamics", key, 0.0) for key in ("damping", "friction"))
+    for key, value in (("effort", effort), ("damping", damping), ("friction", friction)):
         if kind != "fixed" and value < 0:
             raise RobotError(f"joint '{name}': negative {key}")
     axis = _vector(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
@@ -220,6 +218,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
         effort=effort or math.inf,
         velocity=velocity if velocity > 0.0 else math.inf,
         damping=damping,
+        friction=friction,
         **_mimicry(name, element if kind != "fixed" else None),
     )
 

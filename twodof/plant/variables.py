@@ -34,7 +34,7 @@ POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
 """From the smallest normal number on: C++ cannot read smaller ones, and processors may take them for 0."""
 GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
-    **dict.fromkeys((*GAINS, "payload"), NOT_NEGATIVE),
+    **dict.fromkeys((*GAINS, "payload", "friction", "damping", "armature"), NOT_NEGATIVE),
     **dict.fromkeys(("rtol", "atol", "max_step"), POSITIVE),
     "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
     **dict.fromkeys(("control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), NOT_NEGATIVE),
@@ -176,6 +176,9 @@ ROWS = (
     ("rtol", "parameter", "", "", "relative tolerance of the integrator"),
     ("atol", "parameter", "", "", "absolute tolerance of the integrator"),
     ("max_step", "parameter", "", "s", "largest step of the integrator"),
+    ("friction", "parameter", "joint", "N|N.m", "Coulomb friction and stiction"),
+    ("damping", "parameter", "joint", "N.s/m|N.m.s/rad", "viscous friction"),
+    ("armature", "parameter", "joint", "kg|kg.m2", "inertia of the rotor times gear ratio squared"),
     ("control_period", "parameter", "", "s", "sampling period of the controller, 0 for a continuous one"),
     ("control_delay", "parameter", "", "s", "time from a sample to the effort that it commands"),
     ("q_resolution", "parameter", "joint", "m|rad", "resolution of the position sensor"),
@@ -251,6 +254,9 @@ def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]
         "rtol": 1e-3,
         "atol": 1e-6,
         "max_step": 1e-3,
+        "friction": robot.friction,
+        "damping": robot.damping,
+        "armature": (0.0,) * n,
         "control_period": 0.0,
         "control_delay": 0.0,
         "q_resolution": (0.0,) * n,
@@ -288,7 +294,7 @@ def _rows(robot: Robot, control: str) -> list[Row]:
 
 
 def count_event_indicators(robot: Robot, control: str) -> int:
-    """Count the event indicators of Model Exchange: two per joint, and droppable singular values."""
+    """Count the event indicators of Model Exchange: three per joint, and droppable singular values."""
     law = CONTROLS[control]
     rows = len(robot.axes) + 3 * ("quat_des" in law.inputs) if "rcond" in law.parameters else 1
-    return 2 * len(robot.joints) + rows - 1
+    return 3 * len(robot.joints) + rows - 1

@@ -263,13 +263,18 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         xd0 = (linkage.kinematics.jacobian(linkage.frame, q[:1])[0] @ v0)[axes]
         e = task_error(x[0], xd0, held, bag.provenance["step"], bag.steps)
         off = np.linalg.norm(x - target - e, axis=1)
+
+    def recorded(group: str) -> list[float]:
+        return [float(value) for name, value in first.items() if name.startswith(f"{group}[")]
+
     external = [name for name in first if name.startswith(("tau_ext[", "f_ext["))]
     astray = bool(off.max() > NOTABLE)
     at_work = {
         "joint limits": any(joint.at_limit for joint in joints),
         "effort limits": bool(first.get("limit_effort")),
         "singularities": astray and linkage.is_singular(q, float(first.get("rcond", 0.0)), turns),
-        "damping": any(joint.damping for joint in linkage.urdf.joints.values() if joint.moves),
+        "damping": any(recorded("damping") or (j.damping for j in linkage.urdf.joints.values() if j.moves)),
+        "friction": any(recorded("friction")),
         "unknown payload": bool(first.get("payload")) and not first.get("payload_known"),
         "external torque": any(values[name] for _, values in bag.schedule for name in external),
     }
