@@ -299,7 +299,7 @@ class Driver:
 def changed_step(fmu_path, folder, lines):
     """The default FMU, whose plant does this before each step, or in its place."""
     body = indent(dedent(lines).strip(), "    ")
-    code = f"step = Plant.step\n\ndef changed(self, h):\n{body}\n    step(self, h)\n"
+    code = f"step = Plant.step\n\ndef changed(self, *times):\n{body}\n    step(self, *times)\n"
     return changed_plant(fmu_path, folder, f"{code}\nPlant.step = changed\n")
 
 

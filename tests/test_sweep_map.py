@@ -53,7 +53,7 @@ def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_pho
                 shown = context.new_page()
                 shown.set_viewport_size({"width": 390, "height": 844})
                 shown.goto(page.as_uri())
-                seen.append(shown.locator("body > svg").screenshot())
+                seen.append(shown.locator("body > svg[viewBox]").screenshot())
                 ground = shown.evaluate("getComputedStyle(document.body).backgroundColor")
                 assert max(shown.evaluate(LINES)) == 1
                 assert shown.evaluate("document.documentElement.scrollWidth") == 390

@@ -206,8 +206,6 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):
             hover = "none" if stroke.kind else "skip"
             place = {"xaxis": "x", "yaxis": f"y{row}", "hoverinfo": hover}
-            if stroke.mark == "v":
-                place |= {"hoverinfo": "name"}
             data.append({**_trace(stroke.thinned(most)), **place})
     return {"data": data, "layout": layout}
 
