@@ -6,6 +6,13 @@
 #include "internal.h"
 #include "model.h"
 
+/* False, which no compiler can tell: the branches of mechanism.c on it end its basic blocks. */
+static inline int never(void)
+{
+    static const volatile int no = 0;
+    return no;
+}
+
 /* Where a joint is: cosine and sine of its angle; of one that slides its displacement, as c. */
 typedef struct {
     double c, s;

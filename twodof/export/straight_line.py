@@ -15,6 +15,11 @@ from dataclasses import dataclass
 
 WIDTH = 100
 """Characters of a line."""
+LONG, BLOCK = 1500, 50
+"""Statements of a function from which on it gets branches, and statements between two of them.
+
+LLVM's scheduler and register allocator take time quadratic in a basic block; branches make short functions slower.
+"""
 STRUCTS = {"turn": "JointPosition"}
 """Types of functions of C that return no number."""
 
@@ -126,7 +131,7 @@ def varied(
 
 
 def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None) -> str:
-    """Return a function that assigns each result to its lvalue, which is a variable of no result.
+    """Return a void function that assigns each result to its lvalue, which is a variable of no result.
 
     If numbers are complex, ``complexes`` has of each result the real part and how it varies.
     """
@@ -158,7 +163,9 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
             text = f"t{index}"
         texts.append(text)
     lines += [f"    {target} = {_bare(texts[index])};" for target, index in zip(results, indices, strict=True)]
-    return "\n".join(lines)
+    size = BLOCK if len(lines) > LONG else LONG
+    blocks = ("\n".join(lines[i : i + size]) for i in range(0, len(lines), size))
+    return "\n    if (never())\n        return;\n".join(blocks)
 
 
 def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]], list[int]]:
