@@ -311,7 +311,7 @@ def forged(arm, field, value):
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
     joints = len(arm.of.robot.joints)
-    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}di4x{2 * joints + 3}i6i4xQ")
+    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}di4x{3 * joints + 3}i6i4xQ")
     fields = list(layout.unpack(blob))
     names = ["time", "stop_time", "step_start"]
     names += [f"step_{kind}[{i + 1}]" for kind in ("q", "v", "a") for i in range(joints)]
@@ -319,7 +319,7 @@ def forged(arm, field, value):
     names += ["reached_at", "passed_by", "step_begun", "first_sample", "last_sample", "samples"]
     names += [f"sample[{i + 1}]" for i in range(joints)]
     names += [f"pending{k}[{i + 1}]" for k in range(11) for i in range(joints)] + ["waiting"]
-    names += [f"{what}[{i + 1}]" for what in ("held", "watched") for i in range(joints)]
+    names += [f"{what}[{i + 1}]" for what in ("held", "watched", "slip") for i in range(joints)]
     names += ["any_held", "any_watched", "rank", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
     place = n + 1 + names.index(field) if field in names else 1 + arm.of.index(field)
@@ -338,7 +338,8 @@ def fnv(content):
 
 UNSOUND = "fmi2DeSerializeFMUstate: the state is none that an instance can be in"
 FORGERIES = {
-    "held[1]": ((2, -1), UNSOUND),
+    "held[1]": ((4, -1), UNSOUND),
+    "slip[1]": ((2, -2), UNSOUND),
     "watched[2]": ((1, 7), UNSOUND),  # of a joint that is not held
     "phase": ((-1, 4, 5, 7, 77, 2**31 - 1, -(2**31)), UNSOUND),
     "time": ((np.nan, np.inf, -np.inf), UNSOUND),

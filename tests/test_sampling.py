@@ -254,6 +254,12 @@ def test_a_resolution_rounds_to_the_nearest_and_ties_to_even():
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("q, seen", [(0.125, 0.0), (0.375, 0.5), (-0.375, -0.5), (0.13, 0.25)])
+def test_every_flavour_rounds_alike(fmus, kind, q, seen):
+    assert run(fmus("slider", "effort", kind), 0.01, 0.01, q_start=q, q_resolution=0.25)[:, 3].tolist() == [seen] * 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_velocities_are_differences_of_what_is_measured(fmus, kind):
     settings = dict(control_period=0.01, q_resolution=1e-3, q_noise=1e-4, seed=3, v_from_q=True, q_des=1.0, v_start=0.5)
     rows = run(fmus("slider", "joint", kind), 0.5, 0.01, **settings)

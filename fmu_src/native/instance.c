@@ -225,14 +225,20 @@ Status initialise(Instance *instance, int warn)
     return OK;
 }
 
+int show_samples(State *state)
+{
+    Sampling draft = state->sampling;
+    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
+    return (held && state->phase == CONTINUOUS_TIME) || settle(&draft, &state->plant, state->time);
+}
+
 int update_control(Instance *instance)
 {
     State *state = &instance->state;
-    Sampling draft = state->sampling;
     const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
     if (state->has_tau)
         return 1;
-    if (!(held && state->phase == CONTINUOUS_TIME) && !settle(&draft, &state->plant, state->time))
+    if (held && !show_samples(state))
         return 0;
     if (!held && instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
         update_stops(state);

@@ -88,7 +88,7 @@ typedef struct {
     int phase;
     int initialised;  /* the outputs q and v are those of the parameters and the state */
     int has_x;        /* the output x is computed */
-    int has_tau;      /* the outputs tau, q_meas and v_meas are computed */
+    int has_tau;      /* the output tau is computed, with held efforts q_meas and v_meas too */
     int has_stops;    /* the joints that rest are found */
     int has_rates;    /* the derivatives are computed */
 } State;
@@ -171,9 +171,11 @@ INTERNAL Status check_parameters(Instance *instance);
    clamped is logged too. */
 INTERNAL Status initialise(Instance *instance, int warn);
 
-/* Compute the outputs tau, q_meas and v_meas, where that is yet to be done. A sample that is due is taken for them
-   alone, for inputs may still change; in continuous-time mode an event alone takes one. False where an effort is not
-   finite. */
+/* Compute the outputs q_meas and v_meas, and tau where it is held. A sample that is due is taken for them alone, for
+   inputs may still change; in continuous-time mode an event alone takes one. False where an effort is not finite. */
+INTERNAL int show_samples(State *state);
+
+/* Compute the output tau, where that is yet to be done; else as above. */
 INTERNAL int update_control(Instance *instance);
 
 /* The same where these are what acts: of a sampled controller. */

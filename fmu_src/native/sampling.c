@@ -98,10 +98,20 @@ int settle(Sampling *sampling, Plant *plant, double time)
     return 1;
 }
 
+/* Whether there are samples: of a controller, or of sensors without one at communication points. */
+static int are_samples(const double value[N_VARIABLES])
+{
+    int any = value[CONTROL_PERIOD] != 0.0;
+#if !COMMANDS_ACCELERATION
+    any |= value[V_FROM_Q] != 0.0;
+    for (int i = 0; i < N_JOINTS; i++)
+        any |= value[Q_RESOLUTION + i] != 0.0 || value[Q_NOISE + i] != 0.0 || value[V_NOISE + i] != 0.0;
+#endif
+    return any;
+}
+
 int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Failure *failure)
 {
-    Sampling samples = *sampling;
-    Plant draft = *plant;
     const double period = plant->value[CONTROL_PERIOD], max_step = plant->value[MAX_STEP], end = time + h;
     double t = time;
     long evaluations = 0;
@@ -110,6 +120,10 @@ int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Fai
         failure->reason = period != 0.0 && period < max_step ? SHORT_PERIOD : MANY_STEPS;
         return 0;
     }
+    if (!are_samples(plant->value))
+        return advance_plant(plant, h, &evaluations, NULL, failure);
+    Sampling samples = *sampling;
+    Plant draft = *plant;
     while (!last) {
         failure->reason = NOT_FINITE;
         if (!settle(&samples, &draft, t))

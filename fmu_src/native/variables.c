@@ -116,7 +116,10 @@ static Status update(Instance *instance, int variable)
         return ERROR;
     if (variable >= TAU && check_inputs(instance) != OK)
         return ERROR;
-    if (variable >= TAU && !(variable < DER_Q ? update_control : update_held)(instance))
+    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
+    if (!held && variable >= Q_MEAS && variable < DER_Q)
+        show_samples(state);
+    else if (variable >= TAU && (held || variable < Q_MEAS) && !update_control(instance))
         return report(instance, DISCARD, "%s: %s", call_name(GET_REAL), NO_EFFORT);
     if (variable >= END_OF_RATES) {
         update_others(state);
