@@ -120,12 +120,21 @@ class Rubbing:
                 events.append(function)
                 what.append(name)
 
-            for i in slips:
-                watch(lambda t, y, i=i, mode=mode: mode[i] * y[n + i], "arrested", i)
-            for i in np.flatnonzero(~rests):
-                # on its way from a limit, a joint has room: a first step may be too short to leave it
-                watch(lambda t, y, i=i: self.high[i] - y[i] + max(0.0, -y[n + i]), "stopped", i, self.high[i])
-                watch(lambda t, y, i=i: y[i] - self.low[i] + max(0.0, y[n + i]), "stopped", i, self.low[i])
+            for i in slips:  # with room while it accelerates: it may begin at 0, and stop within a first step
+                watch(
+                    lambda t, y, i=i, mode=mode: (
+                        mode[i] * y[n + i] + max(0.0, mode[i] * self.motion(y[:n], y[n:], mode)[0][i])
+                    ),
+                    *("arrested", i),
+                )
+            for i in np.flatnonzero(~rests):  # with room while it moves away, or begins to
+                for side, limit in ((-1.0, self.high[i]), (1.0, self.low[i])):
+                    watch(
+                        lambda t, y, i=i, side=side, limit=limit, mode=mode: (
+                            side * (y[i] - limit) + max(0.0, side * (y[n + i] or self.motion(y[:n], y[n:], mode)[0][i]))
+                        ),
+                        *("stopped", i, limit),
+                    )
             for i in np.flatnonzero(rests):
                 for sign, bound in ((1.0, most[i]), (-1.0, -least[i])):
                     if bound < np.inf:

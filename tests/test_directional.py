@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from native_models import ROBOTS, Engine, Reduced, model
 
-from twodof.plant.stops import CLAMPED, STOPPED
+from twodof.plant.stops import CLAMPED, FREE, STOPPED, STUCK
 
 
 class Derivatives(Engine):
@@ -176,6 +176,41 @@ def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
     assert np.abs(ours - theirs).max() <= 1e-6 * max(1.0, np.abs(theirs).max())
     rates = engine.part(ours, r"der\(v.*", r".*")
     assert not rates[[1, 4]].any() and rates[0].any()
+
+
+@pytest.mark.parametrize("control", ["effort", "joint"])
+def test_joints_that_stick_and_slip_have_pinocchios_derivatives(control):
+    """From M q̈ + h = τ + λ, in the rows of joints that move: M_mm δq̈ = δτ − ∂(M q̈ + h), q̈ being that of the motion."""
+    engine = Derivatives(model("ur5", control))
+    robot, rng = engine.model.robot, np.random.default_rng(6)
+    reference, n = robot.model.copy(), engine.n
+    for _ in range(10):
+        friction, damping, armature = rng.uniform(0.1, 20, (3, n)).tolist()
+        settings = {"f_ext": [0.0] * 3, "friction": friction, "damping": damping, "armature": armature}
+        values = at_random(engine, rng, **settings)
+        slip = rng.choice([-1, 0, 1], n).astype(np.int32)
+        held = np.where(slip == 0, STUCK, FREE).astype(np.int32)
+        reference.gravity.linear = engine.group(values, "gravity")
+        ours, moves = engine.jacobian(values, held, slip), slip != 0
+        engine.call("compute", values, held, slip)
+        q, v, a = (engine.group(values, group) for group in ("q", "v", "der_v"))
+        assert not a[~moves].any()
+        data = reference.createData()
+        by_q, by_v, M = (np.array(x) for x in pin.computeRNEADerivatives(reference, data, q, v, a))
+        M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)
+        effort = {"q": -by_q, "v": -by_v - np.diag(damping), "tau_ext": np.eye(n)}
+        if control == "joint":  # τ = M q̈_cmd + h, of which the armature is a part
+            Kp, Kd = engine.group(values, "Kp"), engine.group(values, "Kd")
+            wanted = engine.group(values, "a_des") + Kd * (engine.group(values, "v_des") - v)
+            wanted += Kp * (engine.group(values, "q_des") - q)
+            law_q, law_v, _ = (np.array(x) for x in pin.computeRNEADerivatives(reference, data, q, v, wanted))
+            effort["q"] = effort["q"] + law_q - M @ np.diag(Kp)
+            effort["v"] = effort["v"] + law_v - M @ np.diag(Kd)
+        for group, change in effort.items():
+            expected = np.zeros((n, n))
+            expected[moves] = np.linalg.solve(M[np.ix_(moves, moves)], change[moves])
+            part = engine.part(ours, r"der\(v.*", rf"{group}\[\d+\]")
+            assert np.abs(part - expected).max() <= 1e-10 * max(1.0, np.abs(expected).max())
 
 
 def test_a_direction_of_any_size_has_its_derivative():

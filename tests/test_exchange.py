@@ -147,6 +147,14 @@ def test_the_description_is_valid(fmus, name):
             assert variables[f"der({state}[{i + 1}])"].derivative is variable
 
 
+RUBBING = {
+    "q_des": (-1, 1),
+    "v_start": (1, 3),
+    "Kp": (10, 90),
+    "Kd": (0, 3),
+    "friction": (0.02, 0.2),
+    "damping": (0, 0.02),
+}
 RUNS = {
     ("effort", "swings into its stops"): {**NARROW, "v_start[1]": 2.0},
     ("effort", "clamped"): {**NARROW, "v_start[1]": 2.0, "rigid_stops": False},
@@ -166,6 +174,15 @@ RUNS = {
     },
     ("task", "forces"): {"tau_ext[1]": 0.2, "f_ext[2]": -0.5, "limit_effort": True},
     ("pose", "stops"): {"q_max[1]": 0.7, "x_des[1]": 0.1, "x_des[2]": 0.2, "quat_des[3]": 0.5, "quat_des[4]": 0.8},
+    ("effort", "sticks, and swings into its stops"): {
+        **NARROW,
+        "v_start[1]": 2.0,
+        "friction[1]": 0.05,
+        "friction[2]": 0.02,
+        "armature[2]": 0.01,
+    },
+    ("joint", "sticks and slips"): {"q_des[1]": 1.2, "Kd[1]": 0.0, "friction[1]": 0.3, "friction[2]": 0.1},
+    ("task", "slips"): {"x_des[1]": 0.14, "Kd[1]": 5.0, "friction[1]": 0.05, "friction[2]": 0.02, "damping[1]": 0.01},
     ("ur5", "falls into its stops"): {
         **{f"q_min[{i}]": -0.3 for i in (2, 3, 4)},
         **{f"q_max[{i}]": 0.4 for i in (2, 3, 4)},
@@ -291,6 +308,19 @@ def test_a_solvers_rounding_does_not_let_a_held_joint_go(fmus):
     model.y = [1.0 - 1e-12, 0.0, -1e-17, 0.0]
     assert model.indicators()[0] > 0.0 and model.rates()[2] == 0.0
     assert model.event() and model.y == [1.0, 0.0, 0.0, 0.0] and model.rates()[2] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sticking_and_slipping_have_few_events(fmus, events, seed):
+    """At most three for each change, of which the steps of 1 ms of co-simulation see some."""
+    rng = np.random.default_rng(seed)
+    starts = {f"{group}[{i}]": rng.uniform(low, high) for i in (1, 2) for group, (low, high) in RUBBING.items()}
+    ours = run(fmus["joint"], "CoSimulation", starts, 2.0, 1e-3)
+    theirs = run(fmus["joint"], "ModelExchange", starts, 2.0, 1e-3, relative_tolerance=1e-10)
+    assert np.abs(ours - theirs).max() <= 1e-6
+    signs = np.sign(ours[:, 2:])
+    changes = np.count_nonzero(np.diff(signs, axis=0)) + 2  # and those within a step, of which there are few
+    assert 1 <= len(events) <= 3 * changes
 
 
 @pytest.fixture

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 from friction_oracle import Rubbing
-from native_models import Engine, Model, from_urdf
+from native_models import Engine, Model, Reduced, engine, from_urdf, model
+
+from twodof.plant.plant import DiscardError
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 SLIDER = """<robot name="slider"><link name="base"/><link name="body"><inertial><mass value="2"/>
@@ -23,7 +27,8 @@ def chain(rng, n):
     text = ['<robot name="chain"><link name="link0"/>']
     for i in range(1, n + 1):
         x = rng.normal(0, 1, (3, 3))
-        inertia = 0.02 * (x @ x.T + 3 * np.eye(3))
+        second = 0.01 * (x @ x.T + np.eye(3))  # moments of the mass, of which the inertia consists
+        inertia = np.trace(second) * np.eye(3) - second
         keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
         tensor = " ".join(f'{key}="{inertia[place]!r}"' for key, place in keys.items())
         text.append(
@@ -57,15 +62,6 @@ def states(native: Engine, plant, h: float, count: int, *, python: bool):
     for _ in range(count):
         assert native.call("advance", values, h) == 1, native.failure()
         yield native.group(values, "q").copy(), native.group(values, "v").copy()
-
-
-def sticks(plant):
-    """Whether each joint of a plant rests by its friction."""
-    stops, y = plant.stops(), [*plant.q, *plant.v]
-    equations, slip = plant.equations_of_motion(), stops.slide(plant.v)
-    a = list(equations.acceleration(np.array(plant.q), np.array(plant.v), None, slip)[0])
-    stops.hold(y, a, [False] * len(plant.q))
-    return [rest == 1 for rest in stops.rest]
 
 
 # --- the Coulomb oscillator ---
@@ -169,3 +165,115 @@ def test_sticking_slipping_and_stopping_together_is_the_oracles(length):
         for _, mode in modes:
             kinds |= {(bool((mode == 0).any()), bool((mode != 0).any()))}
     assert {(True, True), (False, True)} <= kinds
+
+
+# --- energy, MuJoCo, extremes ---
+
+
+@pytest.mark.parametrize("name", ["twodof", "ur5", "panda"])
+def test_energy_never_grows(name, length):
+    native, rng = engine(name, "effort"), np.random.default_rng(8)
+    plant = model(name, "effort").plant()
+    reference = plant.robot.model.copy()
+    reference.gravity.linear = np.array(plant.gravity)
+    reduced, stuck = Reduced(reference, name), 0
+    plant.rtol, plant.atol = 1e-10, 1e-12
+    for _ in range(length(500, 15)):
+        q = rng.uniform(-1, 1, native.n)
+        plant.q_min, plant.q_max = (q - 0.4).tolist(), (q + 0.4).tolist()
+        plant.q, plant.v = q.tolist(), rng.normal(0, 2, native.n).tolist()
+        plant.friction = (rng.uniform(0, 40, native.n) * (rng.random(native.n) < 0.7)).tolist()
+        before = reduced.energy(q, np.array(plant.v))
+        for q, v in states(native, plant, 0.01, 60, python=False):
+            energy = reduced.energy(q, v)
+            assert energy <= before + 1e-9 * max(1.0, abs(before))
+            before = energy
+            stuck += bool(((v == 0.0) & (plant.q_min < q) & (q < plant.q_max)).any())
+    assert stuck
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mujoco_agrees_when_each_joint_sticks(seed):
+    """With steps of 0.1 ms; its friction is soft, so that a joint sticks that is slow."""
+    rng = np.random.default_rng(seed)
+    n, urdf = 3, chain(rng, 3)
+    plant = from_urdf(urdf, "link3", "xyz", "effort").plant()
+    plant.gravity, plant.q, plant.v = [0.0] * 3, [0.0] * n, rng.uniform(-1, 1, n).tolist()
+    plant.friction, plant.armature = rng.uniform(1, 4, n).tolist(), [0.1] * n
+    plant.prepare()
+    theirs = mujoco.MjModel.from_xml_string(urdf)
+    theirs.opt.timestep, theirs.opt.gravity[:] = 1e-4, 0.0
+    theirs.dof_frictionloss[:], theirs.dof_armature[:] = plant.friction, plant.armature
+    theirs.dof_solref[:, 0] = 1e-3
+    data, when = mujoco.MjData(theirs), np.full((2, n), np.inf)
+    data.qvel[:] = plant.v
+    for k in range(10_000):
+        mujoco.mj_step(theirs, data)
+        when[0] = np.where(np.abs(data.qvel) < 2e-3, np.minimum(when[0], k * 1e-4), np.inf)
+    for k in range(1000):
+        plant.step(1e-3)
+        when[1] = np.where(np.array(plant.v) == 0.0, np.minimum(when[1], k * 1e-3), np.inf)
+    assert np.isfinite(when).all() and np.abs(when[0] - when[1]).max() <= 1e-2
+    assert np.abs(data.qpos - plant.q).max() <= 1e-2
+
+
+@pytest.mark.parametrize("friction", [1e-300, 1e-12, 1e12, 1e300])
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+@pytest.mark.parametrize("control", ["effort", "joint"])
+def test_friction_of_any_size_is_right_or_refused(friction, speed, control):
+    native, ends = engine("ur5", control), []
+    for python in (False, True):
+        plant = model("ur5", control).plant()
+        plant.friction, plant.v = [friction] * 6, [speed] * 6
+        if control == "joint":
+            plant.Kp = plant.Kd = [0.0] * 6
+        if friction * speed == 1e300:
+            with pytest.raises((AssertionError, DiscardError)):
+                list(states(native, plant, 0.01, 1, python=python))
+            continue
+        q, v = list(states(native, plant, 0.01, 5, python=python))[-1]
+        ends.append(np.r_[q, v])
+        if friction > 1.0:
+            assert not v.any() and np.abs(q - model("ur5", control).plant().q).max() <= 1e-9
+    if friction < 1.0:  # as without
+        plant = model("ur5", control).plant()
+        plant.v, plant.Kp, plant.Kd = [speed] * 6, [0.0] * 6, [0.0] * 6
+        ends.append(np.concatenate(list(states(native, plant, 0.01, 5, python=False))[-1]))
+    assert all(np.abs(end - ends[0]).max() <= 1e-9 for end in ends)
+
+
+def test_a_robot_that_sticks_stays_to_the_bit_and_costs_nothing():
+    plant = model("ur5", "joint").plant()
+    plant.friction, plant.q_des = [1e3] * 6, [1.0] * 6
+    start, calls = list(plant.q), []
+    equations = plant.equations_of_motion()
+
+    def counted(*state):
+        calls.append(state)
+        return equations.acceleration(*state)
+
+    plant.equations_of_motion = lambda: replace(equations, acceleration=counted)
+    for _ in range(10):
+        plant.step(0.01)
+    assert (plant.q, plant.v, len(calls)) == (start, [0.0] * 6, 10)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_friction_and_stops_do_not_depend_on_the_communication_step(rigid):
+    runs = []
+    for parts in (1, 2, 5, 10):
+        native, plant = engine("twodof", "joint"), model("twodof", "joint").plant()
+        changes = {
+            "q_min": [0.2, -0.4],
+            "q_max": [0.9, 0.5],
+            "q_des": [1.5, -1.0],
+            "Kp": [90.0, 70.0],
+            "Kd": [1.0, 0.0],
+        }
+        changes |= {"friction": [0.05, 0.02], "rtol": 1e-10, "atol": 1e-12, "rigid_stops": rigid, "tau_ext": [0.0, 0.1]}
+        for name, value in changes.items():
+            setattr(plant, name, value)
+        rows = list(states(native, plant, 0.01 / parts, 200 * parts, python=False))
+        runs.append(np.array([np.r_[q, v] for q, v in rows[parts - 1 :: parts]]))
+    for other in runs[1:]:
+        np.testing.assert_allclose(other, runs[0], rtol=0.0, atol=1e-7)

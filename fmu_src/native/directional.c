@@ -102,7 +102,7 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], const int slip[N_JO
         Stops stops = {.rank = rank};
         for (int i = 0; i < N_JOINTS; i++) {
             stops.any_held |= stops.held[i] = held[i];
-            stops.slip[i] = slip[i];
+            stops.any_slip |= stops.slip[i] = slip[i];
         }
         compute_rates(plant, &stops);
     }

@@ -33,8 +33,9 @@ void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double e
               double *margin)
 {
     step->evaluations++;
-    acceleration(step->plant, y, y + N_JOINTS, step->stops.slip, step->stops.rank, a, margin);
-    restrain(step->plant, &step->stops, y, a, effort);
+    acceleration(step->plant, y, y + N_JOINTS, slip_of(&step->stops), step->stops.rank, a, margin);
+    if (step->stops.any_held)
+        restrain(step->plant, &step->stops, y, a, effort);
 }
 
 double dormand_prince(Step *step)

@@ -174,8 +174,6 @@ static double first_crossing(Step *step, Margin *margin, int component)
 static int may_pass(const Step *step, int joint, int side)
 {
     double low = HUGE_VAL, high = -HUGE_VAL;
-    if (!step->stops.watched[joint])
-        return 0;
     for (int stage = 0; stage <= STAGES; stage++) {
         const double margin = grip_of(step, joint, step->effort[stage][joint], side);
         low = fmin(low, margin);
@@ -226,7 +224,7 @@ static double first_release(Step *step, double before)
     double effort[LOOKS + 1][N_JOINTS], look[2 * LOOKS * N_JOINTS];
     int looks = 0, doubt = 0;
     for (int i = 0; i < N_JOINTS; i++)
-        doubt |= may_be_released(step, i);
+        doubt |= step->stops.watched[i] && may_be_released(step, i);
     if (!doubt)
         return HUGE_VAL;
     memcpy(effort[0], step->effort[0], sizeof *effort);
@@ -238,7 +236,7 @@ static double first_release(Step *step, double before)
             double p[LOOKS + 1];
             for (int k = 0; k <= LOOKS; k++)
                 p[k] = grip_of(step, i, effort[k][i], side);
-            if (may_pass(step, i, side))
+            if (step->stops.watched[i] && may_pass(step, i, side))
                 looks += doubtful_minima(p, look + looks);
         }
     for (int k = 1; k <= LOOKS && step->size * (k - 1) / LOOKS < before; k++) {
@@ -258,23 +256,31 @@ static double first_release(Step *step, double before)
     return HUGE_VAL;
 }
 
+/* Whether the velocity of a joint that slips may pass zero within the step. */
+static int may_be_arrested(const Step *step, int joint)
+{
+    const int i = N_JOINTS + joint;
+    double largest = 0.0;
+    for (int stage = 0; stage <= STAGES; stage++)
+        largest = fabs(step->K[stage][i]) > largest ? fabs(step->K[stage][i]) : largest;
+    return !(step->stops.slip[joint] * step->y[i] > REACH * step->size * largest);
+}
+
 /* Positions that may be past a limit within the step, and velocities that may be past zero. Returns a bound on
    the change of singular values. */
 static double sweep(const Step *step, int near[N_STATES])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
-    double fastest[N_STATES] = {0}, change = 0.0;
+    double fastest[N_JOINTS] = {0}, change = 0.0;
     for (int stage = 0; stage <= STAGES; stage++)
-        for (int i = 0; i < N_STATES; i++) { /* quicker than fmax, which minds NaN */
+        for (int i = 0; i < N_JOINTS; i++) { /* quicker than fmax, which minds NaN */
             const double speed = fabs(step->K[stage][i]);
             fastest[i] = speed > fastest[i] ? speed : fastest[i];
         }
     for (int i = 0; i < N_JOINTS; i++) {
         const double q = step->y[i], reach = REACH * step->size * fastest[i];
-        const int slip = step->stops.held[i] ? 0 : step->stops.slip[i];
         near[i] = !step->stops.held[i] && !(q - reach > low[i] && q + reach < high[i]);
-        near[N_JOINTS + i] =
-            slip && !(slip * step->y[N_JOINTS + i] > REACH * step->size * fastest[N_JOINTS + i]);
+        near[N_JOINTS + i] = step->stops.slip[i] && !step->stops.held[i] && may_be_arrested(step, i);
         change += SWING[i] * reach;
     }
     return change;
@@ -304,7 +310,7 @@ double first_event(Step *step, int rank_held, Event *event)
     const int near_rank = !(fmax(step->margin, step->margin_new) > change);
     int any = near_rank;
     for (int i = 0; i < N_JOINTS; i++)
-        any |= near[i] || near[N_JOINTS + i] || may_be_released(step, i);
+        any |= near[i] || near[N_JOINTS + i] || (step->stops.watched[i] && may_be_released(step, i));
     if (!any)
         return 0.0;
     interpolate(step);

@@ -45,11 +45,8 @@ void event_indicators(const Plant *plant, const Stops *stops, double indicator[N
     const double *q = &plant->value[Q], *v = &plant->value[V];
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     double a[N_JOINTS], effort[N_JOINTS];
-    int any = stops->any_watched;
-    for (int i = 0; i < N_JOINTS; i++)
-        any |= stops->slip[i] != 0;
-    if (any) {
-        acceleration(plant, q, v, stops->slip, stops->rank, a, NULL);
+    if (stops->any_watched || stops->any_slip) {
+        acceleration(plant, q, v, slip_of(stops), stops->rank, a, NULL);
         restrain(plant, stops, q, a, effort);
     }
     const double rounding = stops->any_watched ? rounding_of(stops, effort) : 0.0;

@@ -131,7 +131,9 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     for (int i = 0; i < N_JOINTS; i++) {
         if (!accelerates)
             a[i] = 0.0;
-        excess[i] = value[TAU_EXT + i] - value[DAMPING + i] * v[i] - value[FRICTION + i] * slip[i];
+        excess[i] = value[TAU_EXT + i] - value[DAMPING + i] * v[i];
+        if (slip)
+            excess[i] -= value[FRICTION + i] * slip[i];
     }
     if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
         effort_of_force(joint, force, further);

@@ -14,8 +14,8 @@ typedef struct {
 enum { N_STATES = 2 * N_JOINTS }; /* q and v follow each other in the table, their derivatives too */
 
 /* q̈ of the equations of motion at a state, with a J⁺ of this rank, of joints that slip in these directions
-   (−1, 1; 0: without friction), all joints at rest being free. Returns the rank; the margin, which may be
-   NULL, is negative where the singular values give another. */
+   (−1, 1; 0, or NULL: without friction), all joints at rest being free. Returns the rank; the margin, which
+   may be NULL, is negative where the singular values give another. */
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                           const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin);
 

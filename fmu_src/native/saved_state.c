@@ -51,13 +51,14 @@ static int are_integers(const double value[])
 static int are_stops(Stops *stops)
 {
     int sound = stops->rank >= 0 && stops->rank <= N_ROWS;
-    stops->any_held = stops->any_watched = 0;
+    stops->any_held = stops->any_watched = stops->any_slip = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         const int held = stops->held[i], watched = stops->watched[i], slip = stops->slip[i];
         sound = sound && held >= FREE && held <= CLAMPED && (watched == 0 || (watched == 1 && held));
         sound = sound && slip >= -1 && slip <= 1 && (held == FREE || held == CLAMPED || slip == 0);
         stops->any_held |= held != FREE;
         stops->any_watched |= watched;
+        stops->any_slip |= slip != 0;
     }
     return sound;
 }

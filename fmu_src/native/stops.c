@@ -123,19 +123,22 @@ void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOI
                 v[i] = 0.0;
 }
 
-/* Bound what acts on joints at rest by their friction too; that of a clamp which holds in any case, or of a
+/* Bound what acts on joints at rest by their friction too. Whether any may rest. That of a clamp which holds in any case, or of a
    joint without a range, is no matter. */
-static void add_friction(const Plant *plant, const double v[N_JOINTS], Contact contact[N_JOINTS])
+static int add_friction(const Plant *plant, const double v[N_JOINTS], Contact contact[N_JOINTS])
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
+    int any = 0;
     for (int i = 0; i < N_JOINTS; i++) {
         Contact *own = &contact[i];
         const int clamps = own->side != 0.0 && !rigid;
         const double friction = clamps && own->fixed ? 0.0 : plant->value[FRICTION + i];
-        own->there = v[i] == 0.0 && (friction > 0.0 || (own->there && rigid)); /* others move away */
+        any |= v[i] == 0.0 && (friction > 0.0 || own->there); /* others move away */
+        own->there = v[i] == 0.0 && (friction > 0.0 || (own->there && rigid));
         own->low = (clamps ? 0.0 : own->low) - friction;
         own->high = (clamps ? 0.0 : own->high) + friction;
     }
+    return any;
 }
 
 /* Add what the friction of joints that begin to slip does to a, the accelerations without. */
@@ -162,11 +165,14 @@ void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_
     Contact contact[N_JOINTS];
     double stopped[N_JOINTS];
     memset(stops, 0, sizeof *stops);
-    for (int i = 0; i < N_JOINTS; i++)
+    for (int i = 0; i < N_JOINTS; i++) {
         stops->slip[i] = plant->value[FRICTION + i] > 0.0 ? (v[i] > 0.0) - (v[i] < 0.0) : 0;
-    stops->rank = acceleration(plant, y, v, stops->slip, rank, a, margin);
+        stops->any_slip |= stops->slip[i] != 0;
+    }
+    stops->rank = acceleration(plant, y, v, slip_of(stops), rank, a, margin);
     find_contacts(plant, y, kept, contact);
-    add_friction(plant, v, contact);
+    if (!add_friction(plant, v, contact))
+        return;
     memcpy(stopped, a, sizeof stopped);
     if (!complementary(plant, y, contact, stopped)) {
         for (int i = 0; i < N_JOINTS; i++)
@@ -183,6 +189,7 @@ void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_
             stops->held[i] = own->side != 0.0 && rigid ? STOPPED : STUCK;
         if (own->there && !rests && plant->value[FRICTION + i] > 0.0)
             stops->slip[i] = -own->at;
+        stops->any_slip |= stops->slip[i] != 0;
         stops->watched[i] = stops->held[i] && !own->fixed;
         stops->any_held |= stops->held[i] != FREE;
         stops->any_watched |= stops->watched[i];
@@ -207,6 +214,11 @@ double rounding_of(const Stops *stops, const double effort[N_JOINTS])
     return 2.0 * ROUNDING_OF_SUM * largest;
 }
 #endif
+
+const int *slip_of(const Stops *stops)
+{
+    return stops->any_slip ? stops->slip : NULL;
+}
 
 int is_above(const Plant *plant, double q, int i)
 {
@@ -286,6 +298,6 @@ void compute_rates(Plant *plant, const Stops *stops)
 {
     double *value = plant->value, effort[N_JOINTS];
     memcpy(&value[DER_Q], &value[V], N_JOINTS * sizeof *value);
-    acceleration(plant, &value[Q], &value[V], stops->slip, stops->rank, &value[DER_V], NULL);
+    acceleration(plant, &value[Q], &value[V], slip_of(stops), stops->rank, &value[DER_V], NULL);
     restrain(plant, stops, &value[Q], &value[DER_V], effort);
 }

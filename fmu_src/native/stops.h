@@ -14,7 +14,7 @@ typedef enum { FREE, STUCK, STOPPED, CLAMPED } Rest;
    friction, and the rank of J⁺. */
 typedef struct {
     int held[N_JOINTS], watched[N_JOINTS], slip[N_JOINTS];
-    int any_held, any_watched;
+    int any_held, any_watched, any_slip;
     int rank;
 } Stops;
 
@@ -36,6 +36,9 @@ INTERNAL double grip(const Plant *plant, const Stops *stops, int i, double q, do
 /* A bound on the rounding of these efforts. */
 INTERNAL double rounding_of(const Stops *stops, const double effort[N_JOINTS]);
 #endif
+
+/* The directions of slip in a regime, NULL where no joint slips. */
+INTERNAL const int *slip_of(const Stops *stops);
 
 /* Whether a joint is nearer to its upper limit than to its lower one. */
 INTERNAL int is_above(const Plant *plant, double q, int i);

@@ -91,15 +91,13 @@ FMI2_Export void probe_acceleration(const double value[], double a[])
 {
     Plant plant;
     memcpy(plant.value, value, sizeof plant.value);
-    const int slip[N_JOINTS] = {0};
-    acceleration(&plant, &plant.value[Q], &plant.value[V], slip, ANY_RANK, a, NULL);
+    acceleration(&plant, &plant.value[Q], &plant.value[V], NULL, ANY_RANK, a, NULL);
 }
 
 static int rank_of(const double value[])
 {
     double a[N_JOINTS];
-    const int slip[N_JOINTS] = {0};
-    return acceleration((const Plant *)value, &value[Q], &value[V], slip, ANY_RANK, a, NULL);
+    return acceleration((const Plant *)value, &value[Q], &value[V], NULL, ANY_RANK, a, NULL);
 }
 
 static Failure failure;
@@ -137,7 +135,7 @@ FMI2_Export void probe_differentiate(const double value[], const int held[], con
 /* All computed variables. */
 FMI2_Export void probe_compute(double value[], const int held[], const int slip[])
 {
-    Stops stops = {.any_held = 1, .rank = rank_of(value)};
+    Stops stops = {.any_held = 1, .any_slip = 1, .rank = rank_of(value)};
     memcpy(stops.held, held, sizeof stops.held);
     memcpy(stops.slip, slip, sizeof stops.slip);
     compute_position((Plant *)value);
