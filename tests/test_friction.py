@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -242,7 +243,7 @@ def test_friction_of_any_size_is_right_or_refused(friction, speed, control):
     assert all(np.abs(end - ends[0]).max() <= 1e-9 for end in ends)
 
 
-def test_a_robot_that_sticks_stays_to_the_bit_and_costs_nothing():
+def test_a_robot_that_sticks_stays_to_the_bit_and_costs_nothing(monkeypatch):
     plant = model("ur5", "joint").plant()
     plant.friction, plant.q_des = [1e3] * 6, [1.0] * 6
     start, calls = list(plant.q), []
@@ -252,7 +253,7 @@ def test_a_robot_that_sticks_stays_to_the_bit_and_costs_nothing():
         calls.append(state)
         return equations.acceleration(*state)
 
-    plant.equations_of_motion = lambda: replace(equations, acceleration=counted)
+    monkeypatch.setattr(plant, "equations_of_motion", lambda: replace(equations, acceleration=counted))
     for _ in range(10):
         plant.step(0.01)
     assert (plant.q, plant.v, len(calls)) == (start, [0.0] * 6, 10)
@@ -263,7 +264,7 @@ def test_friction_and_stops_do_not_depend_on_the_communication_step(rigid):
     runs = []
     for parts in (1, 2, 5, 10):
         native, plant = engine("twodof", "joint"), model("twodof", "joint").plant()
-        changes = {
+        changes: dict[str, Any] = {
             "q_min": [0.2, -0.4],
             "q_max": [0.9, 0.5],
             "q_des": [1.5, -1.0],
