@@ -20,6 +20,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch
 
 matplotlib.use("Agg")
@@ -57,6 +58,7 @@ def main() -> None:
         draw_map(native, gains, {}, ROOT / "docs" / "map.png")
         loads = {"Kp": np.linspace(250, 5000, 20), "payload": np.linspace(0.024, 0.264, 11)}
         draw_map(native, loads, {"Kd": 80.0, "limit_effort": True}, ROOT / "docs" / "load.png")
+        draw_sampled(Path(folder), ROOT / "docs" / "sampled.png")
     draw_arm(samples, ROOT / "docs" / "arm.png")
     draw_icon(ROOT / "fmu_src" / "model.png")
 
@@ -236,6 +238,57 @@ def draw_map(fmu: Path, grid: dict, settings: dict, path: Path) -> None:
     twodof.sweep(fmu, grid=grid, settings=settings, output=table)
     figure = drawn(drawing(twodof.read_sweep(table), path.stem))
     figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
+
+
+AS_IT_IS = {
+    "q_des": (0.9, 0.8),
+    "friction": 0.05,
+    "control_delay": 0.002,
+    "q_resolution": 2.0 * np.pi / 4096,
+    "v_from_q": True,
+    "max_step": 0.002,
+}
+
+
+def draw_sampled(folder: Path, path: Path) -> None:
+    """Draw where the joints of a sampled arm with friction end, over gains and at two rates."""
+    fmu = twodof.build_fmu(folder / "Joint.fmu", twodof.FmuOptions(control="joint", native=True))
+    grid = {"Kp": np.geomspace(10, 30000, 36), "Kd": np.geomspace(5, 500, 24)}
+    figure, all_axes = plt.subplots(1, 2, figsize=(10, 4.4), sharey=True, layout="constrained")
+    for axes, T in zip(all_axes, (0.001, 0.01)):
+        settings = {**AS_IT_IS, "control_period": T}
+        table = folder / f"sampled {T}"
+        twodof.sweep(fmu, grid=grid, settings=settings, stop_time=3.0, step=0.01, output=table)
+        rows = twodof.read_sweep(table).sort_values(["Kp", "Kd"])
+        Kp, Kd = (np.unique(rows[name]) for name in grid)
+        error, chatter = (rows[m].to_numpy().reshape(len(Kp), len(Kd)) for m in ("final_joint_error", "chatter"))
+        drawn_errors = axes.pcolormesh(Kd, Kp, error, norm=LogNorm(1e-3, 1.0), cmap="viridis", shading="nearest")
+        axes.contourf(Kd, Kp, chatter, levels=[1.0, np.inf], colors="none", hatches=["///"])
+        radius = [[sampled_radius(T, AS_IT_IS["control_delay"], p, d) for d in Kd] for p in Kp]
+        axes.contour(Kd, Kp, radius, levels=[1.0], colors="#d62728", linewidths=2)
+        axes.set(xscale="log", yscale="log", xlabel="Kd, 1/s", title=f"{1.0 / T:g} Hz")
+    all_axes[0].set_ylabel("Kp, 1/s²")
+    figure.colorbar(drawn_errors, ax=all_axes, label="largest joint error after 3 s, rad")
+    figure.savefig(path, dpi=120, pil_kwargs={"optimize": True}, metadata={"Software": None})
+    plt.close(figure)
+
+
+def sampled_radius(T: float, delay: float, Kp: float, Kd: float) -> float:
+    """Return the spectral radius of q̈ = τ̂ under sampled PD control with a delay; velocities are differences.
+
+    The state is q, q̇ and q of the sample before, then the efforts on their way, the latest first.
+    """
+    whole = round(delay // T + (T - delay % T < 1e-9))
+    part = delay - whole * T
+    step = np.zeros((4 + whole, 4 + whole))
+    command = np.array([-Kp - Kd / T, 0.0, Kd / T, *[0.0] * (whole + 1)])
+    oldest, next_one = np.eye(4 + whole)[3 + whole], command if whole == 0 else np.eye(4 + whole)[2 + whole]
+    rest = T - part
+    step[0] = [1.0, T, *[0.0] * (2 + whole)] + oldest * (part * rest + part**2 / 2) + next_one * rest**2 / 2
+    step[1] = [0.0, 1.0, *[0.0] * (2 + whole)] + oldest * part + next_one * rest
+    step[2, 0], step[3] = 1.0, command
+    step[4:, 3:-1] = np.eye(whole)
+    return float(np.abs(np.linalg.eigvals(step)).max())
 
 
 # --- the icon ---

@@ -316,6 +316,16 @@ def read_topics_of_sqlite3(folder):
     return topics
 
 
+def test_chatter_is_the_rms_of_the_efforts_changes(fmus):
+    settings = {"control_period": 0.002, "q_des": (0.9, 0.8), **SEEN}
+    fmu = fmus("twodof", "joint", "fmi2")
+    tau = np.array([sample.tau for sample in twodof.samples(fmu, stop_time=50.0, step=0.01, settings=settings)])
+    assert len(tau) > 4096  # more than is judged at a time
+    expected = np.sqrt(np.mean(np.diff(tau, axis=0) ** 2, axis=0)).max()
+    found = twodof.run(fmu, stop_time=50.0, step=0.01, settings=settings).verdict.numbers["chatter"]
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
 # --- what is refused ---
 
 REFUSED: dict = {

@@ -68,7 +68,7 @@ def test_a_page_of_maps_has_their_colours_in_the_dark_and_whole_numbers_on_a_pho
 def test_map_of_two_variables_holds_the_table_and_marks_the_best(grid_sweep: Path) -> None:
     table = table_of(grid_sweep)
     found = panels(grid_sweep)
-    told = ("settling_time", "overshoot", "final_error", "rms_error", "peak_effort")
+    told = ("settling_time", "overshoot", "final_error", "rms_error", "peak_effort", "chatter")
     assert list(found) == [f"{metric} over Kp and Kd" for metric in (*told, "peak_velocity")]
     for label, axes in found.items():
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("Kp, s⁻²", "Kd, s⁻¹")

@@ -62,6 +62,7 @@ class Judge:
         inputs: those that differ from the start values, as they are now.
         aims: by output that has a target.
         effort, speed: largest magnitude of each joint's, n values; likewise what follows.
+        chatter: sum of the squares of the effort's changes from sample to sample.
         saturated, low, high: samples at the effort limit, and after the first at a position limit.
         moved: time of the last sample at which the velocity is not exactly 0, s.
         changes, changed, travel: of targets: how many, the time of the last, s, and their largest distance from the
@@ -74,7 +75,7 @@ class Judge:
         self.count, self.changes, self.changed = 0, 0, -inf
         self.stopped = False
         self.aims: dict[str, Aim] = {}
-        self.effort, self.speed = np.zeros(n), np.zeros(n)
+        self.effort, self.speed, self.chatter = np.zeros(n), np.zeros(n), np.zeros(n)
         self.saturated, self.low, self.high = np.zeros(n, int), np.zeros(n, int), np.zeros(n, int)
         self.moved, self.travel = np.full(n, -inf), 0.0
         self.first, self.last = np.empty(0), np.empty(0)
@@ -208,6 +209,8 @@ class Judge:
         if own["tau"].shape[1] == n:
             largest = _largest(own["tau"])
             self.effort = np.maximum(self.effort, largest)
+            before = own["tau"][:1] if not self.count else self._of(self.last, "tau")[None]
+            self.chatter += np.square(np.diff(own["tau"], axis=0, prepend=before)).sum(axis=0)
             bound = np.array(setup.limits.effort) * (1.0 - EXACT)
             if (largest >= bound).any():
                 self.saturated += (np.abs(own["tau"]) >= bound).sum(axis=0)
@@ -283,10 +286,11 @@ class Judge:
         efforts = "tau" in self._names
         found = {
             "peak_velocity": float(self.speed.max(initial=0.0)),
-            **dict.fromkeys(("peak_effort", "saturated"), nan),
+            **dict.fromkeys(("peak_effort", "chatter", "saturated"), nan),
         }
         if efforts:
             found["peak_effort"] = float(self.effort.max())
+            found["chatter"] = sqrt(float(self.chatter.max()) / max(1, self.count - 1))
         for name, use, limit in zip(("effort_use", "velocity_use"), self.use(), setup.limits):
             known = min(limit) < inf and (efforts or name == "velocity_use")
             found[name] = float(use.max()) if known else nan

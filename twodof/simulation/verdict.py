@@ -51,6 +51,11 @@ METRICS: Mapping[str, Metric] = {
     ),
     "rms_error": Metric("RMS error", "m", "root of the mean of |e_k|² of the end effector over all samples"),
     "peak_effort": Metric("peak |τ|", "N.m", "largest |τ_i| of any joint at any sample; N for prismatic joints"),
+    "chatter": Metric(
+        "RMS change of τ",
+        "N.m",
+        "root of the mean of (τ_i,k - τ_i,k-1)², of the joint with most; N for prismatic joints",
+    ),
     "peak_velocity": Metric("peak |v|", "rad/s", "largest |v_i| of any joint at any sample; m/s for prismatic joints"),
     "time_at_limits": Metric(
         "time at joint limits",
