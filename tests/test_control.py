@@ -306,7 +306,7 @@ def test_the_description_is_that_of_the_control(fmus, control):
         fmu = twodof.load_fmu(path)
         assert [*fmu.groups("input")] == of[control]
         turned = ["quat", "omega"] if control == "pose" else []
-        assert [*fmu.groups("output")] == ["q", "v", "x", "xd", *turned, "tau"]
+        assert [*fmu.groups("output")] == ["q", "v", "x", "xd", *turned, "tau", "q_meas", "v_meas"]
         description = fmpy.read_model_description(str(path))
         unknowns = {u.variable.name: {d.name for d in u.dependencies} for u in description.outputs}
         driving = set(of[control]) - {"tau_ext", "f_ext"}
@@ -354,7 +354,7 @@ def test_a_target_on_a_limit_does_not_chatter(fmus, side):
 
 
 def test_a_control_that_is_none_is_refused():
-    with pytest.raises(twodof.TwoDofError, match="`control` 'velocity' is none of task, pose, j"):
+    with pytest.raises(twodof.TwoDofError, match="`control` 'velocity' is unknown; there are: task, pose, j"):
         build_fmu(None, FmuOptions(control="velocity"))
 
 
