@@ -257,8 +257,8 @@ def _panda_hand(elbow):
         ({"gravity": (0.0, float("nan"), 0.0)}, "gravity .* must be finite"),
         ({"gravity": (0.0, -9.81)}, r"gravity \(0.0, -9.81\) must be three numbers"),
         ({"mesh_dir": "nowhere"}, "the mesh folder 'nowhere' does not exist"),
-        ({"urdf": ""}, "directory"),
-        ({"urdf": Path("nowhere.urdf")}, "cannot read the URDF 'nowhere.urdf'"),
+        ({"urdf": ""}, "is no URDF: it is a folder"),
+        ({"urdf": Path("nowhere.urdf")}, "there is no URDF 'nowhere.urdf'"),
     ],
 )
 def test_bad_options_are_refused_and_leave_nothing(options, message, tmp_path):

@@ -182,7 +182,7 @@ def test_groups_that_are_chosen(bare):
     model = twodof.linearise(bare, {"q": UPRIGHT}, inputs=["tau_cmd"], outputs=["x", "tau"])
     assert model.inputs == ("tau_cmd[1]", "tau_cmd[2]")
     assert model.outputs == ("x[1]", "x[2]", "tau[1]", "tau[2]")
-    with pytest.raises(twodof.TwoDofError, match="there is no 'Kp'; there are tau_cmd"):
+    with pytest.raises(twodof.TwoDofError, match="there is no 'Kp'; there are: tau_cmd"):
         twodof.linearise(bare, inputs=["Kp"])
 
 

@@ -317,7 +317,7 @@ def test_what_else_is_wrong_is_named(default: Recording, tmp_path: Path, monkeyp
         with pytest.raises(PlotError, match=f"^{re.escape(message)}"):
             save(drawn, output)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
-    with pytest.raises(PlotError, match=r"^cannot read the URDF 'gone\.urdf': No such file"):
+    with pytest.raises(PlotError, match=r"^there is no URDF 'gone\.urdf'"):
         plot(default.bag, urdf="gone.urdf")
     none = elsewhere(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
     with pytest.raises(PlotError, match=r"'.*bag' has 0 positions for 1 joints"):
@@ -373,7 +373,7 @@ def test_the_command_fails_in_one_line(
     for arguments, message in (
         (["gone", "-o", "a.jpg"], "'a.jpg': the name of a plot ends in"),  # before bags are read
         ([str(default.bag), "-o", "gone/a.png"], "cannot write 'gone/a.png'"),
-        ([str(default.bag), "--urdf", "gone"], "cannot read the URDF 'gone'"),
+        ([str(default.bag), "--urdf", "gone"], "there is no URDF 'gone'"),
         (["gone"], "'gone'"),
     ):
         assert main(["plot", *arguments]) == 1
