@@ -60,9 +60,9 @@ def test_streams_that_are_closed_end_no_run(closed: str, native_path: Path, tmp_
     assert len(twodof.read_bag(tmp_path / "bag").t) == 11
 
 
-def test_a_notebooks_backend_of_matplotlib_ends_no_plot(native_path: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("backend", ["module://a_package.that_is_not_here", "a name that matplotlib does not know"])
+def test_a_backend_of_matplotlib_that_is_not_here_ends_no_plot(backend: str, native_path: Path, tmp_path: Path) -> None:
     twodof.simulate(native_path, twodof.Bag(tmp_path / "bag"), stop_time=0.1)
-    backend = "module://a_package.that_is_not_here"
     done = run("plot", "bag", "-o", "plot.png", cwd=tmp_path, MPLBACKEND=backend)
     assert (done.returncode, done.stderr) == (0, "")
 

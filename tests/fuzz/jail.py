@@ -223,7 +223,7 @@ SPECIAL: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pipe": (os.mkfifo, "Not a regular file"),
     "3 GB of zeros": (sparse, "File too large"),
     "a device": (lambda path: path.symlink_to("/dev/zero"), "Not a regular file"),
-    "a folder": (Path.mkdir, "Is a directory"),
+    "a folder": (Path.mkdir, "Is a directory|it is a folder"),
     "a link to itself": (lambda path: path.symlink_to(path.name), "symbolic links"),
 }
 
