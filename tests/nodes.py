@@ -182,7 +182,7 @@ def published(
     try:
         assert process.stdout is not None
         process.told = []
-        while not process.told or "ros2 topic echo" not in process.told[-1]:
+        while not process.told or not process.told[-1].startswith("end "):
             process.told.append(process.stdout.readline())
             assert process.told[-1], process.communicate()
         yield process

@@ -73,7 +73,7 @@ def test_the_command_line_tells_where_it_listens(native_path: Path, number: int)
     options = ["--foxglove", "--foxglove-port", "0", "--scene"]
     with published(number, native_path, *options) as process:
         assert process.stdout is not None
-        url = process.stdout.readline().split()[-1]
+        url = next(line for line in process.stdout if line.startswith("open")).split()[-1]
         with joined(url) as connection:
             assert json.loads(connection.recv())["capabilities"][0] == "parameters"
         process.send_signal(signal.SIGINT)
