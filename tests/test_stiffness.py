@@ -20,7 +20,7 @@ from twodof.plant.plant import DiscardError, Plant
 STEP = 0.01
 TIGHT, DEFAULT = (1e-9, 1e-12), (1e-3, 1e-6)
 WITHIN = {TIGHT: 1e-6, DEFAULT: 1e-3}  # rad
-NOT_FINITE, MANY_STEPS, MANY_EVALUATIONS, SMALL_STEPS = range(4)
+NOT_FINITE, MANY_STEPS, SHORT_PERIOD, MANY_EVALUATIONS, SMALL_STEPS = range(5)
 
 
 def radau(plant: Plant, seconds: float) -> np.ndarray:
@@ -80,6 +80,16 @@ def test_damped_arms_move_as_an_implicit_solver_says(damping, gains, tolerances,
         assert np.abs(plant.q - expected).max() <= WITHIN[tolerances]
 
 
+def test_no_step_of_a_strongly_damped_arm_is_refused(length):
+    rng, of = np.random.default_rng(9), damped_arm(30_000.0)
+    for i in range(30):
+        start = {"q_start": rng.uniform(-3.0, 3.0, 2).tolist(), "v_start": rng.uniform(-1.0, 1.0, 2).tolist()}
+        plant = shipped(of, **start, x_des=rng.uniform(-0.4, 0.4, 2).tolist())
+        found = advanced(of, plant, 1)
+        if i < length(30, 3):
+            assert found == pytest.approx(radau(plant, STEP), abs=1e-3), plant.q_start
+
+
 def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
     of = damped_arm(1e6)
     plant = shipped(of)
@@ -92,7 +102,7 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
     rate = 1e6 * np.linalg.inv(np.triu(inertia) + np.triu(inertia, 1).T)[1, 1]
     *failure, found = of.failure()
     assert failure == [MANY_EVALUATIONS, 1] and found == pytest.approx(rate, rel=1e-3)
-    if length(1, 0):  # a million evaluations in Python
+    if length(1, 0):  # two million evaluations in Python
         with pytest.raises(DiscardError, match="joint 'joint2' changes at a rate") as told:
             plant.step(STEP)
         named = float(re.findall(r"rate of (\S+)", str(told.value))[0])
@@ -100,7 +110,7 @@ def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
         assert plant.q == [0.5, 0.35]
 
 
-@pytest.mark.parametrize("max_step", [1e-12, 1e-300, 2.2250738585072014e-308, 5.9e-8])
+@pytest.mark.parametrize("max_step", [1e-12, 1e-300, 2.2250738585072014e-308, 2.9e-8])
 def test_a_largest_step_beyond_the_budget_is_refused_at_once(max_step):
     of = damped_arm(0.0)
     plant = shipped(of, max_step=max_step)

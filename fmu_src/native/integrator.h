@@ -5,8 +5,6 @@
 #include "internal.h"
 #include "plant.h"
 
-enum { BUDGET = 1000000 }; /* evaluations of the equations of motion in one communication step */
-
 /* Why a communication step cannot be done. */
 typedef struct {
     enum { NOT_FINITE,      /* the equations of motion gave a value that is not */

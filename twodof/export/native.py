@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from ..plant.integrator import BUDGET
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
@@ -37,6 +38,7 @@ def model_header(
         f"#define N_JOINTS {len(robot.joints)} /* that move on their own */\n"
         f"#define N_BODIES {robot.model.njoints - 1} /* of which some may follow others */\n"
         f"#define N_AXES {m}\n#define N_ROWS {m + 3 * ('quat_des' in groups)}\n",
+        f"#define BUDGET {BUDGET} /* evaluations of the equations of motion in one communication step, at most */\n"
         f"#define N_INDICATORS {count_event_indicators(robot, control)} /* of events */\n"
         f"#define COMMANDS_ACCELERATION {int(CONTROLS[control].commands == 'acceleration')}\n"
         + ("#define HAS_RCOND\n" if "rcond" in groups else ""),

@@ -26,7 +26,7 @@ from .pseudo_inverse import rank_margin
 from .stops import STUCK, Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
-BUDGET = 1_000_000
+BUDGET = 2_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
 MOST_ROWS = 6
 """Rows of a task's Jacobian at most: three axes and three of an orientation."""
