@@ -148,6 +148,24 @@ def test_singularities_of_the_orientation_count(ur10):
     assert [model.remarks[0][:15] for model in found] == ["no equilibrium:", "a singular pose"]
 
 
+def test_half_a_turn_from_the_target_is_refused(ur10):
+    """The turn back jumps there from one way round to the other."""
+    q = [0.3, -1.2, 1.4, 0.2, 0.8, 0.3]
+    robot = load_robot(str(twodof.load_fmu(ur10).urdf), "tool0", "xyz")
+    data, frame = robot.model.createData(), robot.model.getFrameId("tool0")
+    pin.framesForwardKinematics(robot.model, data, np.array(q))
+    rotation = pin.Quaternion(data.oMf[frame].rotation)
+
+    def away(angle):
+        target = pin.Quaternion(pin.AngleAxis(angle, np.array([0.6, 0.0, 0.8]))) * rotation
+        return {"q": q, "quat_des": (3.0 * target.coeffs()).tolist()}
+
+    with pytest.raises(twodof.TwoDofError, match="half a turn from quat_des, where the way back jumps"):
+        twodof.linearise(ur10, away(np.pi))
+    for angle in (np.pi - 1e-4, np.pi + 1e-4):
+        assert np.isfinite(twodof.linearise(ur10, away(angle)).A).all()
+
+
 @pytest.mark.parametrize(("tau", "told"), [(9.9, ""), (10.0, "refused"), (-12.0, "saturated")])
 def test_an_effort_limit_is_refused_or_told(tau, told, bare):
     """The URDF's is 10 N·m."""

@@ -245,6 +245,12 @@ class _Point:
         remarks = self._stuck() + self._saturated()
         if self._values.get("control_period"):
             remarks.append("the controller is sampled: the model is that of the plant with its effort held")
+        if "quat_des[1]" in self._fmu.variables:
+            actual, target = (self._read(self._fmu.vector(name)) for name in ("quat", "quat_des"))
+            if abs(actual @ (target / np.linalg.norm(target))) < NEAR_JUMP:
+                raise SimulationError(
+                    "the frame is half a turn from quat_des, where the way back jumps: choose another q or quat_des"
+                )
         rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # all that J⁺ is of
         if "rcond" not in self._fmu.variables or not rows:
             return remarks
