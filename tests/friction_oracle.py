@@ -16,8 +16,8 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 SLACK = 1e-9
-SOON = 1e-9  # s
-SLOW = 1e-9  # rad/s: where joints drive each other off their stops without end, that ends here
+SOON = 1e-11  # s
+SLOW = 1e-8  # rad/s: where joints drive each other off their stops without end, that ends here
 
 
 @dataclass
@@ -103,7 +103,7 @@ class Rubbing:
                     return np.where((side * after < SLOW) & ~inside, 0.0, after)
         raise AssertionError("no impact")
 
-    def run(self, q, v, times, max_step=5e-3):
+    def run(self, q, v, times, max_step=1e-3):
         """States at times from 0 on, and the modes with the times at which they began."""
         n, t, rows, modes = self.n, 0.0, [], []
         q, v = np.array(q, float), self.impact(np.array(q, float), np.array(v, float))
