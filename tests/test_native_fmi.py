@@ -311,7 +311,7 @@ def forged(arm, field, value):
     n = len(arm.of.table)
     head = len(GUID) + 1 + 8 - (len(GUID) + 1) % 8
     joints = len(arm.of.robot.joints)
-    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}di4x{3 * joints + 3}i6i4xQ")
+    layout = struct.Struct(f"={head}s{n + 4 + 5 * joints}d2i{3 + 12 * joints}di4x{3 * joints + 4}i6iQ")
     fields = list(layout.unpack(blob))
     names = ["time", "stop_time", "step_start"]
     names += [f"step_{kind}[{i + 1}]" for kind in ("q", "v", "a") for i in range(joints)]
@@ -320,7 +320,7 @@ def forged(arm, field, value):
     names += [f"sample[{i + 1}]" for i in range(joints)]
     names += [f"pending{k}[{i + 1}]" for k in range(11) for i in range(joints)] + ["waiting"]
     names += [f"{what}[{i + 1}]" for what in ("held", "watched", "slip") for i in range(joints)]
-    names += ["any_held", "any_watched", "rank", "phase", "initialised"]
+    names += ["any_held", "any_watched", "any_slip", "rank", "phase", "initialised"]
     names += ["has_x", "has_tau", "has_stops", "has_rates"]
     place = n + 1 + names.index(field) if field in names else 1 + arm.of.index(field)
     fields[place] = value

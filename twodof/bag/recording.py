@@ -210,7 +210,8 @@ class Recording:
         none, shape = np.empty((len(self.t), 0)), self.q.shape
         targets = {"x": target, "quat": self.target_quat if x.size else none, "q": self.held("q_des", shape[1])}
         quat = setup.orientations(self.q) if targets["quat"].size else none
-        v = self.v if self.v.shape == shape else np.gradient(self.q, self.t, axis=0)
+        with np.errstate(invalid="ignore"):  # positions of others may not be finite
+            v = self.v if self.v.shape == shape else np.gradient(self.q, self.t, axis=0)
         values = {"q": self.q, "v": v, "x": x, "tau": self.tau if self.tau.shape == shape else none, "quat": quat}
         return judged(setup, self.t, values, {name: each for name, each in targets.items() if each.size})
 
