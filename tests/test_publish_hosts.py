@@ -141,7 +141,7 @@ def test_nodes_that_command_are_recorded_and_two_at_once_reported(
         process.send_signal(signal.SIGINT)
         _, err = ended(process, 130)
     (first, facts), (second, others) = commanders()
-    assert 0.0 < first < second
+    assert 0.0 <= first < second  # the first may be there as the run begins
     for node, its in ((one, facts), (two, others)):
         assert its["process"] == str(node.process.pid) and its["host"]
         assert re.fullmatch(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", its["guid"])

@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
 """Start values of the shipped arm; nothing else knows that it has two joints."""
 PLACEHOLDERS: Starts = {"x_des": (0.0,) * 3, "quat_des": (0.0, 0.0, 0.0, 1.0)}
-"""Of a table whose targets are not known yet."""
+"""Start values of targets while the table is made to compute the real ones."""
 POSE = ("q_start", "v_start", "q_min", "q_max", "gravity")
 """Start values on which the pose at the start depends, or that have an option of their own."""
 ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}

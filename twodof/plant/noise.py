@@ -16,7 +16,7 @@ WORD = 2**32 - 1
 LN2 = 0.6931471805599453
 SQRT_HALF = 0.7071067811865476
 TERMS = 11
-"""Of the logarithm's series; the rest is below rounding."""
+"""Terms of the logarithm's series; the rest is below rounding."""
 
 
 def philox(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -19,7 +19,7 @@ from .integrator import Budget, advance
 from .noise import normal_pair
 
 MOST_PERIODS = 10
-"""Of a delay."""
+"""Longest delay, in periods."""
 TIME_TOLERANCE = 1e-9
 """Times of communication points are equal within this part of max(1 s, |t|)."""
 PART_OF_PERIOD = 1e-3

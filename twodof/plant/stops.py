@@ -30,13 +30,13 @@ Limits = Sequence[tuple[float, float]]
 InverseMass = Callable[[Sequence[float]], Array]
 """M(q)⁻¹, n × n."""
 Bounds = Mapping[int, tuple[float, float]]
-"""Of efforts or impulses, by joint."""
+"""Bounds of efforts or impulses, by joint."""
 
 MOST_PIVOTS, BLOCK_TRIES = 10_000, 5
 ROUNDING = 2.0**-40
 """Rounding error of a sum that decides a sign, as a part of its terms."""
 FREE, STUCK, STOPPED, CLAMPED = range(4)
-"""How a joint rests: by its friction, at a limit by a stop that pushes (with its friction), or there by a clamp."""
+"""States of a joint: not at rest, held by friction, held at a limit by a rigid stop, or there by a clamp."""
 
 
 class Stops:

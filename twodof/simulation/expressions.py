@@ -42,7 +42,7 @@ class Expression(NamedTuple):
 
     @property
     def is_condition(self) -> bool:
-        """Whether it compares two values."""
+        """Return whether the expression compares two values."""
         return isinstance(self.tree, ast.Compare)
 
     def value(self, values: Mapping[str, Any]) -> Any:
