@@ -12,13 +12,14 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from bags import START, STORAGES, assert_consistent, both_storages, logging, read_with_rosbags
 
 from twodof.bag.contents import read_messages, storage_files
 from twodof.bag.records import DamageError, ReadBudget
-from twodof.cli import info
+from twodof.cli import info, signals
 from twodof.cli.main import main
 
 TWODOF = [sys.executable, "-m", "twodof"]
@@ -55,7 +56,7 @@ def whole(fmu: Path, folder: Path, n: int) -> Sequence[object]:
 SIGNALS = {
     "Ctrl-C": [signal.SIGINT],
     "Ctrl-C twice": [signal.SIGINT] * 2,
-    "Ctrl-C in anger": [signal.SIGINT] * 30,
+    "Ctrl-C in anger": [signal.SIGINT] * 300,
     "terminated": [signal.SIGTERM],
     "terminal closed": [signal.SIGHUP],
     "terminated and interrupted": [signal.SIGTERM, signal.SIGINT, signal.SIGINT],
@@ -66,22 +67,33 @@ SIGNALS = {
     ("name", "storage", "pace"), [*zip(SIGNALS, STORAGES * 3, ("--realtime", "", "", "--realtime", "--realtime", ""))]
 )
 def test_signals_leave_a_complete_bag(native_path: Path, tmp_path: Path, name: str, storage: str, pace: str) -> None:
-    signals, bag = SIGNALS[name], tmp_path / "bag"
+    numbers, bag = SIGNALS[name], tmp_path / "bag"
     process = begin(native_path, bag, "--storage", storage, *pace.split())
-    for number in signals:
+    for number in numbers:
         process.send_signal(number)
-        time.sleep(0.003)
+        time.sleep(0.003 if len(numbers) < 4 else 0.0003)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "Traceback" not in err and len(err.splitlines()) <= 1
     kept = assert_consistent(bag, storage)
     assert kept
     assert {p.suffix for p in bag.iterdir()} <= {".mcap", ".db3", ".yaml", ".json"}
-    if len(signals) == 1:
+    if len(numbers) == 1:
         assert f"({kept} messages" in out
         assert re.search(rf"stopped +on request at {(kept - 1) * 0.01:g} s", out)
     if kept < 10_000:
         assert read_with_rosbags(bag) == whole(native_path, tmp_path, kept)
+
+
+def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([5.0, 5.0 + 0.5 * signals.CLEAN_UP, 5.0 + 1.5 * signals.CLEAN_UP])
+    monkeypatch.setattr(signals, "_interrupts", [])
+    monkeypatch.setattr(signals, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    with pytest.raises(KeyboardInterrupt):
+        signals.interrupt(signal.SIGINT, None)
+    signals.interrupt(signal.SIGINT, None)
+    with pytest.raises(KeyboardInterrupt):  # the clean-up hangs
+        signals.interrupt(signal.SIGINT, None)
 
 
 LOOP = """

@@ -22,13 +22,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from .cli.signals import INTERRUPTED, interrupt
 
     try:
-        if heard:
-            signal.signal(signal.SIGINT, interrupt)
-        return command(arguments)
-    except KeyboardInterrupt:  # a second one, or between two lines here
-        return INTERRUPTED
-    finally:
+        try:
+            if heard:
+                signal.signal(signal.SIGINT, interrupt)
+            return command(arguments)
+        finally:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except KeyboardInterrupt:  # of the very end, in place of which the next is ignored
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return INTERRUPTED
 
 
 def _open_streams() -> None:

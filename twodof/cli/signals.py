@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -13,13 +14,20 @@ INTERRUPTED = 130
 """Exit status after a request to end."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
 PATIENCE = 5.0  # s in which the work in progress ends on request
-_interrupts: list[int] = []
+CLEAN_UP = 1.0  # s after an interrupt in which no other one disturbs what it ends
+_interrupts: list[float] = []
+"""Times of the interrupts, in seconds of the monotonic clock."""
 
 
-def interrupt(number: int, _frame: object) -> None:
-    """Raise KeyboardInterrupt, and note it, because a C module in import turns it into an ImportError."""
-    _interrupts.append(number)
-    raise KeyboardInterrupt
+def interrupt(_number: int, _frame: object) -> None:
+    """Raise KeyboardInterrupt, and note it, because a C module in import turns it into an ImportError.
+
+    Another signal within CLEAN_UP of it is ignored: it would leave the code that removes temporary files.
+    """
+    now = time.monotonic()
+    if not _interrupts or now > _interrupts[-1] + CLEAN_UP:
+        _interrupts.append(now)
+        raise KeyboardInterrupt
 
 
 def is_interrupt(error: ImportError | OSError) -> bool:
@@ -47,6 +55,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
         if asked:
             for number in SIGNALS:
                 signal.signal(number, signal.SIG_IGN)
+            _interrupts.append(time.monotonic())
             raise KeyboardInterrupt
         asked = True
         signal.setitimer(signal.ITIMER_REAL, PATIENCE)

@@ -82,11 +82,10 @@ def nearest(
     if wanted:
         far = np.hypot(far, (Rotation.from_matrix(scattered.rotation) * wanted.inv()).magnitude())
     found = []
-    margin = 1e-12 + 1e-12 * (high - low)  # the solver starts inside
+    width = high - low
+    margin = 1e-12 * (1 + np.where(np.isfinite(width), width, 0))  # the solver starts inside
     for start in [q, *starts[np.argsort(far)[:IMPROVED]]]:
-        inside = np.clip(
-            start, np.where(np.isfinite(low), low + margin, low), high - np.where(high < np.inf, margin, 0)
-        )
+        inside = np.clip(start, low + margin, high - margin)
         found.append(least_squares(residual, inside, slope, (low, high), xtol=1e-13, ftol=1e-13, gtol=1e-13))
         if found[-1].cost < 0.5 * EXACT**2:
             break
