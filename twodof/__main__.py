@@ -1,8 +1,6 @@
 # PYTHON_ARGCOMPLETE_OK
 """Entry point of ``twodof`` and ``python -m twodof``."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -5,8 +5,6 @@ Landlock leaves the folders that are given, readable, and on x86-64 seccomp leav
 needs; a kernel that has neither keeps the limits. Sources: landlock(7), seccomp(2).
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import platform

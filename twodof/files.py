@@ -1,7 +1,5 @@
 """Size-limited reads of untrusted files, atomic writes, folder locks and temporary folders."""
 
-from __future__ import annotations
-
 import base64
 import errno
 import fcntl

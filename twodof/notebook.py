@@ -1,7 +1,5 @@
 """HTML of results for notebooks: a table of facts beside a small SVG picture, without scripts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from html import escape
 

@@ -1,7 +1,5 @@
 """Keywords that functions share, and the defaults of callbacks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from inspect import Parameter, signature
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Versions of this package and of its dependencies."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache

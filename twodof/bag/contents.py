@@ -1,7 +1,5 @@
 """Storage files of a bag, and the messages in them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -6,8 +6,6 @@ highest, as in Jugel et al., "M4: a visualization-oriented time series data aggr
 halves: what was left out before is not missed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

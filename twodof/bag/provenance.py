@@ -3,8 +3,6 @@
 Of several robots in one bag each has its own, run.NAME.json, with its namespace in the name.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -5,8 +5,6 @@ Memory is bounded by the size of one chunk or message, time by the size of the f
 rosbags reads no file that lacks its end, and believes the rest.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager

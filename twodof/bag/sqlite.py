@@ -1,7 +1,5 @@
 """Read SQLite files of ROS 2 row by row, unfinished ones too."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sqlite3

@@ -4,8 +4,6 @@ rosbags commits sqlite3 only at the end and cuts MCAP chunks at 1 MiB, so that a
 killed leaves little or nothing.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import sqlite3

@@ -1,7 +1,5 @@
 """The folder of a bag in progress: its files, its lock, and the storing thread."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

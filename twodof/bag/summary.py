@@ -8,8 +8,6 @@ It is at the end of a file that was closed, with a checksum over all of it:
 Source: MCAP's specification. A file without one, or without its checksum, is to be read instead.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Verb build: build an FMU from a URDF."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from collections.abc import Sequence

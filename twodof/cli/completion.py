@@ -1,7 +1,5 @@
 """Completion in the shell of the variables, frames and joints of the robot on the command line."""
 
-from __future__ import annotations
-
 import argparse
 import xml.etree.ElementTree as ET
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Verb export: write a bag as a table, or as one MCAP file."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The FMU that a command line names, built on demand."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Help texts: the verbs, examples of each, and what a mistyped command line means."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

@@ -1,7 +1,5 @@
 """Verb layouts: write files with which other tools show a robot."""
 
-from __future__ import annotations
-
 import argparse
 
 from .fmus import chosen_fmu

@@ -1,7 +1,5 @@
 """Verb live: drive an FMU in the browser."""
 
-from __future__ import annotations
-
 import argparse
 
 from .fmus import fast_fmu

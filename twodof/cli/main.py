@@ -3,8 +3,6 @@
 Imports are inside the verbs, so that ``twodof --help`` is instant.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import logging

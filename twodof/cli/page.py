@@ -1,7 +1,5 @@
 """Verb page: write a native FMU as one HTML file."""
 
-from __future__ import annotations
-
 import argparse
 
 from .fmus import chosen_fmu, is_robot

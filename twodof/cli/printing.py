@@ -1,7 +1,5 @@
 """All output to the terminal: lines, tables, JSON, and the library's messages."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Verb recover: complete a bag whose writer died."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Handling of Ctrl-C and of termination signals."""
 
-from __future__ import annotations
-
 import errno
 import signal
 import time

@@ -1,7 +1,5 @@
 """Verb view: replay a bag in the browser."""
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections.abc import Sequence

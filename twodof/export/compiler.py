@@ -1,7 +1,5 @@
 """Compile the C sources of an FMU, for every platform on any platform."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import logging

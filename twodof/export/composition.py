@@ -1,7 +1,5 @@
 """Contents of an FMU's archive and their digest, from a URDF and options."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math

@@ -1,7 +1,5 @@
 """Documentation folder of the FMU: equations, variables, provenance, requirements and licences."""
 
-from __future__ import annotations
-
 import hashlib
 import html
 import importlib.metadata

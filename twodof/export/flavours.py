@@ -1,7 +1,5 @@
 """The two flavours of the FMU: the files that each adds to the common ones."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

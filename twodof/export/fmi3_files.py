@@ -1,7 +1,5 @@
 """XML files of FMI 3.0 besides modelDescription.xml. FMI 3.0.2, sections 2.5 and 2.6."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 

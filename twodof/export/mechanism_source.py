@@ -1,7 +1,5 @@
 """Generate ``mechanism.c`` of the native flavour: the robot's kinematics and dynamics as C."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

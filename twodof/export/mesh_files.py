@@ -1,7 +1,5 @@
 """Find the mesh files of a URDF, and rename them to their paths inside an FMU."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

@@ -4,8 +4,6 @@ Source: FMI 2.0.4, section 2.2; FMI 3.0.2, section 2.4, where elements of vector
 stay scalars for tools that know no arrays.
 """
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence

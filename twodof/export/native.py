@@ -4,8 +4,6 @@ The engine in ``fmu_src/native/`` is generic. Its constants are a C header, ``mo
 dynamics are ``mechanism.c``. Pinocchio has read the URDF.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Detect and repair the faults of pythonfmu's wrapper, the library of a Python FMU."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from contextlib import suppress

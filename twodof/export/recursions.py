@@ -4,8 +4,6 @@ They are written for arrays of numbers or of expressions (``straight_line``): fr
 other the C code that computes it. Vectors and matrices of a body are in the frame of its joint, whose axis is z.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Start values by name, checked against the variables of an FMU, built or yet to be."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from itertools import chain, count, takewhile

@@ -1,7 +1,5 @@
 """Units of variables, and their definitions in a modelDescription."""
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Collection

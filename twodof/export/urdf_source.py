@@ -1,7 +1,5 @@
 """Read the URDF of a build, lock its joints, and find its end effector."""
 
-from __future__ import annotations
-
 import fnmatch
 import warnings
 import xml.etree.ElementTree as ET

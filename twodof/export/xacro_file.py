@@ -5,8 +5,6 @@ Here simpleeval computes its expressions, with numbers, texts and data alone; fi
 folders alone from which a URDF's meshes may come; the environment is empty; memory and time end.
 """
 
-from __future__ import annotations
-
 import ast
 import errno
 import io

@@ -1,7 +1,5 @@
 """Run an instance of an FMU; all uses of FMPy that run code are here."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ Both have unsafe or unbounded code: assimp overruns its heap on damaged files. N
 arrays leaves the process, as bytes and never as a pickle.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections import defaultdict

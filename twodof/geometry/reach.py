@@ -7,8 +7,6 @@ from many starts, each improved by SciPy's bounded least squares (trust region r
 SIAM J. Sci. Comput. 21(1), 1999). A metre counts as a radian.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import pi
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Visual shapes of a robot's links, as triangles."""
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ They are served by a thread of its own, which tells what their controls ask for,
 two steps, and asks for the news. Neither waits for the other.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Holds of joints, and of the rank of J⁺, that would else change to and fro without end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import inf
 

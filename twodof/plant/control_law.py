@@ -1,7 +1,5 @@
 """The interface of control laws, which are the modules ``<name>_control``."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from .equations import Law, Ratios

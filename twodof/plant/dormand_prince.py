@@ -4,8 +4,6 @@ Coefficients, error norm and dense output are those of SciPy's ``RK45``.
 Sources: Dormand & Prince, J. Comp. Appl. Math. 6(1), 1980; Shampine, Math. Comp. 46, 1986.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from math import sqrt

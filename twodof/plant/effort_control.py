@@ -3,8 +3,6 @@
 τ = tau_cmd
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import inf
 

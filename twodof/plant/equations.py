@@ -1,7 +1,5 @@
 """The equations of motion of a plant as functions of its state, and control laws, which are parts of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ are polynomials, whose turning points are known; the other margins are looked at
 for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import inf

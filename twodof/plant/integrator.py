@@ -8,8 +8,6 @@ rank of J⁺. What ends it is an event, located within the step (``event_search`
 next one begins in another regime. A step is accepted only if its error test passes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain, product

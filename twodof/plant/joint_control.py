@@ -5,8 +5,6 @@
 Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, section 8.5.2.
 """
 
-from __future__ import annotations
-
 from math import inf
 
 from .control_law import ControlledPlant

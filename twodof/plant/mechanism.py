@@ -7,8 +7,6 @@ Joints that mimic others follow exactly: with the positions G q + c of all joint
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2; M_all, h_all and J_all are Pinocchio's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

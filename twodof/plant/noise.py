@@ -7,8 +7,6 @@ Sources: Salmon, Moraes, Dror & Shaw, "Parallel random numbers: as easy as 1, 2,
 convenient method for generating normal variables", SIAM Review 6(3), 1964.
 """
 
-from __future__ import annotations
-
 from math import frexp, sqrt
 
 ROUNDS = 10

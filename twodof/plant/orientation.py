@@ -1,7 +1,5 @@
 """Orientations as unit quaternions x, y, z, w, the order of ROS."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import atan2, sqrt
 

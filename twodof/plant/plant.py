@@ -9,8 +9,6 @@ payload, those of the first where ``payload_known``; M has the armature in both.
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; here Pinocchio's.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Sequence
 from math import inf

@@ -4,8 +4,6 @@ With three rows or fewer a call into a linear-algebra library costs more than th
 rows are plain lists of floats.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import inf, sqrt
 

@@ -4,8 +4,6 @@ Pinocchio loads several things silently that this plant cannot simulate, so the 
 checked before Pinocchio sees it, and every refusal names the joint or the link.
 """
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence

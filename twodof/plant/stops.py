@@ -16,8 +16,6 @@ Sources: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 
 Dynamics with Unilateral Contacts", 1996, chapter 5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from math import inf
 

@@ -9,8 +9,6 @@ Source: Luh, Walker & Paul, "Resolved-acceleration control of mechanical manipul
 IEEE TAC 25(3), 1980; the damped self-motion is that of Khatib, IEEE J-RA 3(1), 1987.
 """
 
-from __future__ import annotations
-
 from operator import mul
 
 import numpy as np

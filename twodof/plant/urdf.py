@@ -4,8 +4,6 @@ What only a simulation needs, masses and inertias, is checked where the model is
 standard library alone.
 """
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence

@@ -10,8 +10,6 @@ With the impulse response ψ, the step response γ = ∫ψ and φ = 1 − Kp γ 
     ẋ         = −Kp ψ (x₀ − x_des) + ψ' ẋ₀ + ψ a
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import sqrt
 from typing import NamedTuple

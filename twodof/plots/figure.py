@@ -1,7 +1,5 @@
 """Style, header and files of all figures, of bags and of sweeps."""
 
-from __future__ import annotations
-
 import html
 import io
 import os

@@ -4,8 +4,6 @@ Of each quantity one panel has the curves of all joints. What stands on the page
 as it has them, data and layout, and its library, packed; ``interactive.js`` unpacks and joins them.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import json

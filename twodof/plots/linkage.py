@@ -1,7 +1,5 @@
 """Geometry of a robot for pictures: links, reach and singularities."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil

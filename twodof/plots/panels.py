@@ -1,7 +1,5 @@
 """Contents of a run's panels for any renderer: lines over time, limits and ranges."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Text summaries of a run's settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Derived quantities of a bag and its robot: limits, path, target and error of the end effector."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """Text summaries of runs, for figures and the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

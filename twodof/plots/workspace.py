@@ -1,7 +1,5 @@
 """Lines of the arm in its workspace: start, end, path, targets and reach."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 

@@ -9,8 +9,6 @@ Numbers are aligned to their size, counted from behind the first 4 bytes. Source
 1.3, section 7.4.1, "plain CDR".
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -4,8 +4,6 @@ A control law (``plant.variables.CONTROLS``) follows messages of one type: point
 frame, or JointStates, whose joints are matched by name.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite

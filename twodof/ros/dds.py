@@ -4,8 +4,6 @@ Names, types and qualities of service are those of ROS 2 (REP 2011's type hashes
 Jazzy), so that its tools see the run as they see any node's.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Readers of a ROS 2 network: commands, their senders, and requests to pause."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping

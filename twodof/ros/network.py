@@ -3,8 +3,6 @@
 Variables are those of rcl and rmw_cyclonedds of Jazzy.
 """
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import os

@@ -3,8 +3,6 @@
 Transforms are those of robot_state_publisher: one for each joint, parent link to child link.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import xml.etree.ElementTree as ET

@@ -12,8 +12,6 @@ the mean over the step, with which a robot does not lag half a step behind.
 Source: ros2_controllers, joint_trajectory_controller, "Trajectory Representation".
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise

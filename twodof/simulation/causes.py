@@ -1,7 +1,5 @@
 """Causes of a run that did not do what it was asked to, the root first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import inf, log, pi, radians, sqrt

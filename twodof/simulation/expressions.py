@@ -3,8 +3,6 @@
 Numbers, names, + − * / **, comparisons, and abs, min and max of two values.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import operator

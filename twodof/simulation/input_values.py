@@ -1,7 +1,5 @@
 """Settings of a run: values by name, and CSV files of inputs over time, checked against an FMU."""
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from collections.abc import Iterator, Mapping

@@ -6,8 +6,6 @@ between the end effector's orientation and its target. Nothing is interpolated: 
 extremes those of samples. e_0 is the error at the last change of the target.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from math import inf, nan, sqrt

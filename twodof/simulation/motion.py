@@ -5,8 +5,6 @@ squares give a and b, and the roots z of z² = a z + b the poles s = ln(z) / h =
 method; Hildebrand, "Introduction to Numerical Analysis", 1974, section 9.4.
 """
 
-from __future__ import annotations
-
 from math import hypot, log, pi
 from typing import NamedTuple
 

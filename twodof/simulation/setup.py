@@ -1,7 +1,5 @@
 """Constant facts of a run by which its samples are judged: robot, limits, step and settings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import inf
 from typing import NamedTuple

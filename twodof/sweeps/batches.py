@@ -1,7 +1,5 @@
 """Batches of a sweep's runs for workers, and retries of runs whose worker died."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Iterator
 from itertools import islice

@@ -4,8 +4,6 @@ Who reaches its scheduler runs code on its workers, and in this process. What ke
 Dask's own configuration, ``distributed.comm.tls``.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Design of a sweep: the values of the variables in each run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """Run a sweep in processes of this machine, over private pipes."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
