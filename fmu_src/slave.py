@@ -42,8 +42,10 @@ MAX_STATE = 64 * 1024  # bytes, of a serialised state; that of 128 joints has ha
 UNSOUND = "the state is none that an instance can be in"
 
 
-def import_plant(site_packages: list[str]):
+def import_plant(resources: Path, site_packages: list[str]):
     """Import this FMU's plant module; name the remedy where a package is missing."""
+    for package in sys.modules.keys() & {PACKAGE, f"{PACKAGE}.plant"}:  # of an instance whose folder may be gone
+        sys.modules[package].__path__ = [str(resources.joinpath(*package.split(".")))]
     with suppress(ModuleNotFoundError):
         return importlib.import_module(f"{PACKAGE}.plant.plant")
     for folder in site_packages:
@@ -70,7 +72,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         super().__init__(**kwargs)
         resources = Path(self.resources)
         config = json.loads((resources / "plant.json").read_text("utf-8"))
-        self._plant_module = import_plant(config["site_packages"])
+        self._plant_module = import_plant(resources, config["site_packages"])
         urdf = (resources / "robot.urdf").read_text("utf-8")
         robot = importlib.import_module(f"{PACKAGE}.plant.robot").load_robot(urdf, config["frame"], config["axes"])
         starts = {k: tuple(v) if isinstance(v, list) else v for k, v in config["starts"].items()}

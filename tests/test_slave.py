@@ -12,6 +12,7 @@ import sysconfig
 import threading
 import time
 import zipfile
+from contextlib import nullcontext
 from ctypes import c_double, c_size_t, c_void_p
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from fmpy.fmi1 import FMICallException
 from harness import Driver, changed_plant, in_child_process, unzipped
 from oracles import position, task_error
 
-from twodof import FmuOptions, build_fmu
+from twodof import FmuOptions, TwoDofError, build_fmu, simulate
 from twodof.export.composition import DEFAULT_ARM
 from twodof.files import data_file
 from twodof.plant.plant import Plant
@@ -108,6 +109,23 @@ def test_the_unzip_folder_and_the_working_directory_may_go(fmu_path, tmp_path):
     first.slave.freeInstance()
     os.chdir(tmp_path)
     assert Driver(fmu_path).initialise().run(10) == expected
+
+
+@in_child_process
+def test_an_instance_runs_after_another_was_interrupted_while_it_loaded(fmu_path):
+    """Ctrl-C in a notebook's first cell breaks no later one."""
+
+    class Interrupt:
+        def find_spec(self, name, *_):
+            if name.endswith(".plant.robot"):
+                sys.meta_path.remove(self)
+                raise KeyboardInterrupt
+
+    sys.meta_path.insert(0, Interrupt())
+    for raises in (pytest.raises((TwoDofError, KeyboardInterrupt)), nullcontext()):
+        with raises:  # each from a folder of its own
+            simulate(fmu_path, stop_time=0.02)
+    assert not any(isinstance(finder, Interrupt) for finder in sys.meta_path)
 
 
 @in_child_process
