@@ -54,21 +54,21 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component component)
     return move_on(component, ENTER_INITIALIZATION, INITIALIZATION);
 }
 
-#define VARIABLES(Name, get, set)                                                                  \
+#define VARIABLES(Name, TYPE)                                                                      \
     fmi2Status fmi2Get##Name(fmi2Component component, const fmi2ValueReference vr[], size_t count, \
                              fmi2##Name value[])                                                   \
     {                                                                                              \
-        return get(component, vr, count, value, count);                                            \
+        return get_values(component, GET_##TYPE, vr, count, value, count);                         \
     }                                                                                              \
     fmi2Status fmi2Set##Name(fmi2Component component, const fmi2ValueReference vr[], size_t count, \
                              const fmi2##Name value[])                                             \
     {                                                                                              \
-        return set(component, vr, count, value, count);                                            \
+        return set_values(component, SET_##TYPE, vr, count, value, count);                         \
     }
-VARIABLES(Real, get_reals, set_reals)
-VARIABLES(Boolean, get_booleans, set_booleans)
-VARIABLES(Integer, get_integers, set_integers)
-VARIABLES(String, get_others, set_others)
+VARIABLES(Real, REAL)
+VARIABLES(Boolean, BOOLEAN)
+VARIABLES(Integer, INTEGER)
+VARIABLES(String, OTHER)
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component component,
                                         const fmi2ValueReference unknown[], size_t n_unknown,

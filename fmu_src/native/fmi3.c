@@ -48,54 +48,54 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
     return fmi3OK;
 }
 
-#define VARIABLES(Name, get, set)                                                                  \
+#define VARIABLES(Name, TYPE)                                                                      \
     fmi3Status fmi3Get##Name(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,   \
                              fmi3##Name value[], size_t n_values)                                  \
     {                                                                                              \
-        return get(instance, vr, count, value, n_values);                                          \
+        return get_values(instance, GET_##TYPE, vr, count, value, n_values);                       \
     }                                                                                              \
     fmi3Status fmi3Set##Name(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,   \
                              const fmi3##Name value[], size_t n_values)                            \
     {                                                                                              \
-        return set(instance, vr, count, value, n_values);                                          \
+        return set_values(instance, SET_##TYPE, vr, count, value, n_values);                       \
     }
-VARIABLES(Float64, get_reals, set_reals)
-VARIABLES(Boolean, get_booleans, set_booleans)
-VARIABLES(Float32, get_others, set_others)
-VARIABLES(Int8, get_others, set_others)
-VARIABLES(UInt8, get_others, set_others)
-VARIABLES(Int16, get_others, set_others)
-VARIABLES(UInt16, get_others, set_others)
-VARIABLES(Int32, get_integers, set_integers)
-VARIABLES(UInt32, get_others, set_others)
-VARIABLES(Int64, get_others, set_others)
-VARIABLES(UInt64, get_others, set_others)
-VARIABLES(String, get_others, set_others)
+VARIABLES(Float64, REAL)
+VARIABLES(Boolean, BOOLEAN)
+VARIABLES(Int32, INTEGER)
+VARIABLES(Float32, OTHER)
+VARIABLES(Int8, OTHER)
+VARIABLES(UInt8, OTHER)
+VARIABLES(Int16, OTHER)
+VARIABLES(UInt16, OTHER)
+VARIABLES(UInt32, OTHER)
+VARIABLES(Int64, OTHER)
+VARIABLES(UInt64, OTHER)
+VARIABLES(String, OTHER)
 
 fmi3Status fmi3GetBinary(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
                          size_t size[], fmi3Binary value[], size_t n_values)
 {
     (void)size;
-    return get_others(instance, vr, count, value, n_values);
+    return get_values(instance, GET_OTHER, vr, count, value, n_values);
 }
 
 fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
                          const size_t size[], const fmi3Binary value[], size_t n_values)
 {
     (void)size;
-    return set_others(instance, vr, count, value, n_values);
+    return set_values(instance, SET_OTHER, vr, count, value, n_values);
 }
 
 fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
                         fmi3Clock value[])
 {
-    return get_others(instance, vr, count, value, count);
+    return get_values(instance, GET_OTHER, vr, count, value, count);
 }
 
 fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference vr[], size_t count,
                         const fmi3Clock value[])
 {
-    return set_others(instance, vr, count, value, count);
+    return set_values(instance, SET_OTHER, vr, count, value, count);
 }
 
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknown[],

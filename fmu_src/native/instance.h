@@ -198,30 +198,12 @@ INTERNAL Status update_discrete_states(void *component, Boolean *states_changed,
 
 /* --- variables.c: each reference is of so many values as PLACE says, in all n_values --- */
 
-INTERNAL Status get_reals(void *component, const Reference vr[], size_t count, double value[],
-                          size_t n_values);
-
-INTERNAL Status set_reals(void *component, const Reference vr[], size_t count,
-                          const double value[], size_t n_values);
-
-INTERNAL Status get_booleans(void *component, const Reference vr[], size_t count, Boolean value[],
-                             size_t n_values);
-
-INTERNAL Status set_booleans(void *component, const Reference vr[], size_t count,
-                             const Boolean value[], size_t n_values);
-
-INTERNAL Status get_integers(void *component, const Reference vr[], size_t count, Integer value[],
-                             size_t n_values);
-
-INTERNAL Status set_integers(void *component, const Reference vr[], size_t count,
-                             const Integer value[], size_t n_values);
-
-/* Variables of a type that the FMU does not have: any reference is refused, none is fine. */
-INTERNAL Status get_others(void *component, const Reference vr[], size_t count, const void *value,
+/* Of a type that the FMU does not have any reference is refused, none is fine. */
+INTERNAL Status get_values(void *component, Call call, const Reference vr[], size_t count, void *values,
                            size_t n_values);
 
-INTERNAL Status set_others(void *component, const Reference vr[], size_t count, const void *value,
-                           size_t n_values);
+INTERNAL Status set_values(void *component, Call call, const Reference vr[], size_t count,
+                           const void *values, size_t n_values);
 
 /* The change of the unknowns where the knowns, states and inputs, change by the seed. */
 INTERNAL Status directional_derivative(void *component, const Reference unknown[],

@@ -7,8 +7,9 @@
 #include "events.h"
 #include "instance.h"
 
-typedef enum { REAL, INTEGER, BOOLEAN, OTHER } Type;
-static const char *const TYPE_NAME[] = {REAL_NAME, INTEGER_NAME, "Boolean"};
+/* In the order of the calls that get and set them. */
+typedef enum { REAL, BOOLEAN, INTEGER, OTHER } Type;
+static const char *const TYPE_NAME[] = {REAL_NAME, "Boolean", INTEGER_NAME};
 
 static size_t size_of(Reference vr)
 {
@@ -135,11 +136,20 @@ static Status update(Instance *instance, int variable)
     return OK;
 }
 
-Status get_reals(void *component, const Reference vr[], size_t count, double value[],
-                 size_t n_values)
+/* The number that a value of a type is in an importer's array. */
+static double number_in(Type type, const void *values, size_t i)
 {
-    Instance *instance = enter(component, GET_REAL, 1);
-    if (!instance || !known(instance, GET_REAL, REAL, vr, count, value, n_values))
+    if (type == REAL)
+        return ((const double *)values)[i];
+    return type == INTEGER ? (double)((const Integer *)values)[i] : (double)(((const Boolean *)values)[i] != 0);
+}
+
+Status get_values(void *component, Call call, const Reference vr[], size_t count, void *values, size_t n_values)
+{
+    Instance *instance = enter(component, call, 1);
+    const Type type = (Type)(call - GET_REAL);
+    size_t n = 0;
+    if (!instance || !known(instance, call, type, vr, count, values, n_values))
         return ERROR;
     for (size_t i = 0; i < count; i++)
         for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
@@ -148,75 +158,46 @@ Status get_reals(void *component, const Reference vr[], size_t count, double val
                 if (status != OK)
                     return status;
             }
-    for (size_t i = 0; i < count; value += size_of(vr[i++]))
-        memcpy(value, &instance->state.plant.value[PLACE[vr[i]]], size_of(vr[i]) * sizeof *value);
+    for (size_t i = 0; i < count; i++)
+        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++, n++) {
+            const double number = instance->state.plant.value[k];
+            if (type == REAL)
+                ((double *)values)[n] = number;
+            else if (type == INTEGER)
+                ((Integer *)values)[n] = (Integer)number;
+            else
+                ((Boolean *)values)[n] = number != 0.0;
+        }
     return OK;
 }
 
-Status set_reals(void *component, const Reference vr[], size_t count, const double value[],
-                 size_t n_values)
+/* Whether a variable may have a value now. */
+static int accepts(Instance *instance, Call call, int variable, double value)
 {
-    Instance *instance = enter(component, SET_REAL, 1);
-    const double *next = value;
-    if (!instance || !known(instance, SET_REAL, REAL, vr, count, value, n_values))
+    if (!settable(instance, call, variable))
+        return 0;
+    if (isfinite(value))
+        return check_range(instance, variable, value) == OK;
+    report(instance, ERROR, "%s = %s is not finite", VARIABLE_NAME[variable],
+           isnan(value) ? "nan" : value > 0.0 ? "inf" : "-inf");
+    return 0;
+}
+
+Status set_values(void *component, Call call, const Reference vr[], size_t count, const void *values, size_t n_values)
+{
+    Instance *instance = enter(component, call, 1);
+    const Type type = (Type)(call - SET_REAL);
+    size_t checked = 0, n = 0;
+    if (!instance || !known(instance, call, type, vr, count, values, n_values))
         return ERROR;
-    for (size_t i = 0; i < count; i++) {
-        if (!settable(instance, SET_REAL, PLACE[vr[i]]))
-            return ERROR;
-        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++, next++) {
-            if (!isfinite(*next))
-                return report(instance, ERROR, "%s = %s is not finite", VARIABLE_NAME[k],
-                              isnan(*next) ? "nan" : *next > 0.0 ? "inf" : "-inf");
-            if (check_range(instance, k, *next) != OK)
-                return ERROR;
-        }
-    }
     for (size_t i = 0; i < count; i++)
         for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
-            set(instance, k, *value++);
+            if (!accepts(instance, call, k, number_in(type, values, checked++)))
+                return ERROR;
+    for (size_t i = 0; i < count; i++)
+        for (int k = PLACE[vr[i]]; k < PLACE[vr[i] + 1]; k++)
+            set(instance, k, number_in(type, values, n++));
     return OK;
-}
-
-/* Variables of a type without fractions, by the values' conversions. */
-#define WHOLE_NUMBERS(names, Type, TYPE, OF_VALUE, TO_VALUE)                                                        \
-    Status get_##names(void *component, const Reference vr[], size_t count, Type value[], size_t n_values)          \
-    {                                                                                                               \
-        Instance *instance = enter(component, GET_##TYPE, 1);                                                       \
-        if (!instance || !known(instance, GET_##TYPE, TYPE, vr, count, value, n_values))                            \
-            return ERROR;                                                                                           \
-        for (size_t i = 0; i < count; i++)                                                                          \
-            value[i] = OF_VALUE(instance->state.plant.value[PLACE[vr[i]]]);                                         \
-        return OK;                                                                                                  \
-    }                                                                                                               \
-    Status set_##names(void *component, const Reference vr[], size_t count, const Type value[], size_t n_values)    \
-    {                                                                                                               \
-        Instance *instance = enter(component, SET_##TYPE, 1);                                                       \
-        if (!instance || !known(instance, SET_##TYPE, TYPE, vr, count, value, n_values))                            \
-            return ERROR;                                                                                           \
-        for (size_t i = 0; i < count; i++)                                                                          \
-            if (!settable(instance, SET_##TYPE, PLACE[vr[i]])                                                       \
-                || check_range(instance, PLACE[vr[i]], TO_VALUE(value[i])) != OK)                                   \
-                return ERROR;                                                                                       \
-        for (size_t i = 0; i < count; i++)                                                                          \
-            set(instance, PLACE[vr[i]], TO_VALUE(value[i]));                                                        \
-        return OK;                                                                                                  \
-    }
-#define IS_TRUE(value) ((value) != 0)
-WHOLE_NUMBERS(booleans, Boolean, BOOLEAN, IS_TRUE, IS_TRUE)
-WHOLE_NUMBERS(integers, Integer, INTEGER, (Integer), (double))
-
-Status get_others(void *component, const Reference vr[], size_t count, const void *value,
-                  size_t n_values)
-{
-    Instance *instance = enter(component, GET_OTHER, 1);
-    return instance && known(instance, GET_OTHER, OTHER, vr, count, value, n_values) ? OK : ERROR;
-}
-
-Status set_others(void *component, const Reference vr[], size_t count, const void *value,
-                  size_t n_values)
-{
-    Instance *instance = enter(component, SET_OTHER, 1);
-    return instance && known(instance, SET_OTHER, OTHER, vr, count, value, n_values) ? OK : ERROR;
 }
 
 /* The computed variables that the derivatives of the unknowns by the knowns need; -1, which is logged,

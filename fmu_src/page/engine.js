@@ -54,23 +54,18 @@ class Engine {
     new Uint32Array(this.memory.buffer, this.places, places.length).set(places);
   }
 
+  /** Set variables of any type, all or, where a value is refused, none. */
   /** @type {(places: number[], values: number[]) => void} */
-  setReal(places, values) {
+  set(places, values) {
     this.prepare(places);
     new Float64Array(this.memory.buffer, this.values, values.length).set(values);
-    this.call("engine_set_reals", this.places, places.length, this.values);
-  }
-
-  /** Set a Boolean or an Integer. */
-  /** @type {(place: number, value: Value) => void} */
-  setWhole(place, value) {
-    this.call("engine_set_whole", place, Number(value));
+    this.call("engine_set", this.places, places.length, this.values);
   }
 
   /** @param {number[]} places */
-  getReal(places) {
+  get(places) {
     this.prepare(places);
-    this.call("engine_get_reals", this.places, places.length, this.values);
+    this.call("engine_get", this.places, places.length, this.values);
     return new Float64Array(this.memory.buffer, this.values, places.length);
   }
 

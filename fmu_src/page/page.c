@@ -2,8 +2,6 @@
    variables are set and read one by one, whether they are scalars or elements of vectors. */
 #include "fmu.c"
 
-#include <stdint.h>
-
 #define EXPORT(name) __attribute__((export_name(#name))) name
 
 static Instance *instance;
@@ -64,54 +62,23 @@ void *EXPORT(engine_allocate)(size_t size)
     return malloc(size);
 }
 
-/* Set numbers, all or, where one is refused, none; other elements of their vectors stay. */
-int EXPORT(engine_set_reals)(const int place[], size_t count, const double value[])
+/* Set variables of any type, all or, where a value is refused, none. */
+int EXPORT(engine_set)(const int place[], size_t count, const double value[])
 {
-    static double draft[N_VARIABLES], whole[N_VARIABLES];
-    static Reference vr[N_REFERENCES];
-    static State before;
-    size_t vectors = 0, n_values = 0;
-    Status status = OK;
-    before = instance->state;
-    memcpy(draft, before.plant.value, sizeof draft);
-    for (size_t i = 0; i < count; i++)
-        draft[place[i]] = value[i];
-    for (Reference own = 1; own <= N_REFERENCES && status <= WARNING; own++) {
-        const int first = PLACE[own];
-        size_t i = 0;
-        while (i < count && (place[i] < first || place[i] >= PLACE[own + 1]))
-            i++;
-        if (i == count)
-            continue;
-        if (first >= FIRST_INTEGER && fabs(draft[first]) <= INT32_MAX && draft[first] == rint(draft[first])) {
-            const Integer integer = (Integer)draft[first];
-            status = set_integers(instance, &own, 1, &integer, 1);
-            continue;
-        }
-        vr[vectors++] = own;
-        memcpy(&whole[n_values], &draft[first], size_of(own) * sizeof *whole);
-        n_values += size_of(own);
+    if (!enter(instance, SET_REAL, 1))
+        return ERROR;
+    for (size_t i = 0; i < count; i++) {
+        if (!accepts(instance, SET_REAL, place[i], value[i]))
+            return ERROR;
+        if (place[i] >= FIRST_INTEGER && place[i] < FIRST_BOOLEAN && value[i] != rint(value[i]))
+            return report(instance, ERROR, "%s = %g must be a whole number", VARIABLE_NAME[place[i]], value[i]);
     }
-    if (status <= WARNING)
-        status = set_reals(instance, vr, vectors, whole, n_values);
-    if (status > WARNING)
-        instance->state = before;
-    return status;
+    for (size_t i = 0; i < count; i++)
+        set(instance, place[i], place[i] >= FIRST_BOOLEAN ? value[i] != 0.0 : value[i]);
+    return OK;
 }
 
-/* Set a Boolean or an Integer. */
-int EXPORT(engine_set_whole)(int place, int value)
-{
-    Reference vr = 1;
-    while (PLACE[vr] != place)
-        vr++;
-    const Boolean truth = value != 0;
-    const Integer number = value;
-    return place >= FIRST_BOOLEAN ? set_booleans(instance, &vr, 1, &truth, 1)
-                                  : set_integers(instance, &vr, 1, &number, 1);
-}
-
-int EXPORT(engine_get_reals)(const int place[], size_t count, double value[])
+int EXPORT(engine_get)(const int place[], size_t count, double value[])
 {
     if (!enter(instance, GET_REAL, 1))
         return ERROR;

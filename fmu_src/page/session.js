@@ -41,11 +41,10 @@ class Session extends Samples {
 
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
-    const reals = pairs.filter(([name]) => this.variable(name).type === "Real");
-    const places = reals.map(([name]) => this.variable(name).place);
-    if (reals.length) this.engine.setReal(places, reals.map(([, value]) => Number(value)));
-    for (const [name, value] of pairs)
-      if (this.variable(name).type !== "Real") this.engine.setWhole(this.variable(name).place, value);
+    this.engine.set(
+      pairs.map(([name]) => this.variable(name).place),
+      pairs.map(([, value]) => Number(value)),
+    );
   }
 
   /** Set an input from the next step on; a parameter restarts the simulation. */
@@ -114,6 +113,6 @@ class Session extends Samples {
   }
 
   record() {
-    this.append(this.engine.getReal(this.places));
+    this.append(this.engine.get(this.places));
   }
 }

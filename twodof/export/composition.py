@@ -2,11 +2,10 @@
 
 import hashlib
 import logging
-import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import BuildError, InputError, choice
 from ..files import data_file
@@ -122,28 +121,12 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
         0.0 if low <= 0.0 <= high else 0.5 * (low + high) for low, high in zip(robot.q_min, robot.q_max, strict=True)
     )
     starts: dict[str, Any] = dict(DEFAULT_ARM) if shipped else {"q_start": rest}
-    for key in ("gravity", "q_start"):
-        given = getattr(options, key)
-        if isinstance(given, Mapping):
-            for name in given.keys() - {*robot.joints}:
-                raise BuildError(f"{key}: there is no joint '{name}'{choice(name, robot.joints)}")
-            given = [given.get(name, value) for name, value in zip(robot.joints, starts[key])]
-        if given is not None:
-            if not all(map(math.isfinite, given)):
-                raise BuildError(f"{key} {given} must be finite numbers")
-            starts[key] = tuple(float(value) for value in given)
-    if options.gravity is not None and len(options.gravity) != 3:
-        raise BuildError(f"gravity {options.gravity} must be three numbers")
-    if len(starts["q_start"]) != len(robot.joints):
-        raise BuildError(
-            f"q_start has {len(starts['q_start'])} values, the robot has {len(robot.joints)}"
-            f" joints: {', '.join(robot.joints)}"
-        )
+    settings = _settings(options, dict(zip(robot.joints, starts["q_start"])))
     if shipped and axes != "xy":
         raise BuildError("the shipped arm moves in the x-y plane: its axes are xy")
     try:
-        values = resolve(_Variables(robot, {**PLACEHOLDERS, **starts}, options.control), options.settings)
-        _refuse_twice(options, values)
+        placeholders = variable_table(robot, {**PLACEHOLDERS, **starts}, options.control)
+        values = resolve(_Variables({v.name: v for v in placeholders}, options.control), settings)
         _set(robot, starts, options.control, values, POSE)
         at_rest = {**PLACEHOLDERS, **{group: starts[group] for group in POSE if group in starts}}
         plant = Plant(robot, variable_table(robot, at_rest, "pose"), "pose")
@@ -165,19 +148,29 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
     return robot, table, starts
 
 
-class _Variables:
+class _Variables(NamedTuple):
     """The variables of an FMU that is yet to be built."""
 
-    def __init__(self, robot: Robot, starts: Starts, control: str) -> None:
-        self.control = control
-        self.variables = {variable.name: variable for variable in variable_table(robot, starts, control)}
+    variables: Mapping[str, Variable]
+    control: str
 
 
-def _refuse_twice(options: FmuOptions, values: Mapping[str, Value]) -> None:
-    """Refuse start values that are given by an option of their own too."""
-    for group in {name.partition("[")[0] for name in values} & {"gravity", "q_start"}:
-        if getattr(options, group) is not None:
-            raise InputError(f"{group} is given twice, by `{group}` and as a start value")
+def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, object]:
+    """Return the start values that are given; ``rest`` has the start positions of joints that are not named."""
+    settings = dict(options.settings)
+    for key, given in (("gravity", options.gravity), ("q_start", options.q_start)):
+        if given is None:
+            continue
+        if key in {name.partition("[")[0] for name in settings}:
+            raise BuildError(f"{key} is given twice, by `{key}` and as a start value")
+        if isinstance(given, Mapping):
+            for name in given.keys() - {*rest}:
+                raise BuildError(f"{key}: there is no joint '{name}'{choice(name, rest)}")
+            given = tuple({**rest, **given}.values())
+        if key == "q_start" and len(given) != len(rest):
+            raise BuildError(f"q_start has {len(given)} values, the robot has {len(rest)} joints: {', '.join(rest)}")
+        settings[key] = given
+    return settings
 
 
 def _set(

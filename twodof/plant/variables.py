@@ -136,64 +136,63 @@ CONTROLS = {
 DISTURBANCES = ("tau_ext", "f_ext")
 OF_A_LAW = {group for law in CONTROLS.values() for group in (*law.outputs, *law.parameters)}
 
-ROWS = (
-    ("x_des", "input", "axis", "m", "target position"),
-    ("xd_des", "input", "axis", "m/s", "target velocity"),
-    ("xdd_des", "input", "axis", "m/s2", "target acceleration"),
-    ("quat_des", "input", "quaternion", "", "target orientation of {frame}"),
-    ("omega_des", "input", "turn", "rad/s", "target angular velocity"),
-    ("alpha_des", "input", "turn", "rad/s2", "target angular acceleration"),
-    ("q_des", "input", "joint", "m|rad", "target position"),
-    ("v_des", "input", "joint", "m/s|rad/s", "target velocity"),
-    ("a_des", "input", "joint", "m/s2|rad/s2", "target acceleration"),
-    ("Kp", "input", "controlled", "1/s2", "proportional gain"),
-    ("Kd", "input", "controlled", "1/s", "derivative gain"),
-    ("Kp_rot", "input", "turn", "1/s2", "proportional gain of the orientation"),
-    ("Kd_rot", "input", "turn", "1/s", "derivative gain of the orientation"),
-    ("tau_cmd", "input", "joint", "N|N.m", "effort of the controller"),
-    ("tau_ext", "input", "joint", "N|N.m", "external effort"),
-    ("f_ext", "input", "root", "N", "external force at {frame}"),
-    ("Kn", "input", "", "1/s", "damping of the motion that does not move the end effector"),
-    ("q", "output", "joint", "m|rad", "position"),
-    ("v", "output", "joint", "m/s|rad/s", "velocity"),
-    ("x", "output", "axis", "m", "position"),
-    ("xd", "output", "axis", "m/s", "velocity"),
-    ("quat", "output", "quaternion", "", "orientation of {frame}"),
-    ("omega", "output", "turn", "rad/s", "angular velocity of {frame}"),
-    ("tau", "output", "joint", "N|N.m", "control effort applied"),
-    ("q_meas", "output", "joint", "m|rad", "position that the controller saw"),
-    ("v_meas", "output", "joint", "m/s|rad/s", "velocity that the controller saw"),
-    ("der_q", "local", "joint", "m/s|rad/s", "velocity, the position's derivative"),
-    ("der_v", "local", "joint", "m/s2|rad/s2", "acceleration"),
-    ("q_start", "parameter", "joint", "m|rad", "position at the start"),
-    ("v_start", "parameter", "joint", "m/s|rad/s", "velocity at the start"),
-    ("q_min", "parameter", "joint", "m|rad", "lower limit"),
-    ("q_max", "parameter", "joint", "m|rad", "upper limit"),
-    ("gravity", "parameter", "root", "m/s2", "gravity"),
-    ("payload", "parameter", "", "kg", "point mass at {frame}"),
-    ("payload_com", "parameter", "frame", "m", "where the payload is"),
-    ("rcond", "parameter", "", "", "singular values up to rcond times the largest are dropped"),
-    ("rtol", "parameter", "", "", "relative tolerance of the integrator"),
-    ("atol", "parameter", "", "", "absolute tolerance of the integrator"),
-    ("max_step", "parameter", "", "s", "largest step of the integrator"),
-    ("friction", "parameter", "joint", "N|N.m", "Coulomb friction and stiction"),
-    ("damping", "parameter", "joint", "N.s/m|N.m.s/rad", "viscous friction"),
-    ("armature", "parameter", "joint", "kg|kg.m2", "inertia of the rotor times gear ratio squared"),
-    ("control_period", "parameter", "", "s", "sampling period of the controller, 0 for a continuous one"),
-    ("control_delay", "parameter", "", "s", "time from a sample to the effort that it commands"),
-    ("q_resolution", "parameter", "joint", "m|rad", "resolution of the position sensor"),
-    ("q_noise", "parameter", "joint", "m|rad", "standard deviation of the position sensor's noise"),
-    ("v_noise", "parameter", "joint", "m/s|rad/s", "standard deviation of the velocity sensor's noise"),
-    ("seed", "parameter", "", "", "seed of the sensors' noise"),
-    ("v_from_q", "parameter", "", "", "the controller's velocities are differences of its positions"),
-    ("limit_effort", "parameter", "", "", "limit the control effort to the URDF's effort limits"),
-    ("rigid_stops", "parameter", "", "", "joint stops act on the other joints too"),
-    ("payload_known", "parameter", "", "", "the controller knows the payload"),
+ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ...] = (
+    ("x_des", "input", "axis", "m", None, "target position"),
+    ("xd_des", "input", "axis", "m/s", 0.0, "target velocity"),
+    ("xdd_des", "input", "axis", "m/s2", 0.0, "target acceleration"),
+    ("quat_des", "input", "quaternion", "", None, "target orientation of {frame}"),
+    ("omega_des", "input", "turn", "rad/s", 0.0, "target angular velocity"),
+    ("alpha_des", "input", "turn", "rad/s2", 0.0, "target angular acceleration"),
+    ("q_des", "input", "joint", "m|rad", None, "target position"),
+    ("v_des", "input", "joint", "m/s|rad/s", 0.0, "target velocity"),
+    ("a_des", "input", "joint", "m/s2|rad/s2", 0.0, "target acceleration"),
+    ("Kp", "input", "controlled", "1/s2", 50.0, "proportional gain"),
+    ("Kd", "input", "controlled", "1/s", 40.0, "derivative gain"),
+    ("Kp_rot", "input", "turn", "1/s2", 50.0, "proportional gain of the orientation"),
+    ("Kd_rot", "input", "turn", "1/s", 40.0, "derivative gain of the orientation"),
+    ("tau_cmd", "input", "joint", "N|N.m", 0.0, "effort of the controller"),
+    ("tau_ext", "input", "joint", "N|N.m", 0.0, "external effort"),
+    ("f_ext", "input", "root", "N", 0.0, "external force at {frame}"),
+    ("Kn", "input", "", "1/s", None, "damping of the motion that does not move the end effector"),
+    ("q", "output", "joint", "m|rad", None, "position"),
+    ("v", "output", "joint", "m/s|rad/s", None, "velocity"),
+    ("x", "output", "axis", "m", None, "position"),
+    ("xd", "output", "axis", "m/s", None, "velocity"),
+    ("quat", "output", "quaternion", "", None, "orientation of {frame}"),
+    ("omega", "output", "turn", "rad/s", None, "angular velocity of {frame}"),
+    ("tau", "output", "joint", "N|N.m", None, "control effort applied"),
+    ("q_meas", "output", "joint", "m|rad", None, "position that the controller saw"),
+    ("v_meas", "output", "joint", "m/s|rad/s", None, "velocity that the controller saw"),
+    ("der_q", "local", "joint", "m/s|rad/s", None, "velocity, the position's derivative"),
+    ("der_v", "local", "joint", "m/s2|rad/s2", None, "acceleration"),
+    ("q_start", "parameter", "joint", "m|rad", None, "position at the start"),
+    ("v_start", "parameter", "joint", "m/s|rad/s", 0.0, "velocity at the start"),
+    ("q_min", "parameter", "joint", "m|rad", None, "lower limit"),
+    ("q_max", "parameter", "joint", "m|rad", None, "upper limit"),
+    ("gravity", "parameter", "root", "m/s2", (0.0, 0.0, -9.81), "gravity"),
+    ("payload", "parameter", "", "kg", 0.0, "point mass at {frame}"),
+    ("payload_com", "parameter", "frame", "m", 0.0, "where the payload is"),
+    ("rcond", "parameter", "", "", 0.01, "singular values up to rcond times the largest are dropped"),
+    ("rtol", "parameter", "", "", 1e-3, "relative tolerance of the integrator"),
+    ("atol", "parameter", "", "", 1e-6, "absolute tolerance of the integrator"),
+    ("max_step", "parameter", "", "s", 1e-3, "largest step of the integrator"),
+    ("friction", "parameter", "joint", "N|N.m", None, "Coulomb friction and stiction"),
+    ("damping", "parameter", "joint", "N.s/m|N.m.s/rad", None, "viscous friction"),
+    ("armature", "parameter", "joint", "kg|kg.m2", 0.0, "inertia of the rotor times gear ratio squared"),
+    ("control_period", "parameter", "", "s", 0.0, "sampling period of the controller, 0 for a continuous one"),
+    ("control_delay", "parameter", "", "s", 0.0, "time from a sample to the effort that it commands"),
+    ("q_resolution", "parameter", "joint", "m|rad", 0.0, "resolution of the position sensor"),
+    ("q_noise", "parameter", "joint", "m|rad", 0.0, "standard deviation of the position sensor's noise"),
+    ("v_noise", "parameter", "joint", "m/s|rad/s", 0.0, "standard deviation of the velocity sensor's noise"),
+    ("seed", "parameter", "", "", 0, "seed of the sensors' noise"),
+    ("v_from_q", "parameter", "", "", False, "the controller's velocities are differences of its positions"),
+    ("limit_effort", "parameter", "", "", False, "limit the control effort to the URDF's effort limits"),
+    ("rigid_stops", "parameter", "", "", None, "joint stops act on the other joints too"),
+    ("payload_known", "parameter", "", "", False, "the controller knows the payload"),
 )
-"""Group, causality, owners of the elements (none of a scalar), unit (of a joint that slides | that turns) and
-description."""
+"""Group, causality, owners of the elements (none of a scalar), unit (of a joint that slides | that turns), start value
+(None of what is computed, of what the robot or its control law decides, and of targets) and description."""
 
-Row = tuple[str, str, list[str], list[str], str]
 Starts = Mapping[str, Value | tuple[float, ...]]
 
 
@@ -207,94 +206,51 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
         control: the control law, a key of ``CONTROLS``.
     """
     law = CONTROLS[control]
-    default = _defaults(robot, control)
-    default.update(starts)
+    of_robot = {group: getattr(robot, group) for group in ("q_min", "q_max", "friction", "damping")}
+    redundant = len(robot.joints) > _count_task_rows(robot, law)
+    starts = {**of_robot, "Kn": 10.0 if redundant else 0.0, "rigid_stops": law.rigid_stops, **starts}
     if "q_des" in law.inputs:
-        default.setdefault("q_des", default["q_start"])
+        starts.setdefault("q_des", starts["q_start"])
+    owners = _owners(robot, law)
     table: list[Variable] = []
-    for group, causality, size, units, text in _rows(robot, control):
+    for group, causality, owner, unit, default, text in ROWS:
         own = group in (*law.inputs, *law.outputs, *law.parameters)
-        if own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES:
-            start = default.get(group) if causality in ("input", "parameter") else None
-            for i, (unit, owner) in enumerate(zip(units, size)):
-                value = start[i] if isinstance(start, tuple) else None
-                table.append(Variable(group, i, causality, unit, value, f"{text}, {owner}"))
-            if not size:
-                assert not isinstance(start, tuple)
-                table.append(Variable(group, None, causality, units[0], start, text))
+        if not (own or (causality != "input" and group not in OF_A_LAW) or group in DISTURBANCES):
+            continue
+        start = starts.get(group, default) if causality in ("input", "parameter") else None
+        text, (sliding, _, turning) = text.format(frame=robot.frame), unit.partition("|")
+        for i, element in enumerate(owners[owner]):
+            own_unit = turning if turning and not robot.prismatic[i] else sliding
+            value = start[i] if isinstance(start, tuple) else start
+            table.append(Variable(group, i, causality, own_unit, value, f"{text}, {element}"))
+        if not owner:
+            assert not isinstance(start, tuple)
+            table.append(Variable(group, None, causality, unit, start, text))
     return table
 
 
-def _defaults(robot: Robot, control: str) -> dict[str, Value | tuple[float, ...]]:
-    n, m = len(robot.joints), len(robot.axes)
-    rows = m + 3 * ("quat_des" in CONTROLS[control].inputs)
-    controlled = m if "x_des" in CONTROLS[control].inputs else n
-    return {
-        "xd_des": (0.0,) * m,
-        "xdd_des": (0.0,) * m,
-        "v_des": (0.0,) * n,
-        "a_des": (0.0,) * n,
-        "omega_des": (0.0,) * 3,
-        "alpha_des": (0.0,) * 3,
-        "Kp_rot": (50.0,) * 3,
-        "Kd_rot": (40.0,) * 3,
-        "Kp": (50.0,) * controlled,
-        "Kd": (40.0,) * controlled,
-        "Kn": 10.0 if n > rows else 0.0,
-        "tau_cmd": (0.0,) * n,
-        "tau_ext": (0.0,) * n,
-        "f_ext": (0.0,) * 3,
-        "v_start": (0.0,) * n,
-        "q_min": robot.q_min,
-        "q_max": robot.q_max,
-        "gravity": (0.0, 0.0, -9.81),
-        "payload": 0.0,
-        "payload_com": (0.0,) * 3,
-        "rcond": 0.01,
-        "rtol": 1e-3,
-        "atol": 1e-6,
-        "max_step": 1e-3,
-        "friction": robot.friction,
-        "damping": robot.damping,
-        "armature": (0.0,) * n,
-        "control_period": 0.0,
-        "control_delay": 0.0,
-        "q_resolution": (0.0,) * n,
-        "q_noise": (0.0,) * n,
-        "v_noise": (0.0,) * n,
-        "seed": 0,
-        "v_from_q": False,
-        "limit_effort": False,
-        "rigid_stops": CONTROLS[control].rigid_stops,
-        "payload_known": False,
-    }
-
-
-def _rows(robot: Robot, control: str) -> list[Row]:
-    """Return group, causality, owners of elements (none of a scalar), units and description."""
+def _owners(robot: Robot, law: Control) -> dict[str, list[str]]:
+    """Return what the elements of vectors belong to, in words."""
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
-    owners = {
+    return {
         "": [],
         "joint": joint,
         "axis": axis,
-        "controlled": axis if "x_des" in CONTROLS[control].inputs else joint,
+        "controlled": axis if "x_des" in law.inputs else joint,
         "root": [f"axis {letter} of {robot.root}" for letter in "xyz"],
         "frame": [f"axis {letter} of {robot.frame}" for letter in "xyz"],
         "turn": [f"about axis {letter} of {robot.root}" for letter in "xyz"],
         "quaternion": list("xyzw"),
     }
-    rows = []
-    for group, causality, owner, unit, text in ROWS:
-        sliding, _, turning = unit.partition("|")
-        kinds = robot.prismatic if turning else [True] * max(1, len(owners[owner]))
-        units = [sliding if prismatic else turning for prismatic in kinds]
-        rows.append((group, causality, owners[owner], units, text.format(frame=robot.frame)))
-    return rows
+
+
+def _count_task_rows(robot: Robot, law: Control) -> int:
+    return len(robot.axes) + 3 * ("quat_des" in law.inputs)
 
 
 def count_event_indicators(robot: Robot, control: str) -> int:
     """Count the event indicators of Model Exchange: three per joint, and droppable singular values."""
     law = CONTROLS[control]
-    rows = len(robot.axes) + 3 * ("quat_des" in law.inputs) if "rcond" in law.parameters else 1
+    rows = _count_task_rows(robot, law) if "rcond" in law.parameters else 1
     return 3 * len(robot.joints) + rows - 1
