@@ -69,18 +69,21 @@ static const struct {
     [COUNT_STATES] = {CALL_NAME(GetNumberOf), ANY, MODEL_EXCHANGE},
 };
 
-const char *call_name(Call call)
+/* Name of a call, as messages say it. */
+static const char *call_name(Call call)
 {
     return RULE[call].name;
 }
 
-int can_be_in(Kind kind, int phase)
+/* Whether an instance of a kind can be in a phase. */
+static int can_be_in(Kind kind, int phase)
 {
     const int other = kind == MODEL_EXCHANGE ? PHASE(STEP) | PHASE(STEP_FAILED) : PHASE(EVENT) | PHASE(CONTINUOUS_TIME);
     return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
 }
 
-int allowed(Instance *instance, Call call, const char *culprit)
+/* Whether a call is allowed in the instance's phase; where not, logs it. */
+static int allowed(Instance *instance, Call call, const char *culprit)
 {
     const int phase = instance->state.phase;
     const Kind kind = RULE[call].kind;
@@ -96,7 +99,15 @@ int allowed(Instance *instance, Call call, const char *culprit)
     return 0;
 }
 
-Instance *enter(void *component, Call call, int has_pointers)
+/* Log why a call is refused. */
+static Status refuse(Instance *instance, Call call, const char *reason)
+{
+    return report(instance, ERROR, "%s: %s", call_name(call), reason);
+}
+
+/* The instance where the call is allowed and has the pointers that it needs, else NULL; a refusal is
+   logged. */
+static Instance *enter(void *component, Call call, int has_pointers)
 {
     if (!component || !allowed(component, call, NULL))
         return NULL;
@@ -106,12 +117,8 @@ Instance *enter(void *component, Call call, int has_pointers)
     return NULL;
 }
 
-Status refuse(Instance *instance, Call call, const char *reason)
-{
-    return report(instance, ERROR, "%s: %s", call_name(call), reason);
-}
-
-Status move_on(void *component, Call call, Phase phase)
+/* Where the call is allowed, what it does is to change the phase. */
+static Status move_on(void *component, Call call, Phase phase)
 {
     Instance *instance = enter(component, call, 1);
     if (!instance)
@@ -120,7 +127,8 @@ Status move_on(void *component, Call call, Phase phase)
     return OK;
 }
 
-Status unsupported(Instance *instance, const char *function)
+/* Refuse a call of what the modelDescription says that there is not. Importers bind every name. */
+static Status unsupported(Instance *instance, const char *function)
 {
     if (instance)
         report(instance, ERROR, "%s is not supported by this FMU", function);

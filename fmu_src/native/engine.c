@@ -1,9 +1,7 @@
 /* The equations of motion under the control law. Compiled twice: with real numbers, and with complex ones
-   for derivatives. */
+   for derivatives. A file uses those before it. */
 #include "turn.c"
 #include "mechanism.c"
-#include "plant.c"
-#include "stops.c"
 #if N_ROWS > N_AXES
 #include "orientation.c"
 #endif
@@ -15,3 +13,5 @@
 #else
 #include "joint_control.c"
 #endif
+#include "plant.c"
+#include "stops.c"

@@ -11,11 +11,8 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "polynomial.h"
-
 #ifdef HAS_RCOND
 #include "control.h"
-#include "pseudo_inverse.h"
 #endif
 
 /* Weights of the stages in Dormand and Prince's interpolant: the largest sum of

@@ -2,7 +2,7 @@
    past the limit, that of a joint at rest how it is pressed into it; of friction it is the velocity in the
    direction of slip, and of a joint that sticks how far the effort that holds it is within its bounds. Each
    is off zero after its event. */
-#include "events.h"
+#include "stops.h"
 
 #include <float.h>
 #include <math.h>
@@ -25,7 +25,8 @@ static const double BACK = 1e-13;
    turn drive each other off would else have events without end. */
 static const double SLOW = 1e-4;
 
-void find_stops(const Plant *plant, Stops *stops)
+/* The joints that rest at the plant's state, by the rules of stops.h. */
+static void find_stops(const Plant *plant, Stops *stops)
 {
     const int anti_chatter[N_JOINTS] = {0};
     double a[N_JOINTS], effort[N_JOINTS];
@@ -40,7 +41,9 @@ static double room(double limit, double distance, double v)
     return size < DBL_MAX ? distance + PAST * fmax(1.0, size) + CLEARING * fmax(0.0, v) : 1.0;
 }
 
-void event_indicators(const Plant *plant, const Stops *stops, double indicator[N_INDICATORS])
+/* One indicator of each joint's upper limit, then of each lower one, of each joint's friction, then of the
+   singular values that J⁺ may drop, all but the largest. An event is where one changes its sign. */
+static void event_indicators(const Plant *plant, const Stops *stops, double indicator[N_INDICATORS])
 {
     const double *q = &plant->value[Q], *v = &plant->value[V];
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
@@ -72,7 +75,9 @@ void event_indicators(const Plant *plant, const Stops *stops, double indicator[N
 #endif
 }
 
-int handle_event(Plant *plant, Stops *stops)
+/* Changes at an event: decided by the state alone, so that it is the same whether the importer came
+   early, late or for nothing. Whether the state is another now. */
+static int handle_event(Plant *plant, Stops *stops)
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
     double before[N_STATES], y[N_STATES], fastest = 0.0;

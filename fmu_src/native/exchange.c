@@ -2,7 +2,6 @@
 #include <math.h>
 #include <string.h>
 
-#include "events.h"
 #include "instance.h"
 
 /* The instance where the call is allowed and hands over so many values; its q and v are there. */
@@ -31,7 +30,8 @@ static Instance *enter_with(void *component, Call call, const void *values, size
     return instance;
 }
 
-Status update_discrete_states(void *component, Boolean *states_changed, double *next_event)
+/* Reports whether the states q and v have changed, and the time of the next event, HUGE_VAL where none is known. */
+static Status update_discrete_states(void *component, Boolean *states_changed, double *next_event)
 {
     Instance *instance = enter_with(component, NEW_DISCRETE_STATES, states_changed, 1, 1);
     if (!instance)

@@ -1,4 +1,5 @@
-/* All of the FMU but the derivatives: its files together, for their functions are static. */
+/* All of the FMU but the derivatives: its files together, for their functions are static. A file uses those before
+   it; headers have what is used before its file, and by the derivatives. */
 #include "engine.c"
 #include "dormand_prince.c"
 #include "polynomial.c"

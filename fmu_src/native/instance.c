@@ -1,6 +1,5 @@
 /* The life of an instance: its making, messages, and initialisation. */
 #include "instance.h"
-#include "events.h"
 
 #include <math.h>
 #include <stdarg.h>
@@ -40,7 +39,8 @@ static void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
-Status check_range(Instance *instance, int variable, double value)
+/* Whether a variable may have a value; a refusal is logged. */
+static Status check_range(Instance *instance, int variable, double value)
 {
     for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
         const int index = variable - RANGE[k].first;
@@ -52,7 +52,139 @@ Status check_range(Instance *instance, int variable, double value)
     return OK;
 }
 
-Instance *instantiate(Instance draft, const char *token, int logging_on)
+/* Whether the control law can follow the inputs; a refusal is logged. */
+static Status check_inputs(Instance *instance)
+{
+#if N_ROWS > N_AXES
+    const double *quat = &instance->state.plant.value[QUAT_DES];
+    if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
+        return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
+                      " turns nothing");
+#else
+    (void)instance;
+#endif
+    return OK;
+}
+
+/* Whether the period of the controller is one that its delay and its sensors can have. */
+static Status check_sampling(Instance *instance)
+{
+    const double *value = instance->state.plant.value;
+    const double period = value[CONTROL_PERIOD], delay = value[CONTROL_DELAY];
+    const int of_points = !COMMANDS_ACCELERATION && instance->kind == CO_SIMULATION;
+    const int group[] = {Q_RESOLUTION, Q_NOISE, V_NOISE, V_FROM_Q};
+    if (delay != 0.0 && period == 0.0)
+        return report(instance, ERROR, "control_delay = %g needs a control_period > 0; set that, or leave"
+                      " it out", delay);
+    if (delay > MOST_PERIODS * period)
+        return report(instance, ERROR, "control_delay = %g must be at most %d times control_period = %g; lessen it,"
+                      " or enlarge control_period", delay, MOST_PERIODS, period);
+    for (int i = N_JOINTS; i-- > 0 && value[V_FROM_Q] != 0.0;)
+        if (value[V_NOISE + i] != 0.0)
+            return report(instance, ERROR, "%s = %g has no effect with v_from_q = true; leave one of them out",
+                          VARIABLE_NAME[V_NOISE + i], value[V_NOISE + i]);
+    for (size_t k = 0; k < sizeof group / sizeof *group && period == 0.0 && !of_points; k++)
+        for (int i = group[k]; i < group[k] + (group[k] == V_FROM_Q ? 1 : N_JOINTS); i++)
+            if (value[i] != 0.0) {
+                char text[24] = "true";
+                if (i != V_FROM_Q)
+                    snprintf(text, sizeof text, "%g", value[i]);
+                return report(instance, ERROR, "%s = %s needs a control_period > 0; set that, or leave it out",
+                              VARIABLE_NAME[i], text);
+            }
+    return OK;
+}
+
+/* Whether the joints' limits make ranges, and parameters of sampling go together; a refusal is logged. */
+static Status check_parameters(Instance *instance)
+{
+    const double *value = instance->state.plant.value;
+    for (int i = 0; i < N_JOINTS; i++)
+        if (value[Q_MIN + i] > value[Q_MAX + i])
+            return report(instance, ERROR, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
+                          i + 1, value[Q_MIN + i], i + 1, value[Q_MAX + i], JOINT_NAME[i]);
+    return check_sampling(instance);
+}
+
+/* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
+   clamped is logged too. */
+static Status initialise(Instance *instance, int warn)
+{
+    State *state = &instance->state;
+    double *value = state->plant.value;
+    const int anti_chatter[N_JOINTS] = {0};
+    if (check_parameters(instance) != OK || check_inputs(instance) != OK)
+        return ERROR;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double start = value[Q_START + i];
+        const double low = value[Q_MIN + i], high = value[Q_MAX + i];
+        const double q = start < low ? low : start > high ? high : start;
+        if (warn && q != start)
+            report(instance, WARNING,
+                   "q_start[%d] = %g of joint '%s' is outside its limits [%g, %g] and was clamped"
+                   " to %g", i + 1, start, JOINT_NAME[i], low, high, q);
+        value[Q + i] = q;
+        value[V + i] = value[V_START + i];
+    }
+    impact(&state->plant, &value[Q], anti_chatter);
+    state->sampling = (Sampling){.start = state->time, .time = state->time};
+    for (int i = 0; i < N_JOINTS && value[CONTROL_PERIOD] != 0.0; i++)
+        value[TAU + i] = 0.0;
+    state->initialised = 1;
+    state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
+    return OK;
+}
+
+/* Compute the outputs q_meas and v_meas, and tau where it is held. A sample that is due is taken for them alone, for
+   inputs may still change; in continuous-time mode an event alone takes one. False where an effort is not finite. */
+static int show_samples(State *state)
+{
+    Sampling draft = state->sampling;
+    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
+    return (held && state->phase == CONTINUOUS_TIME) || settle(&draft, &state->plant, state->time);
+}
+
+/* Find the joints that rest, where that is yet to be done. */
+static void update_stops(State *state)
+{
+    if (!state->has_stops)
+        find_stops(&state->plant, &state->stops);
+    state->has_stops = 1;
+}
+
+/* Compute the output tau, where that is yet to be done. False where an effort of a sampled controller is not finite. */
+static int update_control(Instance *instance)
+{
+    State *state = &instance->state;
+    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
+    if (state->has_tau)
+        return 1;
+    if (held && !show_samples(state))
+        return 0;
+    if (!held && instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
+        update_stops(state);
+    compute_effort(&state->plant, instance->kind == MODEL_EXCHANGE ? state->stops.rank : ANY_RANK);
+    state->has_tau = 1;
+    return 1;
+}
+
+/* The same where tau is what acts: of a sampled controller. */
+static int update_held(Instance *instance)
+{
+    return instance->state.plant.value[CONTROL_PERIOD] == 0.0 || update_control(instance);
+}
+
+/* Compute the derivatives, where that is yet to be done. */
+static void update_rates(State *state)
+{
+    update_stops(state);
+    if (!state->has_rates)
+        compute_rates(&state->plant, &state->stops);
+    state->has_rates = 1;
+}
+
+/* A new instance as the draft says; NULL where it has no name or another token. */
+static Instance *instantiate(Instance draft, const char *token, int logging_on)
 {
     const char *function = call_name(INSTANTIATE), *name = draft.name;
     if (!name || !*name) {
@@ -107,8 +239,9 @@ Status STANDARD(SetDebugLogging)(void *component, Boolean on, size_t count,
     return OK;
 }
 
-Status set_up(Instance *instance, Call call, const double *tolerance, double start,
-              const double *stop)
+/* Take over the times of the experiment; a tolerance is ignored, with a message. */
+static Status set_up(Instance *instance, Call call, const double *tolerance, double start,
+                     const double *stop)
 {
     if (!isfinite(start))
         return refuse(instance, call, "the start time is not finite");
@@ -144,125 +277,4 @@ Status STANDARD(Reset)(void *component)
         return ERROR;
     reset_state(&instance->state);
     return OK;
-}
-
-Status check_inputs(Instance *instance)
-{
-#if N_ROWS > N_AXES
-    const double *quat = &instance->state.plant.value[QUAT_DES];
-    if (quat[0] == 0.0 && quat[1] == 0.0 && quat[2] == 0.0 && quat[3] == 0.0)
-        return report(instance, ERROR, "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1)"
-                      " turns nothing");
-#else
-    (void)instance;
-#endif
-    return OK;
-}
-
-/* Whether the period of the controller is one that its delay and its sensors can have. */
-static Status check_sampling(Instance *instance)
-{
-    const double *value = instance->state.plant.value;
-    const double period = value[CONTROL_PERIOD], delay = value[CONTROL_DELAY];
-    const int of_points = !COMMANDS_ACCELERATION && instance->kind == CO_SIMULATION;
-    const int group[] = {Q_RESOLUTION, Q_NOISE, V_NOISE, V_FROM_Q};
-    if (delay != 0.0 && period == 0.0)
-        return report(instance, ERROR, "control_delay = %g needs a control_period > 0; set that, or leave"
-                      " it out", delay);
-    if (delay > MOST_PERIODS * period)
-        return report(instance, ERROR, "control_delay = %g must be at most %d times control_period = %g; lessen it,"
-                      " or enlarge control_period", delay, MOST_PERIODS, period);
-    for (int i = N_JOINTS; i-- > 0 && value[V_FROM_Q] != 0.0;)
-        if (value[V_NOISE + i] != 0.0)
-            return report(instance, ERROR, "%s = %g has no effect with v_from_q = true; leave one of them out",
-                          VARIABLE_NAME[V_NOISE + i], value[V_NOISE + i]);
-    for (size_t k = 0; k < sizeof group / sizeof *group && period == 0.0 && !of_points; k++)
-        for (int i = group[k]; i < group[k] + (group[k] == V_FROM_Q ? 1 : N_JOINTS); i++)
-            if (value[i] != 0.0) {
-                char text[24] = "true";
-                if (i != V_FROM_Q)
-                    snprintf(text, sizeof text, "%g", value[i]);
-                return report(instance, ERROR, "%s = %s needs a control_period > 0; set that, or leave it out",
-                              VARIABLE_NAME[i], text);
-            }
-    return OK;
-}
-
-Status check_parameters(Instance *instance)
-{
-    const double *value = instance->state.plant.value;
-    for (int i = 0; i < N_JOINTS; i++)
-        if (value[Q_MIN + i] > value[Q_MAX + i])
-            return report(instance, ERROR, "q_min[%d] = %g > q_max[%d] = %g (joint '%s')",
-                          i + 1, value[Q_MIN + i], i + 1, value[Q_MAX + i], JOINT_NAME[i]);
-    return check_sampling(instance);
-}
-
-Status initialise(Instance *instance, int warn)
-{
-    State *state = &instance->state;
-    double *value = state->plant.value;
-    const int anti_chatter[N_JOINTS] = {0};
-    if (check_parameters(instance) != OK || check_inputs(instance) != OK)
-        return ERROR;
-    for (int i = 0; i < N_JOINTS; i++) {
-        const double start = value[Q_START + i];
-        const double low = value[Q_MIN + i], high = value[Q_MAX + i];
-        const double q = start < low ? low : start > high ? high : start;
-        if (warn && q != start)
-            report(instance, WARNING,
-                   "q_start[%d] = %g of joint '%s' is outside its limits [%g, %g] and was clamped"
-                   " to %g", i + 1, start, JOINT_NAME[i], low, high, q);
-        value[Q + i] = q;
-        value[V + i] = value[V_START + i];
-    }
-    impact(&state->plant, &value[Q], anti_chatter);
-    state->sampling = (Sampling){.start = state->time, .time = state->time};
-    for (int i = 0; i < N_JOINTS && value[CONTROL_PERIOD] != 0.0; i++)
-        value[TAU + i] = 0.0;
-    state->initialised = 1;
-    state->has_x = state->has_tau = state->has_stops = state->has_rates = 0;
-    return OK;
-}
-
-int show_samples(State *state)
-{
-    Sampling draft = state->sampling;
-    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
-    return (held && state->phase == CONTINUOUS_TIME) || settle(&draft, &state->plant, state->time);
-}
-
-int update_control(Instance *instance)
-{
-    State *state = &instance->state;
-    const int held = state->plant.value[CONTROL_PERIOD] != 0.0;
-    if (state->has_tau)
-        return 1;
-    if (held && !show_samples(state))
-        return 0;
-    if (!held && instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
-        update_stops(state);
-    compute_effort(&state->plant, instance->kind == MODEL_EXCHANGE ? state->stops.rank : ANY_RANK);
-    state->has_tau = 1;
-    return 1;
-}
-
-int update_held(Instance *instance)
-{
-    return instance->state.plant.value[CONTROL_PERIOD] == 0.0 || update_control(instance);
-}
-
-void update_stops(State *state)
-{
-    if (!state->has_stops)
-        find_stops(&state->plant, &state->stops);
-    state->has_stops = 1;
-}
-
-void update_rates(State *state)
-{
-    update_stops(state);
-    if (!state->has_rates)
-        compute_rates(&state->plant, &state->stops);
-    state->has_rates = 1;
 }

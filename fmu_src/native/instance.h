@@ -10,10 +10,6 @@
 #include <stddef.h>
 
 #include "internal.h"
-#include "passed_stops.h"
-#include "plant.h"
-#include "sampling.h"
-#include "stops.h"
 
 #if FMI == 3
 #include "fmi3Functions.h"
@@ -116,99 +112,11 @@ typedef enum {
 static const char NO_EFFORT[] = "the control law gave an effort that is not finite: inputs, payload or speeds are too"
                                 " large";
 
-/* --- what a face has --- */
-
-/* Hand a message, of less than 512 bytes, to the importer. */
+/* Hand a message, of less than 512 bytes, to the importer, as the face knows it. */
 INTERNAL void hand_over(const Instance *instance, Status status, const char *category,
                         const char *text);
 
-/* --- calls.c --- */
-
-/* Name of a call, as messages say it. */
-INTERNAL const char *call_name(Call call);
-
-/* Whether an instance of a kind can be in a phase. */
-INTERNAL int can_be_in(Kind kind, int phase);
-
-/* Whether a call is allowed in the instance's phase; where not, logs it. */
-INTERNAL int allowed(Instance *instance, Call call, const char *culprit);
-
-/* The instance where the call is allowed and has the pointers that it needs, else NULL; a refusal is
-   logged. */
-INTERNAL Instance *enter(void *component, Call call, int has_pointers);
-
-/* Log why a call is refused. */
-INTERNAL Status refuse(Instance *instance, Call call, const char *reason);
-
-/* Where the call is allowed, what it does is to change the phase. */
-INTERNAL Status move_on(void *component, Call call, Phase phase);
-
-/* Refuse a call of what the modelDescription says that there is not. Importers bind every name. */
-INTERNAL Status unsupported(Instance *instance, const char *function);
-
-/* --- instance.c --- */
-
 /* Log a printf message, where the status's category is on. Returns the status. */
 INTERNAL Status report(Instance *instance, Status status, const char *format, ...);
-
-/* A new instance as the draft says; NULL where it has no name or another token. */
-INTERNAL Instance *instantiate(Instance draft, const char *token, int logging_on);
-
-/* Take over the times of the experiment; a tolerance is ignored, with a message. */
-INTERNAL Status set_up(Instance *instance, Call call, const double *tolerance, double start,
-                       const double *stop);
-
-/* Whether a variable may have a value; a refusal is logged. */
-INTERNAL Status check_range(Instance *instance, int variable, double value);
-
-/* Whether the control law can follow the inputs; a refusal is logged. */
-INTERNAL Status check_inputs(Instance *instance);
-
-/* Whether the joints' limits make ranges, and parameters of sampling go together; a refusal is logged. */
-INTERNAL Status check_parameters(Instance *instance);
-
-/* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
-   clamped is logged too. */
-INTERNAL Status initialise(Instance *instance, int warn);
-
-/* Compute the outputs q_meas and v_meas, and tau where it is held. A sample that is due is taken for them alone, for
-   inputs may still change; in continuous-time mode an event alone takes one. False where an effort is not finite. */
-INTERNAL int show_samples(State *state);
-
-/* Compute the output tau, where that is yet to be done; else as above. */
-INTERNAL int update_control(Instance *instance);
-
-/* The same where these are what acts: of a sampled controller. */
-INTERNAL int update_held(Instance *instance);
-
-/* Find the joints that rest, where that is yet to be done. */
-INTERNAL void update_stops(State *state);
-
-/* Compute the derivatives, where that is yet to be done. */
-INTERNAL void update_rates(State *state);
-
-/* --- simulation.c --- */
-
-INTERNAL Status do_step(void *component, double point, double h);
-
-/* --- exchange.c --- */
-
-/* Reports whether the states q and v have changed, and the time of the next event, HUGE_VAL where none is known. */
-INTERNAL Status update_discrete_states(void *component, Boolean *states_changed, double *next_event);
-
-/* --- variables.c: each reference is of so many values as PLACE says, in all n_values --- */
-
-/* Of a type that the FMU does not have any reference is refused, none is fine. */
-INTERNAL Status get_values(void *component, Call call, const Reference vr[], size_t count, void *values,
-                           size_t n_values);
-
-INTERNAL Status set_values(void *component, Call call, const Reference vr[], size_t count,
-                           const void *values, size_t n_values);
-
-/* The change of the unknowns where the knowns, states and inputs, change by the seed. */
-INTERNAL Status directional_derivative(void *component, const Reference unknown[],
-                                       size_t n_unknown, const Reference known[], size_t n_known,
-                                       const double seed[], size_t n_seed, double result[],
-                                       size_t n_result);
 
 #endif

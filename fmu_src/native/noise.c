@@ -2,8 +2,6 @@
    uniform numbers are those of Philox4x32-10, made normal by the polar method, with operations of IEEE 754 alone.
 
    Sources: Salmon, Moraes, Dror & Shaw, SC 2011; Marsaglia & Bray, SIAM Review 6(3), 1964. */
-#include "noise.h"
-
 #include <math.h>
 #include <stdint.h>
 
@@ -51,7 +49,8 @@ static double uniform(uint32_t high, uint32_t low)
     return (double)(((uint64_t)high << 32 | low) >> 11) / 4503599627370496.0 - 1.0;
 }
 
-void normal_pair(double seed, double k, int channel, double pair[2])
+/* Two independent standard normal numbers of a seed, a sample k < 2⁵³ and a channel. */
+static void normal_pair(double seed, double k, int channel, double pair[2])
 {
     const uint64_t sample = (uint64_t)k;
     for (uint32_t attempt = 0;; attempt++) {

@@ -1,10 +1,12 @@
-/* Orientations. With the quaternion (a, w) of R_des Rᵀ the error is 2 atan2(|a|, w) a/|a|.
+/* Orientations as ROS has them: unit quaternions x, y, z, w. With the quaternion (a, w) of R_des Rᵀ the error is
+   2 atan2(|a|, w) a/|a|.
    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 2.6 and 3.7.3. */
-#include "orientation.h"
+#include "internal.h"
 
 #include <math.h>
 
-void quaternion(double R[3][3], double q[4])
+/* The unit quaternion of a rotation matrix, w ≥ 0. */
+INTERNAL void quaternion(double R[3][3], double q[4])
 {
     const double trace = R[0][0] + R[1][1] + R[2][2];
     int i = 0; /* the largest of the axis' components */
@@ -31,7 +33,9 @@ void quaternion(double R[3][3], double q[4])
         q[c] *= sign;
 }
 
-void rotation_error(const double target[4], double R[3][3], double error[3])
+/* log(R_des Rᵀ), rad about the root's axes: the short way from R to R_des, at most π. The target is
+   the quaternion of R_des, not 0, of any length. */
+INTERNAL void rotation_error(const double target[4], double R[3][3], double error[3])
 {
     double a[4], b[4], largest = 0.0;
     for (int c = 0; c < 4; c++)

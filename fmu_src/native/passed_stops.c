@@ -1,14 +1,20 @@
 /* Find the stops that an importer's step has passed. The quintic through position, velocity and acceleration of both
    ends tells whether a joint turned near its limit or outside it; where one did, the engine takes the step
    again, from its start, and its stops decide. */
-#include "passed_stops.h"
 
 #include <math.h>
 #include <string.h>
 
-#include "events.h"
 #include "integrator.h"
-#include "polynomial.h"
+
+/* A step of the importer. */
+typedef struct {
+    double time, y[N_STATES], a[N_JOINTS]; /* its start: s, the state and the accelerations */
+    double reached[N_STATES];              /* the state at time, of a step before that passed a stop */
+    double stop_time;                      /* s: when that stop was reached, */
+    int joint;                             /* by this joint, counted from 1; 0: no stop was passed */
+    int begun;                             /* whether there is a start */
+} Passage;
 
 /* s: no polynomial follows a longer step. */
 static const double LONGEST_STEP = 1.0;
@@ -16,7 +22,8 @@ static const double LONGEST_STEP = 1.0;
    than this part of the difference of their accelerations. */
 static const double BULGE = 0.01728;
 
-void begin_passage(Passage *passage, const Plant *plant, double time)
+/* Start a step of the importer at the plant's state, whose derivatives are computed. */
+static void begin_passage(Passage *passage, const Plant *plant, double time)
 {
     const double *rate = &plant->value[DER_V];
     memset(passage, 0, sizeof *passage);
@@ -56,7 +63,9 @@ static int turned_outside(const Passage *start, const Passage *end, const Plant 
     return 0;
 }
 
-int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, double time)
+/* Find a stop that the importer's step to the plant's state has passed, and start the next one there. Where
+   the engine cannot integrate the step, the joint, counted from 1, that turned at its limit, else 0. */
+static int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, double time)
 {
     const Passage start = *passage;
     const double h = time - start.time;
@@ -90,7 +99,8 @@ int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, d
     return 0;
 }
 
-int take_passed_stop(Passage *passage, Plant *plant, Stops *stops, double time)
+/* At an event at the end of a step that passed a stop: put the plant where the stop has led. Whether it does. */
+static int take_passed_stop(Passage *passage, Plant *plant, Stops *stops, double time)
 {
     const int takes = passage->joint && passage->time == time
                       && memcmp(passage->y, &plant->value[Q], sizeof passage->y) == 0;

@@ -14,9 +14,6 @@
 
 #include "control.h"
 #include "mechanism.h"
-#if N_ROWS > N_AXES
-#include "orientation.h"
-#endif
 
 static double saturated(double tau, double limit)
 {

@@ -1,8 +1,9 @@
-#include "polynomial.h"
+/* Polynomials, and where they change their sign. */
 
 static const double ROOT_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
-double polynomial(const double c[], int degree, double x)
+/* The value of a polynomial of a degree, its constant first. */
+static double polynomial(const double c[], int degree, double x)
 {
     double sum = c[degree];
     for (int k = degree - 1; k >= 0; k--)
@@ -10,7 +11,9 @@ double polynomial(const double c[], int degree, double x)
     return sum;
 }
 
-int sign_changes(const double c[], int degree, double root[])
+/* Where a polynomial of degree 4 or less changes its sign in (0, 1), in ascending order; how often. Between the
+   turning points, at which its derivative does so, it is monotonic. */
+static int sign_changes(const double c[], int degree, double root[])
 {
     double slope[4], turn[5], left = 0.0;
     int turns = 0, count = 0;

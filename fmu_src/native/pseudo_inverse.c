@@ -1,5 +1,5 @@
-/* J⁺ b; the rules and thresholds are those of plant/pseudo_inverse.py. */
-#include "pseudo_inverse.h"
+/* The truncated pseudo-inverse of the task Jacobian; the rules and thresholds are those of plant/pseudo_inverse.py. */
+#include "internal.h"
 
 #include <math.h>
 
@@ -135,7 +135,9 @@ static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double 
         ratio[index[k]] = RE(largest) > 0.0 ? sqrt(square[k] / largest) : 0.0;
 }
 
-double rank_margin(const double ratio[N_ROWS], double rcond, int rank)
+/* Distance of the singular values next to a rank from rcond, as ratios to the largest; negative where
+   the rule σ > rcond·σ_max gives another rank. */
+INTERNAL double rank_margin(const double ratio[N_ROWS], double rcond, int rank)
 {
     double margin = 1.0;
     if (rank > 0)
@@ -168,8 +170,12 @@ static int solve_by_singular_values(double J[N_ROWS][N_JOINTS], double b[N_ROWS]
     return rank;
 }
 
-int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond, int rank,
-                         double result[N_JOINTS], double *margin)
+/* result = J⁺ b, the least-squares solution of smallest norm, where J⁺ keeps as many of the largest
+   singular values as the rank says; ANY_RANK keeps σ > rcond·σ_max. Returns the rank. The margin, where
+   asked for, is that of rank_margin or, where positive, a lower bound of it. J and b are used as
+   working memory. */
+INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond, int rank,
+                                  double result[N_JOINTS], double *margin)
 {
     const double smallest = fmax(rcond * rcond, WELL_CONDITIONED);
     double y[N_ROWS];
@@ -189,7 +195,9 @@ int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rc
     return rank;
 }
 
-void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
+/* The singular values of J over the largest, in descending order; 0 where all are 0. J is used as
+   working memory. */
+INTERNAL void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
 {
     double nothing[N_ROWS] = {0}, square[N_ROWS];
     int index[N_ROWS];

@@ -7,12 +7,22 @@
 
    No effort acts before the first. With T = 0 the law is continuous, and each communication point is a sample of
    the sensors. */
-#include "sampling.h"
+#include "integrator.h"
 
 #include <math.h>
 #include <string.h>
 
-#include "noise.h"
+enum { MOST_PERIODS = 10 }; /* of a delay */
+
+/* Discrete state of the controller and its sensors. What acts is the output tau of the plant. */
+typedef struct {
+    double start;            /* t_0, s */
+    double time;             /* of the latest sample, s */
+    double k;                /* samples so far, a whole number */
+    double q_meas[N_JOINTS]; /* the latest, of which the next may be a difference */
+    double pending[MOST_PERIODS + 1][N_JOINTS]; /* efforts that do not act yet, the oldest first, */
+    int count;                                  /* so many */
+} Sampling;
 
 /* Times are equal within this part of max(1 s, |t|), and of the period. */
 static const double EQUAL_TIMES = 1e-9, PART_OF_PERIOD = 1e-3;
@@ -35,7 +45,8 @@ static double due(const Sampling *sampling, const Plant *plant)
                            : HUGE_VAL;
 }
 
-double next_sampling_event(const Sampling *sampling, const Plant *plant)
+/* When the next sample is taken or the next effort acts, s; HUGE_VAL where there are no samples. */
+static double next_sampling_event(const Sampling *sampling, const Plant *plant)
 {
     return plant->value[CONTROL_PERIOD] == 0.0
                ? HUGE_VAL
@@ -70,7 +81,9 @@ static void measure(Sampling *sampling, Plant *plant, double time)
     sampling->k += 1.0;
 }
 
-int settle(Sampling *sampling, Plant *plant, double time)
+/* Do all that is due at a time, s: the outputs tau, q_meas and v_meas follow, of a continuous controller the last
+   two alone. False, and all unchanged, where an effort is not finite. */
+static int settle(Sampling *sampling, Plant *plant, double time)
 {
     const double period = plant->value[CONTROL_PERIOD], by = time + slack(plant, time);
     if (period == 0.0) {
@@ -110,7 +123,8 @@ static int are_samples(const double value[N_VARIABLES])
     return any;
 }
 
-int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Failure *failure)
+/* Advance plant and samples from a time by h, s. False, and both unchanged, where that cannot be done. */
+static int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Failure *failure)
 {
     const double period = plant->value[CONTROL_PERIOD], max_step = plant->value[MAX_STEP], end = time + h;
     double t = time;
@@ -140,7 +154,8 @@ int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Fai
     return 1;
 }
 
-int is_sampling(const Sampling *sampling, const Plant *plant, double time)
+/* Whether the state, its numbers whatever they are, is one that a plant can be in at a time. */
+static int is_sampling(const Sampling *sampling, const Plant *plant, double time)
 {
     const double k = sampling->k, period = plant->value[CONTROL_PERIOD];
     int sound = isfinite(sampling->start) && isfinite(sampling->time) && k >= 0.0 && k < ALL_WHOLE && k == floor(k)

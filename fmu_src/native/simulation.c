@@ -36,7 +36,7 @@ static Status discard(Instance *instance, double point, double h, const Failure 
                   JOINT_NAME[failure->joint], failure->rate);
 }
 
-Status do_step(void *component, double point, double h)
+static Status do_step(void *component, double point, double h)
 {
     Instance *instance = enter(component, DO_STEP, 1);
     if (!instance)

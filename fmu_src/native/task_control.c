@@ -9,11 +9,6 @@
 
 #include <math.h>
 
-#include "pseudo_inverse.h"
-#if N_ROWS > N_AXES
-#include "orientation.h"
-#endif
-
 /* A row of the law: value references of its inputs, and its error. */
 typedef struct {
     int xd_des, xdd_des, Kp, Kd;

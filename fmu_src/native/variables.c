@@ -1,10 +1,10 @@
-/* Getting and setting variables. A refused call changes no variable. */
+/* Getting and setting variables. A refused call changes no variable. Each reference is of so many values as PLACE
+   says, in all n_values. */
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
 
 #include "directional.h"
-#include "events.h"
 #include "instance.h"
 
 /* In the order of the calls that get and set them. */
@@ -144,7 +144,8 @@ static double number_in(Type type, const void *values, size_t i)
     return type == INTEGER ? (double)((const Integer *)values)[i] : (double)(((const Boolean *)values)[i] != 0);
 }
 
-Status get_values(void *component, Call call, const Reference vr[], size_t count, void *values, size_t n_values)
+/* Of a type that the FMU does not have any reference is refused, none is fine. */
+static Status get_values(void *component, Call call, const Reference vr[], size_t count, void *values, size_t n_values)
 {
     Instance *instance = enter(component, call, 1);
     const Type type = (Type)(call - GET_REAL);
@@ -183,7 +184,8 @@ static int accepts(Instance *instance, Call call, int variable, double value)
     return 0;
 }
 
-Status set_values(void *component, Call call, const Reference vr[], size_t count, const void *values, size_t n_values)
+static Status set_values(void *component, Call call, const Reference vr[], size_t count, const void *values,
+                         size_t n_values)
 {
     Instance *instance = enter(component, call, 1);
     const Type type = (Type)(call - SET_REAL);
@@ -241,9 +243,10 @@ static const char *culprit(const Reference vr[], size_t count, const double valu
     return NULL;
 }
 
-Status directional_derivative(void *component, const Reference unknown[], size_t n_unknown,
-                              const Reference given[], size_t n_given, const double seed[],
-                              size_t n_seed, double result[], size_t n_result)
+/* The change of the unknowns where the knowns, states and inputs, change by the seed. */
+static Status directional_derivative(void *component, const Reference unknown[], size_t n_unknown,
+                                     const Reference given[], size_t n_given, const double seed[],
+                                     size_t n_seed, double result[], size_t n_result)
 {
     const Call call = GET_DIRECTIONAL_DERIVATIVE;
     Instance *instance = enter(component, call, 1);

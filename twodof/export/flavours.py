@@ -90,8 +90,8 @@ def engine_sources(control: str, fmi: int = 2) -> Files:
     """Return the engine's C files with one control law and the functions of one FMI version."""
     law = "task" if control == "pose" else control
     left_out = {f"{other}_control.c" for other in CONTROLS if other != law}
-    left_out |= set() if law == "task" else {"pseudo_inverse.c", "pseudo_inverse.h"}
-    left_out |= set() if control == "pose" else {"orientation.c", "orientation.h"}
+    left_out |= set() if law == "task" else {"pseudo_inverse.c"}
+    left_out |= set() if control == "pose" else {"orientation.c"}
     left_out |= {"fmi2.c"} if fmi == 3 else {"fmi3.c"}
     return {
         path.name: path.read_bytes() for path in data_file("fmu_src", "native").iterdir() if path.name not in left_out
