@@ -12,7 +12,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..fmu import Fmu
 from ..signatures import ignore, never
-from ..simulation.experiments import Experiment, experiment
+from ..simulation.experiments import experiment
 from ..simulation.input_values import Setting
 from .arm import arm_of, arm_page
 from .loop import Loop
@@ -44,24 +44,17 @@ def live(
         settings: start values, as of ``experiment``.
         bag: name of the first recording; None: rosbag2_<date and time>.
         command_line: for the provenance of recordings.
-    """
-    run = experiment(fmu, step=step, stop_time=inf, settings=settings)
-    loop = Loop(run, bag=bag, command_line=command_line)
-    with page_of(loop, run, host, port) as page:
-        opened(page.url)
-        loop.play(stop)
-    return loop.recorded
-
-
-def page_of(loop: Loop, run: Experiment, host: str, port: int) -> Server:
-    """Return the server of a loop's page.
 
     Raises:
-        PageError: it cannot be shown.
+        FmuError, InputError, PageError, SimulationError: before the page is served.
     """
-    arm = arm_of(run)
+    run = experiment(fmu, step=step, stop_time=inf, settings=settings)
+    loop, arm = Loop(run, bag=bag, command_line=command_line), arm_of(run)
     page = arm_page(arm.title, arm, {}, "; connect-src 'self'")
-    return Server(page, host, port, partial(_talk, loop), token=user_token())
+    with Server(page, host, port, partial(_talk, loop), token=user_token()) as server:
+        opened(server.url)
+        loop.play(stop)
+    return loop.recorded
 
 
 async def _talk(loop: Loop, connection: Connection) -> None:

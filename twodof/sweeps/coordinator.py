@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..files import temporary_folder
 from ..fmu import Fmu, opened
 from ..signatures import ignore, never
-from ..simulation.experiments import experiment
+from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 from ..version import versions
 from .batches import Batches
@@ -78,34 +78,25 @@ def sweep(
         BagError: a bag cannot be written.
     """
     run = experiment(fmu, stop_time=stop_time, step=step, settings=settings)
-    end = run.time(run.steps) if stop_time is None else stop_time
-    options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
-    units = [_unit(run.fmu, name) for name in design.names]
     with temporary_folder() as spare:
         path = spare / "sweep" if output is None else Path(output)
-        job = _job(run.fmu, design.names, options, path.resolve() / "bags" if bags else None)
+        job = _job(run, stop_time, design.names, path.resolve() / "bags" if bags else None)
         provenance = _provenance(run.fmu, design, job, command_line)
-        results = Results(path, design.names, units, len(design), provenance, resume=resume)
-        staff = _workers(job, design, ~results.done, workers, scheduler, stop)
-        _collect(staff, results, progress)
+        results = Results(path, design.names, _units(run.fmu, design.names), len(design), provenance, resume=resume)
+        progress(int(results.done.sum()), len(results.done))
+        with _workers(job, design, ~results.done, workers, scheduler, stop) as news, results:  # in this order
+            for rows in news:
+                results.add(rows)
+                progress(int(results.done.sum()), len(results.done))
         return read_sweep(path)
 
 
-def _collect(
-    staff: AbstractContextManager[Iterable[list[Row]]], results: Results, progress: Callable[[int, int], None]
-) -> None:
-    """Store rows as they arrive; nothing is written before the workers have started."""
-    progress(int(results.done.sum()), len(results.done))
-    with staff as news, results:
-        for rows in news:
-            results.add(rows)
-            progress(int(results.done.sum()), len(results.done))
-
-
-def _job(fmu: Fmu, names: tuple[str, ...], options: dict[str, Any], bags: Path | None) -> Job:
-    with opened(fmu):
-        return Job(fmu.path.read_bytes(), fmu.path.name, names, options, bags)
+def _job(run: Experiment, stop_time: float | None, names: tuple[str, ...], bags: Path | None) -> Job:
+    end = run.time(run.steps) if stop_time is None else stop_time
+    options = {"stop_time": end, "step": run.step, "settings": dict(run.given)}
+    with opened(run.fmu):
+        return Job(run.fmu.path.read_bytes(), run.fmu.path.name, names, options, bags)
 
 
 def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
@@ -144,5 +135,6 @@ def _workers(
     return Cluster(job, batches, scheduler, stop)
 
 
-def _unit(fmu: Fmu, name: str) -> str:
-    return " or ".join(dict.fromkeys(fmu.variables[element].unit or "" for element in fmu.vector(name)))
+def _units(fmu: Fmu, names: Sequence[str]) -> list[str]:
+    elements = [[fmu.variables[element] for element in fmu.vector(name)] for name in names]
+    return [" or ".join(dict.fromkeys(variable.unit or "" for variable in group)) for group in elements]
