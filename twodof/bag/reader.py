@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import BagError, no_such
 from ..files import is_being_written, shown
-from ..ros.cdr import JointStateLayout, MixtureError, Rows, unpack_points
+from ..ros.cdr import Layout, MixtureError, Rows, joint_state_layout, unpack_points
 from ..ros.messages import JOINT_STATE, JOINT_STATES, POINT, POSE, TARGET, store_of
 from .contents import read_messages, stated_count, storage_files
 from .downsampling import Downsampler, Indices
@@ -205,7 +205,8 @@ class _JointStates:
     def __init__(self, path: Path) -> None:
         self.names: tuple[str, ...] = ()
         self._path = path
-        self._layout: JointStateLayout | None = None
+        self._layout: Layout | None = None
+        self._sizes: tuple[int, ...] = ()
         self._stamps = array("q")
         self._numbers = [array("d") for _ in range(3)]
 
@@ -240,17 +241,34 @@ class _JointStates:
         message = messages[0].tobytes()
         try:
             if self._layout is None:
-                first: Any = store_of(JOINT_STATE).deserialize_cdr(message, JOINT_STATE)
-                sizes = [len(part) for part in (first.position, first.velocity, first.effort)]
-                self._layout = JointStateLayout(first.name, first.header.frame_id, sizes)
-                self.names = tuple(first.name)
-            return self._layout.read(messages)
+                frame, self.names, *parts = _deserialised(message)
+                self._sizes = tuple(map(len, parts))
+                self._layout = joint_state_layout(self.names, frame, self._sizes)
+            numbers = self._layout.unpack(messages)
+            if numbers is None:
+                numbers = [np.array(part, np.float64) for part in zip(*map(self._decode_one, messages), strict=True)]
+            return numbers
         except MixtureError as error:
             raise BagError(f"'{self._path}' has joint states of different {error}") from error
         except Exception as error:  # rosbags raises anything where a message is no JointState
             packed = message.startswith(ZSTD_MAGIC)
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
+
+    def _decode_one(self, message: Rows) -> list[Array]:
+        """Decode a message with another frame, byte order or padding."""
+        _, names, *parts = _deserialised(message.tobytes())
+        if names != self.names:
+            raise MixtureError("joints")
+        if tuple(map(len, parts)) != self._sizes:
+            raise MixtureError("sizes")
+        return parts
+
+
+def _deserialised(message: bytes) -> tuple[Any, ...]:
+    """Return frame, names, positions, velocities and efforts of a JointState."""
+    state: Any = store_of(JOINT_STATE).deserialize_cdr(message, JOINT_STATE)
+    return state.header.frame_id, tuple(state.name), state.position, state.velocity, state.effort
 
 
 class _Ends(_JointStates):

@@ -61,8 +61,11 @@ class Layout:
             if isinstance(part, Stamp):
                 self._stamps.append(len(content))
                 content += bytes(8)
+            elif isinstance(part, str):
+                text = part.encode() + b"\0"
+                content += struct.pack("<I", len(text)) + text
             else:
-                content += _text(part, "<") if isinstance(part, str) else struct.pack("<I", part)
+                content += struct.pack("<I", part)
         self._plain = np.frombuffer(content, np.uint8)
         self._fixed = np.ones(len(content), bool)
         for at in (*self._numbers, *(slice(at, at + 8) for at in self._stamps)):
@@ -91,56 +94,10 @@ class Layout:
         return [np.ascontiguousarray(rows[:, where]).view("<f8").astype(np.float64) for where in self._numbers]
 
 
-class JointStateLayout(Layout):
-    """Layout of the serialised JointStates of a run.
-
-    Args:
-        names: joint names.
-        frame: frame_id of the header.
-        sizes: how many positions, velocities and efforts there are.
-    """
-
-    def __init__(self, names: Sequence[str], frame: str, sizes: Sequence[int]) -> None:
-        self._sizes = tuple(sizes)
-        self._names = {order: _names(names, order) for order in "<>"}
-        parts = [part for size in self._sizes for part in (size, Numbers(size))]
-        super().__init__(Stamp(), frame, len(names), *names, *parts)
-
-    def read(self, rows: Rows) -> list[Array]:
-        """Return positions, velocities and efforts of N messages, N × size each.
-
-        Raises:
-            MixtureError: they are not all of these joints and sizes.
-            IndexError, ValueError, struct.error: one is damaged.
-        """
-        parts = self.unpack(rows)
-        if parts is None:
-            parts = [np.array(p) for p in zip(*map(self._read_one, rows), strict=True)]
-        return parts
-
-    def _read_one(self, row: Rows) -> list[Array]:
-        """Read a message with another frame, byte order or padding.
-
-        A serialiser would take seconds a megabyte for the names.
-        """
-        message = row.tobytes()
-        order, end = _header(message)
-        start = end + _gap(4, end)
-        expected, said = self._names[order]
-        end = start + len(expected)
-        if (np.frombuffer(message[start:end], np.uint8) != expected)[said].any():
-            raise MixtureError("joints")
-        parts = []
-        for size in self._sizes:
-            if struct.unpack_from(f"{order}I", message, end) != (size,):
-                raise MixtureError("sizes")
-            end += 4
-            end += _gap(8, end) if size else 0
-            parts.append(np.frombuffer(message, f"{order}f8", size, end).astype(np.float64))
-            end += 8 * size
-        if len(message) - end > 3:
-            raise ValueError("it is too long")
-        return parts
+def joint_state_layout(names: Sequence[str], frame: str, sizes: Sequence[int]) -> Layout:
+    """Return the layout of serialised JointStates with so many positions, velocities and efforts."""
+    parts = [part for size in sizes for part in (size, Numbers(size))]
+    return Layout(Stamp(), frame, len(names), *names, *parts)
 
 
 def unpack_points(rows: Rows) -> tuple[bytes, Array]:
@@ -172,18 +129,3 @@ def _header(message: bytes) -> tuple[str, int]:
 
 def _gap(size: int, end: int) -> int:
     return (4 - end) % size
-
-
-def _text(text: str, order: str) -> bytes:
-    content = text.encode() + b"\0"
-    return struct.pack(f"{order}I", len(content)) + content
-
-
-def _names(names: Sequence[str], order: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return the bytes of a list of names, and a mask of the meaningful ones: padding is arbitrary."""
-    count = struct.pack(f"{order}I", len(names))
-    texts = [_text(name, order) for name in names]
-    plain, other = (
-        np.frombuffer(count + b"".join(t + gap * _gap(4, len(t)) for t in texts), np.uint8) for gap in (b"\0", b"\1")
-    )
-    return plain, plain == other

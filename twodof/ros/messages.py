@@ -20,7 +20,7 @@ from ..plant.urdf import Joint, RobotError
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Value
 from ..simulation.sample import Sample
-from .cdr import JointStateLayout, Layout, Numbers, Rows, Stamp
+from .cdr import Layout, Numbers, Rows, Stamp, joint_state_layout
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -150,10 +150,10 @@ class Messages:
         n, m, poses = len(run.fmu.joints), 0, False
         efforts = n if effort else 0
         layouts: dict[str, Layout] = {CLOCK: Layout(Stamp())} if clock else {}
-        layouts[JOINT_STATES] = JointStateLayout(run.fmu.joints, "", (n, n, efforts))
+        layouts[JOINT_STATES] = joint_state_layout(run.fmu.joints, "", (n, n, efforts))
         self.topics = {JOINT_STATES: Topic(JOINT_STATE, STREAM)}
         if measured:
-            layouts[TRUE_STATES] = JointStateLayout(run.fmu.joints, "", (n, n, 0))
+            layouts[TRUE_STATES] = joint_state_layout(run.fmu.joints, "", (n, n, 0))
             self.topics[TRUE_STATES] = Topic(JOINT_STATE, STREAM)
         if self._scene is not None:
             m, poses = len(run.fmu.vector("x_des")), bool(run.fmu.vector("quat_des"))
