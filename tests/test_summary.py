@@ -165,6 +165,28 @@ def test_a_chunk_that_is_not_where_the_summary_says_is_refused(bag: Path) -> Non
         read_ends(bag)
 
 
+def test_messages_that_the_summary_alone_has_are_missed(tmp_path: Path) -> None:
+    """Its checksum is right, and its only chunk has the topic by another name."""
+    file = tmp_path / "bag" / "bag.mcap"
+    file.parent.mkdir()
+    (file.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(JOINT_STATE, "ros2msg", b"")
+        writer.add_message(
+            writer.register_channel("/joint_states", "cdr", schema), 1, serialised(joint_message(0, "j", [0.0])), 1
+        )
+        writer.finish()
+    content = bytearray(file.read_bytes())
+    start, _ = statistics_of(content)
+    content[start:] = content[start:].replace(b"/joint_states", b"/joint_statex")
+    content[-12:-8] = struct.pack("<I", crc32(content[start:-12]))
+    file.write_bytes(content)
+    with pytest.raises(twodof.TwoDofError, match="no messages on /joint_statex, which its summary counts"):
+        read_ends(file.parent)
+
+
 @pytest.mark.parametrize("name", ["/joint_states", "/other"])
 def test_ends_of_another_writer_in_any_order(tmp_path: Path, name: str) -> None:
     """Small chunks, whose stamps overlap; another topic in some of them."""

@@ -9,7 +9,7 @@ Source: MCAP's specification. A file without one, or without its checksum, is to
 """
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
@@ -54,22 +54,12 @@ class McapSummary:
         """
         numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
         chunks = [chunk for chunk in self.chunks if chunk.channels & numbers]
-        yield from self._until(
-            sorted(chunks, key=lambda c: c.first), topic, budget, lambda chunk, stamps: chunk.first > min(stamps)
-        )
-        yield from self._until(
-            sorted(chunks, key=lambda c: -c.last), topic, budget, lambda chunk, stamps: chunk.last < max(stamps)
-        )
-
-    def _until(
-        self, chunks: list[Chunk], topic: str, budget: ReadBudget, beyond: Callable[[Chunk, list[int]], bool]
-    ) -> Iterator[Batch]:
-        """Yield the topic's messages chunk by chunk, while a chunk can have an earlier or later one."""
-        stamps: list[int] = []
+        # each chunk has a message of the topic between its times
+        soonest = min((max(c.first, c.last) for c in chunks), default=0)
+        latest = max((min(c.first, c.last) for c in chunks), default=0)
+        found = not chunks
         with self.path.open("rb") as file, refusing_damage(self.path):
-            for chunk in chunks:
-                if stamps and beyond(chunk, stamps):
-                    return
+            for chunk in [c for c in chunks if c.first <= soonest or c.last >= latest]:
                 file.seek(chunk.offset)
                 opcode, length = HEAD.unpack(file.read(HEAD.size))
                 if opcode != CHUNK or HEAD.size + length != chunk.length:
@@ -78,8 +68,10 @@ class McapSummary:
                 content = unpack_chunk(self.path, file.read(length), budget)
                 for batch in messages_in(self.path, content, Tables(self.channels), budget):
                     if batch.channel.topic == topic:
-                        stamps += [int(batch.stamps.min()), int(batch.stamps.max())]
+                        found = True
                         yield batch
+            if not found:
+                raise DamageError(f"'{self.path.name}' has no messages on {topic}, which its summary counts")
 
 
 def read_summary(path: Path) -> McapSummary | None:
