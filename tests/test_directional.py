@@ -178,8 +178,8 @@ def test_a_joint_at_rest_at_its_stop_stays_there(rigid):
     assert not rates[[1, 4]].any() and rates[0].any()
 
 
-@pytest.mark.parametrize("control", ["effort", "joint"])
-def test_joints_that_stick_and_slip_have_pinocchios_derivatives(control):
+@pytest.mark.parametrize(("control", "period"), [("effort", 0.0), ("joint", 0.0), ("joint", 0.01)])
+def test_joints_that_stick_and_slip_have_pinocchios_derivatives(control, period):
     """From M q̈ + h = τ + λ, in the rows of joints that move: M_mm δq̈ = δτ − ∂(M q̈ + h), q̈ being that of the motion."""
     engine = Derivatives(model("ur5", control))
     robot, rng = engine.model.robot, np.random.default_rng(6)
@@ -187,7 +187,8 @@ def test_joints_that_stick_and_slip_have_pinocchios_derivatives(control):
     for _ in range(10):
         friction, damping, armature = rng.uniform(0.1, 20, (3, n)).tolist()
         settings = {"f_ext": [0.0] * 3, "friction": friction, "damping": damping, "armature": armature}
-        values = at_random(engine, rng, **settings)
+        values = at_random(engine, rng, **settings, control_period=period)
+        values[[i for i, v in enumerate(engine.model.table) if v.group == "tau"]] = rng.normal(0, 30, n)
         slip = rng.choice([-1, 0, 1], n).astype(np.int32)
         held = np.where(slip == 0, STUCK, FREE).astype(np.int32)
         reference.gravity.linear = engine.group(values, "gravity")
@@ -199,7 +200,7 @@ def test_joints_that_stick_and_slip_have_pinocchios_derivatives(control):
         by_q, by_v, M = (np.array(x) for x in pin.computeRNEADerivatives(reference, data, q, v, a))
         M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)
         effort = {"q": -by_q, "v": -by_v - np.diag(damping), "tau_ext": np.eye(n)}
-        if control == "joint":  # τ = M q̈_cmd + h, of which the armature is a part
+        if control == "joint" and not period:  # τ = M q̈_cmd + h, of which the armature is a part; else it is held
             Kp, Kd = engine.group(values, "Kp"), engine.group(values, "Kd")
             wanted = engine.group(values, "a_des") + Kd * (engine.group(values, "v_des") - v)
             wanted += Kp * (engine.group(values, "q_des") - q)

@@ -180,11 +180,13 @@ def test_energy_never_grows(name, length):
     reference.gravity.linear = np.array(plant.gravity)
     reduced, stuck = Reduced(reference, name), 0
     plant.rtol, plant.atol = 1e-10, 1e-12
-    for _ in range(length(500, 15)):
+    for case in range(500):
         q = rng.uniform(-1, 1, native.n)
         plant.q_min, plant.q_max = (q - 0.4).tolist(), (q + 0.4).tolist()
         plant.q, plant.v = q.tolist(), rng.normal(0, 2, native.n).tolist()
         plant.friction = (rng.uniform(0, 40, native.n) * (rng.random(native.n) < 0.7)).tolist()
+        if case >= length(500, 15) and case != 273:  # a Panda's joint stops by an impact of another, and never moves
+            continue
         before = reduced.energy(q, np.array(plant.v))
         for q, v in states(native, plant, 0.01, 60, python=False):
             energy = reduced.energy(q, v)

@@ -291,7 +291,9 @@ static void name_event(Step *step, double passed, const double y[N_STATES], Even
     if (stops->any_watched)
         evaluate(step, y, a, effort, NULL);
     for (int i = 0; i < N_JOINTS; i++) {
-        event->stopped[i] = !stops->held[i] && limit_margin(step, passed, i) < 0.0;
+        const double margin = limit_margin(step, passed, i), speed = y[N_JOINTS + i];
+        const int into = is_above(step->plant, y[i], i) ? speed > 0.0 : speed < 0.0;
+        event->stopped[i] = !stops->held[i] && (margin < 0.0 || (margin == 0.0 && into));
         event->arrested[i] = !stops->held[i] && stops->slip[i] * y[N_JOINTS + i] < 0.0;
         event->released[i] =
             stops->watched[i]

@@ -33,7 +33,7 @@ class Event:
     """Event at the end of a step.
 
     Attributes:
-        stopped: joints that reached a limit.
+        stopped: joints that reached a limit, or are at one still and turn into it.
         arrested: joints that slipped and have no velocity left.
         released: joints that are no longer held.
     """

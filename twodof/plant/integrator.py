@@ -235,7 +235,8 @@ class _Motion:
         for i, (low, high) in enumerate(stops.limits):
             if i in stops.held:
                 continue
-            if not low <= y[i] <= high:
+            side = (y[i] >= high) - (y[i] <= low)
+            if not low <= y[i] <= high or side * y[n + i] > 0.0:
                 event.stopped.append(i)
                 y[i] = min(max(y[i], low), high)
             if stops.slip[i] * y[n + i] < 0.0:
