@@ -55,6 +55,13 @@ FAILURES = {
     "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
     "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] = 0"),
     "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp[1] = 20"),
+    "a joint that sticks": Failure(
+        "arm",
+        "joint",
+        {"friction": (0.3, 0.1), "q_des": (1.2, 0.1), "Kd": (0.0, 1.0)},
+        ("friction",),
+        "'joint2' sticks: its friction of 0.1 holds it from 0 s on",
+    ),
     "a singular pose": Failure(
         "arm", "task", {"q_start": (0.0, 0.0), "x_des": (0.2, 0.0), "Kp": 20.0}, ("singularity",), "near a singularity"
     ),

@@ -86,6 +86,14 @@ def test_a_singular_pose_and_a_motion_are_remarked(native_path):
     assert [remark[:15] for remark in model.remarks] == ["a singular pose", "no equilibrium:"]
 
 
+def test_a_joint_that_sticks_is_remarked_and_stays_and_one_that_begins_to_slip_is_refused(bare):
+    model = twodof.linearise(bare, {"q": [0.3, 0.2], "v": [0.0, 1.0], "friction": [50.0, 0.1]})
+    assert "joint 'joint1' sticks by its friction 50: in the model it stays at rest" in model.remarks
+    assert not model.A[2].any() and model.A[3].any()
+    with pytest.raises(twodof.TwoDofError, match="'joint1' begins to slip against its friction"):
+        twodof.linearise(bare, {"q": [0.3, 0.2], "friction": 0.1, "tau_cmd": [9.0, 0.0]})
+
+
 def test_a_free_joint_has_no_damping_and_what_falls_is_unstable(bare, capsys):
     """Without gravity nothing holds joints; upright, two of four eigenvalues grow."""
     free = twodof.linearise(bare, {"q": [0.3, 0.3], "gravity": 0.0})

@@ -314,6 +314,28 @@ def test_what_the_buttons_and_keys_do(page) -> None:
     until(page, lambda text: "joint1 at limit" in text, said)
 
 
+def test_friction_and_sampling_are_set_in_the_panel(page) -> None:
+    for summary in page.locator("summary").all():
+        if "joints" in str(summary.text_content()) or "sampling" in str(summary.text_content()):
+            summary.click()
+    typed = {"friction[1], N.m": 1e3, "control_period, s": 0.02, "control_delay, s": 0.01, "q_resolution[2], rad": 1e-3}
+    for label, number in typed.items():
+        page.get_by_label(label, exact=True).fill(str(number))
+        page.keyboard.press("Enter")
+        name = label.partition(",")[0].partition("[")[0]
+        assert number in page.evaluate("name => arm.held(name)", name)
+    page.get_by_label("v_from_q").check()
+    until(page, lambda text: "joint1: held by friction" in text and "joint2" not in text, said)
+    page.evaluate("arm.step(10)")
+    assert page.evaluate("arm.at('v')[0] === 0 && arm.at('v')[1] !== 0 && arm.at('q')[0] === arm.held('q_start')[0]")
+    page.get_by_label("control_period, s", exact=True).fill("0")
+    page.keyboard.press("Enter")
+    until(page, lambda text: "control_delay = 0.01 needs a control_period > 0" in text, said)
+    assert page.evaluate("arm.held('control_period')") == [0.02]
+    page.evaluate("arm.set('friction[1]', 0)")
+    until(page, lambda text: "held by friction" not in text, said)
+
+
 def ball(page: Page) -> int:
     """Pixels of the target at the upper edge, where nothing else is."""
     red, green, blue = np.moveaxis(picture(page)[:80].astype(int), -1, 0)

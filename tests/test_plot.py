@@ -202,6 +202,21 @@ def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
     assert "Position in rad; thin dashes: target" in [a["text"] for a in over["layout"]["annotations"]]
 
 
+def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path: Path) -> None:
+    fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
+    settings = {"friction": (3.0, 0.0), "q_des": (1.4, -0.5), "Kd": (0.0, 1.0), "gravity": (0.0, 0.0, 0.0)}
+    recording = record(tmp_path / "bag", fmu, stop_time=1.5, settings=settings)
+    figure, label = plot(recording.bag), "grey band: held by friction"
+    first, second = panels(figure).q
+    band, rests = only(first, label)[:, 1], recording.v[:, 0] == 0.0
+    assert 10 < rests.sum() < len(rests) - 10
+    lone = rests & ~np.append(rests[1:], False) & ~np.append(False, rests[:-1])
+    np.testing.assert_array_equal(band, np.where(rests & ~lone, recording.q[:, 0], np.nan))
+    assert not lines(second, label) and label in texts(figure)
+    over = over_time(read_tracks([recording.bag]))
+    assert any(label in a["text"] for a in over["layout"]["annotations"])
+
+
 def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
     """Beside limits that are long to tell, and efforts; where they are is told once."""
     fmu = build(tmp_path, chain_urdf("zyx" * 4, 0.1, low=-1.234, high=2.345), control="joint")

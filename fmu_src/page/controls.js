@@ -2,7 +2,8 @@
 
 const GAINS = ["Kp", "Kd", "Kp_rot", "Kd_rot", "Kn"];
 const JOINTS = ["friction", "damping", "armature"];
-const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start", ...JOINTS];
+const SENSORS = ["q_resolution", "q_noise", "v_noise"];
+const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start", ...JOINTS, ...SENSORS];
 const PER_AXIS = ["x_des", "xd_des", "xdd_des"];
 const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["target or command", true, ["x_des", "q_des", "tau_cmd"]],
@@ -11,6 +12,7 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["feedforward", false, ["quat_des", "xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
   ["parameters (a change restarts the simulation)", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
   ["joints (a change restarts the simulation)", false, JOINTS],
+  ["sampling (a change restarts the simulation)", false, ["control_period", "control_delay", "v_from_q", ...SENSORS]],
 ]);
 
 /** An element with text, and what it holds. */
@@ -109,6 +111,8 @@ class Controls {
     if (group === "tau_cmd" || group === "tau_ext") return [-(joint.effort ?? strongest), joint.effort ?? strongest];
     if (group === "payload") return [0, force / 9.81];
     if (JOINTS.includes(group)) return [0, Math.max(4 * value, group === "armature" ? 1 : 0.2 * (joint.effort ?? strongest))];
+    const sampled = { control_period: 0.05, control_delay: 0.05, q_resolution: 0.01, q_noise: 0.01, v_noise: 0.1 }[group];
+    if (sampled) return [0, Math.max(4 * value, sampled)];
     const most = { f_ext: force, payload_com: 0.3, gravity: 20, quat_des: 1 }[group] ?? 5;
     return [-most, most];
   }

@@ -212,6 +212,8 @@ class App {
       scene.draw(camera, fractions(colour("--scene")), Number(colour("--bright")));
     }
     const stopped = robot.atLimit(q, session.values);
+    const stuck = robot.sticking(session.at("v", k), session.values).filter((joint) => !stopped.includes(joint));
+    const sticks = stuck.length ? `${stuck.map(({ name }) => name).join(", ")}: held by friction` : "";
     if (this.curves.cursor !== null || this.before - this.drawn > 1000 * PANEL) {
       this.curves.draw([colour("--ink"), colour("--hair")]);
       this.readout.show(k, stopped, this.places(k), session.groups.has("quat_des") ? this.turnError(k) : NaN);
@@ -223,7 +225,8 @@ class App {
     }
     const far = session.groups.has("x_des") && Math.hypot(...plus(target, -1, this.reach.centre)) > this.reach.radius;
     const blind = scene ? "" : "this browser shows no 3D: it has no WebGL 2";
-    const notes = [blind, session.said, session.notice, far ? "target out of reach" : "", ...stopped.map((joint) => `${joint.name} at limit`)];
+    const notes = [blind, session.said, session.notice, far ? "target out of reach" : "", sticks];
+    notes.push(...stopped.map((joint) => `${joint.name} at limit`));
     const text = notes.filter(Boolean).join("\n");
     if (byId("said").textContent !== text) byId("said").textContent = text;
   }

@@ -63,4 +63,10 @@ class Robot {
       }),
     );
   }
+
+  /** Joints that their friction holds: only these have a velocity of exactly 0. */
+  /** @type {(v: Numbers, values: Map<string, Value>) => JointFacts[]} */
+  sticking(v, values) {
+    return this.facts.joints.filter((_, i) => v[i] === 0 && Number(values.get(`friction[${i + 1}]`)) > 0);
+  }
 }

@@ -16,7 +16,7 @@ from ..errors import PlotError
 from ..files import data_file, packed
 from ..version import needing
 from .closed_form import Array
-from .panels import CURVE, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
+from .panels import CURVE, HELD, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
 from .strokes import GREY, HAIR, INK, Stroke, looks
 from .track import Track
 from .words import labels
@@ -200,6 +200,8 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
         strokes = [stroke for panel in panels for stroke in panel.strokes]
         if any(stroke.label == "target" and not stroke.kind for stroke in strokes):
             heading += f"; {TARGET}"
+        if any(stroke.label == HELD for stroke in strokes):
+            heading += f"; {HELD}"
         layout["annotations"].append(_heading(heading, top))
         for stroke in sorted(strokes, key=lambda stroke: stroke.depth):
             hover = "none" if stroke.kind else "skip"

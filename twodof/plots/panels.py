@@ -26,7 +26,7 @@ SEEN_IN = {"limit": "q", "friction": "q", "saturation": "tau"}
 MARKS = {"limit": "at its limit", "friction": "sticks", "saturation": "saturated"}
 """Panels in which the beginnings of some causes are marked, and the marks' names."""
 SETTLED = "within 2 % from here on"
-TARGET = "thin dashes: target"
+TARGET, HELD = "thin dashes: target", "grey band: held by friction"
 Looks = Mapping[tuple[int, str], Look]
 """Styles of each track's joints, and of the track itself, whose joint is ""."""
 
@@ -105,6 +105,9 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
         if kind == "q" and joint.target.size:
             thin = Look("target", look.colour, (3, 2))
             targets.append(_curve("target", i, track.t, joint.target, thin, THIN, 1.95, joint=name))
+        if kind == "q" and np.isfinite(joint.stuck).any():
+            wide = Look(HELD, PALE, ())
+            targets.append(_curve(wide.label, i, track.t, joint.stuck, wide, THICK, 1.85, joint=name))
         targets += _events(i, kind, joint, track)
         own_limits = _limits(kind, joint)
         for limit in own_limits:

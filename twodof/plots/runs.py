@@ -17,7 +17,7 @@ from ..bag.provenance import each_robot
 from ..bag.recording import Recording
 from .figure import Drawing, draw_head, drawn
 from .interactive import body
-from .panels import KINDS, TARGET, UNITS, Panel, duration, joint_names, panels_of, title
+from .panels import HELD, KINDS, TARGET, UNITS, Panel, duration, joint_names, panels_of, title
 from .settings import number
 from .strokes import GREY, INK, Stroke, looks
 from .track import Track, read_tracks
@@ -88,6 +88,7 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
     height = max(rows * pitch + 0.5 + (ERROR + 0.6) * bool(error), least)
     texts = [common_settings(tracks)]
     texts += [TARGET] * any(joint.target.size for track in tracks for joint in track.joints)
+    texts += [HELD] * any(stroke.label == HELD for panel in panels for stroke in panel.strokes)
     texts += [f"▼ {', '.join(named)}"] if (named := _marked([*panels, *([error] if error else [])])) else []
     texts += outcome(tracks[0]) if len(tracks) == 1 else []
     size = width + BESIDE * bool(pictures), height

@@ -34,6 +34,7 @@ class JointTrack:
         effort, speed: limits of the URDF, N·m or N, and per s; None likewise.
         q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample,
             N values each; all but q are empty where they are not known.
+        rubs: whether it has friction.
     """
 
     name: str
@@ -46,6 +47,13 @@ class JointTrack:
     v: Array
     tau: Array
     target: Array
+    rubs: bool
+
+    @property
+    def stuck(self) -> Array:
+        """Positions in stretches of samples in which friction holds the joint, NaN in others, N values."""
+        rests = np.pad((self.v == 0.0) & self.rubs, 1) if self.v.size else np.zeros(len(self.q) + 2, bool)
+        return np.where(rests[1:-1] & (rests[:-2] | rests[2:]), self.q, np.nan)
 
     @property
     def at_limit(self) -> bool:
@@ -212,7 +220,8 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
         )
         if effort is not None and first.get("limit_effort"):  # of commands; a bag's are within it
             tau = np.clip(tau, -effort, effort)
-        joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target))
+        rubs = bool(first.get(f"friction[{i + 1}]"))
+        joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target, rubs))
     return tuple(joints)
 
 

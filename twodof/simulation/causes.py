@@ -214,10 +214,11 @@ def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     friction = setup.given("friction")
     for i, joint in enumerate(setup.joints[: len(friction)]):
         off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > 0.0 if judge.wanted("q").size else bool(missed)
-        held = judge.duration - max(0.0, float(judge.moved[i]))
+        since = max(0.0, float(judge.moved[i]))
+        held = judge.duration - since
         if friction[i] > 0.0 and off and held > OFTEN * judge.duration:
-            text = f"joint '{joint}' sticks: its friction of {friction[i]:.4g} holds it from {judge.moved[i]:.4g} s on"
-            yield Cause("friction", text, held / judge.duration, joint, max(0.0, float(judge.moved[i])))
+            text = f"joint '{joint}' sticks: its friction of {friction[i]:.4g} holds it from {since:.4g} s on"
+            yield Cause("friction", text, held / judge.duration, joint, since)
 
 
 def _load(judge: Judge) -> Iterator[Cause]:
