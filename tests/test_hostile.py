@@ -117,6 +117,14 @@ def many_members(count: int, size: int = 0) -> bytes:
     return fmu_of(description(), *same)
 
 
+def beside(content: str) -> bytes:
+    """An FMU of FMI 3.0 with some content in the file that says how it is built."""
+    data = f'<fmiBuildDescription fmiVersion="3.0">{content}</fmiBuildDescription>'.encode()
+    packer = zlib.compressobj(1, zlib.DEFLATED, -15)
+    packed = packer.compress(data) + packer.flush()
+    return fmu_of(arrays('start="2"'), ("sources/buildDescription.xml", packed, len(data), zlib.crc32(data)))
+
+
 UNPLAIN = "declares entities or is not UTF-8"
 UNLOADED = "cannot be loaded"
 HOSTILE_FMUS: dict[str, tuple[Callable[[], bytes], str]] = {
@@ -140,6 +148,12 @@ HOSTILE_FMUS: dict[str, tuple[Callable[[], bytes], str]] = {
     "10 GB of zeros": (lambda: bomb("resources/x", 2**32 - 1), "it exceeds"),
     "10 GB that are said to be 1 kB": (lambda: bomb("resources/x", 1000), UNLOADED),
     "10 GB of description": (lambda: bomb("modelDescription.xml", 1000), UNPLAIN),
+    "12 million elements beside the description": (lambda: beside("<a/>" * 12_000_000), "no binary for this platform"),
+    "two descriptions": (
+        lambda: fmu_of(description(), ("modelDescription.xml", b"\3\0", 0, 0)),
+        "two members 'modelDescription.xml'",
+    ),
+    "no version": (lambda: fmu_of("<fmiModelDescription/>"), "it states no fmiVersion"),
     "900 folders deep": (lambda: fmu_of(description(), ("a/" * 900 + "b", b"\3\0", 0, 0)), "nested deeper"),
 }
 
@@ -153,10 +167,11 @@ def test_hostile_fmu_is_refused(hostile_fmu: tuple[Callable[[], bytes], str], ja
     jail.run("run", path, "-o", jail.target / "bag", "--scene")
 
 
-def arrays(*dimensions: str, step: str = "0.01") -> str:
-    """The modelDescription.xml of an FMU of FMI 3.0 whose output has these dimensions."""
+def arrays(*dimensions: str, step: str = "0.01", aliases: int = 0) -> str:
+    """The modelDescription.xml of an FMU of FMI 3.0 whose output has these dimensions and so many other names."""
     output = ' causality="output" variability="continuous"'
     inside = "".join(f"<Dimension {dimension}/>" for dimension in dimensions)
+    inside += "".join(f'<Alias name="q{i}"/>' for i in range(aliases))
     return (
         '<fmiModelDescription fmiVersion="3.0" modelName="m" instantiationToken="g">'
         f'<CoSimulation modelIdentifier="m"/><DefaultExperiment stepSize="{step}"/><ModelVariables>'
@@ -177,6 +192,9 @@ ARRAYS = {
     "a product": (arrays(*['start="300"'] * 2), TOO_MANY),
     "a billion times none": (arrays('start="0"', 'start="1000000000"'), TOO_MANY),
     "with an underscore": (arrays('start="2_0"'), "a dimension of no known size"),
+    "20,000 dimensions": (arrays('start="49000"', *['start="1"'] * 20_000), "more than 16 dimensions"),
+    "40,000 names": (arrays('start="40000"', aliases=40_000), TOO_MANY),
+    "300,000 names of a scalar": (arrays(aliases=300_000), TOO_MANY),
     "as many as there may be": (arrays('start="49998"'), "names|to log|cannot be loaded"),
     "a step of 1e-300 s": (arrays('start="2"', step="1e-300"), "at least 1e-06 s"),
 }

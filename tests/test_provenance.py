@@ -330,6 +330,21 @@ def test_provenance_says_where_it_was_full(run: Experiment, tmp_path: Path, monk
     assert provenance["inputs_known_until"] == round(changes[-1][0] * 100 + 1) / 100
 
 
+def test_changes_beyond_what_a_reader_holds_are_not_known(run: Experiment, tmp_path: Path) -> None:
+    """Each of 4000 inputs changes once: together 8 million values in effect, of a file of 100 kB."""
+    with twodof.Bag(tmp_path / "bag").begin(run) as bag:
+        for k in range(5):
+            bag.write(sample(run, k))
+    file = tmp_path / "bag" / "run.json"
+    provenance = json.loads(file.read_text())
+    provenance["input_changes"] = [[k / 1e5, {f"x{k}": 1.0}] for k in range(4000)]
+    file.write_text(json.dumps(provenance))
+    read = twodof.read_bag(tmp_path / "bag").provenance
+    known = len(read["input_changes"])
+    assert sum(range(known + 1)) <= 5_000_000 < sum(range(known + 2))
+    assert read["inputs_known_until"] == known / 1e5
+
+
 def test_custom_data_leaves_out_changes_that_take_yaml_minutes(run: Experiment, tmp_path: Path) -> None:
     with twodof.Bag(tmp_path / "bag").begin(run) as bag:
         for k in range(20_000):

@@ -178,6 +178,17 @@ def test_hostile_database_is_refused(bag: Path, script: str, reason: str, capsys
 # --- small files of much ---
 
 
+def test_mcap_with_more_provenance_than_is_read_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One file alone has it in its metadata, which a folder has in run.json."""
+    content = '{"format":1,"fmu":{}}' + " " * 32 * 1024**2
+    entries = texts("run.json", content)
+    file = tmp_path / "one.mcap"
+    about = record(12, texts("twodof", entries))
+    file.write_bytes(TOPIC + about + message(joint_state(2, START)) + FOOTER)
+    assert main(["info", str(file)]) == 1
+    assert "has metadata 'twodof' of 335" in capsys.readouterr().err
+
+
 def test_mcap_of_records_that_are_all_alike_is_not_read_to_its_end(bag: Path) -> None:
     """Each of its chunks is a million empty messages, packed into 3 kB."""
     million = message(b"") * 1_000_000

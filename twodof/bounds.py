@@ -11,7 +11,8 @@ MAX_FOLDERS_DEEP = 50  # folders in folders
 
 # FMUs
 MAX_DESCRIPTION = 8 * MIB  # some 50,000 variables
-MAX_ELEMENTS = 50_000  # of all arrays of FMI 3.0 together
+MAX_ELEMENTS = 50_000  # of all arrays of FMI 3.0 and of their aliases together
+MAX_DIMENSIONS = 16  # of an array of FMI 3.0; a matrix has 2
 MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB
 MAX_SOURCE = 16 * MIB  # a C file
@@ -46,6 +47,7 @@ MAX_RATIO = 1000  # of unpacked to packed; an arm at rest reaches 24, one of 50 
 MAX_SUMMARY = 64 * MIB
 MAX_METADATA = 64 * MIB
 MAX_PROVENANCE = 32 * MIB  # run.json: a reader of JSON takes 15 times as much memory
+MAX_HELD = 5_000_000  # values of inputs that are in effect, over all times at which one changes
 MAX_PROFILES = 64 * KIB  # all topics' different profiles, in YAML, which is slow to read
 MAX_DEFINITION = 64 * KIB  # a message type
 

@@ -101,8 +101,12 @@ def check_archive(path: str | Path) -> None:
     check_file(path, MAX_ARCHIVE)
     with _Archive(path) as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
+    files = set[str]()
     for member in members:
         _check_member(member)
+        if member.filename in files:  # readers differ in which one they take
+            raise UnsafeArchiveError(f"it is unsafe: it has two members '{member.filename}'")
+        files.add(member.filename)
     names = [PurePosixPath(member.filename) for member in members]
     if len({*names, *(folder for name in names for folder in name.parents)}) > MAX_MEMBERS:
         raise UnsafeArchiveError(f"it has more than {MAX_MEMBERS} files and folders")

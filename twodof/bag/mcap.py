@@ -13,7 +13,7 @@ from zlib import crc32
 import lz4.frame
 import numpy as np
 
-from ..bounds import MAX_CHUNK, MAX_RATIO, MAX_TOPICS
+from ..bounds import MAX_CHUNK, MAX_PROVENANCE, MAX_RATIO, MAX_TOPICS
 from ..ros.cdr import Rows
 from .records import RECORD, TEXT, Batch, Channel, DamageError, ReadBudget, refusing_damage
 
@@ -63,6 +63,8 @@ def read_metadata(path: Path, name: str, key: str) -> str:
         for _, content in _records(path, ReadBudget(), (METADATA,)):
             title, _, position = fields("sI", content, HEAD.size)
             if title == name:
+                if len(content) > MAX_PROVENANCE:
+                    raise DamageError(f"'{path.name}' has metadata '{name}' of {len(content)} bytes")
                 return _entries(content[position:]).get(key, "")
     return ""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, cast
 from urllib.parse import quote, unquote
 
-from ..bounds import MAX_PROVENANCE
+from ..bounds import MAX_HELD, MAX_PROVENANCE
 from ..errors import BagError
 from ..files import NUMBER, VALUES, fits, parsed, read_file
 from ..simulation.experiments import Experiment
@@ -223,9 +223,22 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
         if isinstance(content, dict) and content.get("format") == FORMAT and "fmu" in content:
             if not fits(content, SHAPE):
                 raise ValueError("it is damaged")
-            return cast(Provenance, content)
+            return _limited(cast(Provenance, content))
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError, RecursionError, DamageError) as error:
         raise BagError(f"cannot read '{file}': {error}") from error
     return {}
+
+
+def _limited(provenance: Provenance) -> Provenance:
+    """Return a provenance with no more changes of inputs than a reader can hold; later ones count as not known."""
+    names, room = set[str](), MAX_HELD
+    for i, (time, values) in enumerate(provenance["input_changes"]):
+        names.update(values)
+        room -= len(names)
+        if room < 0:
+            provenance["input_changes"] = provenance["input_changes"][:i]
+            provenance[KNOWN_UNTIL] = time
+            break
+    return provenance

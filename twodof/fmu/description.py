@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import io
 import math
 import re
 import zipfile
@@ -19,7 +20,7 @@ import fmpy
 import numpy as np
 from fmpy.model_description import ModelDescription, ModelVariable
 
-from ..bounds import MAX_DESCRIPTION, MAX_ELEMENTS, MAX_RESOURCE
+from ..bounds import MAX_DESCRIPTION, MAX_DIMENSIONS, MAX_ELEMENTS, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
 from ..export.compiler import host_platform
 from ..export.start_values import groups_of, vector
@@ -176,9 +177,10 @@ def load_fmu(path: str | Path) -> Fmu:
     xml, members = _read(path)
     try:
         root = ET.fromstring(xml)
+        if "fmiVersion" not in root.attrib:
+            raise ValueError("it states no fmiVersion")
         _check_arrays(root)
-        with path.open("rb") as file:  # by its name FMPy would take an XML file too
-            description = fmpy.read_model_description(file, validate=True)
+        description = fmpy.read_model_description(_alone(xml), validate=True)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
         raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
     if not re.match(r"[23]\.0", description.fmiVersion) or description.coSimulation is None:
@@ -274,6 +276,14 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
     return xml, _checksums(archive)
 
 
+def _alone(xml: bytes) -> io.BytesIO:
+    """Return an archive of the description alone: FMPy reads sources/buildDescription.xml whatever its size."""
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("modelDescription.xml", xml)
+    return archive
+
+
 def _is_plain_xml(xml: bytes) -> bool:
     """Return whether XML declares no entities, in an encoding with an ASCII declaration."""
     text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
@@ -285,15 +295,18 @@ def _is_plain_xml(xml: bytes) -> bool:
 
 
 def _check_arrays(root: ET.Element) -> None:
-    """Raise ValueError for arrays of FMI 3.0 with too many elements or invalid sizes."""
+    """Raise ValueError for arrays of FMI 3.0 of invalid sizes, or with too many elements, aliases counted."""
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
     room = MAX_ELEMENTS
     for variable in root.iterfind("ModelVariables/*"):
         dimensions = variable.findall("Dimension")
         texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
+        if len(texts) > MAX_DIMENSIONS:
+            raise ValueError(f"variable '{variable.get('name')}' has more than {MAX_DIMENSIONS} dimensions")
         if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
             raise ValueError(f"variable '{variable.get('name')}' has a dimension of no known size")
-        room -= math.prod(max(1, int(text)) for text in texts) if dimensions else 0
+        elements, aliases = math.prod(max(1, int(text)) for text in texts), len(variable.findall("Alias"))
+        room -= elements * (1 + aliases) if dimensions else aliases
         if room < 0:
             raise ValueError(
                 f"with variable '{variable.get('name')}' its arrays have more than {MAX_ELEMENTS} elements"
