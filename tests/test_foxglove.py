@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from bags import SECOND
-from browser import UPGRADE, answer
+from browser import NOBODY, UPGRADE, answer, connected
 from harness import wait_until
 from nodes import LATCHED, PATIENCE, STREAMS, ended, published, recorded, stamp_of
 from tools import needs
@@ -152,6 +154,20 @@ def test_websites_but_foxgloves_own_are_refused(native_path: Path) -> None:
         for host in ("evil.example", "app.foxglove.dev"):
             assert status(("Host", host), ("Origin", f"https://{host}")) == 403
             assert status(("Host", host)) == 403
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not list the owners of sockets")
+@pytest.mark.parametrize(("set_gains", "status"), [(False, b"101"), (True, b"403")])
+def test_gains_are_no_business_of_other_users(
+    native_path: Path, set_gains: bool, status: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ("Host", "localhost"), ("Sec-WebSocket-Protocol", "foxglove.sdk.v1"), *UPGRADE
+    head = "".join(f"{name}: {value}\r\n" for name, value in asked)
+    viewer = Foxglove(0, set_gains=set_gains).begin(twodof.experiment(native_path))
+    with viewer, connected(viewer.url, "127.0.0.1") as one, monkeypatch.context() as patch:
+        patch.setattr(os, "geteuid", lambda: NOBODY + 1)
+        one.sendall(f"GET / HTTP/1.1\r\n{head}\r\n".encode())
+        assert one.recv(100).split()[1] == status
 
 
 def test_a_client_of_junk_prints_nothing(native_path: Path, caplog: pytest.LogCaptureFixture) -> None:

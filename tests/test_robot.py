@@ -119,6 +119,15 @@ REFUSED = {
         arm(elbow=elbow(LIMIT + '<mimic joint="shoulder" multiplier="two"/>')),
         "'elbow': its <mimic> has a factor or offset that is no number",
     ),
+    "mimics that multiply": (
+        arm(
+            elbow=elbow(LIMIT + '<mimic joint="shoulder" multiplier="1e5"/>'),
+            shoulder=shoulder(LIMIT + '<mimic joint="wrist" multiplier="1e5"/>'),
+            hand=link("hand"),
+            wrist=joint("wrist", "tip", "hand", LIMIT),
+        ),
+        "'elbow': the factors or offsets of the joints that it mimics are too large",
+    ),
     "mimic beyond its limits": (
         arm(elbow=elbow(LIMIT + '<mimic joint="shoulder" offset="9"/>')),
         "'elbow' mimics 'shoulder', but no position of that is within the limits of both",

@@ -8,7 +8,6 @@ import socket
 import sys
 import urllib.request
 from collections.abc import Sequence
-from urllib.parse import urlsplit
 
 import browser
 import pytest
@@ -60,21 +59,6 @@ def test_page_answers_to_its_own_name_and_its_own_page_alone(
             assert answer(served.url, *rest) == 403
 
 
-NOBODY = 65534
-
-
-def connected(url: str, host: str) -> socket.socket:
-    """A connection by a program that is not root's: the owner of a socket is who makes it."""
-    root = os.geteuid() == 0
-    if root:
-        os.seteuid(NOBODY)
-    try:
-        return socket.create_connection((host, urlsplit(url).port or 0), timeout=60)
-    finally:
-        if root:
-            os.seteuid(0)
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not list the owners of sockets")
 @pytest.mark.parametrize(
     ("host", "asked"),
@@ -90,13 +74,19 @@ def connected(url: str, host: str) -> socket.socket:
 )
 def test_a_token_is_of_no_use_to_another_user(host: str, asked: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """All users of a machine can read the command line of a browser, which has the token."""
-    user = os.geteuid() or NOBODY
+    user = os.geteuid() or browser.NOBODY
     with Server(b"page", host, 0, token="secret") as server:
         for server_user, status in ((user, b"200"), (user + 1, b"403"), (0, b"200")):
-            with connected(server.url, asked) as one, monkeypatch.context() as patch:
+            with browser.connected(server.url, asked) as one, monkeypatch.context() as patch:
                 patch.setattr(os, "geteuid", lambda server_user=server_user: server_user)
                 one.sendall(b"GET /?token=secret HTTP/1.1\r\nHost: localhost\r\n\r\n")
                 assert one.recv(100).split()[1] == status
+
+
+def test_a_request_that_is_no_text_is_refused() -> None:
+    with Server(b"page", port=0, token="secret") as server, browser.connected(server.url, "127.0.0.1") as one:
+        one.sendall(b"GET /?token=\xff HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert one.recv(100).split()[1] == b"403"
 
 
 def test_a_server_has_one_page_and_no_socket_that_it_does_not_need() -> None:

@@ -20,8 +20,8 @@ from pathlib import Path
 from subprocess import DEVNULL
 from typing import Any
 
-from ..bounds import MAX_XACRO_MEMORY, MAX_XACRO_SECONDS
-from ..children import Child, confine
+from ..bounds import MAX_XACRO_MEMORY, MAX_XACRO_SECONDS, MAX_XACRO_WAIT
+from ..children import Child, confine, limit_time
 from ..errors import BuildError, ChildError
 from ..files import check_file
 from ..version import install
@@ -41,10 +41,10 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
     if missing:
         raise BuildError(f"cannot expand '{path}': there is no {' and no '.join(missing)}; {install('xacro')}")
     environment = {"LC_ALL": "C.UTF-8"}
-    with Child(_expand, path, folders, most, environment=environment, output=DEVNULL) as child:
+    with Child(_expand, path, folders, most, MAX_XACRO_SECONDS, environment=environment, output=DEVNULL) as child:
         try:
-            if not child.poll(MAX_XACRO_SECONDS):
-                raise EOFError(f"it takes more than {MAX_XACRO_SECONDS} s")
+            if not child.poll(MAX_XACRO_WAIT):
+                raise EOFError(f"it takes more than {MAX_XACRO_WAIT} s")
             text, remarks = child.recv()
         except (EOFError, ChildError) as error:
             raise BuildError(f"cannot expand '{path}': {error}") from error
@@ -53,7 +53,7 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
     return str(text)
 
 
-def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) -> None:
+def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, seconds: int) -> None:
     """Expand the file in the child; send the URDF and the remarks of xacro."""
     import xacro
     from xacro import substitution_args
@@ -66,7 +66,8 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int) ->
     for name in ("isinstance", "repr", "type", "vars"):
         del xacro._global_symbols["python"][name]
     xacro.process_doc(xacro.parse("<a b='${math.pi}'/>"))  # which imports the rest
-    confine(MAX_XACRO_MEMORY, MAX_XACRO_SECONDS, folders)
+    confine(MAX_XACRO_MEMORY, 2 * seconds, folders)
+    limit_time(seconds)  # a signal that names itself, before the one that does not
     sys.addaudithook(_guard(folders, most))
     remarks = io.StringIO()
     try:

@@ -47,7 +47,7 @@ class Foxglove(Sink):
         port: where it listens; 0: any that is free.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        set_gains: let whoever connects set the gains.
+        set_gains: let programs of this user set the gains; those of other users are refused on Linux.
         opened: told when it listens.
 
     Attributes:
@@ -97,7 +97,8 @@ class Foxglove(Sink):
                 server_listener=self._gains,
             )
             talk = partial(relay, f"ws://{hidden}:{self._server.port}")
-            self._door = Server(None, HOST, self._port, talk, origins=APPS, protocol=PROTOCOL)
+            private = self._set_gains
+            self._door = Server(None, HOST, self._port, talk, origins=APPS, protocol=PROTOCOL, private=private)
         except (RuntimeError, OSError, PageError) as error:
             raise PublishError(f"cannot serve Foxglove: {error}") from error
         self._door.__enter__()

@@ -41,7 +41,7 @@ CLOSING = 1.0  # s
 LARGEST = 64 * 1024  # bytes of a message from a browser
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 REFUSED = "open this page as twodof prints it; --host gives it another address or name\n"
-OTHER_USER = "this page answers programs of the user who runs twodof\n"
+OTHER_USER = "only programs of the user who runs twodof are answered\n"
 HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
     "Content-Security-Policy": "frame-ancestors 'none'",
@@ -69,6 +69,7 @@ class Server:
         talk: to each websocket that the page opens; None: it opens none.
         origins: other pages that are answered too.
         token: that requests must have in their query; "": none.
+        private: refuse other users of this machine, also without a token.
         protocol: of the websocket.
 
     Attributes:
@@ -88,8 +89,10 @@ class Server:
         origins: Collection[str] = (),
         protocol: str | None = None,
         token: str = "",
+        private: bool = False,
     ) -> None:
         self._query = f"token={token}" if token else ""
+        self._private = private or bool(token)
         self._page, self._host, self._talk = page, host, talk
         self._origins, self._protocols = origins, protocol and [Subprotocol(protocol)]
         self._started = Event()
@@ -135,13 +138,13 @@ class Server:
     def _answer(self, connection: Connection, request: Request) -> Response | None:
         if not _is_own(request, self._host, self._address, self._origins):
             return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
+        if self._private and _is_of_another_user(connection):
+            return connection.respond(HTTPStatus.FORBIDDEN, OTHER_USER)
         if self._page is None:
             return None
         path, _, query = request.path.partition("?")
-        if self._query and not secrets.compare_digest(query.encode(), self._query.encode()):
+        if self._query and not secrets.compare_digest(query.encode(errors="surrogateescape"), self._query.encode()):
             return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
-        if self._query and _is_of_another_user(connection):
-            return connection.respond(HTTPStatus.FORBIDDEN, OTHER_USER)
         path = path if self._query else request.path
         if path == "/socket" and self._talk is not None:
             return None

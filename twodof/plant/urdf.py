@@ -254,6 +254,8 @@ def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:
             raise RobotError(f"joint '{seen[-1]}' mimics '{joint.leader}', which {reason}")
         seen.append(leader.name)
         ratio, offset = joint.ratio * leader.ratio, joint.ratio * leader.offset + joint.offset
+        if not abs(ratio) + abs(offset) <= LARGEST:
+            raise RobotError(f"joint '{seen[0]}': the factors or offsets of the joints that it mimics are too large")
         joint = replace(joint, leader=leader.leader, ratio=ratio, offset=offset)
     return joint
 
