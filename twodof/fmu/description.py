@@ -180,13 +180,15 @@ def load_fmu(path: str | Path) -> Fmu:
         if "fmiVersion" not in root.attrib:
             raise ValueError("it states no fmiVersion")
         _check_arrays(root)
-        description = fmpy.read_model_description(_alone(xml), validate=True)
+        alone = io.BytesIO()  # FMPy reads sources/buildDescription.xml too, whatever its size
+        with zipfile.ZipFile(alone, "w") as archive:
+            archive.writestr("modelDescription.xml", xml)
+        description = fmpy.read_model_description(alone, validate=True)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
         raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
     if not re.match(r"[23]\.0", description.fmiVersion) or description.coSimulation is None:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
-        form = f"FMI {description.fmiVersion} {kind}"
-        raise FmuError(f"'{path}' is {form}; FMI 2.0 or 3.0 co-simulation is needed")
+        raise FmuError(f"'{path}' is FMI {description.fmiVersion} {kind}; FMI 2.0 or 3.0 co-simulation is needed")
     simulation = root.find("CoSimulation[@providesDirectionalDerivatives]")
     if simulation is not None:  # FMPy knows 2.0's word for it
         derivatives = simulation.get("providesDirectionalDerivatives") in ("true", "1")
@@ -218,8 +220,7 @@ def _check_starts(fmu: Fmu) -> None:
         try:
             _ = variable.start_value
         except ValueError:
-            reason = f"the start value of {name}, '{variable.start:.50}', is no number"
-            raise FmuError(f"'{fmu.path}': {reason}") from None
+            raise FmuError(f"'{fmu.path}': start value of {name}, '{variable.start:.50}', is no number") from None
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):
         raise FmuError(f"'{fmu.path}': its axes '{fmu.axes:.50}' are not different ones of 'xyz'")
     for group in ("x", "x_des") if fmu.axes else ():
@@ -276,14 +277,6 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
     return xml, _checksums(archive)
 
 
-def _alone(xml: bytes) -> io.BytesIO:
-    """Return an archive of the description alone: FMPy reads sources/buildDescription.xml whatever its size."""
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as file:
-        file.writestr("modelDescription.xml", xml)
-    return archive
-
-
 def _is_plain_xml(xml: bytes) -> bool:
     """Return whether XML declares no entities, in an encoding with an ASCII declaration."""
     text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
@@ -299,18 +292,16 @@ def _check_arrays(root: ET.Element) -> None:
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
     room = MAX_ELEMENTS
     for variable in root.iterfind("ModelVariables/*"):
-        dimensions = variable.findall("Dimension")
+        name, dimensions = variable.get("name"), variable.findall("Dimension")
         texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
         if len(texts) > MAX_DIMENSIONS:
-            raise ValueError(f"variable '{variable.get('name')}' has more than {MAX_DIMENSIONS} dimensions")
+            raise ValueError(f"variable '{name}' has more than {MAX_DIMENSIONS} dimensions")
         if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
-            raise ValueError(f"variable '{variable.get('name')}' has a dimension of no known size")
+            raise ValueError(f"variable '{name}' has a dimension of no known size")
         elements, aliases = math.prod(max(1, int(text)) for text in texts), len(variable.findall("Alias"))
         room -= elements * (1 + aliases) if dimensions else aliases
         if room < 0:
-            raise ValueError(
-                f"with variable '{variable.get('name')}' its arrays have more than {MAX_ELEMENTS} elements"
-            )
+            raise ValueError(f"with variable '{name}' its arrays have more than {MAX_ELEMENTS} elements")
 
 
 def _checksums(archive: zipfile.ZipFile) -> dict[str, int]:
