@@ -2,7 +2,10 @@
 
 import functools
 import re
+import struct
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import fmpy
 import native_models
@@ -11,14 +14,17 @@ import pytest
 import scipy.linalg
 import scipy.special
 import scipy.stats
+from harness import wine
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from tools import needs
 
 import twodof
 from twodof import FmuOptions, build_fmu, linearise, load_fmu
 from twodof.errors import TwoDofError
+from twodof.export.compiler import FLAGS, TARGETS, ZIG
 from twodof.fmu import instantiate, resolve
 from twodof.plant.noise import WORD, logarithm, normal_pair, philox
 from twodof.plant.plant import Plant
@@ -218,6 +224,46 @@ def test_every_flavour_has_the_same_noise_to_the_bit(fmus, kind):
     for seed in (0, 1, 2**31 - 1):
         rows = run(fmus("slider", "effort", kind), 0.5, 0.01, q_start=0.0, q_noise=1.0, v_noise=1.0, seed=seed)
         assert [tuple(row[3:]) for row in rows] == [normal_pair(seed, k, 0) for k in range(51)]
+
+
+NOISE = """
+#include <inttypes.h>
+#include <stdio.h>
+#include <string.h>
+#include "noise.c"
+int main(void)
+{
+    for (int i = 0; i < 3000; i++) {
+        double pair[2];
+        uint64_t bits[2];
+        normal_pair(i % 3 * 1073741823.0, i % 2 ? i : 9007199254740991.0 - i, i % 7, pair);
+        memcpy(bits, pair, sizeof bits);
+        printf("%016" PRIx64 " %016" PRIx64 "\\n", bits[0], bits[1]);
+    }
+}
+"""
+
+
+@pytest.mark.parametrize("machine", ["here", "ARM", "Windows"])
+def test_every_platform_has_the_same_noise_to_the_bit(machine, tmp_path):
+    """Compiled with the flags of FMUs; run by qemu and wine."""
+    (tmp_path / "main.c").write_text(NOISE)
+    sources, program = Path(twodof.__file__).parents[1] / "fmu_src/native", tmp_path / "noise.exe"
+    if machine == "ARM":
+        emulator = [needs("qemu"), "-L", str(Path(needs("libc-arm64")).parents[1])]
+        compiler = [*ZIG, *TARGETS["aarch64-linux"]]
+        needs("ziglang")
+    else:
+        emulator, compiler = [], [needs("gcc" if machine == "here" else "mingw")]
+    command = [*compiler, *FLAGS, f"-I{sources}", "-o", str(program), "main.c", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    if machine == "Windows":
+        with wine(tmp_path) as (loader, environment):
+            told = subprocess.run([loader, program], env=environment, capture_output=True, text=True, check=True).stdout
+    else:
+        told = subprocess.run([*emulator, program], capture_output=True, text=True, check=True).stdout
+    ours = [normal_pair(i % 3 * 1073741823, i if i % 2 else 2**53 - 1 - i, i % 7) for i in range(3000)]
+    assert told.split() == [struct.pack(">d", x).hex() for pair in ours for x in pair]
 
 
 def test_noise_is_normal_and_independent():
