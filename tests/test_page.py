@@ -35,6 +35,7 @@ from browser import (
 )
 from mcap_ros2.reader import read_ros2_messages
 from native_models import robots_folder
+from PIL import Image
 from playwright.sync_api import Browser, Page, ViewportSize
 from rosbags.rosbag2 import Reader
 from tools import needs
@@ -311,7 +312,64 @@ def test_what_the_buttons_and_keys_do(page) -> None:
     until(page, lambda text: "target out of reach" in text, said)
     until(page, lambda count: count > 5, ball)  # which is followed
     page.evaluate("arm.set('x_des', [0.2, 0.05]); arm.set('q_max[1]', 0.5)")
-    until(page, lambda text: "joint1 at limit" in text, said)
+    until(page, lambda text: "not reached: joint 'joint1' is at its upper limit" in text, said)
+
+
+HINT = "drag the ball: it is the target"
+HELD = {"q_des": [0.5, 0.8], "q_max": [1.0, 0.6]}
+SADDLED = {"payload": 9.0, "payload_known": True, "limit_effort": True, "gravity": [0.0, -9.81, 0.0]}
+
+
+@pytest.mark.parametrize(
+    ("control", "settings", "words"),
+    [
+        (
+            "task",
+            {"x_des": [0.5, 0.1]},
+            "target out of reach by 0.2099 m; the nearest reachable point is (0.2942, 0.05883)",
+        ),
+        ("task", {"x_des": [200.0, 50.0]}, "in millimetres?"),
+        ("joint", {"q_des": [90.0, 0.35]}, "q_des[1] = 90 rad: 90°? That is 1.571 rad"),
+        ("joint", HELD, "the target 0.8 rad of joint 'joint2' is out of reach by 0.2 rad"),
+        ("task", {"q_min": [0.2, -3.0]}, "joint 'joint1' is at its lower limit"),
+        ("task", {"f_ext": [0.0, 3.0, 0.0]}, "f_ext = (0, 3, 0) acts"),
+        ("task", {"payload": 3.0, "f_ext": [0.0, 1.0, 0.0]}, "the controller does not know the payload of 3 kg"),
+        ("task", {"Kp": [50.0, 0.0]}, "Kp[2] = 0: nothing pulls"),
+        ("task", {"Kd": 0.0, "Kp": 20.0}, "Kd[1] = 0 s⁻¹ damps too little: critical is 8.944 s⁻¹"),
+        ("joint", {"friction": [20.0, 0.0]}, "joint 'joint1' sticks: its friction of 20 holds it"),
+        ("joint", SADDLED, "the motor of joint 'joint1' is saturated for 100 % of the time"),
+        ("task", {"q_start": [0.0, 0.0], "x_des": [0.2, 0.0]}, "the arm is near a singularity"),
+    ],
+)
+def test_the_verdict_names_the_cause(browser, arms, control, settings, words) -> None:
+    with shown(browser, arms[control]) as page:
+        page.evaluate("() => { arm.play(false); arm.startAgain(true); }")
+        if control == "joint" and "q_des" not in settings:
+            settings = {"q_des": [0.9, 0.7], **settings}
+        page.evaluate("settings => { for (const [k, v] of Object.entries(settings)) arm.set(k, v); }", settings)
+        page.wait_for_timeout(300)  # the page sees the target
+        page.evaluate("arm.step(500)")
+        until(page, lambda text: text.splitlines()[:1] and words in text.splitlines()[0], said)
+
+
+@pytest.fixture(scope="module")
+def arms(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The default arm's pages, by control."""
+    folder = tmp_path_factory.mktemp("arms")
+    joint = twodof.build_fmu(folder / "joint.fmu", twodof.FmuOptions(native=True, control="joint"))
+    return {"task": arm, "joint": twodof.page(joint, folder / "joint.html")}
+
+
+def test_a_run_that_reaches_its_target_has_no_cause(browser, arms) -> None:
+    """At the target, on the way to it and after a drag to another, in all steps."""
+    with shown(browser, arms["task"]) as page:
+        page.evaluate("() => { arm.play(false); arm.startAgain(true); }")
+        for target in ([0.2, 0.05], [-0.1, 0.2], [0.0, -0.25]):
+            page.evaluate("x => arm.set('x_des', x)", target)
+            for _ in range(8):
+                page.evaluate("arm.step(40)")
+                page.wait_for_timeout(150)
+                assert said(page) in ("", HINT)
 
 
 def test_friction_and_sampling_are_set_in_the_panel(page) -> None:
@@ -344,6 +402,83 @@ def ball(page: Page) -> int:
 
 def said(page: Page) -> str:
     return str(page.locator("#arm-said").text_content())
+
+
+def test_the_url_has_what_was_set(browser, arm, page) -> None:
+    page.evaluate("() => { arm.set('Kp', [80, 60]); arm.set('x_des[2]', -0.1); arm.set('limit_effort', true); }")
+    expected = "#x_des=0.2,-0.1&Kp=80,60&limit_effort=true"
+    until(page, lambda found: sorted(found[1:].split("&")) == sorted(expected[1:].split("&")), fragment)
+    for part, said_of in ((expected, ""), ("#Kp=1,2,3", "Kp has 2 elements"), ("#Kq=1", "there is no variable 'Kq'")):
+        with browser.new_context(viewport=VIEWPORT, offline=True) as context:
+            other = context.new_page()
+            other.goto(arm.as_uri() + part)
+            other.wait_for_selector(READY)
+            values = other.evaluate("[...arm.held('Kp'), ...arm.held('x_des'), arm.values.get('limit_effort')]")
+            assert values == ([50, 50, 0.2, 0.05, False] if said_of else [80, 60, 0.2, -0.1, True])
+            assert said_of in said(other)
+    page.evaluate("arm.startAgain(true)")
+    until(page, lambda found: found == "", fragment)
+
+
+def fragment(page: Page) -> str:
+    return str(page.evaluate("decodeURI(location.hash)"))
+
+
+def test_keys_turn_the_view_of_a_robot_in_space_and_move_that_of_a_flat_one(browser, panda, page, tmp_path) -> None:
+    before, ball_at = picture(page), target_place(page)
+    page.locator("#arm-scene").focus()
+    page.keyboard.press("ArrowRight")
+    assert target_place(page)[0] == pytest.approx(ball_at[0] + 0.04 * before.shape[1], abs=2.0)
+    press(page, "View")
+    with shown(browser, twodof.page(panda, tmp_path / "panda.html")) as other:
+        other.evaluate("arm.play(false)")
+        seen = picture(other)
+        other.locator("#arm-scene").focus()
+        for key in ("ArrowLeft", "ArrowUp", "+"):
+            other.keyboard.press(key)
+            turned = picture(other)
+            assert (np.abs(turned.astype(int) - seen).max(axis=2) > 40).mean() > 0.01, key
+            seen = turned
+
+
+def test_the_hint_goes_with_the_first_drag(browser, arm) -> None:
+    with shown(browser, arm) as page:
+        page.evaluate("() => { arm.play(false); arm.startAgain(true); }")
+        assert HINT in said(page)
+        x, y = target_place(page)
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 30, y)
+        page.mouse.up()
+        until(page, lambda text: HINT not in text, said)
+
+
+def test_the_picture_is_that_of_the_scene(page, tmp_path) -> None:
+    with page.expect_download() as download:
+        press(page, "Picture")
+    assert download.value.suggested_filename == "TwoDof.png"
+    download.value.save_as(tmp_path / "arm.png")
+    shown_now, saved = picture(page), np.asarray(Image.open(tmp_path / "arm.png").convert("RGB"))
+    small = np.asarray(Image.fromarray(saved).resize(shown_now.shape[1::-1]))
+    assert np.abs(small.astype(int) - shown_now).mean() < 2.0
+
+
+def test_units_stand_beside_the_sliders(page) -> None:
+    units = page.locator("#arm-controls label:visible small").all_text_contents()
+    assert units[:4] == ["m", "m", "s⁻²", "s⁻¹"]
+
+
+def test_a_robot_in_space_stands_on_a_floor_with_its_shadow(browser, panda, tmp_path) -> None:
+    """The shadow's pixels are where the floor's point below the hand is seen, and go with it."""
+    with shown(browser, twodof.page(panda, tmp_path / "panda.html")) as page:
+        page.evaluate("arm.play(false)")
+        places = []
+        for q1 in (0.0, 0.7):
+            page.evaluate("q => arm.set('q_start[1]', q)", q1)
+            shade = pixels(picture(page), lambda r, g, b: (r == 219) & (g == 224) & (b == 229))
+            places.append(shade.mean(axis=0))
+            assert len(shade) > 300
+        assert np.hypot(*(places[1] - places[0])) > 10.0
 
 
 def test_a_browser_without_3d_shows_the_rest(browser, arm) -> None:

@@ -14,7 +14,7 @@ Run it:                         run (the same as simulate), experiment, Experime
 Run it step by step:            samples, Sample, Sink
 Judge a run:                    verdict, Verdict
 Write and read bags:            Bag, read_bag, Recording, export_bag, read_commands, recover
-Draw figures and pages:         plot, view, page, live
+Draw figures and pages:         plot, view, page, live, show
 Run it over many gains:         sweep, read_sweep
 Linear models:                  linearise, LinearModel
 ROS 2 and Foxglove:             publish, publish_together, Publisher, Foxglove, layouts

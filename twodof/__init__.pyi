@@ -17,6 +17,7 @@ from .linear import LinearModel as LinearModel
 from .linear import linearise as linearise
 from .pages.arm import page as page
 from .pages.foxglove import Foxglove as Foxglove
+from .pages.inline import show as show
 from .pages.live_page import live as live
 from .pages.replay import view as view
 from .plots.runs import plot as plot

@@ -6,10 +6,10 @@ const SENSORS = ["q_resolution", "q_noise", "v_noise"];
 const PER_JOINT = ["q_des", "v_des", "a_des", "tau_cmd", "tau_ext", "q_start", "v_start", ...JOINTS, ...SENSORS];
 const PER_AXIS = ["x_des", "xd_des", "xdd_des"];
 const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
-  ["target or command", true, ["x_des", "q_des", "tau_cmd"]],
+  ["target or command", true, ["x_des", "quat_des", "q_des", "tau_cmd"]],
   ["gains", true, GAINS],
   ["disturbance and payload", false, ["f_ext", "tau_ext", "payload", "payload_com", "payload_known"]],
-  ["feedforward", false, ["quat_des", "xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
+  ["feedforward", false, ["xd_des", "xdd_des", "omega_des", "alpha_des", "v_des", "a_des"]],
   ["parameters (a change restarts the simulation)", false, ["limit_effort", "rigid_stops", "q_start", "v_start", "gravity"]],
   ["joints (a change restarts the simulation)", false, JOINTS],
   ["sampling (a change restarts the simulation)", false, ["control_period", "control_delay", "v_from_q", ...SENSORS]],
@@ -80,7 +80,7 @@ class Controls {
       return input;
     });
     this.fields.set(first, inputs);
-    const row = element("label", "", label, ...inputs);
+    const row = element("label", "", label, ...inputs, element("small", unitText(variable.unit)));
     row.className = "slider";
     return row;
   }
@@ -130,6 +130,12 @@ class Controls {
       }
     }
   }
+}
+
+/** An FMI unit as people write it: 1/s2 is s⁻². */
+/** @param {string} unit */
+function unitText(unit) {
+  return unit.replace("1/s2", "s⁻²").replace("1/s", "s⁻¹").replace("2", "²").replace(/\./g, "·");
 }
 
 /** Units of position, velocity and effort. */

@@ -1,5 +1,7 @@
 /** What is dragged in the scene: the target, rings that turn it, and else the view. */
 
+const KEYS = /** @type {Record<string, [number, number]>} */ ({ ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] });
+const STEP = 0.04; // of the picture, by a key
 const GRIP = 26, GRIP_OF_RING = 12; // pixels
 const RING = 0.16; // of the size of the scene
 const RING_POINTS = 48;
@@ -25,6 +27,7 @@ class Handle {
     this.pointers = new Map();
     /** @type {((x: number, y: number) => void) | null} */
     this.drag = null;
+    this.hint = this.axes.length ? "drag the ball: it is the target" : ""; // until the user does
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const end of /** @type {const} */ (["pointerup", "pointercancel"]))
@@ -37,6 +40,14 @@ class Handle {
       camera.zoom(Math.exp(event.deltaY / 800));
     }, { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("keydown", (event) => {
+      const along = KEYS[event.key], zoom = { "+": 1 / 1.1, "-": 1.1 }[event.key];
+      if (event.ctrlKey || event.metaKey || event.altKey || !(along || zoom)) return;
+      event.preventDefault();
+      if (zoom) camera.zoom(zoom);
+      else if (camera.flat !== event.shiftKey) camera.pan(STEP * along[0], STEP * along[1]);
+      else camera.orbit(STEP * along[0], STEP * along[1]);
+    });
   }
 
   /** @param {PointerEvent} event */
@@ -61,7 +72,7 @@ class Handle {
     this.drag = null;
     if (this.pointers.size > 1 || event.button !== 0) return;
     const ring = this.turns ? this.nearest(at, grip) : -1;
-    if (this.axes.length && this.distance(at, this.place()) < GRIP * grip) this.drag = this.carry(at);
+    if (this.axes.length && this.distance(at, this.place()) < GRIP * grip) [this.drag, this.hint] = [this.carry(at), ""];
     else if (ring >= 0) this.drag = this.turn(at, ring);
   }
 

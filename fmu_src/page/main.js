@@ -1,6 +1,7 @@
 /** The page: what is stepped, drawn and told, and when. */
 
 const TRAIL = 1.5; // s
+const TILES = 10; // of the floor, to each side
 const MOMENTS = 30, PATH_POINTS = 600; // of a replay, that are in the picture at first, and of its path
 const PANEL = 0.1; // s between pictures of curves and numbers, where no cursor asks for more
 
@@ -21,6 +22,11 @@ class App {
    */
   constructor(facts, session, meshes) {
     this.session = session;
+    if (session instanceof Session) {
+      const restore = () => this.attempt(() => session.restore(location.hash.slice(1)));
+      if (location.hash) restore();
+      addEventListener("hashchange", restore);
+    }
     for (const id of session.without) byId(id).hidden = true;
     this.robot = new Robot(facts);
     const gl = byId("scene").getContext("webgl2", { antialias: false, alpha: false });
@@ -34,6 +40,9 @@ class App {
     this.curves = new Curves(this.session, this.panels(), byId("curves"));
     this.readout = new Readout(this.session, this.curves);
     this.controls = session.steered ? new Controls(session, this.reach, tell) : null;
+    this.verdict = session.steered ? new Verdict(session, this.robot) : null;
+    /** @type {string[]} */
+    this.lines = [];
     byId("controls").append(...facts.remarks.map((remark) => element("p", remark)));
     this.drawn = -Infinity; // when the panel was, ms
     this.slow = 0; // frames, until now
@@ -153,7 +162,11 @@ class App {
     on("reset", () => this.restart(false));
     on("defaults", () => this.restart(true));
     on("home", () => this.camera.reset());
-    on("download", () => this.download());
+    on("download", () => session instanceof Session && save(new Blob([mcap(session, this.robot)]), `${session.facts.name}.mcap`));
+    on("picture", () => {
+      this.show(); // a scene is kept until the browser has shown it
+      byId("scene").toBlob((/** @type {Blob} */ content) => save(content, `${session.facts.name || "robot"}.png`));
+    });
     if (session instanceof Remote) on("record", () => this.order(() => session.record()));
     if (session instanceof Replay) {
       byId("scrub").max = String(session.duration);
@@ -177,15 +190,6 @@ class App {
     this.curves.chosen = null;
   }
 
-  download() {
-    if (!(this.session instanceof Session)) return;
-    const link = document.createElement("a"), content = mcap(this.session, this.robot);
-    link.href = URL.createObjectURL(new Blob([content]));
-    link.download = `${this.session.facts.name}.mcap`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-  }
-
   /** @param {number} now ms */
   frame(now) {
     const { session } = this, passed = (now - this.before) / 1000;
@@ -205,8 +209,11 @@ class App {
     const target = this.target(k);
     if (!this.handle.drag && target.every(Number.isFinite)) camera.follow(target);
     if (scene) {
-      session.facts.shapes.forEach(({ link, place, colour }, i) => {
-        scene.addSolid(i + 1, multiply(links[link], place), [...colour, 1]);
+      const flat = this.addFloor(scene, fractions(colour("--hair")));
+      session.facts.shapes.forEach(({ link, place, colour: own }, i) => {
+        const model = multiply(links[link], place);
+        scene.addSolid(i + 1, model, [...own, 1]);
+        if (flat && scene.fineness > 1) scene.addSolid(i + 1, multiply(flat, model), [...fractions(colour("--shade")), 2]);
       });
       this.addTrail(scene, k, links);
       scene.draw(camera, fractions(colour("--scene")), Number(colour("--bright")));
@@ -216,17 +223,20 @@ class App {
     const sticks = stuck.length ? `${stuck.map(({ name }) => name).join(", ")}: held by friction` : "";
     if (this.curves.cursor !== null || this.before - this.drawn > 1000 * PANEL) {
       this.curves.draw([colour("--ink"), colour("--hair")]);
-      this.readout.show(k, stopped, this.places(k), session.groups.has("quat_des") ? this.turnError(k) : NaN);
+      const turns = session.groups.has("quat_des");
+      this.readout.show(k, stopped, this.places(k), turns ? this.turnError(k) : NaN);
+      this.lines = this.verdict?.lines(turns ? this.turnError(session.count - 1) : NaN) ?? [];
       this.controls?.show();
       this.label();
       byId("time").textContent = `${session.time(k).toFixed(3)} s`;
+      if (session instanceof Session && location.protocol !== "about:" && decodeURI(location.hash.slice(1)) !== session.state)
+        history.replaceState(null, "", `#${session.state}`);
       if (session instanceof Replay) byId("scrub").value = String(session.moment);
       this.drawn = this.before;
     }
-    const far = session.groups.has("x_des") && Math.hypot(...plus(target, -1, this.reach.centre)) > this.reach.radius;
     const blind = scene ? "" : "this browser shows no 3D: it has no WebGL 2";
-    const notes = [blind, session.said, session.notice, far ? "target out of reach" : "", sticks];
-    notes.push(...stopped.map((joint) => `${joint.name} at limit`));
+    const unsaid = this.lines.some((line) => line.includes("sticks")) ? "" : sticks;
+    const notes = [blind, session.said, session.notice, ...this.lines, unsaid, this.handle.hint];
     const text = notes.filter(Boolean).join("\n");
     if (byId("said").textContent !== text) byId("said").textContent = text;
   }
@@ -237,6 +247,23 @@ class App {
     const { groups, facts } = this.session;
     if (facts.links.length === 1) return {};
     return { "end effector": this.end(k), ...(groups.has("x_des") && { target: this.target(k) }) };
+  }
+
+  /** Draw axes at the root and, below a robot in space, a floor; return what casts a shadow onto that. */
+  /** @type {(scene: Scene, colour: number[]) => Float64Array | null} */
+  addFloor(scene, colour) {
+    const { camera } = this, up = camera.view.vertical, size = camera.size;
+    AXIS_COLOURS.forEach((own, i) => scene.addLine([[0, 0, 0], plus([0, 0, 0], 0.1 * size, base(i))], [...own, 0.9], 1.5, scene.ground));
+    if (camera.flat) return null;
+    const normal = up.findIndex(Boolean), [one, two] = [1, 2].map((i) => base((normal + i) % 3)), cell = 10 ** Math.floor(Math.log10(size / 2));
+    for (let i = -TILES; i <= TILES; i++)
+      for (const [a, b] of [[one, two], [two, one]]) {
+        const [from, to] = [-TILES, TILES].map((end) => plus(plus([0, 0, 0], end * cell, a), i * cell, b));
+        scene.addLine([from, to], [...colour, 1], 1, scene.ground);
+      }
+    const shadow = placed([0, 0, 0]);
+    shadow[5 * normal] = 0;
+    return shadow;
   }
 
   /** What is drawn beside the robot. */
@@ -264,6 +291,14 @@ class App {
       }
     });
   }
+}
+
+/** Let the browser save a file. */
+/** @type {(content: Blob, name: string) => void} */
+function save(content, name) {
+  const link = document.createElement("a");
+  Object.assign(link, { href: URL.createObjectURL(content), download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
 }
 
 /** @param {string} colour as #rrggbb */

@@ -15,7 +15,7 @@ const SOLID = [
   in vec3 turned; out vec4 shown;
   void main() {
     float lit = dot(normalize(turned), light);
-    shown = vec4(mix(colour.rgb, vec3(1.0), bright) * (0.55 + 0.35 * lit + 0.15 * max(lit, 0.0)), colour.a);
+    shown = colour.a > 1.0 ? vec4(colour.rgb, 1.0) : vec4(mix(colour.rgb, vec3(1.0), bright) * (0.55 + 0.35 * lit + 0.15 * max(lit, 0.0)), colour.a);
   }`,
 ];
 const LINES = [
@@ -43,6 +43,8 @@ const LINE_SIZE = 11; // numbers of one
 class Scene {
   /** @type {number[]} to be drawn next */
   lines = [];
+  /** @type {number[]} likewise, below all else */
+  ground = [];
   /** @type {{mesh: number, model: Float64Array, colour: number[]}[]} */
   solids = [];
   fineness = 2; // pixels that are computed for one that is shown, along each side
@@ -111,16 +113,19 @@ class Scene {
     return { array, count: indices.length };
   }
 
-  /** A mesh in red, green, blue, and how much it covers: where not all, it is seen before all that do. */
+  /**
+   * A mesh in red, green, blue, and how much it covers: with less than 1 it is seen before all that cover, and
+   * with 2 it is flat, without light and behind them.
+   */
   /** @type {(mesh: number, model: Float64Array, colour: number[]) => void} */
   addSolid(mesh, model, colour) {
     this.solids.push({ mesh, model, colour });
   }
 
   /** Lines from point to point in such a colour, of a width in pixels. */
-  /** @type {(points: number[][], colour: number[], width: number) => void} */
-  addLine(points, colour, width) {
-    for (let i = 1; i < points.length; i++) this.lines.push(...points[i - 1], ...points[i], ...colour, width);
+  /** @type {(points: number[][], colour: number[], width: number, into?: number[]) => void} */
+  addLine(points, colour, width, into = this.lines) {
+    for (let i = 1; i < points.length; i++) into.push(...points[i - 1], ...points[i], ...colour, width);
   }
 
   /** Show what was added, its colours so far from their own towards white. */
@@ -136,21 +141,32 @@ class Scene {
     gl.clearColor(background[0], background[1], background[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const light = unit(plus(plus(camera.back, 0.5, camera.up), 0.3, camera.right));
+    this.drawLines(this.ground, view, ratio / width, ratio / height);
+    this.drawSolids(this.solids.filter(({ colour }) => colour[3] > 1), view, light, bright);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
     this.drawSolids(this.solids.filter(({ colour }) => colour[3] === 1), view, light, bright);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.enable(gl.CULL_FACE); // a far side would be seen in part
     this.drawSolids(this.solids.filter(({ colour }) => colour[3] < 1), view, light, bright);
     gl.disable(gl.CULL_FACE);
+    gl.disable(gl.BLEND);
+    this.drawLines(this.lines, view, ratio / width, ratio / height);
+    [this.lines, this.ground, this.solids] = [[], [], []];
+  }
+
+  /** @type {(lines: number[], view: Float64Array, across: number, up: number) => void} */
+  drawLines(lines, view, across, up) {
+    const { gl } = this;
+    gl.enable(gl.BLEND);
     gl.useProgram(this.line);
     gl.bindVertexArray(this.linesArray);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.linesBuffer);
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(this.lines), gl.DYNAMIC_DRAW);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(lines), gl.DYNAMIC_DRAW);
     gl.uniformMatrix4fv(gl.getUniformLocation(this.line, "view"), false, new Float32Array(view));
-    gl.uniform2f(gl.getUniformLocation(this.line, "pixel"), ratio / width, ratio / height);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.lines.length / LINE_SIZE);
+    gl.uniform2f(gl.getUniformLocation(this.line, "pixel"), across, up);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, lines.length / LINE_SIZE);
     gl.disable(gl.BLEND);
-    [this.lines, this.solids] = [[], []];
   }
 
   /** @type {(solids: Scene["solids"], view: Float64Array, light: number[], bright: number) => void} */

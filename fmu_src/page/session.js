@@ -39,6 +39,30 @@ class Session extends Samples {
     this.record();
   }
 
+  /** Groups of inputs and parameters that differ from the FMU's, as the fragment of a URL. */
+  get state() {
+    const own = this.defaults(), differ = (/** @type {string} */ name) => this.values.get(name) !== own.get(name);
+    const groups = [...this.groups].filter(([, names]) => names.some(differ));
+    return groups.map(([group, names]) => `${group}=${names.map((name) => this.values.get(name))}`).join("&");
+  }
+
+  /** Restart with the inputs and parameters of such a fragment. */
+  /** @param {string} state */
+  restore(state) {
+    this.values = this.defaults();
+    try {
+      const pairs = decodeURIComponent(state).split("&").filter(Boolean).flatMap((part) => {
+        const [group, ...values] = part.split(/[=,]/);
+        return this.checked(group, /** @type {any} */ (values.map((text) => (text === "true" || text === "false" ? text === "true" : Number(text || NaN)))));
+      });
+      this.values = new Map([...this.values, ...pairs]);
+      this.startAgain();
+    } catch (refused) {
+      this.startAgain(true);
+      throw refused;
+    }
+  }
+
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
     this.engine.set(

@@ -13,13 +13,13 @@ from .signals import asked_to_stop
 
 def add(view: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
-    view.description = "Replay a bag in the browser, or write a page that replays it offline."
+    view.description = "Replay a bag in the browser, or write a page or a film that replays it offline."
     view.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag")
     view.add_argument(
         "--export",
         type=output_file,
-        metavar="FILE.html",
-        help="write one self-contained file instead; - is the standard output",
+        metavar="FILE",
+        help="write a page, .html, or a film, .mp4, .webp, .gif or .png, instead; - is the standard output",
     )
     add_robot_options(view)
     view.add_argument("--mesh-dir", type=Path, metavar="M", help="folder of the packages or meshes of the URDF")
@@ -30,12 +30,13 @@ def add(view: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
-    from ..pages.replay import export, view
+    from ..pages.replay import PICTURES, export, view
 
     robot = said(options, "urdf", "mesh_dir", "frame", "fmu")
     if options.export:
         _print_remarks(export(options.bag, options.export, **robot))
-        say(f"page  {options.export}; it needs no network")
+        film = Path(options.export).suffix.lower() in PICTURES
+        say(f"film  {options.export}" if film else f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:
         view(options.bag, asked, lambda url, remarks: open_page(options, url, remarks), **place(options), **robot)

@@ -83,8 +83,16 @@ def page(
         PageError: the FMU is not a native one of this package, or the page cannot be written.
         BuildError: there is no compiler.
     """
-    run = experiment(fmu, stop_time=inf, step=step, settings=settings)
-    fmu, path, sources = run.fmu, Path(output), _sources(run.fmu)
+    path = Path(output)
+    content = page_of(experiment(fmu, stop_time=inf, step=step, settings=settings))
+    with refusing(PageError, f"write '{path}'"):
+        write_file(path, content)
+    return path
+
+
+def page_of(run: Experiment) -> bytes:
+    """Return the HTML of a run's FMU; errors as of ``page``."""
+    fmu, sources = run.fmu, _sources(run.fmu)
     if not fmu.control or not sources:
         raise PageError(
             f"'{fmu.path}' has no plant in C, as native FMUs of this package have;"
@@ -96,10 +104,7 @@ def page(
     provenance = provenance_of(run, "")
     provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # no other package is at work
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
-    content = arm_page(arm.title, arm, engine, allowed, provenance=provenance)
-    with refusing(PageError, f"write '{path}'"):
-        write_file(path, content)
-    return path
+    return arm_page(arm.title, arm, engine, allowed, provenance=provenance)
 
 
 def is_page(path: Path) -> bool:

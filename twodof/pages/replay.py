@@ -20,6 +20,8 @@ from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
 from ..geometry.shapes import Shape, link_shapes
 from ..plant.urdf import RobotError, read_urdf
+from ..plots.film import PICTURES as PICTURES
+from ..plots.film import film
 from ..plots.track import Track, read_tracks
 from ..signatures import check_keywords, ignore, never, with_keywords_of
 from .arm import RECORDED, Arm, arm_page
@@ -186,11 +188,20 @@ def view(
 
 
 def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotOptions]) -> Sequence[str]:
-    """Write a replay as one HTML file; return its remarks. Options are those of ``replay``.
+    """Write a replay as one HTML file, or as a film; return its remarks. Options are those of ``replay``.
 
     Raises:
-        PageError: it cannot be written.
+        PageError: its name has an unknown suffix, an option does nothing, or it cannot be written.
     """
+    suffix = Path(path).suffix.lower()
+    if suffix in PICTURES:
+        useless = [name for name in ("mesh_dir", "fmu") if robot.get(name) is not None]
+        if useless:
+            raise PageError(f"a film shows the arm as lines: `{useless[0]}`, of its meshes, does nothing")
+        film(bag, path, urdf=robot.get("urdf"), frame=robot.get("frame"))
+        return []
+    if suffix not in ("", ".html", ".htm"):
+        raise PageError(f"'{path}': the name of an export ends in .html, {', '.join(PICTURES)}")
     page, remarks = replay(bag, **robot)
     with refusing(PageError, f"write '{path}'"):
         write_file(Path(path), page)

@@ -100,7 +100,7 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
     """
     path = Path(output) if output is not None else free_name(drawing.name, ".png", _is_ours)
     kind = file_kind(path)
-    content = _html(drawing) if kind == "html" else _rendered(drawn(drawing), kind)
+    content = html_of(drawing) if kind == "html" else _rendered(drawn(drawing), kind)
     with refusing(PlotError, f"write '{path}'"):
         write_file(path, content)
     return path
@@ -195,7 +195,7 @@ def _rendered(figure: Figure, kind: str) -> bytes:
     return content.getvalue()
 
 
-def _html(drawing: Drawing) -> bytes:
+def html_of(drawing: Drawing) -> bytes:
     """Return a self-contained page: the drawing's own body or the figure as SVG, and a table."""
     if drawing.body:
         body = drawing.body()

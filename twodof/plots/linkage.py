@@ -66,11 +66,11 @@ class Linkage(NamedTuple):
 
     def motion(self, q: Array) -> Motion:
         """Return the motion of the links for q, N × ``moving``, rad or m."""
-        start, end = self._skeletons(q[[0, -1]])
+        start, end = self.skeletons(q[[0, -1]])
         path, reach = self.kinematics.path(self.frame, q), self._reach()
         return Motion(self.urdf.name, self.frame, self.urdf.root, path, start, end, reach)
 
-    def _skeletons(self, q: Array) -> Array:
+    def skeletons(self, q: Array) -> Array:
         """Return origins of the root, of the frame's joints, and of the frame; N × points × 3."""
         chain = self.urdf.chain(self.frame)
         transforms = self.kinematics.along(chain, q)
@@ -95,7 +95,7 @@ class Linkage(NamedTuple):
         normal = int(np.argmax(turns[0]))
         if (turns[:, normal] < 1.0 - 1e-9).any():
             return None
-        points = self._skeletons(at_zero)[0, 1:]
+        points = self.skeletons(at_zero)[0, 1:]
         links = np.delete(np.diff(points, axis=0), normal, axis=1)
         return Reach(points[0], float(np.linalg.norm(links, axis=1).sum()), normal)
 

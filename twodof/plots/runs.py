@@ -149,13 +149,7 @@ def _time_axis(axes: Axes, end: float, *, labelled: bool = True) -> None:
 def _draw_workspace(figure: SubFigure, pictures: Sequence[View], heading: str) -> None:
     every = figure.subplots(len(pictures), squeeze=False)[:, 0]
     for axes, view in zip(every, pictures):
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set(xlabel=f"{view.axes[0]} in m", ylabel=f"{view.axes[1]} in m")
-        _set_ticks(axes.xaxis, 5)
-        _set_ticks(axes.yaxis, 5)
-        _draw_strokes(axes, view.strokes)
-        axes.set_xlim(view.across, auto=True)  # so that the aspect may widen them
-        axes.set_ylim(view.up, auto=True)
+        draw_view(axes, view)
     every[0].set_title(heading, pad=ABOVE)
     figure.legend(
         handles=_key(stroke for view in pictures for stroke in view.strokes),
@@ -165,6 +159,17 @@ def _draw_workspace(figure: SubFigure, pictures: Sequence[View], heading: str) -
         columnspacing=1.0,
         borderaxespad=0.9,
     )
+
+
+def draw_view(axes: Axes, view: View) -> None:
+    """Draw a view of the workspace."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel=f"{view.axes[0]} in m", ylabel=f"{view.axes[1]} in m")
+    _set_ticks(axes.xaxis, 5)
+    _set_ticks(axes.yaxis, 5)
+    _draw_strokes(axes, view.strokes)
+    axes.set_xlim(view.across, auto=True)  # so that the aspect may widen them
+    axes.set_ylim(view.up, auto=True)
 
 
 def _draw_joint(axes: Axes, panel: Panel) -> None:

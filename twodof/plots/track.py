@@ -116,6 +116,13 @@ class Track:
         target = np.empty((len(x), 0)) if task is None else task.target
         return bag.verdict_with(self.linkage.urdf, self.linkage.frame, self.linkage.axes, x, target)
 
+    def skeletons(self, times: Array) -> Array:
+        """Return the points of the arm at N times between samples, s: root, joints and end effector, N × points × 3."""
+        assert self.linkage is not None
+        q = np.column_stack([np.interp(times, self.t, joint.q) for joint in self.joints])
+        names = [joint.name for joint in self.joints]
+        return self.linkage.skeletons(_of_linkage(self.recording, self.linkage, names, q))
+
     @property
     def name(self) -> str:
         """Name of the bag, with that of one of its robots."""
@@ -235,7 +242,7 @@ def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: 
     needed = {j.name if j.name in names else j.leader for j in linkage.chain}
     for j, joint in enumerate(linkage.moving):
         if joint.name in names:
-            if values.shape == bag.q.shape:
+            if values.shape[1:] == bag.q.shape[1:]:
                 ordered[:, j] = values[:, names.index(joint.name)]
         elif joint.name in needed:
             raise PlotError(

@@ -45,6 +45,10 @@ class Sample(NamedTuple):
     q_meas: tuple[float, ...] = ()
     v_meas: tuple[float, ...] = ()
 
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{name}={_brief(getattr(self, name))}" for name in ("q", "v", "x", "tau"))
+        return f"<Sample {self.k} at {self.t:g} s: {parts}>"
+
     @property
     def target(self) -> tuple[float, ...] | None:
         """Target x_des, m, one value for each of x; None where the FMU has no such inputs."""
@@ -60,6 +64,12 @@ class Sample(NamedTuple):
     def _given(self, group: str, size: int) -> tuple[float, ...] | None:
         values = [self.inputs.get(f"{group}[{k + 1}]") for k in range(size)]
         return tuple(map(float, values)) if values and None not in values else None  # type: ignore[arg-type]
+
+
+def _brief(values: tuple[float, ...]) -> str:
+    """Return three significant digits of up to three values."""
+    shown = [f"{value:.3g}" for value in values]
+    return f"({', '.join(shown if len(shown) <= 3 else [*shown[:2], f'… {len(shown)}'])})"
 
 
 class Sink:

@@ -1,0 +1,106 @@
+"""The film of a bag: by other readers, FFmpeg's and Pillow's, and the arm where the bag has it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from browser import pixels
+from PIL import Image
+
+import twodof
+from twodof.cli.main import main
+
+GREY = (91, 101, 112)
+STOP, TARGETS = 3.0, ((-0.2, 0.05), (0.1, 0.2))
+
+
+@pytest.fixture(scope="module")
+def bag(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bag = tmp_path_factory.mktemp("film") / "bag"
+    changes = [(1.0, {"x_des": TARGETS[1]})]
+    settings = {"x_des": TARGETS[0], "Kp": 100.0}
+    twodof.run(native_path, twodof.Bag(bag), stop_time=STOP, settings=settings, changes=changes)
+    return bag
+
+
+def frames(path: Path) -> list[np.ndarray]:
+    """Height × width × 3."""
+    if path.suffix == ".mp4":
+        with av.open(str(path)) as container:
+            return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    with Image.open(path) as image:
+        found = []
+        for k in range(getattr(image, "n_frames", 1)):
+            image.seek(k)
+            found.append(np.asarray(image.convert("RGB")))
+        return found
+
+
+def arm_box(picture: np.ndarray) -> np.ndarray:
+    """Least and most of x and y of the arm's pixels, y upwards."""
+    near = lambda *rgb: np.all([abs(a - b) < 25 for a, b in zip(rgb, GREY)], axis=0)  # noqa: E731
+    place = pixels(picture[150:], near) * (1, -1)
+    return np.array([place.min(axis=0), place.max(axis=0)])
+
+
+def pose_box(q: np.ndarray) -> np.ndarray:
+    """The same of the default arm's joints, m."""
+    angles = np.cumsum(q)
+    points = np.cumsum([[0.0, 0.0], *(0.15 * np.array([np.cos(a), np.sin(a)]) for a in angles)], axis=0)
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+@pytest.mark.parametrize(("kind", "rate"), [("mp4", 30), ("webp", 30), ("gif", 25)])
+def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag: Path, tmp_path: Path, kind: str, rate: int) -> None:
+    path = tmp_path / f"run.{kind}"
+    assert main(["view", str(bag), "--export", str(path)]) == 0
+    found = frames(path)
+    assert len(found) == round(STOP * rate) + 1
+    assert {frame.shape for frame in found} == {(720, 1280, 3)}
+    if kind == "mp4":
+        with av.open(str(path)) as container:
+            assert float(container.duration) / av.time_base == pytest.approx(len(found) / rate, abs=0.5 / rate)
+    else:
+        with Image.open(path) as image:
+            shown = [(image.seek(k), image.info["duration"])[1] for k in range(len(found))]
+            assert sum(shown) == pytest.approx(1e3 * len(found) / rate, abs=1e3 / rate)
+            assert image.info["loop"] == 0
+    recording = twodof.read_bag(bag)
+    poses = [np.array([np.interp(k / rate, recording.t, q) for q in recording.q.T]) for k in range(len(found))]
+    (W, H), (X, Y) = (np.diff(box(of), axis=0)[0] for box, of in ((arm_box, found[0]), (pose_box, poses[0])))
+    scale = (W - H) / (X - Y)  # in which the line's width cancels
+    edge = 0.5 * (W - scale * X)
+    offset = arm_box(found[0]).mean(axis=0) - scale * pose_box(poses[0]).mean(axis=0)
+    assert np.ptp(poses, axis=0).max() > 0.5
+    for picture, q in zip(found[::9], poses[::9]):
+        expected = offset + scale * pose_box(q) + edge * np.array([[-1, -1], [1, 1]])
+        np.testing.assert_allclose(arm_box(picture), expected, atol=5.0)
+
+
+def test_a_picture_is_the_end_of_the_run(bag: Path, tmp_path: Path) -> None:
+    for kind in ("png", "mp4"):
+        assert main(["view", str(bag), "--export", str(tmp_path / f"run.{kind}")]) == 0
+    (picture,), film = frames(tmp_path / "run.png"), frames(tmp_path / "run.mp4")
+    assert picture.shape == (720, 1280, 3)
+    off = [np.abs(picture.astype(int) - frame).mean() for frame in (film[0], film[-1])]
+    assert off[1] < 0.5 < off[0]
+
+
+def test_what_makes_no_film_is_said(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    for name, more, words in (
+        ("run.avi", [], "the name of an export ends in .html, .mp4, .webp, .gif, .png"),
+        ("run.mp4", ["--fmu", "a.fmu"], "a film shows the arm as lines: --fmu, of its meshes, does nothing"),
+        ("run.mp4", [], "cannot write"),
+    ):
+        assert main(["view", str(bag), "--export", str(tmp_path / name), *more]) == 1
+        said = capsys.readouterr().err
+        assert words in said and said.count("\n") == 1
+    assert "install the extra 'video'" in said
+    assert not [*tmp_path.iterdir()]

@@ -1,0 +1,68 @@
+"""Pages inline in a notebook: an arm that runs, a replay or a map of a sweep; offline, and without a server."""
+
+from __future__ import annotations
+
+from html import escape
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..bag.recording import Recording
+from ..errors import PageError
+from ..fmu import Fmu
+from ..simulation.experiments import experiment
+from .arm import page_of
+from .replay import replay
+
+if TYPE_CHECKING:
+    import pandas
+
+HEIGHT = 560  # pixels
+
+
+class Inline:
+    """A page that a notebook shows in a frame of its own."""
+
+    def __init__(self, page: str, height: int) -> None:
+        self._page, self._height = page, height
+
+    def __repr__(self) -> str:
+        return f"<page of {len(self._page) / 1024:.0f} KB>"
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{self._height}px;border:0"
+        return f'<iframe srcdoc="{escape(self._page)}" style="{style}" allow="fullscreen"></iframe>'
+
+
+def show(shown: Fmu | Recording | pandas.DataFrame | str | Path, *, height: int = HEIGHT) -> Inline:
+    """Return the page of an FMU, a recording or a sweep for a notebook, which displays it as a cell's result.
+
+    Args:
+        shown: a native FMU, whose plant runs in the page; a recording, which is replayed; the table of a sweep, which
+            becomes an interactive map; or the path of one of them.
+        height: of the frame, pixels.
+
+    Raises:
+        FmuError, BagError, SweepError, PageError, PlotError, BuildError: as ``page``, ``view`` and ``plot`` raise.
+    """
+    if not isinstance(shown, (Fmu, Recording, str, Path)):
+        return Inline(_map(shown, "sweep", None), height)
+    if isinstance(shown, Recording):
+        return Inline(replay(shown)[0].decode(), height)
+    if isinstance(shown, Fmu) or not Path(shown).is_dir():
+        return Inline(page_of(experiment(shown, stop_time=inf)).decode(), height)
+    folder = Path(shown)
+    if not any(folder.glob("*.parquet")):
+        return Inline(replay(folder)[0].decode(), height)
+    from ..sweeps.results import read_sweep
+
+    return Inline(_map(read_sweep(folder), folder.resolve().name, folder / "bags"), height)
+
+
+def _map(table: pandas.DataFrame, name: str, bags: Path | None) -> str:
+    from ..plots.figure import html_of
+    from ..plots.sweeps import drawing
+
+    if "provenance" not in getattr(table, "attrs", {}):
+        raise PageError("`show` shows an FMU, a recording, the table of a sweep, or the path of one of them")
+    return html_of(drawing(table, name, bags=bags)).decode()

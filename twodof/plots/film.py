@@ -1,0 +1,131 @@
+"""Film of a run: the arm moves through its workspace, in the views of the run's figure; needs no display."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bag.recording import Recording
+from ..errors import PlotError
+from ..files import refusing, write_file
+from ..version import needing
+from .figure import Drawing, draw_head, drawn
+from .panels import title
+from .runs import draw_view
+from .settings import number
+from .strokes import GREY, looks
+from .track import Track, read_tracks
+from .words import common_settings, outcome
+from .workspace import views
+
+# isort: split
+from matplotlib.backends.backend_agg import FigureCanvasAgg  # where it is missing, twodof.figure says so
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+
+SIZE, DOTS = (8.0, 4.5), 160  # inches, and pixels in one of them: 1280 × 720
+PALETTE = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"
+FILMS: dict[str, dict[str, Any]] = {
+    ".mp4": dict(
+        fps=30, codec="libx264", output_params=["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
+    ),
+    ".webp": dict(fps=30, codec="libwebp_anim", output_params=["-loop", "0", "-quality", "75"]),
+    ".gif": dict(fps=25, codec="gif", pix_fmt_out="pal8", output_params=["-filter_complex", PALETTE]),
+}
+"""How FFmpeg writes each format, by the file's suffix; a GIF has whole hundredths of a second for a frame."""
+PICTURES = (*FILMS, ".png")
+"""Suffixes of the formats; a PNG is the picture at the end."""
+
+
+def film(
+    bag: Recording | str | Path, output: str | Path, *, urdf: str | Path | None = None, frame: str | None = None
+) -> None:
+    """Write a bag as a film of 1280 × 720 pixels in real time, or the picture at its end.
+
+    Args:
+        bag: the bag, or its folder.
+        output: the file, written whole or not at all; its suffix, of ``PICTURES``, is the format.
+        urdf, frame: the robot and its end effector, as in ``track.read_tracks``.
+
+    Raises:
+        BagError: the bag cannot be read.
+        PlotError: there is no robot, the extra "video" is missing, or the file cannot be written.
+    """
+    path, track = Path(output), read_tracks([bag], urdf=urdf, frame=frame)[0]
+    if track.motion is None:
+        raise PlotError(f"'{track.recording.path}' carries no robot; give one with `urdf`")
+    kind, end, content = path.suffix.lower(), float(track.t[-1]), io.BytesIO()
+    if kind == ".png":
+        shape = (round(SIZE[1] * DOTS), round(SIZE[0] * DOTS), 4)
+        for picture in _frames(track, np.array([end])):
+            imsave(content, np.frombuffer(picture, np.uint8).reshape(shape), format="png")
+    else:
+        form = FILMS[kind]
+        times = np.arange(round(end * form["fps"]) + 1) / form["fps"]
+        content.write(_encoded(_frames(track, times), path, kind))
+    with refusing(PlotError, f"write '{path}'"):
+        write_file(path, content.getvalue())
+
+
+def _encoded(frames: Iterator[bytes], path: Path, kind: str) -> bytes:
+    """Return frames as a file's content, by FFmpeg."""
+    with needing(PlotError, f"write '{path}'", "video"):
+        import imageio_ffmpeg
+    size = tuple(round(side * DOTS) for side in SIZE)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, f"film{kind}")
+        # its default rounds the size up to whole blocks of 16 pixels
+        writer = imageio_ffmpeg.write_frames(
+            file, size, pix_fmt_in="rgba", quality=None, macro_block_size=2, ffmpeg_log_level="error", **FILMS[kind]
+        )
+        writer.send(None)
+        for frame in frames:
+            writer.send(frame)
+        writer.close()
+        return file.read_bytes()
+
+
+def _frames(track: Track, times: np.ndarray[Any, Any]) -> Iterator[bytes]:
+    """Yield pictures of the run at times since its first sample, s: red, green, blue and alpha of each pixel.
+
+    What stands still is drawn once; the arm's points are interpolated between samples by the joints' positions.
+    """
+    figure = drawn(Drawing(title([track]), track.name, partial(_draw, track), ()))
+    figure.set_dpi(DOTS)
+    canvas = FigureCanvasAgg(figure)
+    arms = [(axes, axes.lines[-1]) for axes in figure.axes]
+    clock = figure.text(0.99, 0.02, "", ha="right", color=GREY, animated=True)
+    canvas.draw()
+    still, points = canvas.copy_from_bbox(figure.bbox), track.skeletons(times)
+    planes = [["xyz".index(letter) for letter in axes.get_label()] for axes, _ in arms]
+    for t, arm in zip(times, points):
+        canvas.restore_region(still)
+        clock.set_text(f"{t:.2f} s of {number(float(track.t[-1]))} s")
+        for (axes, line), plane in zip(arms, planes):
+            line.set_data(*arm[:, plane].T)
+            axes.draw_artist(line)
+        figure.draw_artist(clock)
+        yield bytes(canvas.buffer_rgba())
+
+
+def _draw(track: Track, figure: Figure) -> None:
+    """Draw what stands still, and of each view the arm as its last line, which does not."""
+    room = draw_head(figure, title([track]), [common_settings([track]), *outcome(track)[:1]], SIZE)
+    figure.set_size_inches(SIZE)
+    every = views([track], {(0, ""): looks([track.name])[0]})
+    for axes, view in zip(room.subplots(1, len(every), squeeze=False)[0], every):
+        arms = [stroke for stroke in view.strokes if stroke.label == "arm at the end"]
+        others = [stroke for stroke in view.strokes if stroke.label != "arm at the end"]
+        draw_view(axes, view._replace(strokes=(*others, *arms)))
+        seen = track.skeletons(track.t)[:, :, ["xyz".index(letter) for letter in view.axes]].reshape(-1, 2)
+        (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
+        axes.set_xlim(min(view.across[0], left), max(view.across[1], right), auto=True)
+        axes.set_ylim(min(view.up[0], low), max(view.up[1], high), auto=True)
+        axes.set_label(view.axes)
+        axes.lines[-1].set_animated(True)
