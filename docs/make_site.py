@@ -1,10 +1,13 @@
-"""Replace the picture on the site's first page by the running default arm, for mkdocs."""
+"""For mkdocs: replace the picture on the first page by the running default arm, and typeset equations as MathML."""
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from latex2mathml.converter import convert
 
 import twodof
 
@@ -14,6 +17,11 @@ FRAME = (
     f'<iframe src="{PAGE}" title="the default arm, alive" loading="lazy"'
     ' style="width: 100%; height: 34rem; border: 0"></iframe>'
 )
+
+
+def on_page_markdown(text: str, **_: Any) -> str:
+    """Put MathML, which browsers draw without a script, in place of equations in LaTeX."""
+    return re.sub(r"^```math\n(.*?)^```$", lambda found: convert(found[1], display="block"), text, flags=re.M | re.S)
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:

@@ -53,6 +53,9 @@ FAILURES = {
     ),
     "an unknown load": Failure("ur5", "joint", {"payload": 5.0, "Kp": 20.0}, ("load",), "the payload of 5 kg"),
     "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
+    "a joint that sticks": Failure(
+        "arm", "joint", {"q_des": (0.9, 0.35), "friction": (20.0, 0.0)}, ("friction",), "sticks: its friction of 20"
+    ),
     "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] = 0"),
     "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp[1] = 20"),
     "a joint that sticks": Failure(

@@ -1,4 +1,4 @@
-"""The notebook of the documentation runs, and the outputs stored in it are those of this version."""
+"""The notebooks of ``examples`` run, and the outputs stored in them are those of this version."""
 
 from __future__ import annotations
 
@@ -6,43 +6,81 @@ import re
 import runpy
 from pathlib import Path
 
+import browser
 import nbclient
 import nbformat
 import pytest
 
-NOTEBOOK = Path(__file__).parents[1] / "docs" / "first_run.ipynb"
-MAX_SIZE = 500_000  # bytes
+import twodof
 
-
-MAKER = runpy.run_path(str(NOTEBOOK.with_name("make_notebook.py")))
-executed = MAKER["executed"]
+EXAMPLES = Path(__file__).parents[1] / "examples"
+MAKER = runpy.run_path(str(EXAMPLES / "make_notebooks.py"))
+MAX_SIZE = 600_000  # bytes
+executed, notebook_of, NOTEBOOKS = MAKER["executed"], MAKER["notebook_of"], MAKER["NOTEBOOKS"]
+PICTURES = {"first_run": 5, "my_robot": 1, "my_controller": 0, "gains": 1, "linear_model": 1}
+"""SVG pictures in the HTML of each."""
 
 
 def outputs(notebook: nbformat.NotebookNode) -> list[list[tuple[list[str], str]]]:
     """Kinds of each cell's outputs, and their HTML without the numbers, which depend on the machine's speed."""
     return [
-        [
-            (sorted(output.data), re.sub(r"-?\d+(\.\d+)?(e[-+]\d+)?", "N", output.data.get("text/html", "")))
-            for output in cell.outputs
-        ]
+        [(sorted(output.get("data", ())), without_numbers(output)) for output in cell.outputs]
         for cell in notebook.cells
         if cell.cell_type == "code"
     ]
 
 
-def test_the_notebook_runs_and_its_stored_outputs_are_current(tmp_path: Path) -> None:
-    stored = nbformat.read(NOTEBOOK, as_version=4)
+def without_numbers(output: nbformat.NotebookNode) -> str:
+    html = output.get("data", {}).get("text/html", "")
+    return "a page" if html.startswith("<iframe") else re.sub(r"-?\d+(\.\d+)?(e[-+]\d+)?", "N", html)
+
+
+def test_each_notebook_is_there() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.ipynb")} == {*NOTEBOOKS} == {*PICTURES}
+
+
+@pytest.mark.parametrize("name", sorted(NOTEBOOKS))
+def test_a_notebook_runs_and_its_stored_outputs_are_current(name: str, tmp_path: Path) -> None:
+    path = EXAMPLES / f"{name}.ipynb"
+    stored = nbformat.read(path, as_version=4)
     before = outputs(stored)
-    assert tuple(cell.source for cell in stored.cells) == MAKER["CELLS"]
+    assert [cell.source for cell in stored.cells] == [cell.source for cell in notebook_of(NOTEBOOKS[name]).cells]
     assert outputs(executed(stored, tmp_path)) == before
     html = [html for cell in before for _, html in cell if html]
-    assert len(html) == 5 and all("<svg" in text for text in html)
+    assert sum("<svg" in text for text in html) == PICTURES[name]
     assert ["image/png", "text/plain"] in [kinds for cell in before for kinds, _ in cell]
-    assert NOTEBOOK.stat().st_size < MAX_SIZE
+    assert path.stat().st_size < MAX_SIZE
 
 
 def test_a_cell_that_fails_is_an_error(tmp_path: Path) -> None:
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    notebook.cells = [nbformat.v4.new_code_cell("import twodof\ntwodof.load_fmu('absent.fmu')")]
+    notebook = notebook_of(("import twodof\ntwodof.load_fmu('absent.fmu')",))
     with pytest.raises(nbclient.exceptions.CellExecutionError, match=r"there is no FMU 'absent\.fmu'"):
         executed(notebook, tmp_path)
+
+
+def test_pages_are_shown_inline_without_a_network(native_path: Path, tmp_path: Path) -> None:
+    """An arm that moves, a replay and a map, in the frames that a notebook puts into its page."""
+    folder = tmp_path / "sweep"
+    twodof.run(native_path, twodof.Bag(tmp_path / "bag"), stop_time=1)
+    table = twodof.sweep(native_path, grid={"Kp": [20, 60]}, stop_time=1, output=folder)
+    fmu, bag = twodof.load_fmu(native_path), twodof.read_bag(tmp_path / "bag")
+    shown = [twodof.show(of)._repr_html_() for of in (fmu, native_path, bag, tmp_path / "bag", table, folder)]
+    assert max(map(len, shown[:4])) < 600_000
+    with browser.chromium() as chromium, chromium.new_context(offline=True) as context:
+        page = context.new_page()
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: asked.append(str(error)))
+        for html, ready in zip(shown, (browser.READY,) * 4 + ("#maps[data-ready]",) * 2):
+            page.set_content(f"<!DOCTYPE html><html><body>{html}</body></html>")
+            page.frame_locator("iframe").locator(ready).wait_for(timeout=1e3 * browser.PATIENCE)
+            if html is shown[0]:
+                frame = page.frames[-1]
+                frame.wait_for_function("arm.k > 5", timeout=1e3 * browser.PATIENCE)
+        assert asked == ["about:srcdoc"] * len(asked)
+
+
+@pytest.mark.parametrize("other", [3, [1.0, 2.0]])
+def test_what_cannot_be_shown_is_said(other: object) -> None:
+    with pytest.raises(twodof.TwoDofError, match="`show` shows an FMU, a recording, the table of a sweep, or the path"):
+        twodof.show(other)  # type: ignore[arg-type]

@@ -198,3 +198,47 @@ def test_places_are_those_of_the_values(values: tuple[float, ...], expected: tup
     assert tuple(ranks(np.array(values))) == expected
     shuffled = np.random.default_rng(1).permutation(len(values))
     assert tuple(ranks(np.array(values)[shuffled])) == tuple(np.array(expected, int)[shuffled])
+
+
+def test_a_cost_ranks_the_runs(native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Against pandas' own expressions."""
+    folder, cost = str(tmp_path / "s"), "settling + 0.1*peak_effort"
+    grid = ["--grid", "Kp=20:200:4", "--grid", "Kd=10:30:2", "--stop-time", "2"]
+    assert main(["sweep", str(native_path), *grid, "-o", folder, "--cost", cost, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    table = twodof.read_sweep(folder)
+    values = table.eval("settling_time + 0.1 * peak_effort")
+    expected = table.assign(cost=values).dropna(subset="cost").sort_values("cost").head(5)
+    assert facts["cost"] == cost
+    assert [run["run"] for run in facts["best"]] == expected["run"].tolist() != table.head(5)["run"].tolist()
+    assert [run["cost"] for run in facts["best"]] == pytest.approx(expected["cost"].tolist(), rel=1e-12)
+    assert [run["run"] for run in facts["best"]] != [run["run"] for run in best_of(folder, "peak_effort", capsys)]
+    for command in (["info", folder], ["plot", folder, "-o", str(tmp_path / "map.png")]):
+        assert main([*command, "--cost", cost]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        title = lines.index(f"best: least cost, {cost}")
+        assert lines[title + 1].split()[:2] == ["run", "cost"]
+        assert [int(line.split()[0]) for line in lines[title + 3 : title + 8]] == expected["run"].tolist()
+
+
+def best_of(folder: str, cost: str, capsys: pytest.CaptureFixture[str]) -> list[dict[str, float]]:
+    assert main(["info", folder, "--cost", cost, "--json"]) == 0
+    best: list[dict[str, float]] = json.loads(capsys.readouterr().out)["best"]
+    return best
+
+
+@pytest.mark.parametrize(
+    ("cost", "said"),
+    [
+        ("setling", "did you mean settling_time?"),
+        ("settling > 1", "is not a value, as 'settling + 0.1*peak_effort'"),
+        ("peak", "there is no number 'peak'; did you mean peak_effort or peak_velocity?"),
+        ("__import__('os')", "is not a value"),
+    ],
+)
+def test_a_cost_is_refused_before_the_sweep(
+    cost: str, said: str, native_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "s"
+    assert main(["sweep", str(native_path), "--grid", "Kp=20:40:2", "-o", str(folder), "--cost", cost]) == 1
+    assert said in capsys.readouterr().err and not folder.exists()

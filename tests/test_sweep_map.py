@@ -14,7 +14,7 @@ from matplotlib.collections import QuadMesh
 from PIL import Image
 from tables import SMALL, table_of
 
-from twodof import sweep
+from twodof import read_bag, sweep
 from twodof.cli.main import main
 from twodof.plots.figure import drawn, save
 from twodof.plots.sweeps import drawing
@@ -159,3 +159,35 @@ def test_where_no_run_settles_the_best_is_another(
     out = capsys.readouterr().out
     assert "best: with least effort, with least error at the end\n" in out
     assert "settl" not in out.partition("best:")[2]
+
+
+POINT = """run => {
+    const {div} = sweepPage.charts[0], {xaxis, yaxis} = div._fullLayout, {x, y} = div.data[0];
+    const box = div.getBoundingClientRect();
+    return [box.x + xaxis._offset + xaxis.d2p(x[run]), box.y + yaxis._offset + yaxis.d2p(y[run])];
+}"""
+"""Where a run is in the first map, in the window."""
+
+
+@pytest.mark.parametrize("width", [1200, 390])
+def test_a_click_in_the_map_opens_the_runs_curves(native_path: Path, tmp_path: Path, width: int) -> None:
+    folder = tmp_path / "s"
+    sweep(native_path, grid={"Kp": [20, 60, 100], "Kd": [10, 20]}, stop_time=1, output=folder, bags=True)
+    page = save(drawing(read_sweep(folder), "s", bags=folder / "bags"), tmp_path / "s.html")
+    with browser.chromium() as chromium, chromium.new_context(offline=True) as context:
+        shown = context.new_page()
+        shown.set_viewport_size({"width": width, "height": 844})
+        shown.goto(page.as_uri())
+        shown.wait_for_selector("#maps[data-ready]")
+        for run in (4, 1):
+            shown.evaluate("scrollTo(0, sweepPage.charts[0].div.getBoundingClientRect().y + scrollY - 100)")
+            shown.mouse.click(*shown.evaluate(POINT, run))
+            shown.wait_for_function("run => sweepPage.chosen === run", arg=run)
+            bag = read_bag(folder / "bags" / f"{run:06d}")
+            texts = shown.locator("section.run").inner_text()
+            assert f"run {run}: Kp" in texts and bag.verdict.lines[0] in texts
+            curves = shown.evaluate("sweepPage.curve.data.map(({name, x, y}) => [name, [...x], [...y]])")
+            assert [name for name, *_ in curves] == ["distance from the target, m", "joint1", "joint2"]
+            for (_, x, y), truth in zip(curves, (np.linalg.norm(bag.x - bag.target, axis=1), *bag.q.T)):
+                np.testing.assert_allclose(y, np.interp(x, bag.t, truth), rtol=1e-6, atol=1e-8)
+        assert shown.evaluate("document.documentElement.scrollWidth") == width

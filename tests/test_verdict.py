@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from twodof.geometry.kinematics import Kinematics
 from twodof.geometry.reach import nearest
 from twodof.plant.urdf import read_urdf
 from twodof.simulation import master
-from twodof.simulation.judge import Judge
+from twodof.simulation.judge import BLOCK, OUTPUTS, Judge
 from twodof.simulation.motion import motion_of, ringing
 from twodof.simulation.setup import robot_of
 
@@ -146,20 +147,30 @@ def test_the_nearest_point_of_a_panda_is_that_of_an_evolution() -> None:
 # --- what it costs ---
 
 
-def test_the_verdict_takes_little_of_a_native_run(native_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processor time, of many runs in turn; the bound leaves room for a machine that does other things too."""
+def test_the_verdict_takes_little_of_a_native_run(native_path: Path) -> None:
+    """Processor time of a block's samples for the judge, and for the run without it: the least of many of each."""
+    run = twodof.experiment(native_path, stop_time=0.01 * 40 * BLOCK)
+    judge, steps = master.judge_of(run, None), twodof.samples(run)
+    row = memoryview(bytes(8 * sum(len(run.fmu.vector(group)) for group in OUTPUTS)))
 
-    def taken(judge: Any) -> float:
-        monkeypatch.setattr(master, "judge_of", judge)
+    def judged() -> None:
+        for _ in range(BLOCK):
+            judge.rows.write(row)
+        judge.flush()
+
+    def stepped() -> None:
+        for _ in range(BLOCK):
+            next(steps)
+
+    def taken(what: Callable[[], None]) -> float:
         begin = time.process_time()
-        steps = master._stepped(run, judge(run, None), None, lambda: False, lambda: None, lambda *_: None, None)
-        assert sum(1 for _ in steps) == 20_001
+        what()
         return time.process_time() - begin
 
-    run, real = twodof.experiment(native_path, stop_time=200.0), master.judge_of
-    times = np.array([(taken(lambda *_: None), taken(real)) for _ in range(8)])
-    without, with_judge = times.min(axis=0)
-    assert with_judge < 1.1 * without
+    times = np.array([(taken(judged), taken(stepped)) for _ in range(39)])
+    with_judge, alone = times.min(axis=0)
+    assert judge.metrics()["peak_velocity"] == 0.0 and judge.count == 39 * BLOCK
+    assert with_judge < 0.025 * alone
 
 
 def test_the_verdict_takes_no_more_memory_in_a_longer_run(native_path: Path) -> None:
@@ -277,3 +288,31 @@ def test_a_judge_of_nothing_has_no_number() -> None:
         twodof.verdict([], run)
     with pytest.raises(twodof.TwoDofError, match="experiment"):
         twodof.verdict([])
+
+
+def test_a_joint_sticks_from_its_last_motion_on() -> None:
+    """A joint that moves at first and is then held short of its target: from the sample at which its speed is 0."""
+    fmu = fmu_of("arm", "joint")
+    settings = {"q_des": (0.9, 0.35), "friction": (0.03, 0.0), "Kp": 20.0, "Kd": 2.0, "max_step": 0.01}
+    kept = Kept()
+    run = twodof.simulate(fmu, kept, settings=settings, stop_time=5.0)
+    still = np.array([sample.v[0] == 0.0 for sample in kept.samples])
+    stopped = np.flatnonzero(~still)[-1]
+    (cause,) = [cause for cause in run.verdict.causes if cause.kind == "friction"]
+    assert 10 < stopped < 400 and still[stopped + 1 :].all()
+    assert (cause.joint, cause.time) == ("joint1", pytest.approx(0.01 * stopped))
+    assert cause.share == pytest.approx((5.0 - 0.01 * stopped) / 5.0)
+    assert cause is run.verdict.causes[0] and "sticks" in run.verdict.lines[0]
+    creeping = twodof.simulate(fmu, settings={**settings, "friction": (0.05, 0.0), "Kd": 10.0}, stop_time=5.0)
+    assert 0.0 < creeping.last.v[0] < 1e-6  # overdamped, its speed only decays
+    assert "'joint1' sticks: its friction of 0.05 N·m stops it short" in creeping.verdict.lines[0]
+    freed = twodof.simulate(fmu, settings={**settings, "friction": 0.0, "Kd": 10.0}, stop_time=5.0).verdict
+    assert freed.outcome == "reached" and not freed.causes
+
+
+class Kept(twodof.Sink):
+    def __init__(self) -> None:
+        self.samples: list[twodof.Sample] = []
+
+    def write(self, sample: twodof.Sample) -> None:
+        self.samples.append(sample)

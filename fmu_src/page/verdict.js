@@ -5,6 +5,7 @@ const SETTLE = 1; // s after a change of the target before which only causes tha
 const LOOKED_AT = 400, OFTEN = 0.05; // samples, and the share of them from which on a state is a cause
 const SCATTERED = 400, IMPROVED = 6, TRIES = 40; // starts of the search for the nearest reachable point, and steps of those improved
 const SINGULAR = 0.02; // ratio of the smallest to the largest singular value
+const CREEPING = 1e-5; // rad/s or m/s
 const FEWEST = 0.2; // damping ratio below which the damping is too little
 
 class Verdict {
@@ -164,7 +165,7 @@ class Verdict {
   friction() {
     const { session } = this;
     return session.held("friction").flatMap((size, i) => {
-      const still = size > 0 && this.shares((k) => session.value("v", k, i) === 0)[1] > 0.9;
+      const still = size > 0 && this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING)[1] > 0.9;
       const off = !session.groups.has("q_des") || session.value("q", session.count - 1, i) !== session.held("q_des")[i];
       return still && off ? [`joint '${this.joints[i].name}' sticks: its friction of ${short(size)} holds it`] : [];
     });

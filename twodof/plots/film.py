@@ -15,6 +15,7 @@ from ..bag.recording import Recording
 from ..errors import PlotError
 from ..files import refusing, write_file
 from ..version import needing
+from .closed_form import Array
 from .figure import Drawing, draw_head, drawn
 from .panels import title
 from .runs import draw_view
@@ -91,7 +92,7 @@ def _encoded(frames: Iterator[bytes], path: Path, kind: str) -> bytes:
         return file.read_bytes()
 
 
-def _frames(track: Track, times: np.ndarray[Any, Any]) -> Iterator[bytes]:
+def _frames(track: Track, times: Array) -> Iterator[bytes]:
     """Yield pictures of the run at times since its first sample, s: red, green, blue and alpha of each pixel.
 
     What stands still is drawn once; the arm's points are interpolated between samples by the joints' positions.
@@ -103,7 +104,7 @@ def _frames(track: Track, times: np.ndarray[Any, Any]) -> Iterator[bytes]:
     clock = figure.text(0.99, 0.02, "", ha="right", color=GREY, animated=True)
     canvas.draw()
     still, points = canvas.copy_from_bbox(figure.bbox), track.skeletons(times)
-    planes = [["xyz".index(letter) for letter in axes.get_label()] for axes, _ in arms]
+    planes = [["xyz".index(letter) for letter in str(axes.get_label())] for axes, _ in arms]
     for t, arm in zip(times, points):
         canvas.restore_region(still)
         clock.set_text(f"{t:.2f} s of {number(float(track.t[-1]))} s")

@@ -38,6 +38,7 @@ OFTEN = 0.05  # of the samples from which on a state is a cause, and not a passi
 NEAR_SINGULAR = 0.02  # ratio of the smallest to the largest singular value
 LEAST_TURN = 2.0 * pi  # rad: a larger target of a joint may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is not meant in metres
+CREEPING = 1e-3  # of a joint's largest speed: friction stops one that is overdamped without end
 FAST = 0.25  # changes of a velocity's sign a sample, from which on the step shows
 
 
@@ -211,14 +212,16 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
 
 def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup = judge.setup
-    friction = setup.given("friction")
+    friction, v = setup.given("friction"), np.abs(judge.end("v"))
     for i, joint in enumerate(setup.joints[: len(friction)]):
-        off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > 0.0 if judge.wanted("q").size else bool(missed)
-        since = max(0.0, float(judge.moved[i]))
-        held = judge.duration - since
-        if friction[i] > 0.0 and off and held > OFTEN * judge.duration:
-            text = f"joint '{joint}' sticks: its friction of {friction[i]:.4g} holds it from {since:.4g} s on"
-            yield Cause("friction", text, held / judge.duration, joint, since)
+        off = abs(judge.wanted("q")[i] - judge.end("q")[i]) > FLOOR if judge.wanted("q").size else bool(missed)
+        moved = max(0.0, float(judge.moved[i]))
+        held = judge.duration - moved > OFTEN * judge.duration
+        if friction[i] > 0.0 and off and (held or v[i] <= CREEPING * judge.speed[i]):
+            size = f"its friction of {friction[i]:.4g} {'N' if setup.units[i] == 'm' else 'N·m'}"
+            text = f"{size} holds it from {moved:.4g} s on" if held else f"{size} stops it short of its target"
+            share = 1.0 - moved / judge.duration if held else 0.0
+            yield Cause("friction", f"joint '{joint}' sticks: {text}", share, joint, moved if held else None)
 
 
 def _load(judge: Judge) -> Iterator[Cause]:

@@ -94,10 +94,12 @@ def _stepped(
         instance.initialise(run.start_time, run.time(run.steps), run.given)
         ready()
         take, since = _sampler(instance, run, ignore if judge is None else judge.rows.write), run.start_time
+        full = 0
         for k in count():
             sample = take(k, inputs, since)
-            if judge is not None and k % BLOCK == 0:
+            if k == full and judge is not None:
                 judge.flush()
+                full += BLOCK
             if pace is not None:
                 pace.wait(sample.t - run.start_time, stop)
             answer = yield sample
