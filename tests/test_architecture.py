@@ -43,8 +43,9 @@ LIBRARIES = {
     "fmpy": {"fmu"},
     "foxglove": {"pages"},
     "lz4": {"bag"},
+    "imageio_ffmpeg": {"plots"},
     "matplotlib": {"plots"},
-    "pandas": {"sweeps", "bag", "plots", "cli"},  # tables: made, of a recording, drawn, printed
+    "pandas": {"sweeps", "bag", "plots", "pages", "cli"},  # tables: made, of a recording, drawn, shown, printed
     "pinocchio": {"plant"},
     "plotly": {"plots"},
     "pyarrow": {"sweeps"},

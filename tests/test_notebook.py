@@ -83,4 +83,4 @@ def test_pages_are_shown_inline_without_a_network(native_path: Path, tmp_path: P
 @pytest.mark.parametrize("other", [3, [1.0, 2.0]])
 def test_what_cannot_be_shown_is_said(other: object) -> None:
     with pytest.raises(twodof.TwoDofError, match="`show` shows an FMU, a recording, the table of a sweep, or the path"):
-        twodof.show(other)  # type: ignore[arg-type]
+        twodof.show(other)

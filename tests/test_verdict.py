@@ -300,7 +300,7 @@ def test_a_joint_sticks_from_its_last_motion_on() -> None:
     stopped = np.flatnonzero(~still)[-1]
     (cause,) = [cause for cause in run.verdict.causes if cause.kind == "friction"]
     assert 10 < stopped < 400 and still[stopped + 1 :].all()
-    assert (cause.joint, cause.time) == ("joint1", pytest.approx(0.01 * stopped))
+    assert cause.joint == "joint1" and cause.time == pytest.approx(0.01 * stopped)
     assert cause.share == pytest.approx((5.0 - 0.01 * stopped) / 5.0)
     assert cause is run.verdict.causes[0] and "sticks" in run.verdict.lines[0]
     creeping = twodof.simulate(fmu, settings={**settings, "friction": (0.05, 0.0), "Kd": 10.0}, stop_time=5.0)

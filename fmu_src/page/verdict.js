@@ -116,7 +116,7 @@ class Verdict {
         const left = off(wanted, this.place(next)), gain = Math.hypot(...e) - Math.hypot(...left);
         if (gain > 0) [q, e] = [next, left];
         damping *= gain > 0 ? 0.3 : 10;
-        if (damping > 1e9 || (gain > 0 && gain < 1e-7)) break;
+        if (damping > 1e9 || (gain > 0 && gain < 1e-12)) break;
       }
       const distance = Math.hypot(...e);
       if (distance < best.distance - 1e-9) best = { point: this.place(q), distance };

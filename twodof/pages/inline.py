@@ -45,24 +45,15 @@ def show(shown: Fmu | Recording | pandas.DataFrame | str | Path, *, height: int 
     Raises:
         FmuError, BagError, SweepError, PageError, PlotError, BuildError: as ``page``, ``view`` and ``plot`` raise.
     """
-    if not isinstance(shown, (Fmu, Recording, str, Path)):
-        return Inline(_map(shown, "sweep", None), height)
-    if isinstance(shown, Recording):
-        return Inline(replay(shown)[0].decode(), height)
-    if isinstance(shown, Fmu) or not Path(shown).is_dir():
-        return Inline(page_of(experiment(shown, stop_time=inf)).decode(), height)
-    folder = Path(shown)
-    if not any(folder.glob("*.parquet")):
-        return Inline(replay(folder)[0].decode(), height)
-    from ..sweeps.results import read_sweep
+    folder = Path(shown) if isinstance(shown, (str, Path)) and Path(shown).is_dir() else None
+    if isinstance(shown, (Fmu, str, Path)) and folder is None:
+        page = page_of(experiment(shown, stop_time=inf))
+    elif isinstance(shown, Recording) or (folder and not any(folder.glob("*.parquet"))):
+        page, _ = replay(shown if isinstance(shown, Recording) else str(folder))
+    elif folder or "provenance" in getattr(shown, "attrs", {}):
+        from ..plots.sweeps import map_html  # needs the extra "sweep"
 
-    return Inline(_map(read_sweep(folder), folder.resolve().name, folder / "bags"), height)
-
-
-def _map(table: pandas.DataFrame, name: str, bags: Path | None) -> str:
-    from ..plots.figure import html_of
-    from ..plots.sweeps import drawing
-
-    if "provenance" not in getattr(table, "attrs", {}):
+        page = map_html(shown)
+    else:
         raise PageError("`show` shows an FMU, a recording, the table of a sweep, or the path of one of them")
-    return html_of(drawing(table, name, bags=bags)).decode()
+    return Inline(page.decode(), height)

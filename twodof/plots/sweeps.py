@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import PlotError
 from ..sweeps.ranking import METRICS, ROUNDING, USE, beyond_limits, candidates, ranked, ranks, remark
 from .closed_form import Array
-from .figure import Drawing, draw_head
+from .figure import Drawing, draw_head, html_of
 from .maps import map_page
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
 
@@ -53,6 +53,16 @@ class _Panel(NamedTuple):
     metric: str
     x: str
     y: str | None = None
+
+
+def map_html(sweep: pandas.DataFrame | str | Path) -> bytes:
+    """Return the page of a sweep's map, given its table, or its folder with the bags of its runs."""
+    if isinstance(sweep, (str, Path)):
+        from ..sweeps.results import read_sweep
+
+        folder = Path(sweep)
+        return html_of(drawing(read_sweep(folder), folder.resolve().name, bags=folder / "bags"))
+    return html_of(drawing(sweep, "sweep"))
 
 
 def drawing(table: pandas.DataFrame, name: str, cost: Expression | None = None, bags: Path | None = None) -> Drawing:
