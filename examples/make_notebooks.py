@@ -176,7 +176,7 @@ A click on a run opens its curves. The map is drawn where this cell is run, and 
     "twodof.show('gains')",
     """## Between two gains
 
-Two runs in one figure: too little damping, and critical damping, Kd² = 4 Kp.""",
+Two runs in one figure: Kp = 80 with Kd = 5 and with Kd = 20. Critical damping is Kd² = 4 Kp.""",
     "twodof.plot('gains/bags/000008', 'gains/bags/000010')",
 )
 LINEAR_MODEL = (
