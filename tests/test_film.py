@@ -66,7 +66,7 @@ def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag: Path, tmp_path: 
             assert float(container.duration) / av.time_base == pytest.approx(len(found) / rate, abs=0.5 / rate)
     else:
         with Image.open(path) as image:
-            shown = [(image.seek(k), image.info["duration"])[1] for k in range(len(found))]
+            shown = [(image.seek(k), image.load(), image.info["duration"])[-1] for k in range(len(found))]
             assert sum(shown) == pytest.approx(1e3 * len(found) / rate, abs=1e3 / rate)
             assert image.info["loop"] == 0
     recording = twodof.read_bag(bag)
@@ -78,7 +78,7 @@ def test_a_film_has_the_runs_time_and_the_arm_where_it_was(bag: Path, tmp_path: 
     assert np.ptp(poses, axis=0).max() > 0.5
     for picture, q in zip(found[::9], poses[::9]):
         expected = offset + scale * pose_box(q) + edge * np.array([[-1, -1], [1, 1]])
-        np.testing.assert_allclose(arm_box(picture), expected, atol=5.0)
+        np.testing.assert_allclose(arm_box(picture), expected, atol=8.0)  # pixels of 900 in a metre
 
 
 def test_a_picture_is_the_end_of_the_run(bag: Path, tmp_path: Path) -> None:
