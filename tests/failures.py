@@ -53,9 +53,6 @@ FAILURES = {
     ),
     "an unknown load": Failure("ur5", "joint", {"payload": 5.0, "Kp": 20.0}, ("load",), "the payload of 5 kg"),
     "a push": Failure("arm", "task", {"f_ext": (0.0, 3.0, 0.0)}, ("load",), "f_ext = (0, 3, 0) N acts"),
-    "a joint that sticks": Failure(
-        "arm", "joint", {"q_des": (0.9, 0.35), "friction": (20.0, 0.0)}, ("friction",), "sticks: its friction of 20"
-    ),
     "no gain": Failure("arm", "task", {"Kp[2]": 0.0}, ("gain",), "Kp[2] = 0"),
     "no damping": Failure("arm", "task", {"Kd": 0.0, "Kp": 20.0}, ("damping",), "damps Kp[1] = 20"),
     "a joint that sticks": Failure(
@@ -63,7 +60,7 @@ FAILURES = {
         "joint",
         {"friction": (0.3, 0.1), "q_des": (1.2, 0.1), "Kd": (0.0, 1.0)},
         ("friction",),
-        "'joint2' sticks: its friction of 0.1 holds it from 0 s on",
+        "'joint2' sticks: its friction of 0.1 N·m holds it from 0 s on",
     ),
     "a singular pose": Failure(
         "arm", "task", {"q_start": (0.0, 0.0), "x_des": (0.2, 0.0), "Kp": 20.0}, ("singularity",), "near a singularity"
