@@ -29,20 +29,11 @@ static uint64_t checksum(const void *bytes)
 
 enum { SERIALIZED_SIZE = sizeof(State) + sizeof(uint64_t) };
 
-/* Whether all truth values are 0 or 1. */
-static int are_booleans(const double value[])
+/* Whether integers are whole, and truth values 0 or 1; the table has the range of integers. */
+static int are_whole(const double value[])
 {
-    for (int i = 0; i < N_VARIABLES - FIRST_BOOLEAN; i++)
-        if (value[i] != 0.0 && value[i] != 1.0)
-            return 0;
-    return 1;
-}
-
-/* Whether all integers are whole; the table has their range. */
-static int are_integers(const double value[])
-{
-    for (int i = FIRST_INTEGER; i < FIRST_BOOLEAN; i++)
-        if (!(value[i] == floor(value[i])))
+    for (int i = FIRST_INTEGER; i < N_VARIABLES; i++)
+        if (!(value[i] == floor(value[i])) || (i >= FIRST_BOOLEAN && value[i] != 0.0 && value[i] != 1.0))
             return 0;
     return 1;
 }
@@ -82,7 +73,7 @@ static Status take_over(Instance *instance, const void *bytes)
     const double *value = state->plant.value;
     memcpy(state, bytes, sizeof *state);
     int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
-                && state->stop_time > -HUGE_VAL && are_integers(value) && are_booleans(&value[FIRST_BOOLEAN])
+                && state->stop_time > -HUGE_VAL && are_whole(value)
                 && are_stops(&state->stops) && is_passage(&state->passage);
     const int runs = state->phase >= STEP; /* before, initialisation reports errors */
     sound = sound && (!runs || is_sampling(&state->sampling, &state->plant, state->time));

@@ -7,28 +7,13 @@ from collections.abc import Sequence
 from string import Template
 
 from ..files import data_file
+from ..plant.plant import LAWS
 from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, Variable
 from ..version import __version__
 from .flavours import Files, Flavour
 from .fmu_options import FmuOptions
 
-LAWS = {
-    "task": """x, J    position and Jacobian of $frame, rows of the task axes, LOCAL_WORLD_ALIGNED
-a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)          task-space PD
-q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v     J⁺ drops singular values up to rcond·σ_max
-τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
-    "pose": """x, R    position and orientation of $frame; J its Jacobian, LOCAL_WORLD_ALIGNED:
-        rows of the task axes, and three of the angular velocity ω
-a_cmd = xdd_des + Kd ∘ (xd_des − J v) + Kp ∘ (x_des − x)          task-space PD
-α_cmd = alpha_des + Kd_rot ∘ (omega_des − ω) + Kp_rot ∘ log(R_des Rᵀ)
-q̈_cmd = J⁺ ((a_cmd, α_cmd) − J̇ v) − Kn (I − J⁺J) v   J⁺ drops singular values up to rcond·σ_max
-τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
-    "joint": """q̈_cmd = a_des + Kd ∘ (v_des − v) + Kp ∘ (q_des − q)               joint-space PD
-τ     = M(q) q̈_cmd + h(q, v)                   inverse dynamics""",
-    "effort": "τ     = tau_cmd",
-}
-"""The equations of the control laws."""
 NO_DEPENDENCIES = b"None: the binaries need the C library and its mathematics only.\n"
 """Text about dependencies of a native FMU."""
 
@@ -48,7 +33,7 @@ def documentation(
         frame=frame,
         axes=", ".join(robot.axes),
         control=CONTROLS[options.control].title.format(frame=frame),
-        law=LAWS[options.control].replace("$frame", frame),
+        law=html.escape(str(LAWS[options.control].__doc__).strip()),
         root=html.escape(robot.root),
         variables="\n".join(rows),
         fmi=flavour.fmi,

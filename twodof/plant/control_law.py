@@ -1,6 +1,6 @@
 """The interface of control laws, which are the modules ``<name>_control``."""
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from .equations import Law, Ratios
 from .mechanism import Mechanism
@@ -13,28 +13,18 @@ class ControlledPlant:
     Attributes:
         robot, control: the robot and the name of its law, a key of ``CONTROLS``.
         known: the robot as its control law knows it.
-        x_des, …, rcond: the inputs and parameters of the laws, of which a plant has those of its own law.
+
+    Each variable of the table is an attribute of its group's name: a list of floats of a vector, in SI units, task
+    vectors in the root frame; a float, int or bool of a scalar.
     """
 
     robot: Robot
     control: str
     known: Mechanism
-    x_des: list[float]
-    xd_des: list[float]
-    xdd_des: list[float]
-    quat_des: list[float]
-    omega_des: list[float]
-    alpha_des: list[float]
-    Kp_rot: list[float]
-    Kd_rot: list[float]
-    q_des: list[float]
-    v_des: list[float]
-    a_des: list[float]
-    Kp: list[float]
-    Kd: list[float]
-    tau_cmd: list[float]
-    Kn: float
-    rcond: float
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, group: str) -> Any: ...
 
 
 class ControlLaw(Protocol):

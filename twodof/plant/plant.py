@@ -60,9 +60,8 @@ def refusing(kind: type[Exception]) -> Iterator[None]:
 class Plant(ControlledPlant):
     """A robot and its control law as a system with inputs, parameters, state and outputs.
 
-    Every variable of the table is an attribute of its group's name: lists of floats for vectors (SI units; task
-    vectors in the root frame), floats and bools for scalars. ``q`` and ``v`` are the state; ``x``, ``xd``, ``tau``
-    and the state's derivatives ``der_q`` and ``der_v`` are computed when read.
+    Of its variables (``ControlledPlant``) ``q`` and ``v`` are the state; ``x``, ``xd``, ``tau`` and the state's
+    derivatives ``der_q`` and ``der_v`` are computed when read.
 
     Args:
         robot: the robot.
@@ -74,32 +73,6 @@ class Plant(ControlledPlant):
         time: of the state, s.
         sampling: discrete state of the sampled controller and its sensors.
     """
-
-    tau_ext: list[float]
-    f_ext: list[float]
-    q_start: list[float]
-    v_start: list[float]
-    q_min: list[float]
-    q_max: list[float]
-    gravity: list[float]
-    payload: float
-    payload_com: list[float]
-    payload_known: bool
-    rtol: float
-    atol: float
-    max_step: float
-    friction: list[float]
-    damping: list[float]
-    armature: list[float]
-    control_period: float
-    control_delay: float
-    q_resolution: list[float]
-    q_noise: list[float]
-    v_noise: list[float]
-    seed: int
-    v_from_q: bool
-    limit_effort: bool
-    rigid_stops: bool
 
     def __init__(self, robot: Robot, table: Sequence[Variable], control: str = "task") -> None:
         self.robot, self.control, self._table = robot, control, table

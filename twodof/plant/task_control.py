@@ -5,6 +5,9 @@
     q̈_cmd = J⁺ (a_cmd − J̇ v) − Kn (I − J⁺J) v
           = J⁺ (a_cmd − J̇ v + Kn J v) − Kn v
 
+x, R and J are position, orientation and Jacobian of the task frame, LOCAL_WORLD_ALIGNED. J has the rows of the task
+axes, with an orientation three of the angular velocity ω too; J⁺ drops singular values up to rcond·σ_max.
+
 Source: Luh, Walker & Paul, "Resolved-acceleration control of mechanical manipulators",
 IEEE TAC 25(3), 1980; the damped self-motion is that of Khatib, IEEE J-RA 3(1), 1987.
 """

@@ -39,6 +39,7 @@ NEAR_SINGULAR = 0.02  # ratio of the smallest to the largest singular value
 LEAST_TURN = 2.0 * pi  # rad: a larger target of a joint may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is not meant in metres
 CREEPING = 1e-3  # of a joint's largest speed: friction stops one that is overdamped without end
+EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
 FAST = 0.25  # changes of a velocity's sign a sample, from which on the step shows
 
 
@@ -72,36 +73,33 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     ill = bool(missed) or motion == "diverging"
     if missed:
         found += [*_reach(judge, missed), *_gains(judge, missed), *_load(judge), *_friction(judge, missed)]
-        found += [*_singular(judge, missed), *_slow(judge, missed)]
+        found += [*_singular(judge), *_slow(judge, missed)]
     if ill or not judge.aims:
         found += [*_at_limits(judge, missed), *_saturated(judge), *_sampled(judge)]
     if missed and motion in ("oscillating", "diverging"):
-        found += _damping(judge, missed)
+        found += _damping(judge)
     order = [*KINDS]
     return tuple(sorted(found, key=lambda cause: (order.index(cause.kind), -cause.share))[:MOST])
 
 
 def _degrees(judge: Judge) -> Iterator[Cause]:
-    setup, held = judge.setup, {**judge.setup.starts, **judge.inputs}
+    setup = judge.setup
     for group in ("q_des", "q_start"):
-        for i, value in enumerate(setup.given(group, held)[: len(setup.joints)]):
-            meant = radians(value)
-            fits = setup.low[i] - AT_LIMIT <= meant <= setup.high[i] + AT_LIMIT
+        for i, (value, joint) in enumerate(zip(judge.given(group), setup.joints)):
+            fits = setup.low[i] - AT_LIMIT <= radians(value) <= setup.high[i] + AT_LIMIT
             if setup.units[i] == "rad" and abs(value) > LEAST_TURN and fits:
-                name = f"{group}[{i + 1}]"
-                yield Cause(
-                    "degrees", f"{name} = {value:g} rad: {value:g}°? That is {meant:.4g} rad", 1.0, setup.joints[i]
-                )
+                text = f"{group}[{i + 1}] = {value:g} rad: {value:g}°? That is {radians(value):.4g} rad"
+                yield Cause("degrees", text, 1.0, joint)
 
 
 def _beyond_limits(judge: Judge) -> Iterator[Cause]:
     setup = judge.setup
-    for kind, peaks, bounds, use in zip(("effort", "velocity"), (judge.effort, judge.speed), setup.limits, judge.use()):
+    speeds = {unit: f"{unit}/s" for unit in setup.units}
+    kinds = ("effort", "effort", judge.effort, EFFORT_UNITS), ("velocity", "speed", judge.speed, speeds)
+    for (kind, what, peaks, units), bounds, use in zip(kinds, setup.limits, judge.use()):
         for joint, unit, peak, limit, share in zip(setup.joints, setup.units, peaks, bounds, use):
             if share > 1.0 + EXACT:
-                effort = {"rad": "N·m", "m": "N"}.get(unit, "")
-                of = effort if kind == "effort" else f"{unit}/s"
-                what = "effort" if kind == "effort" else "speed"
+                of = units.get(unit, "")
                 text = (
                     f"joint '{joint}' has a peak {what} of {peak:.4g} {of}, beyond the URDF's limit of {limit:.4g} {of}"
                 )
@@ -119,20 +117,19 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     robot, target, quat = setup.robot, judge.wanted("x"), judge.wanted("quat")
     if robot is None or setup.frame not in robot.links or not target.size or not {"x", "quat"} & {*missed}:
         return
-    from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
-    from ..geometry.reach import nearest
+    from ..geometry.reach import nearest  # SciPy takes half a second to import
 
-    kinematics, axes = Kinematics(robot, setup.joints), ["xyz".index(axis) for axis in setup.axes]
-    size = max(BAND * judge.aims["x"].first, FLOOR)
-    search = partial(nearest, kinematics, setup.frame, axes=axes, target=target)
+    axes, size = setup.rows, max(BAND * judge.aims["x"].first, FLOOR)
+    search = partial(nearest, setup.kinematics, setup.frame, axes=axes, target=target)
     best = search(quat=np.empty(0), low=setup.low, high=setup.high, q=judge.end("q"))
     if best.distance > size:
         free = np.full(len(setup.joints), inf)
         text = f"the target is out of reach by {best.distance:.4g} m"
-        stops = _stops(judge, best.q)
-        if stops:
+        near = (best.q <= setup.low + 1e-6) | (best.q >= setup.high - 1e-6)
+        if near.any():
             wide = search(quat=np.empty(0), low=-free, high=free, q=best.q)
-            text += f" within the joint limits ({', '.join(stops)})" if wide.distance < size else ""
+            stops = ", ".join(f"'{name}'" for name, at in zip(setup.joints, near) if at)
+            text += f" within the joint limits ({stops})" if wide.distance < size else ""
         if np.abs(target).max() > MILLIMETRES and np.linalg.norm(0.001 * target - best.point[axes]) < best.distance:
             text += "; is it in millimetres?"
         text += f"; the nearest reachable point is {point_text(best.point[axes])} m"
@@ -149,18 +146,9 @@ def point_text(values: Array) -> str:
     return f"({', '.join(f'{value:.4g}' for value in np.round(values, 9) + 0.0)})"
 
 
-def _stops(judge: Judge, q: Array) -> list[str]:
-    """Return the joints that positions hold at a limit, quoted."""
-    setup = judge.setup
-    near = (q <= setup.low + 1e-6) | (q >= setup.high - 1e-6)
-    return [f"'{name}'" for name, at in zip(setup.joints, near) if at]
-
-
 def _gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    held = {**judge.setup.starts, **judge.inputs}
-    for name in missed:
-        group = "Kp_rot" if name == "quat" else "Kp"
-        zero = [f"{group}[{i + 1}]" for i, gain in enumerate(judge.setup.given(group, held)) if gain == 0.0]
+    for group in ("Kp_rot" if name == "quat" else "Kp" for name in missed):
+        zero = [f"{group}[{i + 1}]" for i, gain in enumerate(judge.given(group)) if gain == 0.0]
         if zero:
             yield Cause("gain", f"{', '.join(zero)} = 0: nothing pulls this to its target", 1.0)
 
@@ -201,13 +189,9 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
     for i, joint in enumerate(setup.joints):
         beyond = judge.effort[i] > bounds[i] * (1.0 + EXACT)
         if judge.share[i] > OFTEN and not beyond and _late(judge, inside[:, i]) > OFTEN:
-            unit = "N" if setup.units[i] == "m" else "N·m"
-            text = (
-                f"the motor of joint '{joint}' was saturated at {bounds[i]:.4g} {unit} for {100 * judge.share[i]:.3g} %"
-            )
-            yield Cause(
-                "saturation", f"{text} of the time", float(judge.share[i]), joint, float(t[inside[:, i].argmax()])
-            )
+            most = f"{bounds[i]:.4g} {EFFORT_UNITS.get(setup.units[i], '')} for {100 * judge.share[i]:.3g} %"
+            text = f"the motor of joint '{joint}' was saturated at {most} of the time"
+            yield Cause("saturation", text, float(judge.share[i]), joint, float(t[inside[:, i].argmax()]))
 
 
 def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
@@ -225,15 +209,14 @@ def _friction(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def _load(judge: Judge) -> Iterator[Cause]:
-    held = {**judge.setup.starts, **judge.inputs}
-    if held.get("payload") and not held.get("payload_known"):
-        yield Cause("load", f"the controller does not know the payload of {held['payload']:g} kg", 1.0)
+    if judge.held.get("payload") and not judge.held.get("payload_known"):
+        yield Cause("load", f"the controller does not know the payload of {judge.held['payload']:g} kg", 1.0)
     joints = judge.setup.robot.joints if judge.setup.robot is not None else {}
     damped = [f"'{name}'" for name in judge.setup.joints if name in joints and joints[name].damping > 0.0]
     if damped:
         yield Cause("drag", f"the controller does not know the damping of joints {', '.join(damped)} in the URDF", 0.2)
     for group, unit in (("tau_ext", ""), ("f_ext", " N")):
-        values = judge.setup.given(group, held)
+        values = judge.given(group)
         if values.any():
             yield Cause("load", f"{group} = {point_text(values)}{unit} acts, which the controller does not know", 0.5)
 
@@ -247,16 +230,14 @@ def _sampled(judge: Judge) -> Iterator[Cause]:
     i = int(turns.argmax())
     if turns[i] >= FAST:
         gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
-        text = (
-            f"joint '{setup.joints[i]}' turns round every {1.0 / turns[i]:.2g} communication steps of {setup.step:g} s"
-        )
-        yield Cause("sampling", f"{text}: the gains{gains} are too high for the step", float(turns[i]), setup.joints[i])
+        often = f"every {1.0 / turns[i]:.2g} communication steps of {setup.step:g} s"
+        text = f"joint '{setup.joints[i]}' turns round {often}: the gains{gains} are too high for the step"
+        yield Cause("sampling", text, float(turns[i]), setup.joints[i])
 
 
-def _damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    held = {**judge.setup.starts, **judge.inputs}
+def _damping(judge: Judge) -> Iterator[Cause]:
     for stiff, damp in (("Kp", "Kd"), ("Kp_rot", "Kd_rot")):
-        Kp, Kd = judge.setup.given(stiff, held), judge.setup.given(damp, held)
+        Kp, Kd = judge.given(stiff), judge.given(damp)
         ratios = [(d / (2.0 * sqrt(p)), i, p, d) for i, (p, d) in enumerate(zip(Kp, Kd)) if p > 0.0]
         if ratios and min(ratios)[0] < 0.2:
             ratio, i, p, d = min(ratios)
@@ -264,16 +245,12 @@ def _damping(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
             yield Cause("damping", f"{text}: critical damping is {2.0 * sqrt(p):.4g} s⁻¹", 1.0 - ratio)
 
 
-def _singular(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
+def _singular(judge: Judge) -> Iterator[Cause]:
     setup, q, t = judge.setup, judge.history("q"), judge.history()
     if not _chain(judge) or len(setup.axes) + 3 * bool(judge.wanted("quat").size) > len(setup.joints):
         return
-    assert setup.robot is not None
-    from ..geometry.kinematics import Kinematics
-
-    rows = [*("xyz".index(axis) for axis in setup.axes), *((3, 4, 5) if judge.wanted("quat").size else ())]
-    jacobian = Kinematics(setup.robot, setup.joints).jacobian(setup.frame, q)[:, rows]
-    sigma = np.linalg.svd(jacobian, compute_uv=False)
+    rows = [*setup.rows, *((3, 4, 5) if judge.wanted("quat").size else ())]
+    sigma = np.linalg.svd(setup.kinematics.jacobian(setup.frame, q)[:, rows], compute_uv=False)
     ratio = sigma[:, -1] / np.maximum(sigma[:, 0], 1e-300)
     near = max(NEAR_SINGULAR, 2.0 * float(setup.starts.get("rcond", 0.0)))
     k = int(ratio.argmin())

@@ -71,7 +71,6 @@ class Judge:
         n = len(setup.joints)
         self.setup, self.inputs = setup, dict[str, float]()
         self.count, self.changes, self.changed = 0, 0, -inf
-        self.stopped = False
         self.aims: dict[str, Aim] = {}
         self.effort, self.speed, self.chatter = np.zeros(n), np.zeros(n), np.zeros(n)
         self.saturated, self.low, self.high = np.zeros(n, int), np.zeros(n, int), np.zeros(n, int)
@@ -80,6 +79,7 @@ class Judge:
         self._ends = np.cumsum([0, *sizes])
         self._names = [name for name, size in zip(OUTPUTS, sizes) if size]
         self._targets: dict[str, Array] = {}
+        self._first: dict[str, Array] = {}  # targets
         self._held = self._at_start()
         self._where = {
             f"{TARGETS[name]}[{i + 1}]": (name, i) for name, held in self._held.items() for i in range(len(held))
@@ -170,16 +170,11 @@ class Judge:
                 start = max(start, int(new[-1]) if len(new) else 0)
                 if len(new) and not start:
                     self.changed = self._time
-            self.travel = max(self.travel, float(np.abs(target - self.target(name, target[0])).max()))
-            self._targets.setdefault(f"{name} at first", target[0])
+            self.travel = max(self.travel, float(np.abs(target - self._first.setdefault(name, target[0])).max()))
             self._targets[name] = target[-1]
         if start or not self.count:
             self.changed = float(t[max(0, start - 1)])
         return start
-
-    def target(self, name: str, usual: Array | None = None) -> Array:
-        """Return the first target of an output."""
-        return self._targets.get(f"{name} at first", np.empty(0) if usual is None else usual)
 
     def wanted(self, name: str) -> Array:
         """Return the last target of an output; empty where there is none."""
@@ -272,6 +267,15 @@ class Judge:
     def share(self) -> Array:
         """Share of the samples at which each motor is at its effort limit."""
         return np.asarray(self.saturated / max(1, self.count))
+
+    @property
+    def held(self) -> Mapping[str, float]:
+        """Inputs and parameters as they are now."""
+        return {**self.setup.starts, **self.inputs}
+
+    def given(self, group: str) -> Array:
+        """Return the elements of a vector of inputs or parameters as they are now."""
+        return self.setup.given(group, self.held)
 
     def use(self) -> tuple[Array, Array]:
         """Return peak efforts and speeds as shares of the URDF's limits, 0 where there is none."""

@@ -1,14 +1,19 @@
 """Constant facts of a run by which its samples are judged: robot, limits, step and settings."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from math import inf
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..fmu import Fmu
 from ..plant.urdf import UNBOUNDED, RobotError, Urdf, read_urdf
+
+if TYPE_CHECKING:
+    from ..geometry.kinematics import Kinematics
 
 Array = NDArray[np.float64]
 
@@ -53,21 +58,29 @@ class Setup(NamedTuple):
             found.append(float(values[name]))
         return np.array(found)
 
-    def positions(self, q: Array) -> Array:
-        """Return positions of the end effector along the task axes at N samples, N × m."""
+    @property
+    def kinematics(self) -> Kinematics:
+        """Forward kinematics of the robot, which must be known."""
         from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
 
         assert self.robot is not None
-        path = Kinematics(self.robot, self.joints).path(self.frame, q)
-        return path[:, ["xyz".index(axis) for axis in self.axes]]
+        return Kinematics(self.robot, self.joints)
+
+    @property
+    def rows(self) -> list[int]:
+        """Indices of the task axes."""
+        return ["xyz".index(axis) for axis in self.axes]
+
+    def positions(self, q: Array) -> Array:
+        """Return positions of the end effector along the task axes at N samples, N × m."""
+        return self.kinematics.path(self.frame, q)[:, self.rows]
 
     def orientations(self, q: Array) -> Array:
         """Return orientations of the end effector at N samples, quaternions x, y, z, w, N × 4."""
-        from ..geometry.kinematics import Kinematics, quaternions
+        from ..geometry.kinematics import quaternions
 
-        assert self.robot is not None
-        kinematics = Kinematics(self.robot, self.joints)
-        return quaternions(kinematics.along(self.robot.chain(self.frame), q)[-1].rotation)
+        kinematics = self.kinematics
+        return quaternions(kinematics.along(kinematics.urdf.chain(self.frame), q)[-1].rotation)
 
 
 def limits_of(robot: Urdf | None, names: Sequence[str]) -> Limits:
