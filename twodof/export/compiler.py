@@ -254,31 +254,24 @@ def zig_cache() -> Path | None:
     Raises:
         BuildError: ``ZIG_GLOBAL_CACHE_DIR`` names a folder that cannot be.
     """
-    named = os.environ.get("ZIG_GLOBAL_CACHE_DIR")
+    named, fault = os.environ.get("ZIG_GLOBAL_CACHE_DIR"), ""
     try:
         home = named or os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
         cache = Path(home) if named else Path(home, "zig")
         cache.parent.mkdir(parents=True, exist_ok=True)
         cache.mkdir(mode=0o700, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
+        if not _is_ours(cache):
+            fault = f"its cache '{cache}' is another user's, or others write to it"
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
         if named:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BuildError(
                 f"zig's cache cannot be '{named}': {reason}; ZIG_GLOBAL_CACHE_DIR names its folder"
             ) from error
-        LOG.warning(
-            "zig compiles the C library each time: it has no folder for its cache, which"
-            " ZIG_GLOBAL_CACHE_DIR names (%s)",
-            error,
-        )
-        return None
-    if not _is_ours(cache):
-        LOG.warning(
-            "zig compiles the C library each time: its cache '%s' is another user's, or"
-            " others write to it; ZIG_GLOBAL_CACHE_DIR names another",
-            cache,
-        )
+        fault = f"it has no folder for its cache ({error})"
+    if fault:
+        LOG.warning("zig compiles the C library each time: %s; ZIG_GLOBAL_CACHE_DIR names another folder", fault)
         return None
     return cache
 

@@ -140,17 +140,12 @@ def experiment(
         stamp_start=stamp_start,
     )
     run.first_stamp()  # which refuses what has none
-    _tell_late(run, "`changes`" if input_file is None else f"'{input_file}'")
-    return run
-
-
-def _tell_late(run: Experiment, source: str) -> None:
-    """Warn of inputs whose time is after the stop time."""
-    end = run.time(run.steps)
-    if late := sum(t > end + TIME_TOLERANCE * run.step for t, _ in run.changes):
+    end, source = run.time(run.steps), "`changes`" if input_file is None else f"'{input_file}'"
+    if late := sum(t > end + TIME_TOLERANCE * step for t, _ in run.changes):
         LOG.warning(
             f"{source}: {late} of its times are after the run's end at {end:g} s, and their inputs are never set"
         )
+    return run
 
 
 def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str, Value]:

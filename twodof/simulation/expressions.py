@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InputError
 
 LONGEST = 500  # characters
-OPERATORS: dict[type, Callable[..., Any]] = {
+OPERATORS: dict[object, Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
@@ -26,43 +26,20 @@ OPERATORS: dict[type, Callable[..., Any]] = {
     ast.LtE: operator.le,
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
+    ("abs", 1): np.abs,
+    ("min", 2): np.minimum,
+    ("max", 2): np.maximum,
 }
-FUNCTIONS = {"abs": (np.abs, 1), "min": (np.minimum, 2), "max": (np.maximum, 2)}
+"""Operators, and functions by their names and numbers of arguments."""
+Values = Mapping[str, Any]
 
 
 class Expression(NamedTuple):
-    """A checked expression, and the names that it has."""
+    """A checked expression, the names that it has, and its value for numbers, or arrays of equal lengths, by name."""
 
     text: str
-    tree: ast.expr
     names: tuple[str, ...]
-    known: tuple[str, ...]
-
-    @property
-    def is_condition(self) -> bool:
-        """Return whether the expression compares two values."""
-        return isinstance(self.tree, ast.Compare)
-
-    def value(self, values: Mapping[str, Any]) -> Any:
-        """Return the value for numbers, or arrays of equal lengths, by name."""
-        with np.errstate(all="ignore"):
-            return self._value(self.tree, values)
-
-    def _value(self, node: ast.expr, values: Mapping[str, Any]) -> Any:
-        if isinstance(node, ast.Constant):
-            return np.float64(node.value)  # type: ignore[arg-type]
-        if isinstance(node, ast.Name):
-            return np.asarray(values[full_name(node.id, self.known)], dtype=np.float64)
-        if isinstance(node, ast.UnaryOp):
-            return OPERATORS[type(node.op)](self._value(node.operand, values))
-        if isinstance(node, ast.BinOp):
-            return OPERATORS[type(node.op)](self._value(node.left, values), self._value(node.right, values))
-        if isinstance(node, ast.Compare):
-            return OPERATORS[type(node.ops[0])](
-                self._value(node.left, values), self._value(node.comparators[0], values)
-            )
-        assert isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-        return FUNCTIONS[node.func.id][0](*(self._value(argument, values) for argument in node.args))
+    value: Callable[[Values], Any]
 
 
 def full_name(name: str, known: Iterable[str]) -> str:
@@ -81,39 +58,52 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
     Raises:
         InputError: it is none, or has a name that is not known.
     """
-    names = tuple(known)
+    known = tuple(known)
     try:
         if len(text) > LONGEST:
             raise ValueError
-        tree = ast.parse(text.strip(), mode="eval").body
-        found = _check(tree, condition)
-    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        names: list[str] = []
+        value = _compiled(ast.parse(text.strip(), mode="eval").body, names, condition)
+    except (ValueError, SyntaxError, OverflowError, RecursionError, MemoryError):
         like = "a comparison, as 'error > 1e-3'" if condition else "a value, as 'settling + 0.1*peak_effort'"
         raise InputError(f"'{text:.100}' is not {like}") from None
-    for name in found:
-        if not full_name(name, names):
-            near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
-            begun = [each for each in names if each.startswith(name)]
-            hint = f"did you mean {' or '.join(begun or near)}?" if begun or near else f"there are: {', '.join(names)}"
+    for name in names:
+        if not full_name(name, known):
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+            begun = [each for each in known if each.startswith(name)]
+            hint = f"did you mean {' or '.join(begun or near)}?" if begun or near else f"there are: {', '.join(known)}"
             raise InputError(f"'{text:.100}': there is no number '{name:.50}'; {hint}")
-    return Expression(text.strip(), tree, tuple(full_name(name, names) for name in found), names)
+    full = {name: full_name(name, known) for name in names}
+
+    def evaluate(values: Values) -> Any:
+        with np.errstate(all="ignore"):
+            return value({name: np.asarray(values[own], dtype=np.float64) for name, own in full.items()})
+
+    return Expression(text.strip(), tuple(full[name] for name in names), evaluate)
 
 
-def _check(node: ast.expr, condition: bool = False) -> list[str]:
-    """Return the names in an expression; raise ValueError for any other content."""
-    if isinstance(node, ast.Compare) == condition:
-        if isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in OPERATORS:
-            return _check(node.left) + _check(node.comparators[0])
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            return []
-        if isinstance(node, ast.Name):
-            return [node.id]
-        if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
-            return _check(node.operand)
-        if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
-            return _check(node.left) + _check(node.right)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
-            _, count = FUNCTIONS.get(node.func.id, (None, -1))
-            if len(node.args) == count:
-                return [name for argument in node.args for name in _check(argument)]
-    raise ValueError
+def _compiled(node: ast.expr, names: list[str], condition: bool = False) -> Callable[[Values], Any]:
+    """Return an expression as a function, and add its names; raise ValueError for any other content."""
+    if isinstance(node, ast.Compare) != condition:
+        raise ValueError
+    parts: list[ast.expr] = []
+    kind: Any = None
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        number = np.float64(node.value)  # type: ignore[arg-type]
+        return lambda values: number
+    if isinstance(node, ast.Name):
+        name = node.id
+        names.append(name)
+        return lambda values: values[name]
+    if isinstance(node, ast.Compare) and len(node.ops) == 1:
+        kind, parts = type(node.ops[0]), [node.left, *node.comparators]
+    elif isinstance(node, ast.UnaryOp):
+        kind, parts = type(node.op), [node.operand]
+    elif isinstance(node, ast.BinOp):
+        kind, parts = type(node.op), [node.left, node.right]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
+        kind, parts = (node.func.id, len(node.args)), node.args
+    if kind not in OPERATORS:
+        raise ValueError
+    function, inner = OPERATORS[kind], [_compiled(part, names) for part in parts]
+    return lambda values: function(*(part(values) for part in inner))

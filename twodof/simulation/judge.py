@@ -315,13 +315,9 @@ class Judge:
             found["overshoot"] = ways[0]
         if moved:
             late = [aim.last > BAND * aim.first for aim in moved]
-            ends = [self._after(aim) - aim.began for aim in moved]
+            ends = [aim.outside + taken - aim.began for aim in moved]  # at the sample after the last one outside
             found["settling_time"] = inf if any(late) else max(ends)
         return found
-
-    def _after(self, aim: Aim) -> float:
-        """Return the time of the sample after the last one outside the band."""
-        return aim.outside + self.duration / max(1, self.count - 1)
 
 
 def _largest(values: Array) -> Array:

@@ -84,22 +84,14 @@ def motion_of(t: Array, signals: Array, scale: float) -> tuple[str, Ringing | No
         t = even
     quarter = len(t) // 4
     third, last = signals[-2 * quarter : -quarter], signals[-quarter:]
-    before, after = (_amplitudes(part) for part in (third, last))
+    before, after = (0.5 * np.ptp(part, axis=0) for part in (third, last))
     j = int(np.argmax(after if after.max() > LASTING * scale else np.ptp(signals, axis=0)))
     found, y = ringing(t, signals[:, j]), signals[:, j]
     if after[j] <= LASTING * scale:
         return "steady", found, j
     turns = swings(last[:, j] - last[:, j].mean())
     grows = after[j] > GROWTH * before[j] and abs(y[-1]) > abs(y[-2 * quarter])
-    growing_swings = grows and turns >= 3 and after[j] > LASTING * scale
-    runs_away = (
-        grows and turns < 3 and abs(y[-1] - y[0]) > abs(scale) and np.abs(last[:, j]).min() >= np.abs(third[:, j]).max()
-    )
-    if growing_swings or runs_away:
+    away = abs(y[-1] - y[0]) > abs(scale) and np.abs(last[:, j]).min() >= np.abs(third[:, j]).max()
+    if grows and (turns >= 3 or away):
         return "diverging", found, j
     return ("oscillating", found, j) if turns >= 3 or (found and found.damping < 0.2) else ("moving", found, j)
-
-
-def _amplitudes(part: Array) -> Array:
-    """Return half the range of each signal."""
-    return np.asarray(0.5 * np.ptp(part, axis=0))
