@@ -59,6 +59,7 @@ class Judge:
         count: samples so far.
         inputs: those that differ from the start values, as they are now.
         aims: by output that has a target.
+        targets: with which the run starts, or that hold now, by output, 1 × values.
         effort, speed: largest magnitude of each joint's, n values; likewise what follows.
         chatter: sum of the squares of the effort's changes from sample to sample.
         saturated, low, high: samples at the effort limit, and after the first at a position limit.
@@ -80,16 +81,14 @@ class Judge:
         self._names = [name for name, size in zip(OUTPUTS, sizes) if size]
         self._targets: dict[str, Array] = {}
         self._first: dict[str, Array] = {}  # targets
-        self._held = self._at_start()
-        self._where = {
-            f"{TARGETS[name]}[{i + 1}]": (name, i) for name, held in self._held.items() for i in range(len(held))
-        }
+        held = self._at_start()
+        self.targets = {name: target[None] for name, target in held.items()}
+        self._where = {f"{TARGETS[name]}[{i + 1}]": (name, i) for name in held for i in range(len(held[name]))}
         self._time = 0.0
         self._kept, self._filled, self._stride = np.empty((2 * KEPT, 1 + len(TARGETS) + self._ends[-1])), 0, 1
         self._recent: list[Array] = []
-        self._constant: Mapping[str, Array] = {}
         self._same: Mapping[str, Array] = {}
-        self.rows, self._changed = io.BytesIO(), [(0, self._held)]
+        self.rows, self._changed = io.BytesIO(), [(0, held)]
         self._at_limits = 0
 
     # --- from a master ---
@@ -116,14 +115,14 @@ class Judge:
 
     def _in_effect(self, count: int) -> Mapping[str, Array]:
         """Return the targets of the rows that wait: the object of the block before where none has changed."""
-        if len(self._changed) == 1 and self._constant:
-            return self._constant
+        if len(self._changed) == 1:
+            return self.targets
         changed = [(max(0, k - self.count), held) for k, held in self._changed]
         lengths = np.diff([*(k for k, _ in changed), count])
-        targets = {name: np.repeat([held[name] for _, held in changed], lengths, axis=0) for name in self._held}
+        targets = {name: np.repeat([held[name] for _, held in changed], lengths, axis=0) for name in self.targets}
         self._changed = [(0, changed[-1][1])]
-        self._constant = {name: held[None] for name, held in self._changed[0][1].items()}
-        return targets if len(changed) > 1 else self._constant
+        self.targets = {name: held[None] for name, held in changed[-1][1].items()}
+        return targets
 
     def _at_start(self) -> dict[str, Array]:
         """Return the targets with which the run starts."""
@@ -133,11 +132,6 @@ class Judge:
         return {name: value for name, value in fit.items() if name != "quat" or value.any()}
 
     # --- from anyone ---
-
-    @property
-    def targets(self) -> dict[str, Array]:
-        """Targets with which the run starts, by output, 1 × values."""
-        return {name: held[None] for name, held in self._held.items()}
 
     def judge(self, t: Array, rows: Array, targets: Mapping[str, Array]) -> None:
         """Judge N samples.
