@@ -92,53 +92,24 @@ fmi2Status fmi2CancelStep(fmi2Component component)
     return fmi2Error;
 }
 
-/* Whether there is such a status to tell, and a place for it; refusals are logged. */
-static fmi2Status ask(fmi2Component component, int exists, const void *value)
-{
-    Instance *instance = enter(component, GET_STATUS, value != NULL);
-    if (!instance)
-        return fmi2Error;
-    return exists ? fmi2OK : report(instance, DISCARD, "fmi2GetStatus: no such status");
-}
-
-fmi2Status fmi2GetStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Status *value)
-{
-    const fmi2Status answer = ask(component, kind == fmi2DoStepStatus, value);
-    if (answer == fmi2OK)
-        *value = ((Instance *)component)->state.phase == STEP_FAILED ? fmi2Discard : fmi2OK;
-    return answer;
-}
-
-fmi2Status fmi2GetRealStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Real *value)
-{
-    const fmi2Status answer = ask(component, kind == fmi2LastSuccessfulTime, value);
-    if (answer == fmi2OK)
-        *value = ((Instance *)component)->state.time;
-    return answer;
-}
-
-fmi2Status fmi2GetBooleanStatus(fmi2Component component, const fmi2StatusKind kind,
-                                fmi2Boolean *value)
-{
-    const fmi2Status answer = ask(component, kind == fmi2Terminated, value);
-    if (answer == fmi2OK)
-        *value = fmi2False;
-    return answer;
-}
-
-fmi2Status fmi2GetIntegerStatus(fmi2Component component, const fmi2StatusKind kind,
-                                fmi2Integer *value)
-{
-    (void)kind;
-    return ask(component, 0, value);
-}
-
-fmi2Status fmi2GetStringStatus(fmi2Component component, const fmi2StatusKind kind,
-                               fmi2String *value)
-{
-    (void)kind;
-    return ask(component, 0, value);
-}
+/* A status, where the kind that is asked for exists. */
+#define STATUS(Name, Type, exists, answer)                                                            \
+    fmi2Status fmi2Get##Name(fmi2Component component, const fmi2StatusKind kind, Type *value)         \
+    {                                                                                                 \
+        Instance *instance = enter(component, GET_STATUS, value != NULL);                             \
+        (void)kind;                                                                                   \
+        if (!instance)                                                                                \
+            return fmi2Error;                                                                         \
+        if (!(exists))                                                                                \
+            return report(instance, DISCARD, "fmi2GetStatus: no such status");                        \
+        *value = (answer);                                                                            \
+        return fmi2OK;                                                                                \
+    }
+STATUS(Status, fmi2Status, kind == fmi2DoStepStatus, instance->state.phase == STEP_FAILED ? fmi2Discard : fmi2OK)
+STATUS(RealStatus, fmi2Real, kind == fmi2LastSuccessfulTime, instance->state.time)
+STATUS(BooleanStatus, fmi2Boolean, kind == fmi2Terminated, fmi2False)
+STATUS(IntegerStatus, fmi2Integer, 0, 0)
+STATUS(StringStatus, fmi2String, 0, NULL)
 
 fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
 {
