@@ -122,6 +122,18 @@ def test_a_held_joint_is_released_where_its_acceleration_turns(side, h):
     assert q[0] == pytest.approx(side * (0.1 - 0.7**3 / 6), abs=1e-10)
 
 
+def test_a_release_between_two_looks_at_the_effort_is_found():
+    """q̈ = 1000 ((t − 0.875)² − ε²) pulls for 2ε, once within a step; the step ends where v is 0 again."""
+    width, h = 0.04, 0.875 + 2 * 0.04
+
+    def acceleration(q, v):  # joint 2 is a clock of constant speed
+        return [1000.0 * ((q[1] - 0.875) ** 2 - width**2), 0.0]
+
+    (q, _), (v, _) = advance(smooth(acceleration), [0.0, 0.0], [0.0, 1.0], h, [(-1.0, 0.0), *FREE], 1e-3, 1e-3, h)
+    assert q == pytest.approx(-1000.0 * 27.0 * width**4 / 12.0, abs=1e-9)
+    assert v == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_joint_at_rest_at_its_limit_is_not_let_go_where_nothing_pulls():
     calls = 0
 
