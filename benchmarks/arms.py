@@ -55,7 +55,7 @@ def shipped_arm(control: str = "task") -> Arm:
 
 
 def panda(control: str = "task") -> Arm:
-    """The Panda as it comes, but for its fingers, which are fixed: one mimics the other."""
+    """Return the stock Panda with fixed fingers, because one mimics the other."""
     tree = without_shapes((ROBOTS / "panda_description/urdf/panda.urdf").read_text("utf-8"))
     for joint in tree.findall("joint"):
         if "finger" in joint.get("name", ""):
@@ -71,7 +71,7 @@ def ur5(control: str = "task") -> Arm:
 
 
 def chain(n: int) -> Arm:
-    """Rods one after the other, their joints about y and z in turns."""
+    """Return a chain of rods whose joints rotate about y and z in turns."""
     links = [
         f'<link name="l{i}"><inertial><origin xyz="0.05 0 0"/><mass value="0.5"/>'
         '<inertia ixx="1e-4" iyy="5e-4" izz="5e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'
@@ -85,7 +85,7 @@ def chain(n: int) -> Arm:
 
 
 def spatial_arm(tree: ET.Element, frame: str, q_start: tuple[float, ...], control: str = "task") -> Arm:
-    """An arm of three task axes whose target is 0.1 m from its start along each."""
+    """Return an arm with three task axes whose target is 0.1 m from its start along each."""
     robot = load_robot(ET.tostring(tree, encoding="unicode"), frame, "xyz")
     starts: dict[str, Any] = {"q_start": q_start, "x_des": (0.0, 0.0, 0.0)}
     plant = Plant(robot, variable_table(robot, starts))
@@ -105,7 +105,7 @@ def without_shapes(urdf: str) -> ET.Element:
 def compiled(
     arm: Arm, folder: Path, program: str, change: Callable[[Sources], None] = lambda _: None, flags: Sequence[str] = ()
 ) -> ctypes.CDLL:
-    """A program in C that includes the engine's files, compiled as the FMU is.
+    """Compile a C program that includes the engine's files, with the flags of the FMU.
 
     Args:
         change: the engine's sources, by name.
@@ -127,14 +127,14 @@ def compiled(
 def native_cost(
     arm: Arm, folder: Path, change: Callable[[Sources], None] = lambda _: None, flags: Sequence[str] = ()
 ) -> Callable[[], float]:
-    """Times a step in a run of the native engine in C, s."""
+    """Return a function that measures a step of the native engine in C, s."""
     step_cost = compiled(arm, folder, "native_step.c", change, flags).step_cost
     step_cost.argtypes, step_cost.restype = (ctypes.c_double, ctypes.c_int), ctypes.c_double
     return lambda: float(step_cost(STEP, STEPS))
 
 
 def by_own_compiler(*of: Any) -> Callable[[], float]:
-    """As native_cost, where ziglang is not installed."""
+    """Return the function of native_cost, built by the machine's compiler."""
     find = importlib.util.find_spec
     with patch("importlib.util.find_spec", lambda name: None if name == "ziglang" else find(name)):
         return native_cost(*of)

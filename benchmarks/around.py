@@ -1,4 +1,4 @@
-"""What the run around the native engine costs: logging, scenes, sweeps, start-up, big bags.
+"""Cost of a run besides the native engine: logging, scenes, sweeps, start-up, big bags.
 
     python benchmarks/around.py [MESSAGES]
 
@@ -32,7 +32,7 @@ TWODOF = [sys.executable, "-m", "twodof"]
 
 
 def floor(folder: Path) -> Callable[[int, bool], float]:
-    """Processor time of a step in C, s, of a run of so many, logged or bare."""
+    """Return a function that measures a step in C, s, over some steps, logged or bare."""
     cost = compiled(shipped_arm(), folder, "logged_step.c").logged_cost
     cost.argtypes = (ctypes.c_double, ctypes.c_int, ctypes.c_char_p, ctypes.c_int)
     cost.restype = ctypes.c_double
@@ -50,7 +50,7 @@ sys.exit(code)
 
 
 def process(*arguments: str, folder: Path) -> tuple[float, float]:
-    """Processor time, s, and largest memory, MB, of a command and its children.
+    """Measure the processor time, s, and peak memory, MB, of a command and its children.
 
     Started by a small process: at first a child counts the memory of the one that it comes from.
     """
@@ -62,7 +62,7 @@ def process(*arguments: str, folder: Path) -> tuple[float, float]:
 
 
 def big_bag(fmu: twodof.Fmu, path: Path, messages: int) -> None:
-    """The first ten seconds again and again, which takes less time than to simulate all."""
+    """Write the first ten seconds repeatedly, which takes less time than to simulate all."""
     run = twodof.experiment(fmu, stop_time=messages * STEP, step=STEP, stamp_start=1_700_000_000)
     with twodof.Bag(path).begin(run) as bag:
         source = twodof.samples(run)
@@ -125,8 +125,10 @@ def sweep_around(fmu: twodof.Fmu, in_c: Callable[[int, bool], float]) -> Iterato
 
 
 def workers_around(fmu: twodof.Fmu) -> Iterator[Figure]:
-    """How well two workers share. A start is a sweep of one run for each; a run is what one more
-    costs."""
+    """Compare two workers with one.
+
+    A start is a sweep of one run for each worker; a run is the cost of one more.
+    """
     gains = np.linspace(10.0, 200.0, SWEPT)
 
     def swept(workers: int, count: int) -> np.ndarray:
@@ -134,7 +136,7 @@ def workers_around(fmu: twodof.Fmu) -> Iterator[Figure]:
         return np.array(spent(lambda: twodof.sweep(fmu, grid=grid, workers=workers)))
 
     def start_and_run(workers: int) -> np.ndarray:
-        """Of a start and of a run, by coordinator and workers, s."""
+        """Measure a start and a run, by coordinator and workers, s."""
         start = swept(workers, workers)
         return np.array([start, (swept(workers, SWEPT) - start) / (SWEPT - workers)])
 
@@ -176,7 +178,7 @@ def processes(folder: Path, messages: int) -> Iterator[Figure]:
 
 
 def main(messages: int = MESSAGES) -> list[Figure]:
-    """Measure and print; the figures of which something is wanted."""
+    """Measure and print; return the figures that have a bound."""
     with tempfile.TemporaryDirectory(prefix="twodof_") as name:
         folder = Path(name)
         options = twodof.FmuOptions(native=True)

@@ -1,4 +1,4 @@
-"""The native engine in C by robot, path and compiler: beside MuJoCo, and C that CasADi generates.
+"""The native engine in C by robot, path and compiler, compared with MuJoCo and C of CasADi.
 
     python benchmarks/engine.py [JOINTS ...]
 
@@ -61,7 +61,7 @@ Costs = dict[str, float]
 
 
 def programs(n: int, folder: Path) -> dict[str, Callable[[], float]]:
-    """What is timed of one robot; names of rivals end in how they were built."""
+    """Return the timed programs of one robot; names of other engines end in their build."""
     arm = shipped_arm() if n == 2 else chain(n)
     free = Arm(replace(arm.robot, effort=(1e6,) * n), arm.starts)
     pushed = Arm(free.robot, {**free.starts, "tau_ext": (1e-3,) * n})
@@ -83,7 +83,7 @@ def programs(n: int, folder: Path) -> dict[str, Callable[[], float]]:
 
 
 def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]]]:
-    """Compiles mujoco_step.c; a run of so many steps gives a step's cost, s, and the last angles.
+    """Compile mujoco_step.c; return a function that runs some steps: a step's cost, s, and the last angles.
 
     A run has a process of its own, in which MuJoCo's Python package is not even imported.
     """
@@ -104,7 +104,7 @@ def mujoco_runner(folder: Path) -> Callable[[str, int], tuple[float, list[float]
 
 
 def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float, float]:
-    """Of the right-hand side and of a derivative, s: the least of runs in turns."""
+    """Measure the right-hand side and a derivative, s: the least of interleaved runs."""
     side_cost = compiled(arm, folder, "native_step.c").side_cost
     side_cost.restype = ctypes.c_double
     names = [variable.name for variable in variable_table(arm.robot, arm.starts, arm.control)]
@@ -115,7 +115,7 @@ def derivative_costs(arm: Arm, folder: Path, calls: int = CALLS) -> tuple[float,
 
 
 def measured(joints: Sequence[int]) -> Iterator[tuple[int, list[Costs]]]:
-    """The costs of each round, by joints."""
+    """Yield the costs of each round, by joints."""
     for n in joints:
         with tempfile.TemporaryDirectory(prefix="twodof_") as folder:
             costs = programs(n, Path(folder))
@@ -127,19 +127,19 @@ def ratio(rounds: list[Costs], a: str, b: str) -> float:
 
 
 def best(path: str, rounds: list[Costs]) -> str:
-    """The rival's fastest build, by its median."""
+    """Return CasADi's fastest build, by its median."""
     names = [name for name in rounds[0] if name.startswith(f"{path}: ")]
     return min(names, key=lambda name: median(times[name] for times in rounds))
 
 
 def growth(joints: Sequence[int], times: Sequence[float]) -> float:
-    """The exponent p of time ~ joints^p, the largest between neighbours."""
+    """Return the exponent p of time ~ joints^p, the largest between neighbours."""
     pairs = itertools.pairwise(zip(joints, times, strict=True))
     return max(math.log(t1 / t0) / math.log(n1 / n0) for (n0, t0), (n1, t1) in pairs)
 
 
 def figures_of(n: int, rounds: list[Costs]) -> Iterator[Figure]:
-    """Of which something is wanted."""
+    """Yield the figures that have a bound."""
     ours = f"{n} joints: engine by zig, flags as in its FMU"
     for path in PATHS:
         row = best(path, rounds)
@@ -153,7 +153,7 @@ def figures_of(n: int, rounds: list[Costs]) -> Iterator[Figure]:
 
 
 def main(joints: Sequence[int] = JOINTS) -> list[Figure]:
-    """Measure and print; the figures of which something is wanted."""
+    """Measure and print; return the figures that have a bound."""
     head = (
         "joints",
         *PATHS,

@@ -1,4 +1,4 @@
-"""A rival of the native engine: its right-hand side as C that CasADi generates.
+"""The native engine with a right-hand side in C that CasADi generates, for comparison.
 
 q̈(q, v) of the task control is one function of CasADi's, from the textbook's recursions with the
 robot's constants folded, in the integrator of the native engine. It does less: it knows no payload,
@@ -72,7 +72,7 @@ def _vector(name: str, count: int) -> tuple[Any, Array]:
 
 
 def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
-    """q̈ of q, v and INPUTS.
+    """Return q̈ as a function of q, v and INPUTS.
 
     Args:
         robot: without joints that mimic others.
@@ -109,7 +109,7 @@ def right_hand_side(robot: Robot, way: str | None) -> casadi.Function:
 
 
 def with_rival(arm: Arm, way: str | None) -> Callable[[dict[str, bytes]], None]:
-    """What makes the native engine's sources those of the rival."""
+    """Return a function that replaces the engine's sources by those of CasADi."""
     code = casadi.CodeGenerator("generated.c", {"with_header": False})
     code.add(right_hand_side(arm.robot, way))
     inputs = ", ".join(f"&value[{name.upper()}]" for name in INPUTS)
@@ -123,7 +123,7 @@ def with_rival(arm: Arm, way: str | None) -> Callable[[dict[str, bytes]], None]:
 
 
 def rivals(arm: Arm, folder: Path, general: bool) -> dict[str, Callable[[], float]]:
-    """Times runs of each build of the rival in C, by its settings; see native_cost."""
+    """Return the timed run of each build of CasADi's C, by its settings; see native_cost."""
     return {
         " ".join(filter(None, (compiler, way, *flags))): cost(arm, folder, with_rival(arm, way), flags)
         for compiler, cost in {"zig": native_cost, "cc": by_own_compiler}.items()

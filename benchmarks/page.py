@@ -1,4 +1,4 @@
-"""What pages cost a browser: until they are ready, a frame, and a drag.
+"""Cost of pages in a browser: time until ready, of a frame, and of a drag.
 
     python benchmarks/page.py [ARM.html|PLOT.html ...]
 
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def pages(folder: Path) -> Iterator[Path]:
-    """Those that are measured by default."""
+    """Make the pages that are measured by default."""
     arm = twodof.build_fmu(folder / "arm.fmu", twodof.FmuOptions(native=True))
     yield twodof.page(arm, folder / "arm.html")
     robot = {
@@ -100,7 +100,7 @@ def pages(folder: Path) -> Iterator[Path]:
 def measure(chromium: Browser, path: Path) -> None:
     """Open a page, and print what it costs."""
     with chromium.new_context(viewport=browser.VIEWPORT, offline=True) as context:
-        context.set_default_timeout(1e3 * browser.PATIENCE)
+        context.set_default_timeout(1e3 * browser.TIMEOUT)
         page = context.new_page()
         with spent() as processor:
             page.goto(path.absolute().as_uri(), wait_until="commit")
@@ -116,7 +116,7 @@ def measure(chromium: Browser, path: Path) -> None:
 
 
 def frames(page: Page) -> None:
-    """Of an arm that runs."""
+    """Print frame rate and delays of a running arm."""
     page.wait_for_timeout(1000)
     with spent() as processor:
         shown = np.array(page.evaluate(FRAMES, SECONDS))  # when, and the time of the arm
@@ -130,7 +130,7 @@ def frames(page: Page) -> None:
 
 
 def drag(page: Page) -> None:
-    """Of a target."""
+    """Print the delays of dragging a target."""
     page.locator("#arm-reset").click()
     place = browser.target_place(page)
     before = page.evaluate("arm.held('x_des')")
@@ -149,14 +149,14 @@ def drag(page: Page) -> None:
 
 @contextmanager
 def spent() -> Iterator[list[float]]:
-    """The processor time of the browser meanwhile, s, in all of its processes."""
+    """Measure the processor time, s, of all browser processes during the context."""
     before, seconds = processor_time(), [0.0]
     yield seconds
     seconds[0] = processor_time() - before
 
 
 def processor_time() -> float:
-    """Of all processes that descend from this one, with those of theirs that have ended, s."""
+    """Return the processor time of all descendants of this process, s, including ended ones."""
     total = 0.0
     for child in psutil.Process().children(recursive=True):
         with suppress(psutil.NoSuchProcess):  # it has ended since

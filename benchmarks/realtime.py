@@ -1,4 +1,4 @@
-"""How well ``twodof publish`` and ``twodof live`` keep time, beside a bare sleep loop meanwhile.
+"""Timing of ``twodof publish`` and ``twodof live``, and of a bare sleep loop at the same time.
 
     python benchmarks/realtime.py publish|live [SECONDS] [python|native]
 
@@ -54,7 +54,7 @@ def print_missed(pace: RealTime, count: int) -> None:
 
 
 def bare(seconds: str) -> None:
-    """A loop that does nothing else."""
+    """Run a loop that only sleeps."""
     print("ready", flush=True)
     pace, times = RealTime(), []
     for k in range(round(float(seconds) / STEP)):
@@ -106,7 +106,7 @@ def browse(url: str, seconds: str, nice: str) -> None:
 
 
 def beside(part: str, *arguments: object) -> subprocess.Popen[str]:
-    """A part of this file in a process of its own, that is ready."""
+    """Start a part of this file in its own process, and wait until it is ready."""
     command = [sys.executable, __file__, part, *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stdout.readline() == "ready\n"

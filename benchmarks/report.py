@@ -1,4 +1,4 @@
-"""How benchmarks tell what they have measured, and processor time."""
+"""Tables of benchmarks, and processor time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from twodof.cli.printing import print_table
 
 
 class Figure(NamedTuple):
-    """What was measured beside what is wanted; both sides are named with their settings."""
+    """A measured value and its bound; the name has the settings of both sides."""
 
     what: str
     measured: str
@@ -23,7 +23,7 @@ class Figure(NamedTuple):
 
 
 def print_rows(title: str, *rows: Iterable[object]) -> None:
-    """A table in columns, its title above, its first column to the left."""
+    """Print a table with a title; the first column is aligned to the left."""
     texts = [[*map(str, row)] for row in rows]
     width = max(len(row[0]) for row in texts)
     print(f"\n{title}\n")
@@ -31,14 +31,14 @@ def print_rows(title: str, *rows: Iterable[object]) -> None:
 
 
 def print_figures(figures: Iterable[Figure]) -> None:
-    """A table in Markdown."""
+    """Print a table in Markdown."""
     print("\n| what | measured | wanted |\n| --- | --- | --- |")
     for figure in figures:
         print("| " + " | ".join(figure) + " |")
 
 
 def machine() -> str:
-    """The versions and the processor; a virtual one may hide its name, and seldom its numbers."""
+    """Return the versions and the processor; a virtual one may hide its name, and seldom its numbers."""
     try:
         text = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:
@@ -52,7 +52,7 @@ def machine() -> str:
 
 
 def spent(work: Callable[[], object]) -> tuple[float, float]:
-    """Processor time of this process, and of those that it starts and that end meanwhile, s."""
+    """Return the processor time of work, s: of this process, and of children that end during it."""
 
     def now() -> list[float]:
         usages = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

@@ -1,4 +1,4 @@
-"""Every URDF of example-robot-data as it is, built and run, and FMI 3.0 against 2.0.
+"""Build and run every URDF of example-robot-data without changes, and compare FMI 3.0 with 2.0.
 
     python benchmarks/robots.py                      all, about 20 minutes
     python benchmarks/robots.py panda ur5            those whose path has one of these words
@@ -7,7 +7,7 @@
 Prints a table in Markdown, and ends with status 1 where something is wrong.
 
 Each is run for 1 s and logged in both flavours. A robot with several last links is built with the
-first of those that most joints move. "off" is how far the bare plant, thrown at 1 rad/s or m/s a
+first of those that most joints move. "error" is how far the bare plant, thrown at 1 rad/s or m/s a
 joint for 0.1 s without limits at rtol 1e-9, ends from SciPy's DOP853 (Radau where joints are
 damped) on Pinocchio's dynamics, rad or m. Times are processor time for a step of 10 ms of the
 default control at rest on its target, its message in the bag included. Wrong is a URDF that is
@@ -68,7 +68,7 @@ COMPARED = (
 FLIGHT = 0.1  # s
 GROUPS = ("q", "v", "x", "tau")
 STEP, STEPS, ROUNDS = 0.01, 100, 60
-PATIENCE = 60.0  # s of processor time, after which a run of a stiff robot is cut short
+MOST_SECONDS = 60.0  # s of processor time, after which a run of a stiff robot is cut short
 
 
 class Clock(twodof.Sink):
@@ -77,24 +77,24 @@ class Clock(twodof.Sink):
     first = last = 0.0
 
     def write(self, sample: twodof.Sample) -> None:
-        """Look at it."""
+        """Note the processor time."""
         self.last = time.process_time()
         self.first = self.first or self.last
 
     def late(self) -> bool:
-        """Whether it has taken too long."""
-        return self.last > self.first + PATIENCE
+        """Return True if the run took too long."""
+        return self.last > self.first + MOST_SECONDS
 
 
 def frame_of(text: str) -> str:
-    """The last link that most joints move, the first of several; the root where none moves."""
+    """Return the first of the last links that most joints move; the root if no joint moves."""
     urdf = read_urdf(text)
     ends = last_links(urdf) or [urdf.root]
     return max(ends, key=lambda link: sum(joint.moves for joint in urdf.chain(link)))
 
 
 def apart(fmu: Path, robot: Robot) -> float:
-    """How far the bare plant's flight ends from another solver's on Pinocchio's dynamics."""
+    """Return the bare plant's largest difference from SciPy's solution on Pinocchio's dynamics."""
     n, model = len(robot.joints), robot.model
     model.gravity.linear = np.array([0.0, 0.0, -9.81])
     data, damping = model.createData(), np.array(robot.damping)
@@ -117,7 +117,7 @@ def apart(fmu: Path, robot: Robot) -> float:
 
 
 def built(urdf: Path, folder: Path) -> list[str]:
-    """A row of the table: joints, frame, how far off, µs a step of either flavour."""
+    """Return a row of the table: joints, frame, error, µs a step of either flavour."""
     text = urdf.read_text("utf-8")
     frame = frame_of(text)
     times = []
@@ -139,7 +139,7 @@ def built(urdf: Path, folder: Path) -> list[str]:
 
 
 def simulated(path: Path) -> np.ndarray:
-    """All samples, by FMPy: a row of q, v, x and tau each."""
+    """Return all samples, by FMPy: rows of q, v, x and tau."""
     fmu = twodof.load_fmu(path)
     starts = {"v_start": [0.3] * len(fmu.joints), "f_ext": [1.0, 2.0, -3.0]}
     names: list[str] = list(GROUPS)
@@ -160,7 +160,7 @@ def simulated(path: Path) -> np.ndarray:
 
 
 def seconds(fmu: twodof.Fmu, instance: Instance) -> float:
-    """Processor time of a run."""
+    """Return the processor time of a run, s."""
     instance.reset()
     instance.initialise(0.0, np.inf, {name: 0.3 for name in fmu.vector("v_start")})
     read = instance.reader([name for group in GROUPS for name in fmu.vector(group)])
@@ -172,13 +172,13 @@ def seconds(fmu: twodof.Fmu, instance: Instance) -> float:
 
 
 def library_size(path: Path) -> int:
-    """Bytes of the binary."""
+    """Return the size of the binary in bytes."""
     with zipfile.ZipFile(path) as archive:
         return sum(i.file_size for i in archive.infolist() if i.filename[:9] == "binaries/")
 
 
 def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
-    """A row of the table, and whether all values are equal."""
+    """Return a row of the table, and True if all values are equal."""
     frame = frame_of(urdf.read_text("utf-8"))
     paths = []
     for fmi in (2, 3):
@@ -198,8 +198,8 @@ def compared(urdf: Path, control: str, folder: Path) -> tuple[list[str], bool]:
 
 
 def built_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
-    """Rows of the table, and whether each is right."""
-    yield ["URDF", "joints", "frame", "off", "Python, µs a step", "native"], True
+    """Yield rows of the table, and True for each that is right."""
+    yield ["URDF", "joints", "frame", "error", "Python, µs a step", "native"], True
     for urdf in sorted(ROBOTS.rglob("*.urdf")):
         name = str(urdf.relative_to(ROBOTS))
         if words and not any(word in name for word in words):
@@ -213,7 +213,7 @@ def built_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool
 
 
 def compared_rows(words: list[str], folder: Path) -> Iterator[tuple[list[str], bool]]:
-    """Rows of the table, and whether each is right."""
+    """Yield rows of the table, and True for each that is right."""
     yield ["URDF", "joints", "frame", "control", "equal", "moved", "bytes", "time"], True
     for name in COMPARED:
         for control in CONTROLS if not words or any(word in name for word in words) else ():

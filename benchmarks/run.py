@@ -1,4 +1,4 @@
-"""All that docs/speed.md tells of the engine and of what is around it, in one run and one table.
+"""Measure the numbers of docs/speed.md on the engine and the runs around it, in one table.
 
     python benchmarks/run.py
 

@@ -1,4 +1,4 @@
-"""A step of the guide's listing and of FMUs, and a message that is logged, in one run.
+"""Cost of a step of the tutorial's listing and of FMUs, and of a logged message.
 
     python benchmarks/steps.py
 
@@ -45,10 +45,10 @@ class Simulator(Protocol):
 
     def restart(self) -> None: ...
     def step(self, k: int) -> None:
-        """One communication step from k·STEP on; this is timed."""
+        """Do the timed communication step that starts at k·STEP."""
 
     def q(self) -> Sequence[float]:
-        """Joint angles, rad; not timed."""
+        """Return the joint angles, rad; not timed."""
 
 
 class Listing:
@@ -63,7 +63,7 @@ class Listing:
 
 
 class FmuInFmpy:
-    """An FMU stepped by bare FMPy calls; of this package's master nothing is used."""
+    """An FMU stepped by bare FMPy calls, without this package's master."""
 
     def __init__(self, path: Path, folder: Path, *, outputs: bool) -> None:
         description = fmpy.read_model_description(str(path))
@@ -101,7 +101,7 @@ class FmuInFmpy:
 
 
 def simulators(stack: ExitStack, folder: Path) -> dict[str, Simulator]:
-    """By what they are, the listing first."""
+    """Return the simulators by name, the listing first."""
     rows: dict[str, Simulator] = {"the listing, as written": Listing()}
     for flavour, native in (("Python", False), ("native", True)):
         fmu = twodof.build_fmu(folder / f"{flavour}.fmu", twodof.FmuOptions(native=native))
@@ -117,7 +117,7 @@ def simulators(stack: ExitStack, folder: Path) -> dict[str, Simulator]:
 
 
 def exact(k: int) -> np.ndarray:
-    """Position of the end effector after k steps, m: e(t) from rest, in closed form."""
+    """Return the position of the end effector after k steps, m, by the closed form of e(t) from rest."""
     t, root = k * STEP, math.sqrt(KD * KD / 4 - KP)
     decay = math.exp(-KD / 2 * t)
     share = decay * (math.cosh(root * t) + KD / 2 / root * math.sinh(root * t))
@@ -125,14 +125,14 @@ def exact(k: int) -> np.ndarray:
 
 
 def position(q: Sequence[float]) -> np.ndarray:
-    """End effector of the arm at angles q, m."""
+    """Return the end effector's position at angles q, m."""
     elbow = np.array([math.cos(q[0]), math.sin(q[0])])
     wrist = np.array([math.cos(q[0] + q[1]), math.sin(q[0] + q[1])])
     return LINK * (elbow + wrist)
 
 
 def accuracy(simulator: Simulator) -> float:
-    """Largest distance from the exact solution at any sample of the default run, m."""
+    """Return the largest distance from the exact solution at any sample of the default run, m."""
     simulator.restart()
     largest = 0.0
     for k in range(STEPS):
@@ -142,7 +142,7 @@ def accuracy(simulator: Simulator) -> float:
 
 
 def step_times(simulators: Sequence[Simulator], passes: int = PASSES) -> list[float]:
-    """Median processor time of a step of each, s: of whole default runs, in turns of some steps."""
+    """Return the median processor time of a step of each, s, over interleaved parts of default runs."""
     times: list[list[int]] = [[] for _ in simulators]
     for _ in range(passes):
         for simulator in simulators:
@@ -157,7 +157,7 @@ def step_times(simulators: Sequence[Simulator], passes: int = PASSES) -> list[fl
 
 
 def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
-    """Time of one JointState in bare rosbags and in this package's bag, s, by storage.
+    """Measure the time of one JointState in bare rosbags and in this package's bag, s, by storage.
 
     Medians over bags written in turns, from the first message to the closed file, in processor
     time of all threads: this package's bag stores in one of its own.
@@ -183,7 +183,7 @@ def log_times(folder: Path, fmu: Path) -> dict[str, tuple[float, float]]:
 
 
 def log_time(stack: ExitStack, write: Callable[[Any], None], items: Sequence[Any]) -> float:
-    """Processor time of one message, s: of writing all and closing the bag on the stack."""
+    """Measure the processor time of one message, s: of writing all and closing the bag on the stack."""
     begin = time.process_time()
     for item in items:
         write(item)
@@ -192,7 +192,7 @@ def log_time(stack: ExitStack, write: Callable[[Any], None], items: Sequence[Any
 
 
 def bare_rosbags(stack: ExitStack, path: Path, storage: str) -> Callable[[int], None]:
-    """A function that writes one message, the same each time, at a stamp; nothing else."""
+    """Return a function that writes one message, always the same, at a stamp."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "sensor_msgs/msg/JointState"
     header = store.types["std_msgs/msg/Header"](
@@ -212,7 +212,7 @@ def bare_rosbags(stack: ExitStack, path: Path, storage: str) -> Callable[[int], 
 
 
 def main() -> list[Figure]:
-    """Measure and print; the figures of which something is wanted."""
+    """Measure and print; return the figures that have a bound."""
     with tempfile.TemporaryDirectory(prefix="twodof_") as name, ExitStack() as stack:
         folder = Path(name)
         rows = simulators(stack, folder)

@@ -58,8 +58,8 @@ def import_plant(resources: Path, site_packages: list[str]):
         message = (
             f"the Python of this process ({version}, {sys.prefix}) has no package"
             f" '{missing.name}'{linked}: install resources/requirements.txt of this FMU into it,"
-            " or see documentation/externalDependencies.txt, or build the FMU with"
-            " --link-environment, or use the native FMU, which needs no Python"
+            " or see documentation/externalDependencies.txt, or build the FMU with the option"
+            " link_environment, or use the native FMU, which needs no Python"
         )
         print(message, file=sys.stderr)  # importers that do not log show nothing else
         raise ImportError(message) from None

@@ -32,7 +32,7 @@ LINKS = (
     lambda r, g, b: (r > 190) & (g > 110) & (g < 180) & (b < 100),
 )
 """What colours the default arm's two links have."""
-PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
+TIMEOUT = 120.0  # s: a guard against hanging; a busy machine takes its time
 VIEWPORT: ViewportSize = {"width": 900, "height": 560}
 ARGUMENTS = (
     "--no-sandbox",
@@ -66,7 +66,7 @@ EVERY_OTHER_FRAME = """{
 }"""
 """To draw in software 30 times a second in place of 60 leaves a processor to who runs beside it."""
 AT_REST = """async () => {
-    const asked = () => arm.news === undefined || arm.news.heard === arm.told && !arm.news.playing;
+    const asked = () => arm.news === undefined || arm.news.received === arm.sent && !arm.news.playing;
     if (arm.playing || !asked()) return false;
     const {run, count} = arm;
     await new Promise((resolve) => setTimeout(resolve, 200));
@@ -75,7 +75,7 @@ AT_REST = """async () => {
 }"""
 """Whether the arm stands still for longer than a step, news of it and a picture of the numbers
 take, so that these are shown as they are now."""
-NOTES = ".arm .bar, .arm .said { visibility: hidden }"
+NOTES = ".arm .bar, .arm .message { visibility: hidden }"
 LATENCY = """([label, text, row]) => new Promise(resolve => {
     const cell = document.querySelector(`[data-value="${row}"]`), before = cell.textContent;
     const field = document.querySelector(`input[aria-label="${label}"]`);
@@ -97,7 +97,7 @@ def chromium() -> Iterator[Browser]:
     """A headless browser that renders in software."""
     program = needs("chromium")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS, timeout=1e3 * PATIENCE)
+        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS, timeout=1e3 * TIMEOUT)
         yield browser
         browser.close()
 
@@ -109,7 +109,7 @@ def opened(
     """A page that is shown, on a screen of so many pixels for one of the page's, and that begins
     with a script; at its end, no error is in its console but of a server that has ended."""
     with browser.new_context(viewport=VIEWPORT, device_scale_factor=scale) as context:
-        context.set_default_timeout(1e3 * PATIENCE)
+        context.set_default_timeout(1e3 * TIMEOUT)
         page = context.new_page()
         page.add_init_script(begin)
         errors: list[str] = []
@@ -146,7 +146,7 @@ class Served:
     def interrupt(self, number: int = signal.SIGINT) -> tuple[int, str, str]:
         """Ctrl-C; exit status and what was printed on stdout and stderr."""
         self.process.send_signal(number)
-        output, errors = self.process.communicate(timeout=PATIENCE)
+        output, errors = self.process.communicate(timeout=TIMEOUT)
         return self.process.returncode, output, errors
 
     def children(self) -> list[int]:
@@ -258,7 +258,7 @@ def numbers(text: str) -> list[float]:
 
 def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], Any] = rows) -> Any:
     """What is seen on a page, its readout by default, once it fulfils a condition."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition(found := look(page)):
         assert time.monotonic() < end, found
         page.wait_for_timeout(20)

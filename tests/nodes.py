@@ -32,7 +32,7 @@ TWODOF = [sys.executable, "-m", "twodof"]
 STREAMS = ("/joint_states", "/tf", "/target", "/end_effector")
 LATCHED = ("/robot_description", "/tf_static")
 COMMANDS = ("/target_command", "/clicked_point")
-PATIENCE = 120.0  # s: a guard against hanging; a busy machine takes its time
+TIMEOUT = 120.0  # s: a guard against hanging; a busy machine takes its time
 
 
 @pytest.fixture(scope="session")
@@ -95,8 +95,8 @@ class Node:
         """Fields of what came on a topic."""
         return [it[3] for it in self.told if it[:2] == ["message", topic]]
 
-    def until(self, condition: Callable[[], Any], patience: float = PATIENCE) -> None:
-        end = time.monotonic() + patience
+    def until(self, condition: Callable[[], Any], timeout: float = TIMEOUT) -> None:
+        end = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < end, self.told[-3:]
             time.sleep(0.02)
@@ -136,7 +136,7 @@ class Node:
         assert self.process.stdin is not None
         self.process.stdin.close()
         try:
-            self.process.wait(PATIENCE)
+            self.process.wait(TIMEOUT)
         finally:
             self.process.kill()
             self._thread.join()
@@ -193,7 +193,7 @@ def published(
 
 def ended(process: subprocess.Popen[str], status: int = 0) -> tuple[str, str]:
     """What it said at its end."""
-    out, err = process.communicate(timeout=PATIENCE)
+    out, err = process.communicate(timeout=TIMEOUT)
     assert process.returncode == status, err
     return out, err
 

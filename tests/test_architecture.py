@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -143,20 +144,147 @@ def test_no_two_files_of_the_package_have_one_name() -> None:
     assert len(names) == len({*names}), sorted(name for name in names if names.count(name) > 1)
 
 
-RIDDLES = {"What", "Of", "Who", "Whose", "How", "That", "Which", "Beside"}
+RIDDLES = {"What", "Of", "Who", "Whose", "How", "That", "Which", "Beside", "Whether", "Where", "When", "If"}
+VERBS = frozenset(
+    [
+        "Add",
+        "Advance",
+        "Append",
+        "Apply",
+        "Bound",
+        "Build",
+        "Change",
+        "Check",
+        "Close",
+        "Compare",
+        "Compile",
+        "Complete",
+        "Compose",
+        "Confine",
+        "Convert",
+        "Count",
+        "Create",
+        "Deserialise",
+        "Determine",
+        "Discard",
+        "Do",
+        "Draw",
+        "End",
+        "Execute",
+        "Exit",
+        "Expand",
+        "Find",
+        "Flush",
+        "Format",
+        "Free",
+        "Import",
+        "Install",
+        "Instantiate",
+        "Integrate",
+        "Join",
+        "Judge",
+        "Keep",
+        "Let",
+        "Limit",
+        "Load",
+        "Lock",
+        "Make",
+        "Mark",
+        "Match",
+        "Measure",
+        "Merge",
+        "Move",
+        "Name",
+        "Note",
+        "Open",
+        "Pack",
+        "Parse",
+        "Pass",
+        "Prevent",
+        "Print",
+        "Publish",
+        "Put",
+        "Queue",
+        "Quote",
+        "Raise",
+        "Read",
+        "Receive",
+        "Refuse",
+        "Register",
+        "Reject",
+        "Remove",
+        "Replace",
+        "Replay",
+        "Report",
+        "Reset",
+        "Resolve",
+        "Restart",
+        "Restore",
+        "Restrict",
+        "Return",
+        "Rotate",
+        "Round",
+        "Run",
+        "Sample",
+        "Save",
+        "Say",
+        "Send",
+        "Set",
+        "Show",
+        "Simulate",
+        "Split",
+        "Start",
+        "Stay",
+        "Step",
+        "Stop",
+        "Store",
+        "Subtract",
+        "Take",
+        "Transform",
+        "Wait",
+        "Warn",
+        "Write",
+        "Yield",
+    ]
+)
+"""The first words of a function's docstring."""
 
 
-def test_docstrings_begin_with_no_riddle() -> None:
-    """Ruff checks the mood of functions; modules, classes and properties are noun phrases."""
-    found = {
-        f"{path}: {text.split(chr(10))[0]}"
-        for path, tree in PYTHON.items()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-        and (text := ast.get_docstring(node))
-        and (text.split()[0].rstrip(":,.") in RIDDLES or len(text.split()) < 2)
-    }
-    assert not found
+def is_property(node: ast.AST) -> bool:
+    return any("property" in ast.unparse(decorator) for decorator in getattr(node, "decorator_list", []))
+
+
+def fragments(tree: ast.AST) -> list[str]:
+    """Return first lines of docstrings that are no noun phrase or, of a function, begin with no verb."""
+    nodes = (node for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef))
+    found = []
+    for node in nodes:
+        words = (ast.get_docstring(node) or "Return it.").split()
+        is_phrase = isinstance(node, ast.Module | ast.ClassDef) or is_property(node)
+        first = words[0].rstrip(":,.")
+        if len(words) < 2 or first in RIDDLES or not (is_phrase or first in VERBS):
+            found.append((ast.get_docstring(node) or "").partition("\n")[0])
+    return found
+
+
+def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase() -> None:
+    texts = [(ROOT / folder).rglob("*.py") for folder in ("docs", "benchmarks")]
+    scripts = {path.relative_to(ROOT): ast.parse(path.read_text("utf-8")) for paths in texts for path in paths}
+    found = [f"{path}: {line}" for path, tree in (PYTHON | scripts).items() for line in fragments(tree)]
+    assert not found, "\n".join(found)
+
+
+def test_a_message_of_the_library_names_arguments() -> None:
+    """The command line translates them; a page of a sweep shows a command to type."""
+    option = re.compile(r"(?<!pip install)(?:^|[\s'`(])--[a-z]")
+    library = (path for path in PYTHON if "cli" not in path.parts and path.name != "maps.py")
+    found = [
+        f"{path}:{node.lineno}: {node.value}"
+        for path in library
+        for node in ast.walk(PYTHON[path])
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and option.search(node.value)
+    ]
+    assert not found, "\n".join(found)
 
 
 def test_one_function_prints() -> None:

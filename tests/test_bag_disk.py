@@ -60,7 +60,7 @@ def test_a_foreign_lock_is_not_waited_for_without_end(
     native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A program that locks each folder that appears."""
-    monkeypatch.setattr("twodof.files.PATIENCE", 0.1)
+    monkeypatch.setattr("twodof.files.LOCK_TIMEOUT", 0.1)
     mkdir, held = Path.mkdir, []
 
     def locked(path: Path, mode: int = 0o777, *, parents: bool = False, exist_ok: bool = False) -> None:

@@ -96,10 +96,10 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
 def test_frames_and_bodies_leave_few_constants():
     """What rounding in a URDF (1.57079632679) makes of a right angle does not fill all of them."""
     constants = joint_tree(model("panda").robot)
-    carrier = constants.path[-1]
+    end_body = constants.path[-1]
     for i, body in enumerate(constants.body):
         if constants.prismatic[i]:
             continue
         assert not constants.R[i].all()
-        if i != carrier:
+        if i != end_body:
             assert body.mass == body.moment[2] == body.inertia[1, 1] == 0.0

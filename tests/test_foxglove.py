@@ -16,7 +16,7 @@ import pytest
 from bags import SECOND
 from browser import NOBODY, UPGRADE, answer, connected
 from harness import wait_until
-from nodes import LATCHED, PATIENCE, STREAMS, ended, published, recorded, stamp_of
+from nodes import LATCHED, STREAMS, TIMEOUT, ended, published, recorded, stamp_of
 from tools import needs
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
@@ -44,7 +44,7 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path: Pa
     twodof.simulate(
         native_path, viewer, twodof.Bag(bag, scene=True, effort=True), stop_time=4, step=step, pace=twodof.RealTime()
     )
-    assert clients[0].wait(PATIENCE) == 0
+    assert clients[0].wait(TIMEOUT) == 0
     heard: dict[str, list[Any]] = {}
     for line in told.read_text().splitlines():
         topic, *content = json.loads(line)
@@ -115,7 +115,7 @@ def ask(connection: Connection, asked: dict[str, Any]) -> list[Any]:
     """Set a parameter; what then holds, as it is answered."""
     connection.send(json.dumps({"op": "setParameters", "parameters": [asked], "id": "a"}))
     while True:
-        text = connection.recv(timeout=PATIENCE)
+        text = connection.recv(timeout=TIMEOUT)
         if isinstance(text, str) and (answer := json.loads(text))["op"] == "parameterValues":
             return [it["value"] for it in answer["parameters"]]
 

@@ -144,7 +144,7 @@ def test_a_replay_shows_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(tmp_path)
     assert main(["view", "bag", "--export", "bag.html", "--no-browser"]) == 0
     with browser.chromium() as shown, shown.new_context(viewport=SMALL, offline=True) as context:
-        context.set_default_timeout(1e3 * browser.PATIENCE)
+        context.set_default_timeout(1e3 * browser.TIMEOUT)
         page = context.new_page()
         page.clock.install(time=0)
         page.clock.pause_at(1)  # a replay that never rests cannot be looked at

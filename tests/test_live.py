@@ -110,7 +110,7 @@ def time_of(found: dict[str, str]) -> float:
 
 def watch(page: Page, until_time: float, *, least: int = 1) -> list[dict[str, str]]:
     """The readout at some moments, so many at least."""
-    seen, end = [rows(page)], time.monotonic() + browser.PATIENCE
+    seen, end = [rows(page)], time.monotonic() + browser.TIMEOUT
     while time_of(seen[-1]) < until_time or len(seen) < least:
         assert time.monotonic() < end, seen[-1]
         page.wait_for_timeout(30)
@@ -189,7 +189,7 @@ def test_two_viewers_see_and_steer_the_same(command: Served, page: Page) -> None
     with open_socket(socket_of(command)) as other:
 
         def sees(condition: Callable[[dict[str, Any]], bool]) -> None:
-            while not condition(json.loads(other.recv(timeout=browser.PATIENCE))):
+            while not condition(json.loads(other.recv(timeout=browser.TIMEOUT))):
                 pass
 
         other.send('["change", {"x_des[1]": 0.11}]')
@@ -234,7 +234,7 @@ def test_who_gives_no_orders_is_not_listened_to(command: Served, page: Page) -> 
                 connection.send(order)
             with pytest.raises(ConnectionClosed):
                 while True:
-                    connection.recv(timeout=browser.PATIENCE)
+                    connection.recv(timeout=browser.TIMEOUT)
     press(page, "Step")
     until(page, lambda found: found["time"] == "0.010 s")
 
@@ -269,10 +269,10 @@ def test_a_flood_of_orders_stops_no_news(command: Served, page: Page) -> None:
                     if not sending.is_alive():
                         break
             sending.join()
-        while json.loads(other.recv(timeout=browser.PATIENCE))["values"]["Kp[1]"] != 56.0:
+        while json.loads(other.recv(timeout=browser.TIMEOUT))["values"]["Kp[1]"] != 56.0:
             pass
         other.send('["play", false]')
-        while json.loads(other.recv(timeout=browser.PATIENCE))["playing"]:
+        while json.loads(other.recv(timeout=browser.TIMEOUT))["playing"]:
             pass
 
 
@@ -325,7 +325,7 @@ def latest(command: Served, condition: Callable[[dict[str, Any]], bool], *orders
     with open_socket(socket_of(command)) as connection:
         for order in orders:
             connection.send(json.dumps(order))
-        while not condition(news := json.loads(connection.recv(timeout=browser.PATIENCE))):
+        while not condition(news := json.loads(connection.recv(timeout=browser.TIMEOUT))):
             pass
     return dict(news)
 
@@ -371,7 +371,7 @@ def test_the_socket_is_guarded_as_the_page(command: Served) -> None:
 def test_the_page_talks_to_its_server_alone(shown: Browser, command: Served) -> None:
     """By its policy: nothing else that it would ask for is asked for."""
     with socket.create_server(("127.0.0.1", 0)) as other, shown.new_context() as context:
-        context.set_default_timeout(1e3 * browser.PATIENCE)
+        context.set_default_timeout(1e3 * browser.TIMEOUT)
         page, port = context.new_page(), other.getsockname()[1]
         page.goto(command.url)
         page.wait_for_selector(browser.READY)
@@ -435,7 +435,7 @@ def test_recording_is_what_was_shown(page: Page, folder: Path, native_path: Path
 
 
 def told(page: Page) -> str:
-    return page.inner_text("#arm-said")
+    return page.inner_text("#arm-message")
 
 
 SLIDER = """<robot name="slider">

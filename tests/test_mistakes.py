@@ -62,7 +62,7 @@ MISTAKES: dict[str, str] = {
     "info gain": "no 'gain'; did you mean 'gains'",
     "info bagg": "no 'bagg'; did you mean 'bag'",
     "info robot.urdf": "'robot.urdf' is no FMU: .*; 'twodof build robot.urdf'",
-    "info table.csv": "'table.csv' is no FMU: it is a CSV file",
+    "info table.csv": "'table.csv' is no FMU: it is a CSV file, for --input of a run",
     "info notes.txt": "'notes.txt' is neither an FMU nor the folder of a bag or a sweep",
     f"{RUN} --input gains": "'gains' is no bag: it is a sweep",
     f"{RUN} --input tabel.csv": "no CSV 'tabel.csv'; did you mean 'table.csv'",

@@ -377,7 +377,7 @@ def test_fmi_2_on_a_raspberry_is_refused_at_the_run(raspberry, fmu_path, tmp_pat
     captured = capsys.readouterr()
     assert captured.err.strip().endswith(
         f"'{fmu_path}' has no binary for this platform (aarch64-linux, which FMI 2.0 has no name"
-        " for), only for: linux64; one of FMI 3.0 can: 'twodof build --native --fmi 3'"
+        " for), only for: linux64; build one with --native and --fmi 3"
     )
     assert not (tmp_path / "bag").exists()
 

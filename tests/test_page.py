@@ -19,8 +19,8 @@ from browser import (
     EVERY_OTHER_FRAME,
     HOSTILE,
     LINKS,
-    PATIENCE,
     READY,
+    TIMEOUT,
     VIEWPORT,
     assert_shown_as_text,
     chromium,
@@ -64,7 +64,7 @@ def browser() -> Iterator[Browser]:
 def shown(browser: Browser, path: Path, begin: str = EVERY_OTHER_FRAME, **context: Any) -> Iterator[Page]:
     """A page from its file, without a network; it asks for nothing and complains of nothing."""
     with browser.new_context(viewport=VIEWPORT, offline=True, accept_downloads=True, **context) as opened:
-        opened.set_default_timeout(1e3 * PATIENCE)
+        opened.set_default_timeout(1e3 * TIMEOUT)
         page = opened.new_page()
         page.add_init_script(begin)
         said: list[str] = []
@@ -401,7 +401,7 @@ def ball(page: Page) -> int:
 
 
 def said(page: Page) -> str:
-    return str(page.locator("#arm-said").text_content())
+    return str(page.locator("#arm-message").text_content())
 
 
 def test_the_url_has_what_was_set(browser, arm, page) -> None:
@@ -491,7 +491,7 @@ def test_a_robot_in_space_stands_on_a_floor_with_its_shadow(browser, panda, tmp_
 
 def test_a_browser_without_3d_shows_the_rest(browser, arm) -> None:
     with browser.new_context(viewport=VIEWPORT, offline=True) as context:
-        context.set_default_timeout(1e3 * PATIENCE)
+        context.set_default_timeout(1e3 * TIMEOUT)
         page = context.new_page()
         page.add_init_script(
             """const given = HTMLCanvasElement.prototype.getContext;

@@ -491,7 +491,7 @@ def test_a_missing_package_is_named_with_the_remedy(fmu_path):
     assert "has no package 'pinocchio'" in message
     assert "resources/requirements.txt" in message
     assert "externalDependencies.txt" in message
-    assert "--link-environment" in message
+    assert "link_environment" in message
 
 
 HOST_WITHOUT_PINOCCHIO = """

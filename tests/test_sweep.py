@@ -218,7 +218,7 @@ def test_bad_input_gets_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if "--scheduler" in arguments:
-        monkeypatch.setattr("twodof.sweeps.cluster.PATIENCE", 0.5)
+        monkeypatch.setattr("twodof.sweeps.cluster.SCHEDULER_TIMEOUT", 0.5)
     (tmp_path / "taken").mkdir()
     assert main(["sweep", str(native_path), *arguments]) in (1, 2)
     out, err = capsys.readouterr()

@@ -310,7 +310,7 @@ def test_a_cluster_that_asks_for_keys(native_path: Path, tmp_path: Path, monkeyp
         check=True,
         capture_output=True,
     )
-    monkeypatch.setattr("twodof.sweeps.cluster.PATIENCE", 2.0)
+    monkeypatch.setattr("twodof.sweeps.cluster.SCHEDULER_TIMEOUT", 2.0)
     names = (("--tls-ca-file", certificate), ("--tls-cert", certificate), ("--tls-key", key))
     options = ["--protocol", "tls", *(word for pair in names for word in pair)]
     files = {"CA_FILE": certificate, "CLIENT__KEY": key, "CLIENT__CERT": certificate}

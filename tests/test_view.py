@@ -252,7 +252,7 @@ def test_exported_file_replays_offline(shown: Browser, folder: Path, truth: np.n
     assert (done.returncode, done.stderr) == (0, "")
     file = folder / "replay.html"
     with shown.new_context(viewport={"width": 450, "height": 640}, offline=True) as context:
-        context.set_default_timeout(1e3 * browser.PATIENCE)
+        context.set_default_timeout(1e3 * browser.TIMEOUT)
         page = context.new_page()
         said: list[str] = []
         page.on("request", lambda request: said.append(request.url))

@@ -12,8 +12,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Ctrl-C ends the process at once while the command line is loaded, and not any more when the command has ended.
     """
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or to be ignored
-    if heard:
+    interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or to be ignored
+    if interruptible:
         signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
     _open_streams()
     from .cli.main import main as command
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         try:
-            if heard:
+            if interruptible:
                 signal.signal(signal.SIGINT, interrupt)
             return command(arguments)
         finally:

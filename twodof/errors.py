@@ -22,7 +22,7 @@ KINDS = {
     "FMU": ("an FMU", "twodof run"),
     "URDF": ("a robot description", "twodof build"),
     "page": ("a page", "xdg-open"),
-    "CSV": ("a CSV file", "twodof run --input"),
+    "CSV": ("a CSV file, for `changes` of a run", ""),
     "folder": ("a folder without a bag or a sweep", ""),
 }
 """Kinds of paths: their words, and the command that takes one."""

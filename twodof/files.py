@@ -27,7 +27,7 @@ METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
 MAX_LINKS_FOLLOWED = 40  # as the kernel
 TEMPORARY = ".twodof."
 """Prefix of folders whose process has died, or holds their lock."""
-PATIENCE = 5.0  # s that a lock is waited for
+LOCK_TIMEOUT = 5.0  # s that a lock is waited for
 NUMBER = int | float
 VALUES = {str: NUMBER}
 
@@ -241,7 +241,7 @@ def lock(path: Path, *, wait: bool = False) -> int:
 
     Args:
         path: the folder.
-        wait: up to PATIENCE s, for those that look whether it is being written.
+        wait: up to LOCK_TIMEOUT s, for those that look whether it is being written.
 
     Raises:
         BlockingIOError: another process writes it.
@@ -249,7 +249,7 @@ def lock(path: Path, *, wait: bool = False) -> int:
     """
     folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place would be waited for
     try:
-        end = time.monotonic() + (PATIENCE if wait else 0.0)
+        end = time.monotonic() + (LOCK_TIMEOUT if wait else 0.0)
         while not (own := _locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) and time.monotonic() < end:
             time.sleep(0.01)
         if not own or not os.path.samestat(os.fstat(folder), os.stat(path)):

@@ -86,7 +86,7 @@ Status STANDARD(CompletedIntegratorStep)(void *component, Boolean no_set_state_p
     update_rates(state);
     const int failed = find_passed_stop(passage, &state->plant, &state->stops, state->time);
     if (failed)
-        report(instance, WARNING, "%s: joint '%s' turned at a limit in the solver's step to %.12g s, which"
+        report(instance, WARNING, "%s: joint '%s' reversed at a limit in the solver's step to %.12g s, which"
                " the FMU cannot integrate: %s", call, JOINT_NAME[failed - 1], state->time, remedy);
     *enter_event_mode = passage->joint != 0;
     *terminate = 0;

@@ -34,7 +34,7 @@ typedef struct {
    about the frame of its joint: xx, xy, yy, xz, yz, zz. */
 typedef struct {
     double mass, moment[3], inertia[6];
-} Carrier;
+} EndBody;
 
 /* The position of a joint that turns. */
 INTERNAL JointPosition turn(double angle);
@@ -49,18 +49,18 @@ INTERNAL void task_frame(const JointPosition joint[N_BODIES], const double v[N_J
 INTERNAL void effort_of_force(const JointPosition joint[N_BODIES], const double force[3],
                               double tau[N_JOINTS]);
 
-/* The carrier with a point mass, kg, at an offset in the task frame, m. */
-INTERNAL void load_carrier(double payload, const double offset[3], Carrier *carrier);
+/* The end_body with a point mass, kg, at an offset in the task frame, m. */
+INTERNAL void load_end_body(double payload, const double offset[3], EndBody *end_body);
 
 /* τ = M(q) a + h(q, v), joint efforts in N·m or N. The gravity is in the root's axes, m/s2. M has the
    armature, kg·m2 or kg, on its diagonal. */
-INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const Carrier *carrier,
+INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const EndBody *end_body,
                                const double armature[N_JOINTS], const double v[N_JOINTS],
                                const double a[N_JOINTS], const double gravity[3],
                                double tau[N_JOINTS]);
 
 /* Bounds of |τ| but for rounding, in fewer operations from a few joints on. */
-INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const Carrier *carrier,
+INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const EndBody *end_body,
                             const double armature[N_JOINTS], const double v[N_JOINTS],
                             const double a[N_JOINTS], const double gravity[3],
                             double bound[N_JOINTS]);
@@ -68,14 +68,14 @@ INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const Carrier *
 /* a and λ of M(q) a = τ + λ. Of free joints, 1, τ is given, and λ is 0; of the others, 0, a is given, and
    τ is 0. Derivatives do without. */
 #ifndef IS_COMPLEX
-INTERNAL void hybrid_dynamics(const JointPosition joint[N_BODIES], const Carrier *carrier,
+INTERNAL void hybrid_dynamics(const JointPosition joint[N_BODIES], const EndBody *end_body,
                               const double armature[N_JOINTS], const double free[N_JOINTS],
                               const double given[N_JOINTS], double a[N_JOINTS],
                               double reaction[N_JOINTS]);
 #endif
 
 /* a = M(q)⁻¹ τ, the accelerations that efforts cause beyond those of h(q, v). */
-INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const Carrier *carrier,
+INTERNAL void acceleration_of_effort(const JointPosition joint[N_BODIES], const EndBody *end_body,
                                      const double armature[N_JOINTS], const double tau[N_JOINTS],
                                      double a[N_JOINTS]);
 

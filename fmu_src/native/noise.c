@@ -1,4 +1,4 @@
-/* Normal random numbers of a seed, a sample and a channel, equal to the bit to those of plant/noise.py: the
+/* Normal random numbers of a seed, a sample and a channel, bit-identical to those of plant/noise.py: the
    uniform numbers are those of Philox4x32-10, made normal by the polar method, with operations of IEEE 754 alone.
 
    Sources: Salmon, Moraes, Dror & Shaw, SC 2011; Marsaglia & Bray, SIAM Review 6(3), 1964. */

@@ -1,5 +1,5 @@
 /* Find the stops that an importer's step has passed. The quintic through position, velocity and acceleration of both
-   ends tells whether a joint turned near its limit or outside it; where one did, the engine takes the step
+   ends shows whether a joint reversed near its limit or outside it; where one did, the engine takes the step
    again, from its start, and its stops decide. */
 
 #include <math.h>
@@ -35,8 +35,8 @@ static void begin_passage(Passage *passage, const Plant *plant, double time)
         passage->begun &= isfinite(rate[i]) != 0;
 }
 
-/* Whether a joint turned around outside its limits, or so near them that the quintic cannot tell. */
-static int turned_outside(const Passage *start, const Passage *end, const Plant *plant, int i)
+/* Whether a joint reversed outside its limits, or so near them that the quintic cannot tell. */
+static int reversed_outside(const Passage *start, const Passage *end, const Plant *plant, int i)
 {
     const double h = end->time - start->time, low = plant->value[Q_MIN + i];
     const double q = start->y[i], high = plant->value[Q_MAX + i], D = end->y[i] - q;
@@ -64,18 +64,18 @@ static int turned_outside(const Passage *start, const Passage *end, const Plant 
 }
 
 /* Find a stop that the importer's step to the plant's state has passed, and start the next one there. Where
-   the engine cannot integrate the step, the joint, counted from 1, that turned at its limit, else 0. */
+   the engine cannot integrate the step, the joint, counted from 1, that reversed at its limit, else 0. */
 static int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, double time)
 {
     const Passage start = *passage;
     const double h = time - start.time;
-    int turned[N_JOINTS], any = 0;
+    int reversed[N_JOINTS], any = 0;
     begin_passage(passage, plant, time);
     if (!start.begun || !passage->begun || !(h > 0.0 && h <= LONGEST_STEP))
         return 0;
     for (int i = 0; i < N_JOINTS; i++) {
-        turned[i] = !stops->held[i] && turned_outside(&start, passage, plant, i);
-        any = turned[i] ? i + 1 : any;
+        reversed[i] = !stops->held[i] && reversed_outside(&start, passage, plant, i);
+        any = reversed[i] ? i + 1 : any;
     }
     if (!any)
         return 0;
@@ -90,7 +90,7 @@ static int find_passed_stop(Passage *passage, const Plant *plant, const Stops *s
         || !advance_plant(&again, h, &evaluations, stopped_at, &failure))
         return any;
     for (int i = 0; i < N_JOINTS; i++)
-        if (turned[i] && stopped_at[i] < first) {
+        if (reversed[i] && stopped_at[i] < first) {
             first = stopped_at[i];
             passage->joint = i + 1;
         }

@@ -21,7 +21,7 @@ static double saturated(double tau, double limit)
 }
 
 /* The robot as it is, or as its control law knows it. */
-static void body(const double value[N_VARIABLES], int as_known, Carrier *carrier)
+static void body(const double value[N_VARIABLES], int as_known, EndBody *end_body)
 {
     double payload = value[PAYLOAD];
 #if COMMANDS_ACCELERATION
@@ -30,7 +30,7 @@ static void body(const double value[N_VARIABLES], int as_known, Carrier *carrier
 #else
     (void)as_known;
 #endif
-    load_carrier(payload, &value[PAYLOAD_COM], carrier);
+    load_end_body(payload, &value[PAYLOAD_COM], end_body);
 }
 
 /* Whether the effort that acts is the output tau, held until a sampled controller commands another. */
@@ -56,7 +56,7 @@ static void wanted_effort(const double value[N_VARIABLES], const JointPosition j
                           double tau[N_JOINTS])
 {
 #if COMMANDS_ACCELERATION
-    Carrier known;
+    EndBody known;
     body(value, 1, &known);
     inverse_dynamics(joint, &known, &value[ARMATURE], v, given, &value[GRAVITY], tau);
 #else
@@ -77,7 +77,7 @@ static int may_saturate(const double value[N_VARIABLES], const JointPosition joi
 {
     const double with_rounding = 1.0 + 1e-9;
     double bound[N_JOINTS];
-    Carrier known;
+    EndBody known;
     body(value, 1, &known);
     effort_bounds(joint, &known, &value[ARMATURE], v, a, &value[GRAVITY], bound);
     for (int i = 0; i < N_JOINTS; i++)
@@ -98,9 +98,9 @@ static void add_excess(const double value[N_VARIABLES], const JointPosition join
         wanted_effort(value, joint, v, given, tau);
     memcpy(needed, tau, sizeof needed);
     if (!knows_all(value)) {
-        Carrier carrier;
-        body(value, 0, &carrier);
-        inverse_dynamics(joint, &carrier, &value[ARMATURE], v, a, &value[GRAVITY], needed);
+        EndBody end_body;
+        body(value, 0, &end_body);
+        inverse_dynamics(joint, &end_body, &value[ARMATURE], v, a, &value[GRAVITY], needed);
     }
     limit_effort(value, tau);
     for (int i = 0; i < N_JOINTS; i++)
@@ -142,9 +142,9 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
-        Carrier carrier;
-        body(value, 0, &carrier);
-        acceleration_of_effort(joint, &carrier, &value[ARMATURE], excess, further);
+        EndBody end_body;
+        body(value, 0, &end_body);
+        acceleration_of_effort(joint, &end_body, &value[ARMATURE], excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
@@ -156,13 +156,13 @@ void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
                   const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS])
 {
     JointPosition joint[N_BODIES];
-    Carrier carrier;
+    EndBody end_body;
     place_joints(q, joint);
-    body(plant->value, 0, &carrier);
+    body(plant->value, 0, &end_body);
     for (int k = 0; k < count; k++) {
         double unit[N_JOINTS] = {0};
         unit[joints[k]] = 1.0;
-        acceleration_of_effort(joint, &carrier, &plant->value[ARMATURE], unit, columns[k]);
+        acceleration_of_effort(joint, &end_body, &plant->value[ARMATURE], unit, columns[k]);
     }
 }
 #else
@@ -170,10 +170,10 @@ void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double fr
                    const double given[N_JOINTS], double a[N_JOINTS], double reaction[N_JOINTS])
 {
     JointPosition joint[N_BODIES];
-    Carrier carrier;
+    EndBody end_body;
     place_joints(q, joint);
-    body(plant->value, 0, &carrier);
-    hybrid_dynamics(joint, &carrier, &plant->value[ARMATURE], free, given, a, reaction);
+    body(plant->value, 0, &end_body);
+    hybrid_dynamics(joint, &end_body, &plant->value[ARMATURE], free, given, a, reaction);
 }
 #endif
 

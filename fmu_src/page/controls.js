@@ -33,12 +33,12 @@ class Controls {
   /**
    * @param {Samples} session
    * @param {{centre: number[], radius: number}} reach
-   * @param {(name: string, value: Value | number[]) => void} told
+   * @param {(name: string, value: Value | number[]) => void} onChange
    */
-  constructor(session, reach, told) {
+  constructor(session, reach, onChange) {
     this.session = session;
     this.reach = reach;
-    this.told = told;
+    this.onChange = onChange;
     this.names = shortNames(session.facts.joints);
     /** @type {Map<string, HTMLInputElement[]>} */
     this.fields = new Map();
@@ -74,8 +74,8 @@ class Controls {
       if (type !== "checkbox") input.value = String(value);
       if (type !== "checkbox") input.setAttribute("aria-label", `${name}, ${typed}`);
       input.addEventListener(variable.causality === "parameter" || type !== "range" ? "change" : "input", () => {
-        if (type === "checkbox") this.told(name, input.checked);
-        else if (input.value !== "") this.told(name, Number(input.value));
+        if (type === "checkbox") this.onChange(name, input.checked);
+        else if (input.value !== "") this.onChange(name, Number(input.value));
       });
       return input;
     });

@@ -32,7 +32,7 @@ class Engine {
   }
 
   /** What the FMU has logged. */
-  said() {
+  message() {
     const bytes = new Uint8Array(this.memory.buffer, this.calls.engine_message());
     return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));
   }
@@ -41,7 +41,7 @@ class Engine {
   /** @type {(name: string, ...values: number[]) => void} */
   call(name, ...values) {
     this.calls.engine_forget();
-    if (this.calls[name](...values) >= ERROR) throw new Error(this.said() || name);
+    if (this.calls[name](...values) >= ERROR) throw new Error(this.message() || name);
   }
 
   /** @param {number[]} places */

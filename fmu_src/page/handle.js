@@ -13,14 +13,14 @@ class Handle {
    * @param {Camera} camera
    * @param {Samples} session
    * @param {() => number[]} place where the target is, in the root frame
-   * @param {(name: string, values: number[]) => void} told what the target is to be
+   * @param {(name: string, values: number[]) => void} onChange called with the new target
    */
-  constructor(canvas, camera, session, place, told) {
+  constructor(canvas, camera, session, place, onChange) {
     this.canvas = canvas;
     this.camera = camera;
     this.session = session;
     this.place = place;
-    this.told = told;
+    this.onChange = onChange;
     this.axes = session.steered && session.groups.has("x_des") ? session.axes : [];
     this.turns = session.steered && session.groups.has("quat_des");
     /** @type {Map<number, number[]>} where pointers are, in parts of the picture */
@@ -104,15 +104,15 @@ class Handle {
       const met = camera.meet(x, y, begin, normal);
       if (!met) return;
       const place = plus(plus(begin, 1, met), -1, first);
-      this.told("x_des", axes.map((axis) => place[axis]));
+      this.onChange("x_des", axes.map((axis) => place[axis]));
     };
   }
 
   /** The points of the ring about an axis of the target. */
   /** @type {(axis: number) => number[][]} */
   ring(axis) {
-    const turned = rotation(this.session.held("quat_des"));
-    const [one, two] = [1, 2].map((i) => transform(turned, base((axis + i) % 3)));
+    const orientation = rotation(this.session.held("quat_des"));
+    const [one, two] = [1, 2].map((i) => transform(orientation, base((axis + i) % 3)));
     return circle(this.place(), RING * this.camera.size, one, two, RING_POINTS);
   }
 
@@ -127,8 +127,8 @@ class Handle {
   /** Turn the target about one of its axes. */
   /** @type {(at: number[], axis: number) => (x: number, y: number) => void} */
   turn(at, axis) {
-    const place = this.place(), start = this.session.held("quat_des"), turned = rotation(start);
-    const normal = transform(turned, base(axis)), one = transform(turned, base((axis + 1) % 3));
+    const place = this.place(), start = this.session.held("quat_des"), orientation = rotation(start);
+    const normal = transform(orientation, base(axis)), one = transform(orientation, base((axis + 1) % 3));
     const two = cross(normal, one);
     /** @type {(x: number, y: number) => number | null} */
     const angle = (x, y) => {
@@ -141,7 +141,7 @@ class Handle {
       const now = angle(x, y);
       if (now === null || first === null) return;
       const half = (now - first) / 2;
-      this.told("quat_des", compose(start, [...plus([0, 0, 0], Math.sin(half), base(axis)), Math.cos(half)]));
+      this.onChange("quat_des", compose(start, [...plus([0, 0, 0], Math.sin(half), base(axis)), Math.cos(half)]));
     };
   }
 }

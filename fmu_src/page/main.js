@@ -1,4 +1,4 @@
-/** The page: what is stepped, drawn and told, and when. */
+/** The page: steps the session, draws it and handles its controls. */
 
 const TRAIL = 1.5; // s
 const TILES = 10; // of the floor, to each side
@@ -12,7 +12,7 @@ async function unpacked(id) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
 }
 
-const SLOW = 0.04, PATIENCE = 10; // s of a frame, and so many in a row, from which on edges are not smoothed
+const SLOW = 0.04, SLOW_FRAMES = 10; // s of a frame, and so many in a row, from which on edges are not smoothed
 
 class App {
   /**
@@ -105,7 +105,7 @@ class App {
   /** Do what the user asks for. */
   /** @type {(action: () => void) => void} */
   order(action) {
-    this.session.said = "";
+    this.session.message = "";
     this.attempt(action);
     this.label();
   }
@@ -115,7 +115,7 @@ class App {
     try {
       action();
     } catch (refused) {
-      this.session.said = refused instanceof Error ? refused.message : String(refused);
+      this.session.message = refused instanceof Error ? refused.message : String(refused);
       this.session.play(false);
     }
   }
@@ -196,7 +196,7 @@ class App {
     this.before = now;
     if (session.playing) this.attempt(() => session.advance(passed, Number(byId("speed").value)));
     this.slow = passed > SLOW ? this.slow + 1 : 0;
-    if (this.slow === PATIENCE && this.scene) this.scene.fineness = 1;
+    if (this.slow === SLOW_FRAMES && this.scene) this.scene.fineness = 1;
     this.show();
     requestAnimationFrame((next) => this.frame(next));
   }
@@ -236,9 +236,9 @@ class App {
     }
     const blind = scene ? "" : "this browser shows no 3D: it has no WebGL 2";
     const unsaid = this.lines.some((line) => line.includes("sticks")) ? "" : sticks;
-    const notes = [blind, session.said, session.notice, ...this.lines, unsaid, this.handle.hint];
+    const notes = [blind, session.message, session.notice, ...this.lines, unsaid, this.handle.hint];
     const text = notes.filter(Boolean).join("\n");
-    if (byId("said").textContent !== text) byId("said").textContent = text;
+    if (byId("message").textContent !== text) byId("message").textContent = text;
   }
 
   /** What the readout tells of sample k beside the joints, m. */
@@ -330,5 +330,5 @@ async function main() {
 }
 
 main().catch((error) => {
-  byId("said").textContent = error instanceof Error ? error.message : String(error);
+  byId("message").textContent = error instanceof Error ? error.message : String(error);
 });

@@ -5,14 +5,14 @@
 #define EXPORT(name) __attribute__((export_name(#name))) name
 
 static Instance *instance;
-static char said[1024];
+static char last_message[1024];
 
 #if FMI == 3
 static void note(fmi3InstanceEnvironment environment, fmi3Status status, fmi3String category,
                  fmi3String message)
 {
     (void)environment, (void)status, (void)category;
-    snprintf(said, sizeof said, "%s", message);
+    snprintf(last_message, sizeof last_message, "%s", message);
 }
 #else
 static void note(fmi2ComponentEnvironment environment, fmi2String name, fmi2Status status,
@@ -21,7 +21,7 @@ static void note(fmi2ComponentEnvironment environment, fmi2String name, fmi2Stat
     va_list arguments;
     (void)environment, (void)name, (void)status, (void)category;
     va_start(arguments, format);
-    vsnprintf(said, sizeof said, format, arguments);
+    vsnprintf(last_message, sizeof last_message, format, arguments);
     va_end(arguments);
 }
 #endif
@@ -49,12 +49,12 @@ int EXPORT(engine_initialise)(void)
 /* The last log message, which is then cleared. */
 const char *EXPORT(engine_message)(void)
 {
-    return said;
+    return last_message;
 }
 
 void EXPORT(engine_forget)(void)
 {
-    said[0] = '\0';
+    last_message[0] = '\0';
 }
 
 void *EXPORT(engine_allocate)(size_t size)

@@ -188,8 +188,8 @@ function mcap(session, robot) {
     if (chunk.records.length > CHUNK) flush();
   }
   flush();
-  const at = file.length, told = new Bytes().text("twodof").raw(textMap({ "run.json": provenance(session) }).content);
-  file.record(OP.metadata, told);
+  const at = file.length, content = new Bytes().text("twodof").raw(textMap({ "run.json": provenance(session) }).content);
+  file.record(OP.metadata, content);
   const metadata = new Bytes().put(64, at, file.length - at).text("twodof");
   file.record(OP.dataEnd, new Bytes().put(32, 0));
   const summary = file.length, statistics = new Bytes();

@@ -4,7 +4,7 @@
  * @typedef {Object} News what has happened
  * @property {number} run number of the run
  * @property {number} t of the latest sample, s; there may be more than there was room for
- * @property {number} heard how many orders of this page were heard by then
+ * @property {number} received number of this page's requests received before it was sent
  * @property {number[][]} rows samples, each with its time first
  * @property {Record<string, Value>} values inputs and parameters
  * @property {boolean} playing
@@ -34,7 +34,7 @@ function seek() {
 
 class Remote extends Samples {
   without = ["scrub", "loops", "pace", "download"];
-  told = 0; // orders
+  sent = 0; // requests
   run = -1;
   noted = -1;
   forgetting = 0; // timer of the note
@@ -81,7 +81,7 @@ class Remote extends Samples {
       this.count -= this.count >> 1;
     }
     for (const row of news.rows) this.append(row);
-    if (news.heard === this.told) {
+    if (news.received === this.sent) {
       this.values = new Map(Object.entries(news.values));
       this.playing = news.playing;
     }
@@ -100,7 +100,7 @@ class Remote extends Samples {
 
   /** @type {(order: string, value?: unknown) => void} */
   tell(order, value = null) {
-    this.told += 1;
+    this.sent += 1;
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify([order, value]));
   }
 

@@ -44,7 +44,7 @@ class Samples {
   count = 0;
   playing = true;
   steered = true; // by its inputs
-  said = ""; // message to the user, until the next request
+  message = ""; // message to the user, until the next request
   notice = ""; // the same, for some time
   recorded = 0; // samples in a bag that is being written
   /** @type {string[]} what of the page it has no use for */
@@ -89,8 +89,8 @@ class Samples {
   /** Inputs and parameters as they are at first. */
   /** @returns {Map<string, Value>} */
   defaults() {
-    const told = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
-    return new Map(told.map((v) => [v.name, /** @type {Value} */ (v.start)]));
+    const settable = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
+    return new Map(settable.map((v) => [v.name, /** @type {Value} */ (v.start)]));
   }
 
   /** What is to be set, element by element; a number by a vector's name sets all of its elements. */
@@ -108,8 +108,8 @@ class Samples {
         throw new Error(`${element} = ${values[i]} is not a whole number of 32 bits`);
       return /** @type {[string, Value]} */ ([element, values[i]]);
     });
-    const told = new Map([...this.values, ...pairs]);
-    if (this.groups.get("quat_des")?.every((element) => !told.get(element)))
+    const all = new Map([...this.values, ...pairs]);
+    if (this.groups.get("quat_des")?.every((element) => !all.get(element)))
       throw new Error("quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns nothing");
     return pairs;
   }

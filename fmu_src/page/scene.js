@@ -4,17 +4,17 @@ const SOLID = [
   `#version 300 es
   uniform mat4 view, model; uniform vec3 low; uniform float size;
   layout(location = 0) in vec3 place; layout(location = 1) in vec3 normal;
-  out vec3 turned;
+  out vec3 rotated;
   void main() {
-    turned = mat3(model) * normal;
+    rotated = mat3(model) * normal;
     gl_Position = view * model * vec4(low + size * place, 1.0);
   }`,
   `#version 300 es
   precision highp float;
   uniform vec3 light; uniform vec4 colour; uniform float bright;
-  in vec3 turned; out vec4 shown;
+  in vec3 rotated; out vec4 shown;
   void main() {
-    float lit = dot(normalize(turned), light);
+    float lit = dot(normalize(rotated), light);
     shown = colour.a > 1.0 ? vec4(colour.rgb, 1.0) : vec4(mix(colour.rgb, vec3(1.0), bright) * (0.55 + 0.35 * lit + 0.15 * max(lit, 0.0)), colour.a);
   }`,
 ];

@@ -1,6 +1,6 @@
 /** A run of the FMU's engine in this very page. */
 
-const LATE = 0.25; // s behind the clock from which on time is let go
+const LATE = 0.25; // s behind the clock above which the session falls behind real time
 const BUSY = 0.012, SHARE = 0.5; // s of a frame, or its share, in which the plant is stepped
 
 class Session extends Samples {

@@ -43,29 +43,29 @@ FMI2_Export void probe_inverse_dynamics(const double q[], const double v[], cons
                                         const double gravity[], double tau[])
 {
     JointPosition joint[N_BODIES];
-    Carrier carrier;
+    EndBody end_body;
     place_joints(q, joint);
-    load_carrier(0.0, v, &carrier);
-    inverse_dynamics(joint, &carrier, NO_ARMATURE, v, a, gravity, tau);
+    load_end_body(0.0, v, &end_body);
+    inverse_dynamics(joint, &end_body, NO_ARMATURE, v, a, gravity, tau);
 }
 
 FMI2_Export void probe_effort_bounds(const double q[], const double v[], const double a[],
                                      const double gravity[], double bound[])
 {
     JointPosition joint[N_BODIES];
-    Carrier carrier;
+    EndBody end_body;
     place_joints(q, joint);
-    load_carrier(0.0, v, &carrier);
-    effort_bounds(joint, &carrier, NO_ARMATURE, v, a, gravity, bound);
+    load_end_body(0.0, v, &end_body);
+    effort_bounds(joint, &end_body, NO_ARMATURE, v, a, gravity, bound);
 }
 
 FMI2_Export void probe_acceleration_of_effort(const double q[], const double tau[], double a[])
 {
     JointPosition joint[N_BODIES];
-    Carrier carrier;
+    EndBody end_body;
     place_joints(q, joint);
-    load_carrier(0.0, q, &carrier);
-    acceleration_of_effort(joint, &carrier, NO_ARMATURE, tau, a);
+    load_end_body(0.0, q, &end_body);
+    acceleration_of_effort(joint, &end_body, NO_ARMATURE, tau, a);
 }
 
 #ifdef HAS_RCOND

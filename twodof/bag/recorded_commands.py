@@ -130,17 +130,17 @@ def _only(topics: Mapping[str, object], path: Path, topic: str | None, types: Se
 
 def _read(commands: Stored, begin: int, read: Callable[[int, str, bytes], Read], bag: str) -> list[tuple[int, Read]]:
     """Return the time and content of each command; errors name the bag."""
-    said = []
+    read_so_far = []
     for came, kind, data in commands:
         try:
-            said.append((came, read(came, kind, data)))
+            read_so_far.append((came, read(came, kind, data)))
         except CommandError as error:
             t = (came - begin) / NANOSECONDS
             raise InputError(f"{bag}: the command at {t:g} s {error}") from error
-    if names := {name for _, command in said for name in command.unknown_joints}:
+    if names := {name for _, command in read_so_far for name in command.unknown_joints}:
         unknown_joints = ", ".join(sorted(names))[:LONGEST_NAME]
         LOG.warning(f"{bag}: joints that this robot has not are left out: {unknown_joints!r}")
-    return said
+    return read_so_far
 
 
 def _followed(commands: Stored, begin: int, fmu: Fmu, given: Mapping[str, Value], step: float, bag: str) -> Changes:

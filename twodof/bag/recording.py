@@ -73,7 +73,7 @@ class Recording:
         joints: joint names.
         q, v: positions (rad, m) and velocities, N × n.
         tau: efforts (N·m, N), N × n, or N × 0 where the bag has none.
-        received: what /target said; None where the bag has no such points.
+        received: points received on /target; None where the bag has no such points.
         provenance: the logger's facts of the run, {} for a third-party bag.
 
     Raises:
@@ -169,7 +169,7 @@ class Recording:
             return np.empty((len(self.stamps), 0))
         begins = [k for k, _ in self.schedule]
         values = np.array([[float(held[name]) for name in names] for _, held in self.schedule])
-        # at its own communication point a change has not been at work yet
+        # at its own communication point a change has had no effect yet
         return cast(Array, values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
 
     @property
@@ -210,7 +210,7 @@ class Recording:
         none, shape = np.empty((len(self.t), 0)), self.q.shape
         targets = {"x": target, "quat": self.target_quat if x.size else none, "q": self.held("q_des", shape[1])}
         quat = setup.orientations(self.q) if targets["quat"].size else none
-        with np.errstate(invalid="ignore"):  # positions of others may not be finite
+        with np.errstate(invalid="ignore"):  # third-party positions may not be finite
             v = self.v if self.v.shape == shape else np.gradient(self.q, self.t, axis=0)
         values = {"q": self.q, "v": v, "x": x, "tau": self.tau if self.tau.shape == shape else none, "quat": quat}
         return judged(setup, self.t, values, {name: each for name, each in targets.items() if each.size})

@@ -104,7 +104,7 @@ def read_summary(path: Path) -> McapSummary | None:
 def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
     """Return a summary from its records at an offset; None where they are inconsistent."""
     tables, chunks, counts = Tables(), [], None
-    position, said, chunk_count = 0, 0, 0
+    position, stated, chunk_count = 0, 0, 0
     while position < len(content):
         opcode, length = HEAD.unpack_from(content, position)
         position += HEAD.size
@@ -116,11 +116,11 @@ def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
             channels = frozenset(number for number, _ in struct.iter_unpack("<HQ", offsets))
             chunks.append(Chunk(first, last, offset, size, channels))
         elif opcode == STATISTICS:
-            said, *_, chunk_count, _, _, size = STATISTICS_FIELDS.unpack_from(content, position)
+            stated, *_, chunk_count, _, _, size = STATISTICS_FIELDS.unpack_from(content, position)
             pairs = content[position + STATISTICS_FIELDS.size :][:size]
             counts = dict(struct.iter_unpack("<HQ", pairs))
         position += length
-    whole = counts is not None and sum(counts.values()) == said and len(chunks) == chunk_count
+    whole = counts is not None and sum(counts.values()) == stated and len(chunks) == chunk_count
     inside = all(len(MAGIC) <= c.offset and c.offset + c.length <= start for c in chunks)
     if counts is None or not whole or not inside:
         return None

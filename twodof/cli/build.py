@@ -14,10 +14,10 @@ from .options import (
     add_output,
     check_company,
     completed,
+    given_options,
     not_empty,
     output_file,
     parse_settings,
-    said,
 )
 from .printing import busy, print_next, print_table, quote, say
 
@@ -139,7 +139,7 @@ def _build(options: argparse.Namespace) -> Path:
         settings=parse_settings(options.settings),
         arrays=not options.scalars,
         platforms=tuple(dict.fromkeys(platforms)),
-        **said(options, "axes", "link_environment", "native", "fmi"),
+        **given_options(options, "axes", "link_environment", "native", "fmi"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     return build_fmu(options.output, chosen, overwrite=options.overwrite)

@@ -110,7 +110,7 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
     completed(frame, completion.links)
 
 
-def said(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return keyword arguments of the library from options of the same meaning."""
     return {name: getattr(options, name) for name in names}
 
@@ -130,7 +130,7 @@ def check_company(
 def _given(options: argparse.Namespace, option: str) -> bool:
     """Return whether an option is on the command line; such options have no default of their own."""
     names = SAME.get(option, (option.lstrip("-").replace("-", "_"),))
-    return any(value is not None and value is not False and value != [] for value in said(options, *names).values())
+    return any(v is not None and v is not False and v != [] for v in given_options(options, *names).values())
 
 
 def parse_settings(texts: Iterable[str], option: str = "--set") -> dict[str, Setting]:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .options import OF_A_RUN, CommandLineError, add_options, add_output, check_company, said
+from .options import OF_A_RUN, CommandLineError, add_options, add_output, check_company, given_options
 from .printing import in_options, print_json, print_next, print_table, quote, say
 from .run import bag_of, experiment_of, facts_of, print_summary
 from .signals import INTERRUPTED, asked_to_stop
@@ -83,7 +83,7 @@ def call(options: argparse.Namespace) -> int:
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
     viewers = [_foxglove(options)] if options.foxglove else []
     sinks = {name: [*viewers, *filter(None, [bags.get(name)])] for name in robots}
-    publisher = said(options, "clock", "namespace", *PublisherOptions.__optional_keys__ - {"opened"})
+    publisher = given_options(options, "clock", "namespace", *PublisherOptions.__optional_keys__ - {"opened"})
     publisher["network"] = network_of_environment(subnet=options.subnet)
     if not options.json:
         publisher["opened"] = partial(_print_network, options.stop_time)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .fmus import chosen_fmu
-from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_output, dated, parse_settings, said
+from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_output, dated, given_options, parse_settings
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 
@@ -106,7 +106,7 @@ def bag_of(options: argparse.Namespace, path: str | Path, *, measured: bool = Fa
     from ..bag.writer import Bag
 
     names = ("storage", "compress", "scene", "meshes", "effort", "overwrite", "fsync", "command_line")
-    return Bag(path, measured=measured, **said(options, *names))
+    return Bag(path, measured=measured, **given_options(options, *names))
 
 
 def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from ..errors import SimulationError
 INTERRUPTED = 130
 """Exit status after a request to end."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
-PATIENCE = 5.0  # s in which the work in progress ends on request
+STOP_TIMEOUT = 5.0  # s in which the work in progress ends on request
 CLEAN_UP = 1.0  # s after an interrupt in which no other one disturbs what it ends
 _interrupts: list[float] = []
 """Times of the interrupts, in seconds of the monotonic clock."""
@@ -56,7 +56,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
             _interrupts.append(time.monotonic())
             raise KeyboardInterrupt
         asked = True
-        signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+        signal.setitimer(signal.ITIMER_REAL, STOP_TIMEOUT)
 
     before = {number: signal.signal(number, ask) for number in SIGNALS}
     try:

@@ -20,8 +20,8 @@ from .options import (
     check_company,
     completed,
     dated,
+    given_options,
     parse_settings,
-    said,
 )
 from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
@@ -103,7 +103,7 @@ def call(options: argparse.Namespace) -> int:
             output=output,
             progress=progress,
             stop=asked,
-            **said(options, "stop_time", "step", "resume", "bags", "workers", "scheduler", "command_line"),
+            **given_options(options, "stop_time", "step", "resume", "bags", "workers", "scheduler", "command_line"),
         )
     stopped = len(table) < total
     counts = table["outcome"].value_counts()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .options import OF_A_PAGE, add_options, add_robot_options, check_company, output_file, said
+from .options import OF_A_PAGE, add_options, add_robot_options, check_company, given_options, output_file
 from .printing import in_options, say
 from .signals import asked_to_stop
 
@@ -32,7 +32,7 @@ def call(options: argparse.Namespace) -> int:
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
     from ..pages.replay import PICTURES, export, view
 
-    robot = said(options, "urdf", "mesh_dir", "frame", "fmu")
+    robot = given_options(options, "urdf", "mesh_dir", "frame", "fmu")
     if options.export:
         _print_remarks(export(options.bag, options.export, **robot))
         film = Path(options.export).suffix.lower() in PICTURES
@@ -45,7 +45,7 @@ def call(options: argparse.Namespace) -> int:
 
 def place(options: argparse.Namespace) -> dict[str, Any]:
     """Return the host and port options of a served page."""
-    return {key: value for key, value in said(options, "host", "port").items() if value is not None}
+    return {key: value for key, value in given_options(options, "host", "port").items() if value is not None}
 
 
 def open_page(options: argparse.Namespace, url: str, remarks: Sequence[str] = (), fmu: Path | None = None) -> None:

@@ -67,7 +67,7 @@ class FmuOptions:
 
     @property
     def is_default_arm(self) -> bool:
-        """Whether this is the shipped arm with its default settings, in any flavour."""
+        """True for the shipped arm with its default settings, in any flavour."""
         model = ("urdf", "frame", "lock", "axes", "gravity", "q_start", "control", "settings", "name")
         return all(getattr(self, key) == getattr(FmuOptions(), key) for key in model)
 

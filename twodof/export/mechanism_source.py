@@ -48,7 +48,7 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
     functions = {
         f"task_frame({in_all}, const double v[N_JOINTS], TaskFrame *task)": frame,
         f"effort_of_force({in_all}, const double force[3], double tau[N_JOINTS])": _elements("tau", J[:3].T.dot(force)),
-        "load_carrier(double payload, const double offset[3], Carrier *carrier)": load,
+        "load_end_body(double payload, const double offset[3], EndBody *end_body)": load,
         f"inverse_dynamics({motion}, double tau[N_JOINTS])": _elements("tau", effort),
     }
     alike = {
@@ -103,8 +103,8 @@ MECHANISM = """\
 
 #include <math.h>
 """
-INERTIAS = "const Carrier *carrier, const double armature[N_JOINTS]"
-HELD = ("carrier->", "armature[", "gravity[", "payload", "offset[")
+INERTIAS = "const EndBody *end_body, const double armature[N_JOINTS]"
+HELD = ("end_body->", "armature[", "gravity[", "payload", "offset[")
 """Parameters, along which there are no derivatives."""
 LOWER = np.tril_indices(3)
 
@@ -135,15 +135,15 @@ def _places(robot: JointTree) -> dict[str, Value]:
 
 def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
     """Return the bodies, the last with the payload as variables, and the names of these."""
-    carrier, offset = robot.path[-1], _variables("offset", 3)
-    loaded = robot.body[carrier].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
-    load = {"carrier->mass": loaded.mass}
-    load |= _elements("carrier->moment", loaded.moment)
-    load |= _elements("carrier->inertia", loaded.inertia[LOWER])
+    end_body, offset = robot.path[-1], _variables("offset", 3)
+    loaded = robot.body[end_body].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
+    load = {"end_body->mass": loaded.mass}
+    load |= _elements("end_body->moment", loaded.moment)
+    load |= _elements("end_body->inertia", loaded.inertia[LOWER])
     inertia = np.zeros((3, 3), dtype=object)
-    inertia[LOWER] = inertia.T[LOWER] = _variables("carrier->inertia", 6)
+    inertia[LOWER] = inertia.T[LOWER] = _variables("end_body->inertia", 6)
     bodies = list(robot.body)
-    bodies[carrier] = Body(Expression("carrier->mass"), _variables("carrier->moment", 3), inertia)
+    bodies[end_body] = Body(Expression("end_body->mass"), _variables("end_body->moment", 3), inertia)
     return bodies, load
 
 

@@ -21,7 +21,7 @@ SIGNS = "change their sign where a joint meets or leaves a stop, or J⁺ its ran
 def model_header(
     robot: Robot, table: Sequence[Variable], control: str, guid: str, fmi: int = 2, arrays: bool = True
 ) -> str:
-    """Return the text of ``model.h``: constants of a robot and its variables, exact to the bit.
+    """Return the text of ``model.h``: constants of a robot and its variables, bit-exact.
 
     Names from the URDF, which may be anybody's, are string literals and nothing else. At as many
     joints as a URDF may have the engine's working memory, which is on the stack, is 0.2 MB.

@@ -257,7 +257,7 @@ def instantiate(fmu: Fmu) -> Iterator[Instance]:
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"
         there = ", ".join(fmu.platforms) or "none"
-        remedy = "" if fmu.platform else "; one of FMI 3.0 can: 'twodof build --native --fmi 3'"
+        remedy = "" if fmu.platform else "; build one with `native` and `fmi` 3"
         reason = f"has no binary for this platform ({here}), only for: {there}{remedy}"
         raise FmuError(f"'{fmu.path}' {reason}")
     with temporary_folder() as folder:

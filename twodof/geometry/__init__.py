@@ -1,1 +1,1 @@
-"""Where the links of a URDF are, and what they look like."""
+"""Poses and shapes of the links of a URDF."""

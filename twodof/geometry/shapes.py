@@ -94,15 +94,15 @@ BOX = np.array([half for a, b, c, d in FACES for half in ((a, b, c), (a, c, d))]
 def sphere(radius: float) -> tuple[Array, Indices]:
     """Return a sphere about the origin."""
     polar = np.linspace(0.0, math.pi, SIDES // 2 + 1)
-    return _turned(radius * np.sin(polar), -radius * np.cos(polar))
+    return _revolved(radius * np.sin(polar), -radius * np.cos(polar))
 
 
 def cylinder(radius: float, length: float) -> tuple[Array, Indices]:
     """Return a cylinder about the origin, along z."""
-    return _turned(np.array([0.0, radius, radius, 0.0]), length / 2 * np.array([-1, -1, 1, 1]))
+    return _revolved(np.array([0.0, radius, radius, 0.0]), length / 2 * np.array([-1, -1, 1, 1]))
 
 
-def _turned(radii: Array, heights: Array) -> tuple[Array, Indices]:
+def _revolved(radii: Array, heights: Array) -> tuple[Array, Indices]:
     """Return the surface of revolution of a polyline about z."""
     angle = np.linspace(0.0, 2 * math.pi, SIDES, endpoint=False)
     x, y = np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle))

@@ -94,15 +94,12 @@ def page_of(run: Experiment) -> bytes:
     """Return the HTML of a run's FMU; errors as of ``page``."""
     fmu, sources = run.fmu, _sources(run.fmu)
     if not fmu.control or not sources:
-        raise PageError(
-            f"'{fmu.path}' has no plant in C, as native FMUs of this package have;"
-            " build one with 'twodof build --native'"
-        )
+        raise PageError(f"'{fmu.path}' has no plant in C, as native FMUs of this package have; build one with `native`")
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
     module = compile_web_module(files, ["page.c"])  # a page asks for no derivatives
     provenance = provenance_of(run, "")
-    provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # no other package is at work
+    provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses no other package
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
     return arm_page(arm.title, arm, engine, allowed, provenance=provenance)
 

@@ -47,8 +47,8 @@ class Foxglove(Sink):
         port: where it listens; 0: any that is free.
         scene: also the robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        set_gains: let programs of this user set the gains; those of other users are refused on Linux.
-        opened: told when it listens.
+        set_gains: allow programs of this user to set the gains; those of other users are refused on Linux.
+        opened: called when it listens.
 
     Attributes:
         url: of the WebSocket, known when it listens.
@@ -82,9 +82,9 @@ class Foxglove(Sink):
     def __enter__(self) -> Foxglove:
         context = self._context = Context()  # which its channels do not keep
         self._channels = {}
-        for name, said in self._messages.topics.items():
-            text, _ = store_of(said.type).generate_msgdef(said.type, ros_version=2)
-            schema = Schema(name=said.type, encoding="ros2msg", data=text.encode())
+        for name, topic in self._messages.topics.items():
+            text, _ = store_of(topic.type).generate_msgdef(topic.type, ros_version=2)
+            schema = Schema(name=topic.type, encoding="ros2msg", data=text.encode())
             self._channels[name] = Channel(name, schema=schema, message_encoding="cdr", context=context)
         hidden = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
         try:

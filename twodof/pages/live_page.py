@@ -38,7 +38,7 @@ def live(
     Args:
         fmu: the FMU or its path.
         stop: asked between two steps.
-        opened: told the URL, when it can be opened.
+        opened: called with the URL, when it can be opened.
         host, port: where to listen.
         step: communication step, s; None: the FMU's own.
         settings: start values, as of ``experiment``.
@@ -59,10 +59,10 @@ def live(
 
 async def _talk(loop: Loop, connection: Connection) -> None:
     """Send one page the news at its own pace, and pass its requests to the loop."""
-    heard, seen, before = 0, {"run": 0, "seen": 0}, None
+    received, seen, before = 0, {"run": 0, "seen": 0}, None
 
     async def listen() -> None:
-        nonlocal heard
+        nonlocal received
         async for text in connection:
             try:
                 order, value = json.loads(text)
@@ -71,7 +71,7 @@ async def _talk(loop: Loop, connection: Connection) -> None:
                 loop.note(str(error))
             except (ValueError, TypeError, AttributeError):
                 return  # none of our pages
-            heard += 1
+            received += 1
             await asyncio.sleep(1 / RATE if loop.behind else 0.0)  # the news have their turn
 
     loop.viewers += 1
@@ -80,9 +80,9 @@ async def _talk(loop: Loop, connection: Connection) -> None:
         while not listening.done():
             news = loop.news(**seen)
             seen = {name: news[name] for name in seen}
-            rest = {**news, "rows": [], "seen": 0, "heard": heard}
+            rest = {**news, "rows": [], "seen": 0, "received": received}
             if news["rows"] or rest != before:
-                await connection.send(json.dumps({**news, "heard": heard}))
+                await connection.send(json.dumps({**news, "received": received}))
                 before = rest
             await asyncio.sleep(1 / RATE)
     finally:

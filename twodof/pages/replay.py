@@ -175,7 +175,7 @@ def view(
     Args:
         bag: the bag, or its folder.
         stop: asked 20 times a second.
-        opened: told the URL, when it can be opened, and of what is not as it should be.
+        opened: called with the URL when it can be opened, and with remarks.
         host, port: where to listen.
         robot: options of ``replay``.
     """

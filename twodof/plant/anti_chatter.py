@@ -23,6 +23,6 @@ class Hold:
     length: float = 0.0
 
     def again(self, t: float, soon: float, longest: float) -> None:
-        """Begin a hold at t, longer than the last one where that ended within the time ``soon``."""
+        """Start a hold at t, longer than the last one if that ended less than ``soon`` ago."""
         self.length = min(HOLD_GROWTH * self.length, longest) if t - self.until < soon else FIRST_HOLD * longest
         self.until = t + self.length

@@ -1,4 +1,4 @@
-"""Normal random numbers of a seed, a sample and a channel, equal to the bit on every platform.
+"""Normal random numbers of a seed, a sample and a channel, bit-identical on every platform.
 
 The uniform numbers are those of Philox4x32-10, a function of a counter and a key, so that noise has no state. The
 polar method makes them normal, u √(−2 ln s / s) with s = u² + w² < 1; its logarithm has operations of IEEE 754 alone.

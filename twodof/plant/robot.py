@@ -56,7 +56,7 @@ class Robot:
     warnings: tuple[str, ...]
 
     def moves_frame(self) -> tuple[bool, ...]:
-        """Whether each joint lies between the root and the task frame."""
+        """Return the mask of the joints between the root and the task frame."""
         return tuple(bool(column.any()) for column in self._path().T)
 
     def swing(self) -> tuple[float, ...]:
@@ -72,7 +72,7 @@ class Robot:
         return tuple(bound.tolist())
 
     def _path(self) -> NDArray[np.float64]:
-        """Rows of the coupling of joints between the root and the task frame."""
+        """Return the rows of the coupling of joints between the root and the task frame."""
         support = list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
         coupling = np.eye(len(self.joints)) if self.coupling is None else self.coupling
         return coupling[[i - 1 for i in support]]

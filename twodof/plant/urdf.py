@@ -68,12 +68,12 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether the joint is not fixed."""
+        """True for a joint that is not fixed."""
         return self.type != "fixed"
 
     @property
     def prismatic(self) -> bool:
-        """Whether the coordinate is a length."""
+        """True for a joint whose coordinate is a length."""
         return self.type == "prismatic"
 
 
@@ -86,7 +86,7 @@ class Urdf:
         root: the link without a parent.
         links: names, in the order of the file.
         joints: by name, in the order of the file.
-        tree: the XML, for what is not said here.
+        tree: the XML, for all other facts.
         warnings: what was read but has no effect, one line each.
     """
 

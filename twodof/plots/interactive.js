@@ -6,7 +6,7 @@
 /** @typedef {{data: {meta: [number, string, string]}, fullData: {x: ArrayLike<number>}, pointNumber: number, x: number, y: number}} Hovered */
 /** @typedef {{data: {meta: [number | null, string, string]}[], layout: object}} Chart */
 
-const ROUNDING = 1e-12; // what is less is not told
+const ROUNDING = 1e-12; // smaller values are not shown
 const UNITS_OF = { q: "position", v: "velocity", tau: "effort", error: "distance" };
 
 /** @param {Row} row @param {() => void} changed @returns {HTMLTableRowElement} a box, a look, a name */
@@ -78,8 +78,8 @@ async function drawPlots() {
   /** @type {{figures: Chart[], rows: Row[]}} */
   const { figures, rows } = JSON.parse(await unpackedText("content"));
   const place = /** @type {HTMLElement} */ (document.getElementById("plots"));
-  const told = new Set(figures[0].data.map((trace) => trace.meta[2]));
-  const kinds = Object.keys(UNITS_OF).filter((kind) => told.has(kind));
+  const shown = new Set(figures[0].data.map((trace) => trace.meta[2]));
+  const kinds = Object.keys(UNITS_OF).filter((kind) => shown.has(kind));
   const drawn = figures.map(() => Object.assign(document.createElement("div"), { className: "plot" }));
   const legend = new Legend(rows, kinds, () => {
     figures.forEach(({ data }, i) => {

@@ -89,9 +89,9 @@ class SweepPage {
       base.xaxis = { ...base.xaxis, title: { text: this.title(shown[0]) } };
       base.yaxis = { ...base.yaxis, title: { text: this.title(shown[1]) } };
       Plotly.react(div, traces, base, { responsive: true, displayModeBar: false });
-      const heard = /** @type {any} */ (div);
-      heard.removeAllListeners("plotly_click");
-      heard.on("plotly_click", (/** @type {any} */ event) => {
+      const map = /** @type {any} */ (div);
+      map.removeAllListeners("plotly_click");
+      map.on("plotly_click", (/** @type {any} */ event) => {
         const point = event.points.find((/** @type {any} */ each) => each.curveNumber === 0);
         if (point) this.choose(point.pointNumber);
       });

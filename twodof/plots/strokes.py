@@ -59,12 +59,12 @@ class Stroke(NamedTuple):
 
     @property
     def is_limit(self) -> bool:
-        """Whether this is a limit, and not a curve with that label."""
+        """True for a limit, and not for a curve with that label."""
         return self.label == "limit" and not self.kind
 
     @property
     def is_whole(self) -> bool:
-        """Whether this consists of lines across the whole picture."""
+        """True for lines across the whole picture."""
         return len(self.x) != len(self.y)
 
     def thinned(self, most: int) -> Stroke:

@@ -57,7 +57,7 @@ class JointTrack:
 
     @property
     def at_limit(self) -> bool:
-        """Whether the joint was at a limit at any sample."""
+        """True for a joint that was at a limit at any sample."""
         return any(
             bool((np.abs(self.q - limit) <= AT_LIMIT * max(1.0, abs(limit))).any())
             for limit in (self.low, self.high)
@@ -75,7 +75,7 @@ class Task:
         closed_form: the same for the closed form; None where the gains are not known, or the robot
             has fewer joints than the task has coordinates.
         off: distance between the two positions, m, N values; None likewise.
-        disturbances: what was at work that the closed form does not have.
+        disturbances: effects that the closed form leaves out.
     """
 
     axes: str

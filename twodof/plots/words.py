@@ -99,14 +99,14 @@ def difference(first: Track, other: Track) -> str:
 
 def summary(track: Track, first: Track | None = None) -> dict[str, str]:
     """Return the main numbers of a run by name, and its difference from the first."""
-    told = ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
+    shown = ("FMU", "step", "x_des", "quat_des", "q_des", "tau_cmd", "Kp", "Kd")
     stopped = [joint.name for joint in track.joints if joint.at_limit]
     rows = {
         "bag": track.name,
         "robot": track.motion.robot if track.motion else "",
         "end effector": track.motion.frame if track.motion else "",
         "duration": f"{number(float(track.t[-1]))} s, {track.recording.count} samples",
-        **{key: track.settings[key] for key in told if key in track.settings},
+        **{key: track.settings[key] for key in shown if key in track.settings},
         "at a limit": ", ".join(stopped) or "no joint",
     }
     rows["verdict"] = "\n".join(outcome(track))

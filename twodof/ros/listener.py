@@ -64,9 +64,9 @@ class Commanders:
         facts = {"guid": str(endpoint.participant_key)}
         for one in self._participants.read(1000):
             if one.key == endpoint.participant_key and one.qos is not None:
-                said = {p.key: p.value for p in one.qos if isinstance(p, core.Policy.Property)}
+                properties = {p.key: p.value for p in one.qos if isinstance(p, core.Policy.Property)}
                 names = ((fact, key) for fact, keys in PROPERTIES.items() for key in keys)
-                facts |= {fact: said[key][:LONGEST_NAME] for fact, key in names if key in said}
+                facts |= {fact: properties[key][:LONGEST_NAME] for fact, key in names if key in properties}
         known = [fact for _, fact in self._run.commanders]
         if facts not in known and len(known) < MOST_COMMANDERS:
             self._run.commanders.append((t, facts))
@@ -96,7 +96,7 @@ class Listener:
         run: Experiment,
     ) -> None:
         self._commanders = Commanders(participant, run)
-        self._follows, self._heard, self._oldest = follows, received, oldest
+        self._follows, self._topics, self._oldest = follows, received, oldest
         self._readers = {
             name: sub.DataReader(participant, dds_topic(participant, name, kind), dds_qos(STREAM, kind))
             for name, kind in {**received, **(ORDERS if orders else {})}.items()
@@ -117,7 +117,7 @@ class Listener:
 
     def commands(self, sample: Sample) -> Iterator[Command]:
         """Return received commands; log one warning per kind of invalid message."""
-        for name, kind in self._heard.items():
+        for name, kind in self._topics.items():
 
             def read(cdr: bytes, kind: str = kind) -> Command:
                 command = self._follows.read(kind, cdr)

@@ -68,7 +68,7 @@ class Network(NamedTuple):
 
         Cyclone DDS listens on all addresses, whatever its interfaces, and answers whoever finds
         its ports. So the kernel drops packets that come neither by the loopback interface, as all
-        of this host do, nor from a peer: Cyclone DDS sends to nobody whom it has not heard of.
+        of this host do, nor from a peer: Cyclone DDS sends only to hosts from which it received.
 
         Raises:
             PublishError: the kernel refuses.
@@ -77,13 +77,13 @@ class Network(NamedTuple):
         yield
         if self.range not in ("LOCALHOST", "OFF") and not self.loopback:
             return
-        heard = [] if self.range == "OFF" else [(INTERFACE, socket.if_nametoindex("lo"))]
+        allowed = [] if self.range == "OFF" else [(INTERFACE, socket.if_nametoindex("lo"))]
         for peer in self.peers if self.range == "LOCALHOST" else ():
             found = socket.getaddrinfo(peer, None, socket.AF_INET, socket.SOCK_DGRAM)
-            heard += [(SOURCE, int(ip_address(address[0]))) for *_, address in found]
+            allowed += [(SOURCE, int(ip_address(address[0]))) for *_, address in found]
         rules = [
             (code, skipped, k)
-            for field, value in heard
+            for field, value in allowed
             for code, skipped, k in ((LOAD, 0, field), (EQUAL, 1, value), (ACCEPT, 0, 0xFFFFFFFF))
         ]
         program = b"".join(struct.pack("HBBI", c, 0, n, k) for c, n, k in (*rules, (ACCEPT, 0, 0)))
@@ -99,7 +99,7 @@ class Network(NamedTuple):
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
         """Return the configuration of Cyclone DDS, equivalent to that of rmw_cyclonedds of Jazzy.
 
-        LOCALHOST looks for others by messages to this host's own addresses, and so is heard by nobody else. Unlike
+        LOCALHOST looks for others by messages to this host's own addresses, which no other host receives. Unlike
         there it keeps doing so each second: a participant that starts later, and announces itself by multicast alone,
         else would find us after half a minute or never. And it uses the loopback interface too: Fast DDS speaks to
         its own host there, and Cyclone DDS drops what comes by an interface that it does not use.
@@ -207,25 +207,25 @@ def open_domain(network: Network) -> OpenDomain:
         PublishError: saying what Cyclone DDS says.
     """
     own = LOOPBACK if network.loopback else None
-    opened, used, said = _try_to_open(network, own)
+    opened, used, messages = _try_to_open(network, own)
     if opened and network.range == "LOCALHOST" and not used.keys() & LOOPBACK:
         del opened  # which closes it
-        opened, both, said = _try_to_open(network, {**used, **LOOPBACK})
+        opened, both, messages = _try_to_open(network, {**used, **LOOPBACK})
         if opened:
             used = both
         else:  # CYCLONEDDS_URI names interfaces, and none may be named twice
-            opened, used, said = _try_to_open(network, own)
+            opened, used, messages = _try_to_open(network, own)
     interfaces = ", ".join(used) or "an interface of CYCLONEDDS_URI"
-    if opened is None and "failed to find interfaces" in said:
+    if opened is None and "failed to find interfaces" in messages:
         LOG.warning("there is no network interface: nobody can hear what is published")
         interfaces = "no interface"
         opened = domain.Domain(network.domain, NO_NETWORK)
     elif opened is None:
         names = ", ".join(name for _, name in socket.if_nameindex())
         blame = f"; correct CYCLONEDDS_URI (interfaces here: {names})" if network.custom else ""
-        raise PublishError(f"DDS domain {network.domain} cannot be opened: {said}{blame}")
-    elif said:
-        LOG.warning("Cyclone DDS: %s", said)
+        raise PublishError(f"DDS domain {network.domain} cannot be opened: {messages}{blame}")
+    elif messages:
+        LOG.warning("Cyclone DDS: %s", messages)
     return OpenDomain(network, interfaces, opened)
 
 
@@ -254,5 +254,5 @@ def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, 
     present = dict(re.findall(r"(\S+) udp/([\d.]+)", "".join(re.findall(": interfaces: .*", account))))
     chosen = re.findall(r"(\S+) \(index", "".join(re.findall("selected interfaces: .*", account)))
     # each line of an error begins with time, domain and program
-    said = "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
-    return opened, {name: present.get(name, "localhost") for name in chosen}, said
+    messages = "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
+    return opened, {name: present.get(name, "localhost") for name in chosen}, messages

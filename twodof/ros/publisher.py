@@ -39,20 +39,20 @@ class Publisher(Sink):
         clock: also the samples' stamps as /clock; and hear /pause and /step.
         namespace: of all topics but /clock, /pause, /step and names given that begin with "/".
         state_topic: of the joint states.
-        command_topic: where commands are heard; None: "joint_commands", or "target_command" for an
+        command_topic: topic of received commands; None: "joint_commands", or "target_command" for an
             FMU whose control has a target of the frame.
         lockstep: each communication step awaits the command that has the sample's stamp.
         timeout: s without a command until the robot is held, or in lockstep until the run ends,
             by the wall clock; None: 0.5, in lockstep 10.
         on_timeout: "hold" or "ramp", as of ``Watchdog``; None: what is safe.
-        opened: told when the network is open.
+        opened: called when the network is open.
 
     Attributes:
         lockstep: as given.
         network: the network.
         interface: names of the network interfaces in use, known when it is open.
         topics: what is published.
-        commands: the topics on which commands are heard; none where the FMU has no inputs for
+        commands: the topics of received commands; none where the FMU has no inputs for
             them, or does not say which axes of which frame targets are. Known when it has begun.
 
     Raises:
@@ -112,16 +112,16 @@ class Publisher(Sink):
             raise InputError("`timeout` is for commands of joints, and for `lockstep`")
         elif self._on_timeout is not None:
             raise InputError("`on_timeout` is for commands of joints that are not in `lockstep`")
-        self._heard = {}
+        self._subscribed = {}
         self._begun = self._answered = False
         if self._follows.type:
             usual = JOINT_COMMANDS if of_joints else TARGET_COMMAND
-            self._heard[self._resolved(self._command_topic or usual)] = self._follows.type
+            self._subscribed[self._resolved(self._command_topic or usual)] = self._follows.type
             if not of_joints and not self.lockstep:
-                self._heard[self._resolved(CLICKED_POINT)] = POINT
+                self._subscribed[self._resolved(CLICKED_POINT)] = POINT
         elif self.lockstep or self._command_topic:
             raise InputError(f"'{run.fmu.path}' has no inputs that `command_topic` could command")
-        self.commands = tuple(self._heard)
+        self.commands = tuple(self._subscribed)
         for both in {*self.commands} & {*self.topics}:
             raise InputError(f"`command_topic` is '{both}', which is published")
         named = [*self.topics, *self.commands, *(ORDERS if self._clock else ())]
@@ -148,14 +148,14 @@ class Publisher(Sink):
                 participant = self._participant = domain.DomainParticipant(self.network.domain)
             self._writers = {
                 name: pub.DataWriter(
-                    participant, dds_topic(participant, self._named(name), said.type), dds_qos(said.qos, said.type)
+                    participant, dds_topic(participant, self._named(name), topic.type), dds_qos(topic.qos, topic.type)
                 )
-                for name, said in self._messages.topics.items()
+                for name, topic in self._messages.topics.items()
             }
             self._listener = Listener(
                 participant,
                 self._follows,
-                self._heard,
+                self._subscribed,
                 orders=self._clock,
                 oldest=None if self._watchdog is None else self._watchdog.timeout,
                 run=self._run,

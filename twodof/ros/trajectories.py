@@ -134,7 +134,7 @@ class _Path:
         times = edges[:-1, None] + spans[:, None] * (NODES + 1.0) / 2.0
         means = []
         for order in range(3):
-            start = self._values(order, grid[:-1])  # so that what rests does so to the bit
+            start = self._values(order, grid[:-1])  # so that a joint at rest stays exactly at rest
             off = (self._values(order, times) - start[steps, None]) @ (WEIGHTS / 2.0) * spans
             total = np.add.reduceat(off, np.searchsorted(edges, grid[:-1]))
             means.append(start + total / np.diff(grid))

@@ -108,10 +108,10 @@ def _beyond_limits(judge: Judge) -> Iterator[Cause]:
 
 def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
     setup = judge.setup
-    told = {cause.joint for cause in _degrees(judge)}
+    known = {cause.joint for cause in _degrees(judge)}
     for joint, unit, wanted, low, high in zip(setup.joints, setup.units, judge.wanted("q"), setup.low, setup.high):
         by, limit = (low - wanted, low) if wanted < low else (wanted - high, high)
-        if by > AT_LIMIT and joint not in told:
+        if by > AT_LIMIT and joint not in known:
             text = f"the target {wanted:.4g} {unit} of joint '{joint}' is out of reach by {by:.4g} {unit}"
             yield Cause("reach", f"{text}: its limit is {limit:.4g} {unit}", float(by), joint)
     robot, target, quat = setup.robot, judge.wanted("x"), judge.wanted("quat")

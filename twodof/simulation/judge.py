@@ -34,7 +34,7 @@ class Aim:
         self.way: Array = np.empty(0)
 
     def begin(self, t: float, e: Array, size: float) -> None:
-        """Begin a way at a new target, from an error vector (empty for an angle) of a size."""
+        """Start a move to a new target, from an error vector (empty for an angle) and its magnitude."""
         self.began, self.outside, self.first, self.last, self.past, self.way = t, t, size, size, 0.0, e
 
     def add(self, t: Array, e: Array, size: Array) -> None:

@@ -124,11 +124,11 @@ class Verdict:
         """
         for condition in [expression(text, RESULTS, condition=True) for text in conditions]:
             unknown = [name for name in condition.names if name not in self.numbers]
-            told = ", ".join(f"{name} = {self.numbers[name]:.6g}" for name in condition.names if name not in unknown)
+            values = ", ".join(f"{name} = {self.numbers[name]:.6g}" for name in condition.names if name not in unknown)
             if unknown:
                 return f"{condition.text} cannot be decided: {unknown[0]} is not defined for this run"
             if condition.value(self.numbers):
-                return f"{condition.text} holds: {told}"
+                return f"{condition.text} holds: {values}"
         return ""
 
     def facts(self) -> dict[str, object]:

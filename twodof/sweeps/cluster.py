@@ -20,7 +20,7 @@ from .runner import Job, Point, Row, Runner
 with needing(SweepError, "use a cluster", "cluster"):
     from distributed import Client, Future, KilledWorker, Worker, WorkerPlugin, get_worker, wait
 
-PATIENCE = 5.0  # s for a scheduler to answer
+SCHEDULER_TIMEOUT = 5.0  # s for a scheduler to answer
 NO_WORKER = 60.0  # s after which nobody hopes for another
 IN_HAND = 2  # tasks a worker, so that it never waits for the next
 
@@ -88,7 +88,7 @@ class Cluster:
     def __exit__(self, *exception: object) -> None:
         self._ended.set()
         if self._answers:
-            self._thread.join(PATIENCE)  # it takes back the job
+            self._thread.join(SCHEDULER_TIMEOUT)  # it takes back the job
 
     def _next(self) -> list[Row] | None:
         """Return the thread's next message; None at its end, or if the sweep is to stop."""
@@ -145,12 +145,12 @@ def _result(future: Future, batch: list[Point], batches: Batches) -> list[Row]:
 @contextmanager
 def _client(address: str) -> Iterator[Client]:
     try:
-        client = Client(address, timeout=PATIENCE)
+        client = Client(address, timeout=SCHEDULER_TIMEOUT)
     except (OSError, ValueError, TypeError) as error:
         raise SweepError(f"the scheduler '{address}' does not answer: {error!s:.200}") from error
     with client:
         try:
-            client.wait_for_workers(1, timeout=PATIENCE)
+            client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
         except TimeoutError:
             raise SweepError(f"the scheduler '{address}' has no workers") from None
         yield client

@@ -67,7 +67,7 @@ def sweep(
         workers: processes of this machine; None: as many as there are cores.
         scheduler: address of a Dask scheduler whose workers are to be used instead. Who can reach
             it runs code as you, unless Dask is configured to use TLS.
-        progress: told the number of runs that are done, and of all.
+        progress: called with the number of finished runs and of all runs.
         stop: asked at least twice a second; True ends the sweep with what it has.
         command_line: for the provenance.
 

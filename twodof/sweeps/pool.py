@@ -53,7 +53,7 @@ class Pool:
 
     def __exit__(self, *exception: object) -> None:
         for worker in self._workers:
-            worker.close()  # what it has, it has told; its files go with the folder
+            worker.close()  # it has sent all its rows; its files are removed with the folder
         self._exit.close()
 
     def _rows(self) -> Iterator[list[Row]]:

@@ -192,8 +192,8 @@ def read_sweep(path: str | Path) -> pandas.DataFrame:
         raise SweepError(no_such("sweep", path))
     table = pa.concat_tables(table for _, table in _read(files)).sort_by("run")
     rows = SweepTable(table.to_pandas())
-    said = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}
-    rows.attrs["units"] = {name: unit.decode("utf-8", "replace") for name, unit in said.items()}
+    units = {field.name: (field.metadata or {}).get(b"unit", b"") for field in table.schema}
+    rows.attrs["units"] = {name: unit.decode("utf-8", "replace") for name, unit in units.items()}
     rows.attrs["provenance"] = _provenance(files[0], table.schema)
     return rows
 

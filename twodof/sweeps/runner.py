@@ -140,7 +140,7 @@ def lost(point: Point, end: float, outcome: str, message: str) -> Row:
 def trace(run: Experiment, instance: Instance) -> Array:
     """Return the outputs q, v, x, tau and quat side by side at all samples of a run without changes, N + 1 × values.
 
-    For whoever needs the numbers alone, without a ``Sample`` for each; errors as of ``samples``.
+    Without a ``Sample`` for each; errors as of ``samples``.
     """
     instance.initialise(run.start_time, run.time(run.steps), run.given)
     names = [*chain(*map(run.fmu.vector, OUTPUTS))]
