@@ -68,7 +68,7 @@ class Provenance(TypedDict, total=False):
     urdf: str | None
     input_changes: list[list[Any]]
     inputs_known_until: float
-    commanders: list[Any]
+    commanders: list[object]
     verdict: dict[str, Any]
 
 
@@ -91,13 +91,13 @@ class ProvenanceFile:
         self.path, self.key = folder / file_of(namespace), key_of(namespace)
         self._head = _as_json(provenance_of(run, command_line))[:-1] + b',"input_changes":['
         self._run, self._commanders = run, len(run.commanders)
-        self._verdict: dict[str, Any] | None = None
+        self._verdict: dict[str, object] | None = None
         self._until: float | None = None
         self.path.write_bytes(self._head + self._tail())
         self._start, self._end = run.start_time, len(self._head)
         self._separator, self._full = b"", False
 
-    def add(self, changes: Changes, verdict: dict[str, Any] | None = None) -> None:
+    def add(self, changes: Changes, verdict: dict[str, object] | None = None) -> None:
         """Append times and the inputs that changed there, up to a reader's limit, and set the verdict."""
         commanders = len(self._run.commanders)
         same = commanders == self._commanders and verdict is self._verdict

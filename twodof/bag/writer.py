@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from copy import copy
 from pathlib import Path
-from typing import Any
 
 from ..errors import BagError
 from ..files import sync
@@ -114,7 +113,7 @@ class Bag(Sink):
             raise BagError("a bag is given its experiment first: 'with bag.begin(experiment):'")
         self._queue: deque[bytes] = deque()  # numbers of samples
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
-        self._verdict: dict[str, Any] | None = None
+        self._verdict: dict[str, object] | None = None
         self._taken = 0  # samples, counted by the thread
         self._store.enter(self)
         return self

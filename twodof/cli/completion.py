@@ -4,7 +4,6 @@ import argparse
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 Completer = Callable[..., list[str]]
 
@@ -19,7 +18,7 @@ def _file(options: argparse.Namespace) -> Path | None:
 def variables(suffix: str = "=") -> Completer:
     """Return a completer of an FMU's inputs and parameters."""
 
-    def complete(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    def complete(parsed_args: argparse.Namespace, **_: object) -> list[str]:
         path = _file(parsed_args)
         if path is None or path.suffix != ".fmu":
             return []
@@ -31,12 +30,12 @@ def variables(suffix: str = "=") -> Completer:
     return complete
 
 
-def links(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+def links(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     """Complete the links of a URDF or of a bag's robot."""
     return [str(link.get("name")) for link in _robot(parsed_args).iterfind("link")]
 
 
-def joints(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+def joints(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     """Complete the moving joints of a URDF or of a bag's robot."""
     found = _robot(parsed_args).iterfind("joint")
     return [str(joint.get("name")) for joint in found if joint.get("type") != "fixed"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..errors import InputError, kind_of, neighbour, no_such
 from .options import add_options
@@ -94,7 +94,7 @@ def _print_fmu_json(fmu: Fmu) -> None:
     )
 
 
-def _bag_facts(bag: Recording) -> dict[str, Any]:
+def _bag_facts(bag: Recording) -> dict[str, object]:
     verdict = _verdict_of(bag)
     return dict(
         kind="bag",

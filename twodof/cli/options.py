@@ -34,7 +34,8 @@ def output_file(text: str) -> str:
     return STANDARD_OUTPUT if text == "-" else not_empty(text)
 
 
-Table = dict[str, dict[str, Any]]
+Keywords = dict[str, Any]
+Table = dict[str, Keywords]
 OF_A_RUN: Table = {
     "--native": dict(action="store_true", help="build and run a native FMU, of the URDF or the default arm"),
     "--set": dict(
@@ -110,7 +111,7 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
     completed(frame, completion.links)
 
 
-def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+def given_options(options: argparse.Namespace, *names: str) -> Keywords:
     """Return keyword arguments of the library from options of the same meaning."""
     return {name: getattr(options, name) for name in names}
 

@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .fmus import chosen_fmu
 from .options import OF_A_RUN, CommandLineError, add_fmu, add_options, add_output, dated, given_options, parse_settings
@@ -109,7 +109,7 @@ def bag_of(options: argparse.Namespace, path: str | Path, *, measured: bool = Fa
     return Bag(path, measured=measured, **given_options(options, *names))
 
 
-def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None) -> dict[str, Any]:
+def facts_of(run: Experiment, bag: Bag | None, summary: Summary, pace: RealTime | None) -> dict[str, object]:
     """Return the facts of a run for another program."""
     last = summary.last
     return dict(

@@ -4,9 +4,8 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from .options import OF_A_PAGE, add_options, add_robot_options, check_company, given_options, output_file
+from .options import OF_A_PAGE, Keywords, add_options, add_robot_options, check_company, given_options, output_file
 from .printing import in_options, say
 from .signals import asked_to_stop
 
@@ -43,7 +42,7 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def place(options: argparse.Namespace) -> dict[str, Any]:
+def place(options: argparse.Namespace) -> Keywords:
     """Return the host and port options of a served page."""
     return {key: value for key, value in given_options(options, "host", "port").items() if value is not None}
 

@@ -77,7 +77,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     return flavour, files, finish
 
 
-def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Mapping[str, Any]) -> Flavour:
+def _flavour(options: FmuOptions, robot: Robot, table: list[Variable], urdf: str, starts: Starts) -> Flavour:
     if not options.native:
         if options.platforms or options.fmi not in (None, 2) or not options.arrays:
             raise BuildError(
@@ -155,7 +155,7 @@ class _Variables(NamedTuple):
     control: str
 
 
-def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, object]:
+def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:
     """Return the start values that are given; ``rest`` has the start positions of joints that are not named."""
     settings = dict(options.settings)
     for key, given in (("gravity", options.gravity), ("q_start", options.q_start)):

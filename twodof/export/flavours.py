@@ -6,18 +6,17 @@ import logging
 import os
 import site
 import sysconfig
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pythonfmu
 
 from ..errors import BuildError
 from ..files import data_file
 from ..plant.robot import Robot
-from ..plant.variables import CONTROLS, Variable
+from ..plant.variables import CONTROLS, Starts, Variable
 from .compiler import EXTENSIONS, UNITS, compile_library, standard_headers
 from .fmi3_files import build_description, terminals_and_icons
 from .fmu_options import FmuOptions
@@ -55,11 +54,11 @@ class Flavour:
     arrays: bool = False
 
 
-def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Mapping[str, Any]) -> Flavour:
+def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Starts) -> Flavour:
     """Return the Python flavour: the plant behind pythonfmu's wrapper, for linux64."""
     folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     folders += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
-    config: dict[str, Any] = {
+    config: dict[str, object] = {
         "frame": robot.frame,
         "axes": robot.axes,
         "control": options.control,

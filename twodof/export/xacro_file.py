@@ -108,7 +108,7 @@ class _Every(set[str]):
         return True
 
 
-def _evaluate(expression: str, symbols: dict[str, Any], _: object = None) -> object:
+def _evaluate(expression: str, symbols: dict[str, object], _: object = None) -> object:
     """Return the value of an expression, in place of xacro's own function, which calls ``eval``."""
     import xacro
     from simpleeval import BASIC_ALLOWED_ATTRS, EvalWithCompoundTypes

@@ -36,7 +36,7 @@ Values = Array[c_double]
 class _Staying:
     """The module os with a ``chdir`` that does nothing."""
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(os, name)
 
     def chdir(self, folder: str) -> None:

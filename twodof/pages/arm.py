@@ -151,7 +151,7 @@ def _sources(fmu: Fmu) -> dict[str, bytes]:
         }
 
 
-def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: Any) -> bytes:
+def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "", **facts: object) -> bytes:
     """Return the HTML of an arm.
 
     Args:
@@ -186,7 +186,7 @@ def _asset(name: str) -> str:
     return data_file("fmu_src", "page", name).read_text("utf-8")
 
 
-def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
+def _facts(arm: Arm) -> tuple[dict[str, object], bytes]:
     """Return the page's facts about its FMU, and the content of its meshes."""
     urdf = read_urdf(arm.urdf)
     ball = Shape("", Placement(np.zeros(3), np.eye(3)), (0, 0, 0), *sphere(1.0))
@@ -204,7 +204,7 @@ def _facts(arm: Arm) -> tuple[dict[str, Any], bytes]:
     return facts, b"".join(content for _, content in packed)
 
 
-def _joint(name: str, joint: Joint | None) -> dict[str, Any]:
+def _joint(name: str, joint: Joint | None) -> dict[str, object]:
     """Return an independent joint's facts; null for an unknown or missing limit."""
     if joint is None:
         return {"name": name, "prismatic": False, "low": None, "high": None, "effort": None}
@@ -213,11 +213,11 @@ def _joint(name: str, joint: Joint | None) -> dict[str, Any]:
     return {"name": name, "prismatic": joint.prismatic, **finite}
 
 
-def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, Any]], dict[str, int]]:
+def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], dict[str, int]]:
     """Return the tree of links, parents first, with the joint above each, and link numbers by name."""
     kinematics = Kinematics(urdf, joints)
     number = {urdf.root: 0}
-    links: list[dict[str, Any]] = [{"parent": -1}]
+    links: list[dict[str, object]] = [{"parent": -1}]
     for joint in sorted(urdf.joints.values(), key=lambda joint: len(urdf.chain(joint.child))):
         number[joint.child] = len(links)
         column, ratio, offset = kinematics.column(joint)
@@ -244,7 +244,7 @@ def _matrix(transform: Placement) -> list[float]:
     return values
 
 
-def _mesh(shape: Shape) -> tuple[dict[str, Any], bytes]:
+def _mesh(shape: Shape) -> tuple[dict[str, object], bytes]:
     """Return a mesh with unique 16-bit vertices relative to its size, and 32-bit triangle indices."""
     low = shape.vertices.min(axis=0)
     size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-9)

@@ -11,7 +11,6 @@ import secrets
 from collections.abc import Callable, Mapping
 from functools import partial
 from threading import Lock
-from typing import Any
 
 from ..errors import InputError, PageError, PublishError
 from ..plant.variables import GAINS
@@ -30,6 +29,7 @@ with needing(PublishError, "serve Foxglove", "foxglove"):
     from foxglove import Channel, Context, Parameter, Schema, start_server
     from foxglove.websocket import Capability, ServerListener
 
+Parameters = list[Parameter]
 LOG = logging.getLogger(__name__)
 PORT = 8765
 PROTOCOL = "foxglove.sdk.v1"
@@ -138,7 +138,7 @@ class _Gains(ServerListener):
         self._groups = {g: names for g, names in groups.items() if names[0] in run.fmu.variables}
         self._lock, self._asked, self._new = Lock(), dict[str, Value](), False
 
-    def on_subscribe(self, client: Any, channel: Any) -> None:
+    def on_subscribe(self, client: object, channel: object) -> None:
         """Register a subscription to a topic."""
         self._new = True
 
@@ -153,7 +153,7 @@ class _Gains(ServerListener):
             asked, self._asked = self._asked, {}
         return asked
 
-    def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:
+    def on_get_parameters(self, client: object, param_names: list[str], request_id: str | None = None) -> Parameters:
         """Return gains by name, all where no name is given."""
         with self._lock:
             values = {**self.held, **self._asked}
@@ -163,7 +163,7 @@ class _Gains(ServerListener):
             if not param_names or group in param_names
         ]
 
-    def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
+    def on_set_parameters(self, client: object, parameters: Parameters, request_id: str | None = None) -> Parameters:
         """Set gains, one number for all elements or one each; return the values in effect."""
         for parameter in parameters:
             try:
@@ -181,7 +181,7 @@ class _Gains(ServerListener):
         return self.on_get_parameters(client, [parameter.name for parameter in parameters])
 
 
-def _numbers(value: Any) -> Any:
+def _numbers(value: object) -> object:
     """Return a parameter's numbers; an integer counts, and one number is for all elements."""
     if isinstance(value, list):
         return value[0] if len(value) == 1 else value

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
@@ -115,7 +115,7 @@ def _groups(track: Track) -> dict[str, Array]:
     return {name: values for name, values in groups.items() if values.size}
 
 
-def _variables(track: Track, groups: dict[str, Array]) -> Iterator[dict[str, Any]]:
+def _variables(track: Track, groups: dict[str, Array]) -> Iterator[dict[str, object]]:
     """Return the variables of the groups, and the parameters that pictures need."""
     values: dict[str, float | None] = {
         f"{name}[{i + 1}]": None for name, rows in groups.items() for i in range(rows.shape[1])

@@ -10,12 +10,12 @@ from itertools import chain
 from math import ceil
 from pathlib import Path
 from string import Template
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..errors import PlotError
 from ..files import data_file, descriptor_of, free_name, head_of, refusing, write_file
 from ..version import __version__, needing
-from .strokes import GREY, HAIR, INK
+from .strokes import GREY, HAIR, INK, Style
 
 with needing(PlotError, "plot", "view"):
     import matplotlib.style
@@ -45,7 +45,7 @@ STYLE = {
     "pdf.fonttype": 42,
 }
 LETTER = 0.058  # inches, mean width
-TICK_STYLE: dict[str, Any] = {
+TICK_STYLE: Style = {
     "direction": "in",
     "width": 0.7,
     "color": GREY,
@@ -150,8 +150,8 @@ def draw_head(
     rows = len(lines) + ceil(len(handles) / columns)
     figure.set_size_inches(size[0], size[1] + 0.45 + 0.17 * rows)
     figure.set_layout_engine("constrained", w_pad=0.05, h_pad=0.05, wspace=0.0, hspace=0.0)
-    look: dict[str, Any] = {"x": 0.1 / size[0], "ha": "left", "fontsize": 11, "fontweight": "bold"}
-    figure.suptitle(_end(title, letters // 2), **look)
+    style: Style = {"x": 0.1 / size[0], "ha": "left", "fontsize": 11, "fontweight": "bold"}
+    figure.suptitle(_end(title, letters // 2), **style)
     room = figure.add_subfigure(figure.add_gridspec()[0])
     legend = room.legend(
         handles=handles,

@@ -28,7 +28,9 @@ and the page has some four megabytes."""
 ROW, GAP, EDGE, TOP = 150, 34, 44, 50
 """Pixels: a panel's height, between panels, below the last, and above the first, for its heading
 and plotly's buttons above that."""
-LAYOUT: dict[str, Any] = {
+Chart = dict[str, Any]
+"""A figure of plotly, or a part of one, as JSON."""
+LAYOUT: Chart = {
     "font": {"family": "sans-serif", "size": 12, "color": INK},
     "plot_bgcolor": "white",
     "paper_bgcolor": "white",
@@ -37,7 +39,7 @@ LAYOUT: dict[str, Any] = {
     "dragmode": "zoom",
     "margin": {"l": 64, "r": 14, "t": TOP, "b": EDGE},
 }
-AXIS: dict[str, Any] = {
+AXIS: dict[str, object] = {
     "gridcolor": HAIR,
     "linecolor": GREY,
     "zeroline": False,
@@ -70,7 +72,7 @@ def _verdicts(tracks: Sequence[Track]) -> str:
     return f'<p class="verdict">{"<br/>".join(map(html.escape, lines))}</p>\n'
 
 
-def scripts(name: str, library: str, content: Any) -> str:
+def scripts(name: str, library: str, content: object) -> str:
     """Return the HTML of plotly's library and a page's content, both packed, and of the script that draws it."""
     code = "".join(data_file("plots", file).read_text("utf-8") for file in ("unpack.js", name))
     return (
@@ -86,14 +88,14 @@ def _numbers(values: Array) -> dict[str, str]:
     return {"dtype": "f8", "bdata": base64.b64encode(content).decode()}
 
 
-def _line(stroke: Stroke) -> dict[str, Any]:
+def _line(stroke: Stroke) -> dict[str, object]:
     dash = ",".join(f"{stroke.width * part:g}px" for part in stroke.dashes)
     return {"color": stroke.colour, "width": stroke.width, "dash": dash or "solid"}
 
 
-def _trace(stroke: Stroke) -> dict[str, Any]:
+def _trace(stroke: Stroke) -> dict[str, object]:
     """Return a line or markers of a track's joint; the legend groups it by kind."""
-    mark: dict[str, Any] = {"color": stroke.colour}
+    mark: dict[str, object] = {"color": stroke.colour}
     if stroke.mark == "+":
         mark = {"symbol": "cross-thin-open", "size": 13, "color": INK, "line": {"width": 1.6}}
     elif stroke.mark in ("v", "x"):
@@ -115,7 +117,7 @@ def _trace(stroke: Stroke) -> dict[str, Any]:
     }
 
 
-def _thinned(tracks: Sequence[Track], figure: dict[str, Any]) -> str:
+def _thinned(tracks: Sequence[Track], figure: Chart) -> str:
     """Return the samples to draw where they are too many: a line for each track."""
     text = ""
     for i, track in enumerate(tracks):
@@ -143,7 +145,7 @@ def _looks(tracks: Sequence[Track]) -> Looks:
     return own
 
 
-def _rows(tracks: Sequence[Track]) -> list[dict[str, Any]]:
+def _rows(tracks: Sequence[Track]) -> list[dict[str, object]]:
     """Return the legend's rows: each track, and each of its joints."""
     return [
         {
@@ -160,7 +162,7 @@ def _rows(tracks: Sequence[Track]) -> list[dict[str, Any]]:
 # --- over time ---
 
 
-def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
+def over_time(tracks: Sequence[Track]) -> Chart:
     """Return a figure with a row for each quantity, on one time axis."""
     own = _looks(tracks)
     rows: dict[str, list[Panel]] = {}
@@ -210,7 +212,7 @@ def over_time(tracks: Sequence[Track]) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str, Any]:
+def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str, object]:
     low = min(panel.range[0] for panel in panels)
     high = max(panel.range[1] for panel in panels)
     axis = {**AXIS, "anchor": "x", "domain": [max(bottom, 0.0), top]}
@@ -221,7 +223,7 @@ def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str,
     return {**axis, "range": [low - pad, high + pad], "nticks": 6}
 
 
-def _heading(text: str, top: float) -> dict[str, Any]:
+def _heading(text: str, top: float) -> dict[str, object]:
     text = html.escape(text, quote=False)  # plotly reads tags
     return {
         "text": text,
@@ -239,12 +241,12 @@ def _heading(text: str, top: float) -> dict[str, Any]:
 # --- the workspace ---
 
 
-def in_workspace(tracks: Sequence[Track]) -> list[dict[str, Any]]:
+def in_workspace(tracks: Sequence[Track]) -> list[dict[str, object]]:
     """Return a figure for each view."""
     return [_view(view, workspace_title(tracks)) for view in views(tracks, _looks(tracks))]
 
 
-def _view(view: View, title: str) -> dict[str, Any]:
+def _view(view: View, title: str) -> dict[str, object]:
     axes = [
         {**AXIS, "title": {"text": f"{letter} in m"}, "range": limits, "nticks": 6}
         for letter, limits in zip(view.axes, (view.across, view.up))
@@ -264,7 +266,7 @@ def _view(view: View, title: str) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _whole_lines(stroke: Stroke) -> list[dict[str, Any]]:
+def _whole_lines(stroke: Stroke) -> list[dict[str, object]]:
     """Return shapes for lines at one coordinate, which traces cannot draw."""
     up = [{"x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper"} for x in stroke.x]
     across = [{"x0": 0, "x1": 1, "y0": y, "y1": y, "xref": "paper"} for y in stroke.y]

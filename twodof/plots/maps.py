@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bag.reader import read_bag
 from ..errors import BagError
@@ -59,13 +60,13 @@ def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, 
     return f'<div id="maps"></div>\n{scripts("maps.js", get_plotlyjs(), content)}'
 
 
-def _numbers(values: Any) -> list[float | None]:
+def _numbers(values: NDArray[np.float64]) -> list[float | None]:
     return [float(f"{value:.9g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
-def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, Any]]:
+def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, object]]:
     """Return curves of each run that has a bag, by its number: the distance from the target, or the joints."""
-    curves: dict[str, dict[str, Any]] = {}
+    curves: dict[str, dict[str, object]] = {}
     if bags is None or not bags.is_dir():
         return curves
     for run in rows["run"].tolist()[:MOST_CURVES]:

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from math import ceil, log10
 from pathlib import Path
-from typing import Any
 
 from ..bag.provenance import each_robot
 from ..bag.recording import Recording
@@ -19,7 +18,7 @@ from .figure import Drawing, draw_head, drawn
 from .interactive import body
 from .panels import HELD, KINDS, TARGET, UNITS, Panel, duration, joint_names, panels_of, title
 from .settings import number
-from .strokes import GREY, INK, Stroke, looks
+from .strokes import GREY, INK, Stroke, Style, looks
 from .track import Track, read_tracks
 from .words import common_settings, labels, outcome, summary
 from .workspace import View, views, workspace_title
@@ -201,7 +200,7 @@ def _draw_error(axes: Axes, panel: Panel) -> None:
 # --- strokes ---
 
 
-def _line(colour: str, dashes: Sequence[float]) -> dict[str, Any]:
+def _line(colour: str, dashes: Sequence[float]) -> Style:
     """Return matplotlib's line properties of a style."""
     return {"color": colour, "linestyle": (0, tuple(dashes)) if dashes else "-"}
 
@@ -220,7 +219,7 @@ def _draw_strokes(axes: Axes, strokes: Iterable[Stroke]) -> None:
             axes.axhline(value, **look)
 
 
-def _marks(stroke: Stroke) -> dict[str, Any]:
+def _marks(stroke: Stroke) -> Style:
     if stroke.mark == "+":
         return {"marker": "+", "markersize": 11, "markeredgewidth": 1.3, "linestyle": "none"}
     if stroke.mark in ("v", "x"):

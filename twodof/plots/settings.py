@@ -1,7 +1,6 @@
 """Text summaries of a run's settings."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from ..bag.recording import Recording
 from ..plant.urdf import UNBOUNDED
@@ -36,7 +35,7 @@ def settings_of(bag: Recording) -> dict[str, str]:
     (_, first), *later = bag.schedule
     given = {name for _, values in provenance["input_changes"] for name in values}
     varied = {_group(n) for n in given if any(values[n] != first[n] for _, values in later)}
-    groups: dict[str, list[Any]] = {}
+    groups: dict[str, list[float | bool]] = {}
     for name, value in first.items():
         groups.setdefault(_group(name), []).append(value)
     for group, values in groups.items():
@@ -49,7 +48,7 @@ def _group(name: str) -> str:
     return name.partition("[")[0]
 
 
-def _text(values: Sequence[Any]) -> str:
+def _text(values: Sequence[float | bool]) -> str:
     """Return one value where all are equal, as gains often are, else all of them."""
     texts = [str(v).lower() if isinstance(v, bool) else number(v) for v in values]
     return texts[0] if len(set(texts)) == 1 else f"({', '.join(texts)})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from ..bag.downsampling import Indices, extremes
 from ..notebook import COLOURS as COLOURS
 from .closed_form import Array
 
+Style = dict[str, Any]
+"""Keywords of a matplotlib artist."""
 INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
 ALARM = "#D55E00"
 DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))

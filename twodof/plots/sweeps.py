@@ -11,7 +11,7 @@ from functools import partial
 from itertools import combinations
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,11 +20,12 @@ from ..sweeps.ranking import METRICS, ROUNDING, USE, beyond_limits, candidates, 
 from .closed_form import Array
 from .figure import Drawing, draw_head, html_of
 from .maps import map_page
-from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR
+from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR, Style
 
 # isort: split
 from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
 from matplotlib.axis import Axis
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
@@ -41,10 +42,10 @@ WIDTH, HEIGHT = 3.2, 2.5  # of a panel with its axes and bar, inches
 WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "rad/s2": "rad/s²"}
 """FMI's units, as other figures have them."""
 WIDE = 10.0  # ratio of largest to smallest from which on colours are logarithmic
-BEST: dict[str, Any] = dict(marker="*", s=90, color=COLOURS[1], edgecolors="white", linewidths=0.7)
-BEYOND: dict[str, Any] = dict(marker="X", s=10, color=INK, edgecolors="white", linewidths=0.4)
-CRITICAL: dict[str, Any] = dict(linestyle=(0, (4, 2)), linewidth=1.2)
-MISSING: dict[str, Any] = dict(facecolor=HAIR, hatch="////", edgecolor="#c3cad1", linewidth=0.0)
+BEST: Style = dict(marker="*", s=90, color=COLOURS[1], edgecolors="white", linewidths=0.7)
+BEYOND: Style = dict(marker="X", s=10, color=INK, edgecolors="white", linewidths=0.4)
+CRITICAL: Style = dict(linestyle=(0, (4, 2)), linewidth=1.2)
+MISSING: Style = dict(facecolor=HAIR, hatch="////", edgecolor="#c3cad1", linewidth=0.0)
 
 
 class _Panel(NamedTuple):
@@ -163,7 +164,7 @@ def _draw_curve(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
         _label_decades(axes.yaxis)
 
 
-def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
+def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> ScalarMappable:
     cells = rows.pivot(index=panel.y, columns=panel.x, values=panel.metric)
     values = np.ma.masked_invalid(cells.to_numpy(dtype=float))
     axes.grid(False)
@@ -180,7 +181,7 @@ def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
     )
 
 
-def _draw_dots(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> Any:
+def _draw_dots(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> ScalarMappable:
     missing = rows[rows[panel.metric].isna()]
     axes.scatter(missing[panel.x], missing[panel.y], s=7, facecolors="none", edgecolors=PALE)
     return axes.scatter(

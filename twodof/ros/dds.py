@@ -14,20 +14,20 @@ from ..version import needing
 from .messages import store_of
 
 with needing(PublishError, "publish", "ros"):
-    from cyclonedds import idl, qos, topic
+    from cyclonedds import domain, idl, qos, topic
 
 
 def _keep(self: Any, cdr: bytes) -> None:
     self.cdr = cdr
 
 
-CARRIER = {
+SERIALISED = {
     "__init__": _keep,
     "serialize": lambda self, **_options: self.cdr,
     "deserialize": classmethod(lambda cls, cdr: cls(cdr)),
     "deserialize_key": classmethod(lambda cls, _key: None),  # a notice without a message: a writer has left
 }
-"""Methods of every DDS type: it carries messages already serialised, whose meaning is rosbags' business."""
+"""Methods of every DDS type, whose messages rosbags has already serialised."""
 
 
 @functools.cache
@@ -36,7 +36,7 @@ def dds_type(name: str) -> Any:
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
     struct = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
-    for name, method in CARRIER.items():  # a base would be part of the type
+    for name, method in SERIALISED.items():  # a base class would be part of the type
         setattr(struct, name, method)
     return struct
 
@@ -49,7 +49,7 @@ def _field_type(node: Nodetype, of: Any) -> Any:
     return {"string": str, "bool": bool}.get(of[0]) or getattr(idl.types, of[0])
 
 
-def dds_qos(offered: Qos, type_name: str) -> Any:
+def dds_qos(offered: Qos, type_name: str) -> qos.Qos:
     """Return the quality of service of a writer or reader.
 
     A write never waits for a reader: one that does not keep up misses messages.
@@ -64,6 +64,6 @@ def dds_qos(offered: Qos, type_name: str) -> Any:
     )
 
 
-def dds_topic(participant: Any, name: str, type_name: str) -> Any:
+def dds_topic(participant: domain.DomainParticipant, name: str, type_name: str) -> topic.Topic:
     """Return a topic of ROS 2 in DDS."""
     return topic.Topic(participant, f"rt{name}", dds_type(type_name))

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from ..simulation.experiments import NANOSECONDS, Experiment
 from ..simulation.pace import RealTime
@@ -14,7 +14,7 @@ from .dds import dds_qos, dds_topic
 from .messages import JOINT_STATE, POINT, POSE, STREAM
 
 # isort: split
-from cyclonedds import builtin, core, sub  # where missing, dds says so
+from cyclonedds import builtin, core, domain, sub  # where missing, dds says so
 
 LOG = logging.getLogger(__name__)
 ORDERS = {"/pause": "std_msgs/msg/Bool", "/step": "std_msgs/msg/UInt32"}
@@ -39,14 +39,14 @@ class Commanders:
         run: that is commanded.
     """
 
-    def __init__(self, participant: Any, run: Experiment) -> None:
+    def __init__(self, participant: domain.DomainParticipant, run: Experiment) -> None:
         topic = builtin.BuiltinTopicDcpsParticipant
         self._participants, self._run = builtin.BuiltinDataReader(participant, topic), run
         self._names: dict[int, str] = {}
         self._latest, self._since = "", 0.0
         self._warn = warner(LOG)
 
-    def note(self, reader: Any, writer: int, t: float) -> None:
+    def note(self, reader: sub.DataReader, writer: int, t: float) -> None:
         """Register the writer of a command, by its handle, at a time of the run, s."""
         if writer not in self._names:
             self._names[writer] = self._record(reader, writer, t)
@@ -56,7 +56,7 @@ class Commanders:
             self._warn("two", f"two nodes command the robot at once, {both}: the newest wins")
         self._latest, self._since = name, now
 
-    def _record(self, reader: Any, writer: int, t: float) -> str:
+    def _record(self, reader: sub.DataReader, writer: int, t: float) -> str:
         """Return the GUID of a writer's participant, and record its host and process."""
         endpoint = reader.get_matched_publication_data(writer)
         if endpoint is None:  # it has left
@@ -80,14 +80,14 @@ class Listener:
         participant: of the DDS domain.
         follows: what messages ask of the FMU.
         received: topics and types of commands.
-        orders: hear /pause and /step.
+        orders: receive /pause and /step.
         oldest: s before a sample that joint commands for it may be stamped; None: any time.
         run: in which the nodes that command are recorded.
     """
 
     def __init__(
         self,
-        participant: Any,
+        participant: domain.DomainParticipant,
         follows: Commands,
         received: Mapping[str, str],
         *,

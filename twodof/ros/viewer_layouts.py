@@ -118,7 +118,7 @@ def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
 def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[str, str]) -> str:
     """Return a layout of the robot in 3D with its gains, beside plots of the joint states."""
     shown = [prefix + DESCRIPTION, *(name for name, kind in types.items() if kind == POSE)]
-    panels: dict[str, Any] = {
+    panels: dict[str, object] = {
         "3D!robot": {
             "followTf": fmu.root,
             "cameraState": {"distance": 1.5},
@@ -140,7 +140,7 @@ def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[st
     *upper, plots = [f"Plot!{part}" for part in units]
     for plot in reversed(upper):
         plots = {"direction": "column", "first": plot, "second": plots}  # type: ignore[assignment]
-    left: Any = "3D!robot"
+    left: object = "3D!robot"
     if any(group in GAINS for group in fmu.groups("input")):
         panels["Parameters!gains"] = {"title": "Gains"}
         left = {"direction": "column", "first": left, "second": "Parameters!gains", "splitPercentage": 75}

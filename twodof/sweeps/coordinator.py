@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,7 @@ def _job(run: Experiment, stop_time: float | None, names: tuple[str, ...], bags:
         return Job(run.fmu.path.read_bytes(), run.fmu.path.name, names, options, bags)
 
 
-def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, Any]:
+def _provenance(fmu: Fmu, design: Design, job: Job, command_line: str) -> dict[str, object]:
     return {
         "fmu": {
             "file": fmu.path.name,

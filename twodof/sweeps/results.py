@@ -74,7 +74,7 @@ class Results:
         names: Sequence[str],
         units: Sequence[str],
         runs: int,
-        provenance: dict[str, Any],
+        provenance: dict[str, object],
         *,
         resume: bool = False,
     ) -> None:
@@ -120,7 +120,7 @@ class Results:
         what = "exists; resume it with `resume=True`, or" if known else "exists and is no sweep;"
         return SweepError(f"'{self.path}' {what} choose another `output`")
 
-    def _resume(self, provenance: dict[str, Any]) -> None:
+    def _resume(self, provenance: dict[str, object]) -> None:
         if not self.path.is_dir():
             raise SweepError(f"there is no sweep '{self.path}' to resume")
         if is_being_written(self.path):
@@ -198,7 +198,7 @@ def read_sweep(path: str | Path) -> pandas.DataFrame:
     return rows
 
 
-def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, Any]) -> pa.Schema:
+def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, object]) -> pa.Schema:
     def number(name: str, unit: str, text: str) -> pa.Field:
         return pa.field(name, pa.float64(), metadata={"unit": unit, "description": text})
 
@@ -322,7 +322,7 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
         raise SweepError(f"'{path}' was begun by twodof {there['versions']['twodof']}; go on with that version")
 
 
-def _differing(there: dict[str, Any], wanted: dict[str, Any]) -> str:
+def _differing(there: dict[str, object], wanted: dict[str, object]) -> str:
     """Return the settings of a design or of options that differ from the stored ones."""
     return ", ".join(
         f"{key.replace('_', ' ')} {json.dumps(value):.200}" for key, value in there.items() if value != wanted.get(key)
