@@ -73,10 +73,10 @@ def test_pages_are_shown_inline_without_a_network(native_path: Path, tmp_path: P
         page.on("pageerror", lambda error: asked.append(str(error)))
         for html, ready in zip(shown, (browser.READY,) * 4 + ("#maps[data-ready]",) * 2):
             page.set_content(f"<!DOCTYPE html><html><body>{html}</body></html>")
-            page.frame_locator("iframe").locator(ready).wait_for(timeout=1e3 * browser.PATIENCE)
+            page.frame_locator("iframe").locator(ready).wait_for(timeout=1e3 * browser.TIMEOUT)
             if html is shown[0]:
                 frame = page.frames[-1]
-                frame.wait_for_function("arm.k > 5", timeout=1e3 * browser.PATIENCE)
+                frame.wait_for_function("arm.k > 5", timeout=1e3 * browser.TIMEOUT)
         assert asked == ["about:srcdoc"] * len(asked)
 
 
