@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from ..plant.robot import Robot
 
+Scalar = Any
+"""A float or an Expression."""
 Array = NDArray[Any]
 """Array of numbers, or of numbers and expressions."""
 Frame = tuple[Array, Array]
@@ -31,11 +33,11 @@ class Body:
         inertia: about the frame's origin, kg·m², 3 × 3.
     """
 
-    mass: Any
+    mass: Scalar
     moment: Array
     inertia: Array
 
-    def with_point(self, mass: Any, offset: Array) -> Body:
+    def with_point(self, mass: Scalar, offset: Array) -> Body:
         """Return the body with an added point mass."""
         points = offset * mass
         tensor = np.eye(3) * offset.dot(points) - np.outer(offset, points)

@@ -5,11 +5,10 @@ other the C code that computes it. Vectors and matrices of a body are in the fra
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from .bodies import Array, Body, JointTree, cross, symmetric
+from .bodies import Array, Body, JointTree, Scalar, cross, symmetric
 
 
 def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]]:
@@ -118,7 +117,7 @@ def effort_bounds(
     """
     rates, accelerations = np.abs(robot.G.dot(v)), np.abs(robot.G.dot(a))
     reach = [_length(p) + (abs(c) if slides else 0.0) for p, slides, (c, _) in zip(robot.p, robot.prismatic, joint)]
-    motions: list[tuple[Any, Any, Any]] = []
+    motions: list[tuple[Scalar, Scalar, Scalar]] = []
     force, moment = [], []
     for i, parent in enumerate(robot.parent):
         omega, alpha, linear = motions[parent] if parent >= 0 else (0.0, 0.0, _length(gravity))
@@ -142,7 +141,7 @@ def effort_bounds(
     return bound
 
 
-def _length(a: Array) -> Any:
+def _length(a: Array) -> Scalar:
     return np.sqrt(a.dot(a))
 
 
@@ -274,7 +273,7 @@ def hybrid_by_recursion(
 
 
 def _passed_on(
-    blocks: tuple[Array, Array, Array], slides: bool, inverse: Any, passed: Any
+    blocks: tuple[Array, Array, Array], slides: bool, inverse: Scalar, passed: Scalar
 ) -> tuple[Array, Array, Array]:
     """Return I − U Uᵀ/D of a body; along its axis a free joint transmits its armature's part, another everything."""
     A, B, C = blocks

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf
-from typing import TYPE_CHECKING
+from typing import Any
 
 from .integrator import Budget, advance
 from .noise import normal_pair
 
-if TYPE_CHECKING:
-    from .plant import Plant
-
+Plant = Any
+"""A plant.Plant, whose module imports this one."""
 MOST_PERIODS = 10
 """Longest delay, in periods."""
 TIME_TOLERANCE = 1e-9
