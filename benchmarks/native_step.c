@@ -1,4 +1,4 @@
-/* What the engine costs in C, compiled in: a communication step of co-simulation, and in Model
+/* Cost of the engine in C, compiled in: a communication step of co-simulation, and in Model
    Exchange the right-hand side and a directional derivative. As a program it only runs. */
 #include <time.h>
 

@@ -77,12 +77,12 @@ class Logging(NamedTuple):
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """Of each sample that there was, s of the time in which the process ran."""
+        """Return for each sample s of the time in which the process ran."""
         times = np.fromfile(self.clock, "<f8")
         return times[times > 0.0]
 
     def lost(self, kept: int) -> float:
-        """How old the first sample that is not kept was when there was the last, s."""
+        """Return the age of the first lost sample at the time of the last one, s."""
         times = self.times
         return float(times[-1] - times[kept]) if kept < len(times) else 0.0
 
@@ -119,7 +119,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 class JointState(NamedTuple):
-    """A message as some reader gives it; numbers as bytes, so that equal is equal to the bit."""
+    """A message as some reader gives it; numbers as bytes, so that equal means bit-identical."""
 
     log_time: int
     stamp: int
@@ -213,7 +213,7 @@ def serialised(message: Any, *, little_endian: bool = True) -> bytes:
     return bytes(STORE.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
 
 
-def write_elsewhere(
+def write_third_party(
     path: Path, messages: Iterable[tuple[str, int, Any]], *, zstd: bool = False, **options: Any
 ) -> Path:
     """A bag that rosbags alone writes, of (topic, log time, message)."""

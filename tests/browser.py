@@ -257,7 +257,7 @@ def numbers(text: str) -> list[float]:
 
 
 def until(page: Page, condition: Callable[[Any], bool], look: Callable[[Page], Any] = rows) -> Any:
-    """What is seen on a page, its readout by default, once it fulfils a condition."""
+    """Return a page's text, by default its readout, once it fulfils a condition."""
     end = time.monotonic() + TIMEOUT
     while not condition(found := look(page)):
         assert time.monotonic() < end, found
@@ -290,7 +290,7 @@ def latency(page: Page, label: str, value: float) -> float:
 
 
 def picture(page: Page) -> np.ndarray:
-    """What the 3D scene shows now, without the notes before it, height × width × 3."""
+    """Return the picture of the 3D scene without its notes, height × width × 3."""
     page.evaluate(DRAWN)
     return still(page)
 
@@ -327,7 +327,7 @@ def area(shown: np.ndarray, seen: Callable[..., np.ndarray]) -> np.ndarray:
 
 
 def direction(link: np.ndarray) -> float:
-    """That of a patch's longest extent, rad, or the opposite; y of its pixels is downwards."""
+    """Return the direction of a patch's longest extent, rad, or the opposite; y of its pixels is downwards."""
     x, y = np.linalg.eigh(np.cov(link.T))[1][:, -1]
     return float(np.arctan2(-y, x))
 

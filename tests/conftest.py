@@ -46,7 +46,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="session")
 def length(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
-    """How much of a long test is run: the first number with --full, else the second."""
+    """Return the length of a long test: the first number with --full, else the second."""
     return lambda full, short: full if request.config.getoption("full") else short
 
 

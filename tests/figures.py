@@ -1,4 +1,4 @@
-"""What a figure of runs holds, by its artists."""
+"""Contents of a figure of runs, by its artists."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def only(axes: Axes, label: str) -> np.ndarray:
 
 
 def heights(axes: Axes, label: str) -> list[float]:
-    """Where level lines are, the lowest first."""
+    """Return the heights of level lines, the lowest first."""
     return sorted(points(line)[0, 1] for line in lines(axes, label))
 
 

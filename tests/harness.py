@@ -132,12 +132,12 @@ def children_of(process):
 
 
 def _tracks(process):
-    """Whether it is the one that multiprocessing starts once and leaves until the end."""
+    """Return True for the process that multiprocessing starts once and leaves until the end."""
     return b"resource_tracker" in Path(f"/proc/{process}/cmdline").read_bytes()
 
 
 def lives(process):
-    """Whether it has not ended."""
+    """Return True if the process has not ended."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

@@ -37,7 +37,7 @@ SCRATCH = run_folder() / "native"
 
 
 def robots_folder() -> Path:
-    """Where the package example-robot-data keeps its URDFs."""
+    """Return the folder of example-robot-data's URDFs."""
     for parent in Path(pin.__file__).parents:
         folder = parent / "share" / "example-robot-data" / "robots"
         if folder.is_dir():

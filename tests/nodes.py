@@ -192,7 +192,7 @@ def published(
 
 
 def ended(process: subprocess.Popen[str], status: int = 0) -> tuple[str, str]:
-    """What it said at its end."""
+    """Return the output at the end of the process."""
     out, err = process.communicate(timeout=TIMEOUT)
     assert process.returncode == status, err
     return out, err

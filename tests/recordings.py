@@ -83,7 +83,7 @@ def changing(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Record
     return Recording(folder / "bag", samples)
 
 
-def elsewhere(bag: Path, names: Sequence[str], t: np.ndarray, q: np.ndarray, v: np.ndarray | None) -> Path:
+def third_party_bag(bag: Path, names: Sequence[str], t: np.ndarray, q: np.ndarray, v: np.ndarray | None) -> Path:
     """A bag as another recorder writes it, without provenance."""
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -153,7 +153,7 @@ def build(folder: Path, urdf: str, **options: Any) -> Path:
 @pytest.fixture(scope="session")
 def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Joint states of a UR5 in alphabetical order, as joint_state_broadcaster writes them."""
-    return elsewhere(tmp_path_factory.mktemp("foreign") / "ur5_log", UR5_JOINTS, *waves(6))
+    return third_party_bag(tmp_path_factory.mktemp("foreign") / "ur5_log", UR5_JOINTS, *waves(6))
 
 
 def long_run(default: Recording, q: np.ndarray) -> twodof.Recording:

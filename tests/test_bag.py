@@ -31,7 +31,7 @@ from bags import (
     metadata,
     read_with_rosbags,
     serialised,
-    write_elsewhere,
+    write_third_party,
 )
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
@@ -306,10 +306,10 @@ def write_states(path: Path, states: Sequence[tuple[Sequence[str], Sequence[floa
     messages = [joint_message(t, *state, [0.0] * len(state[0])) for t, state in zip(times, states)]
     hello = STORE.types["std_msgs/msg/String"]("hello")
     given = [("/robot/joint_states", t, message) for t, message in zip(times, messages)]
-    return write_elsewhere(path, [("/chatter", 1, hello), *given], storage_plugin=StoragePlugin.SQLITE3)
+    return write_third_party(path, [("/chatter", 1, hello), *given], storage_plugin=StoragePlugin.SQLITE3)
 
 
-def test_bag_from_elsewhere_is_read_without_provenance(tmp_path: Path) -> None:
+def test_third_party_bag_is_read_without_provenance(tmp_path: Path) -> None:
     states = [(["a", "b", "c"], [k, k + 0.1, k + 0.2]) for k in range(4)]
     found = twodof.read_bag(write_states(tmp_path / "bag", states))
     assert found.provenance == {}
@@ -336,7 +336,7 @@ def test_targets_are_known_where_they_are_in_one_frame(tmp_path: Path, frames: S
         for topic, parts in (("/joint_states", states), ("/target", targets))
         for k, message in enumerate(parts)
     ]
-    heard = twodof.read_bag(write_elsewhere(tmp_path / "bag", messages)).received
+    heard = twodof.read_bag(write_third_party(tmp_path / "bag", messages)).received
     assert (heard.frame if heard else "") == known
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bags import STORE, header, joint_message, write_elsewhere
+from bags import STORE, header, joint_message, write_third_party
 from rosbags.rosbag2 import StoragePlugin
 
 import twodof
@@ -35,7 +35,7 @@ def effort(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return twodof.build_fmu(path, twodof.FmuOptions(control="effort", native=True))
 
 
-def test_a_recorded_run_is_replayed_to_the_bit(native_path: Path, tmp_path: Path) -> None:
+def test_a_recorded_run_is_replayed_bit_for_bit(native_path: Path, tmp_path: Path) -> None:
     targets = {0: (0.1, 0.2), 70: (0.22, 0.05), 71: (0.2, 0.0), 150: (0.0, 0.25)}
     run = twodof.experiment(native_path, stop_time=2, step=0.01, settings={"Kp": 80})
     source = twodof.samples(run)
@@ -93,7 +93,7 @@ def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: Stora
         ("/cmd", BEGIN + k * STEP - 7, joint_message(5, ("joint2", "joint1"), (), (), tau[::-1]))
         for k, tau in given.items()
     ]
-    bag = write_elsewhere(tmp_path / "real", sorted(states + commands, key=lambda m: m[1]), storage_plugin=storage)
+    bag = write_third_party(tmp_path / "real", sorted(states + commands, key=lambda m: m[1]), storage_plugin=storage)
     model = tmp_path / "model"
     options = ["--stop-time", "0.99", "-o", str(model)]
     assert main(["run", str(effort), "--input", f"{bag}:/cmd", *options]) == 0
@@ -108,7 +108,7 @@ def test_commands_of_another_writer(effort: Path, tmp_path: Path, storage: Stora
 
 def test_points(native_path: Path, tmp_path: Path) -> None:
     goals = [(BEGIN, point(0, 0.1, 0.2)), (BEGIN + STEP, point(0, 0.2, 0.1))]
-    bag = write_elsewhere(tmp_path / "bag", [("/goal", *goal) for goal in goals])
+    bag = write_third_party(tmp_path / "bag", [("/goal", *goal) for goal in goals])
     assert twodof.read_commands(native_path, bag) == [
         (0.0, {"x_des[1]": 0.1, "x_des[2]": 0.2}),
         (0.01, {"x_des[1]": 0.2, "x_des[2]": 0.1}),
@@ -142,7 +142,7 @@ def test_what_cannot_be_replayed(
     topic: str | None,
     reason: str,
 ) -> None:
-    bag = write_elsewhere(tmp_path / "bag", messages)
+    bag = write_third_party(tmp_path / "bag", messages)
     given = f"{bag}:{topic}" if topic else str(bag)
     assert main(["run", str(effort), "--input", given, "-o", str(tmp_path / "none")]) == 1
     (line,) = capfd.readouterr().err.splitlines()
@@ -159,7 +159,7 @@ def test_how_far_apart_bags_are_is_not_told_of_what_is_not_finite(
 
     def bag(name: str, last: float) -> str:
         return str(
-            write_elsewhere(
+            write_third_party(
                 tmp_path / name,
                 [
                     ("/joint_states", BEGIN + k * STEP, joint_message(0, "ab", (a, 0.1)))
@@ -183,7 +183,7 @@ def test_a_plot_of_two_bags_tells_how_far_they_are_apart(tmp_path: Path, capfd: 
             return (0.5 * t, 0.1 + off * t)
 
         return str(
-            write_elsewhere(
+            write_third_party(
                 tmp_path / name,
                 [("/joint_states", BEGIN + k * step, joint_message(0, "ab", q(k))) for k in range(count)],
             )

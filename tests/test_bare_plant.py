@@ -199,7 +199,7 @@ def test_stops_are_the_same_in_both_flavours(name, rigid):
 
 
 @pytest.mark.parametrize(("name", "together"), [("twodof", 2), ("ur5", 4), ("panda", 5)])
-def test_joints_pressed_and_let_go_in_any_order_do_not_depend_on_the_step(name, together):
+def test_joints_pressed_and_released_in_any_order_do_not_depend_on_the_step(name, together):
     """Efforts that turn at random, in a narrow range; never beyond a limit, whatever the step."""
     native, rng = engine(name, "effort"), np.random.default_rng(0)
     plant = model(name, "effort").plant()

@@ -1,4 +1,4 @@
-"""What the benchmarks say beside the times: that all compute the same, and what is measured."""
+"""Results of the benchmarks besides times: all engines compute the same."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def twodof_command(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What a user sees who builds, runs and looks."""
+    """Return the output of a session that builds, runs and shows."""
     cwd = tmp_path_factory.mktemp("session")
     outputs = {"cwd": str(cwd)}
     with pytest.MonkeyPatch.context() as patch:

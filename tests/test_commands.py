@@ -1,4 +1,4 @@
-"""What messages ask of an FMU; they are serialised by rosbags."""
+"""Commands of ROS 2 messages, which rosbags serialises."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ def test_energy_of_the_free_plant_is_kept(fmus, native):
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_stops_do_not_depend_on_the_step_or_the_flavour(fmus, control):
-    """Stopped and let go at several limits, by an input that turns."""
+    """Stopped and released at several limits, by an input that turns."""
     settings = {"q_min": (0.2, 0.1), "q_max": (0.7, 0.5), "rigid_stops": True, **TIGHT}
     table = {
         "task": ("x_des", [(0.1, 0.25), (0.28, 0.05), (0.2, 0.15)]),

@@ -38,7 +38,7 @@ def begin(fmu: Path, bag: Path, *options: str) -> subprocess.Popen[str]:
 
 
 def has_samples(bag: Path) -> bool:
-    """Whether the first sample of a run is in its bag, beside which the reserve is then."""
+    """Return True if the first sample of a run is in its bag, which then has its reserve."""
     try:
         return (bag / "reserve").exists() and any(any(read_messages(file, ReadBudget())) for file in storage_files(bag))
     except (OSError, DamageError):
@@ -56,7 +56,7 @@ def whole(fmu: Path, folder: Path, n: int) -> Sequence[object]:
 SIGNALS = {
     "Ctrl-C": [signal.SIGINT],
     "Ctrl-C twice": [signal.SIGINT] * 2,
-    "Ctrl-C in anger": [signal.SIGINT] * 300,
+    "Ctrl-C many times": [signal.SIGINT] * 300,
     "terminated": [signal.SIGTERM],
     "terminal closed": [signal.SIGHUP],
     "terminated and interrupted": [signal.SIGTERM, signal.SIGINT, signal.SIGINT],

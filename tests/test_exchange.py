@@ -283,7 +283,7 @@ def test_an_impact_beyond_all_numbers_is_refused_and_changes_nothing(fmus):
 
 
 @pytest.mark.parametrize("rigid", [False, True])
-def test_a_held_joint_is_let_go_where_it_is_pulled_off_and_no_sooner(fmus, rigid):
+def test_a_held_joint_is_released_where_it_is_pulled_off_and_no_sooner(fmus, rigid):
     model = Model(
         fmus["effort"],
         gravity=[0.0, 0.0, 0.0],

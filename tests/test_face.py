@@ -1,4 +1,4 @@
-"""What a user of the package sees: names, types, one-line reprs, and what is missing when."""
+"""The public face of the package: names, types, one-line reprs, and missing extras."""
 
 from __future__ import annotations
 
@@ -290,5 +290,5 @@ def test_columns_of_a_csv_are_named_as_settings_are(native_path: Path, tmp_path:
 
 
 def test_versions_are_of_what_is_installed() -> None:
-    """Where there is no Pinocchio, a run still says what made it."""
+    """A run without Pinocchio still records its versions."""
     assert versions("numpy", "no-such-package") == {"twodof": twodof.__version__, "numpy": np.__version__}

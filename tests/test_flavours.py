@@ -113,7 +113,7 @@ def test_the_shipped_arm_s_file_is_known_by_what_it_was_made_of(tmp_path, monkey
 
 
 def test_the_python_flavour_is_of_fmi_2(fmu_path, tmp_path):
-    """Which may be said."""
+    """`fmi=2` is accepted for it."""
     assert build_fmu(tmp_path / "A.fmu", FmuOptions(fmi=2)).read_bytes() == fmu_path.read_bytes()
     with pytest.raises(twodof.TwoDofError, match="native flavour only"):
         build_fmu(tmp_path / "B.fmu", FmuOptions(fmi=3))

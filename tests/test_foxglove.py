@@ -66,7 +66,7 @@ def test_foxgloves_own_client_decodes_every_topic_and_sets_gains(native_path: Pa
 
 
 def fields(value: Any) -> Any:
-    """What JSON has as ``listed`` gives it."""
+    """Return the fields of a JSON message as ``listed`` gives them."""
     parts = [*value.values()] if isinstance(value, dict) else value
     return [*map(fields, parts)] if isinstance(parts, list) else parts
 

@@ -246,7 +246,7 @@ def test_friction_of_any_size_is_right_or_refused(friction, speed, control):
     assert all(np.abs(end - ends[0]).max() <= 1e-9 for end in ends)
 
 
-def test_a_robot_that_sticks_stays_to_the_bit_and_costs_nothing(monkeypatch):
+def test_a_robot_that_sticks_stays_bit_for_bit_and_costs_nothing(monkeypatch):
     plant = model("ur5", "joint").plant()
     plant.friction, plant.q_des = [1e3] * 6, [1.0] * 6
     start, calls = list(plant.q), []

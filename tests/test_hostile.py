@@ -1,4 +1,4 @@
-"""Files from elsewhere that mean harm, made by hand: a command refuses them with one clear line, or
+"""Untrusted files that mean harm, made by hand: a command refuses them with one clear line, or
 reads them for what they hold, in bounded time and memory."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a user sets: constants, inputs over time, and what a run makes of them."""
+"""Settings of a run: constants and inputs over time, and their effect."""
 
 from __future__ import annotations
 

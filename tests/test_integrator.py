@@ -134,7 +134,7 @@ def test_a_release_between_two_looks_at_the_effort_is_found():
     assert v == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_joint_at_rest_at_its_limit_is_not_let_go_where_nothing_pulls():
+def test_a_joint_at_rest_at_its_limit_is_not_released_where_nothing_pulls():
     calls = 0
 
     def acceleration(q, v):

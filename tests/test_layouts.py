@@ -24,7 +24,7 @@ QOS = {"Reliability Policy": "reliability", "Durability Policy": "durability"}
 
 @pytest.fixture(scope="module", params=["task", "pose", "joint", "effort"])
 def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of an FMU beside it, with all that a layout shows."""
+    """Return a bag with everything that a layout shows."""
     folder = tmp_path_factory.mktemp("layouts")
     fmu = folder / "Arm 1.fmu"
     twodof.build_fmu(fmu, twodof.FmuOptions(control=request.param))

@@ -88,7 +88,7 @@ def closed(fmu: Path, n: int, steps: int, delay: Callable[[int], int]) -> Iterat
         sample = run.send({"tau_cmd": past[at]} if at >= 0 else None)
 
 
-def test_lockstep_is_the_loop_closed_in_python_to_the_bit(
+def test_lockstep_is_the_loop_closed_in_python_bit_for_bit(
     bare: Callable[[int], Path], tmp_path: Path, number: int, listen: Listen, length: Callable[[int, int], int]
 ) -> None:
     fmu, steps = bare(7), length(6000, 1000)

@@ -310,7 +310,7 @@ def test_closing_the_last_page_pauses(native_path: Path, tmp_path: Path) -> None
     with served("live", native_path, cwd=tmp_path) as command:
 
         def stands() -> bool:
-            """Whether time goes on no more than somebody looks."""
+            """Return True if time stands still."""
             left = latest(command, lambda news: True)["t"]
             time.sleep(0.7)
             return bool(latest(command, lambda news: True)["t"] < left + 0.3)

@@ -33,7 +33,7 @@ def test_the_end_does_not_wait_for_orders(native_path: Path) -> None:
 
 @pytest.mark.parametrize("everything", [False, True])
 def test_orders_are_carried_out_in_turn(native_path: Path, everything: bool) -> None:
-    """What is set before a step holds for it, and what is set after a reset is not reset."""
+    """Values set before a step hold for it, and values set after a reset are not reset."""
     loop = loop_of(native_path)
     for order, value in (
         ("change", {"x_des[1]": 0.11}),
@@ -92,7 +92,7 @@ def test_orders_of_one_kind_become_one(native_path: Path) -> None:
 
 
 def test_orders_of_several_kinds_are_all_done(native_path: Path) -> None:
-    """Whoever gives more than that is asked to wait."""
+    """Further requests have to wait."""
     loop = loop_of(native_path)
     for k in range(100):
         loop.tell("change" if k % 2 else "step", {"x_des[1]": k / 1e3} if k % 2 else None)

@@ -167,7 +167,7 @@ def test_too_long_a_name_is_refused(disk: Path) -> None:
 
 @pytest.mark.parametrize("uri", ["../meshes/base.stl", PACKAGE])
 def test_folder_of_the_urdf_alone_where_there_is_no_package(disk: Path, uri: str) -> None:
-    """Whatever a folder above is called: the home folder has a name too."""
+    """The names of parent folders have no effect: the home folder has a name too."""
     (disk / "ws/arm_description/package.xml").unlink()
     with pytest.raises(BuildError, match="not found in"):
         collect(disk, uri, None)
@@ -265,7 +265,7 @@ def test_an_obj_brings_the_library_of_its_colours(disk: Path, name: str, content
     assert libraries == ({"meshes/box.obj.mtl": content.strip()} if content else {})
 
 
-def test_a_library_from_elsewhere_is_refused(disk: Path) -> None:
+def test_a_library_outside_of_the_folders_is_refused(disk: Path) -> None:
     path = disk / "ws/arm_description/meshes/box.obj"
     path.write_text("mtllib ../../../secret.stl\n")
     with pytest.raises(BuildError, match=r"secret\.stl.* may come from nowhere else"):

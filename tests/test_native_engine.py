@@ -283,7 +283,7 @@ def test_damping_and_saturation(kind, axis, limit_effort):
 
 
 def test_damping_changes_the_motion():
-    """That D enters at all, against Pinocchio's forward dynamics."""
+    """The motion with damping agrees with Pinocchio's forward dynamics."""
     of = Engine(from_urdf(WEAK.format(kind="prismatic", axis="1 0.5 0"), "tool", "xy"))
     plant = of.model.plant()
     plant.q, plant.v, plant.tau_ext, plant.limit_effort = [0.3, 0.5], [1.0, -2.0], [1.0, 2.0], True

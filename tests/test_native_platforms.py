@@ -107,7 +107,7 @@ def fmi_functions() -> set[str]:
 
 
 def shown(*command: object) -> str:
-    """What one of binutils says of a library."""
+    """Return the output of one of binutils on a library."""
     needs("binutils")
     return subprocess.check_output([*map(str, command)], text=True)
 
@@ -189,7 +189,7 @@ def variables(fmu: Path) -> tuple[str, dict[str, int]]:
 def drive(
     unzipped: Path, platform: str, folder: Path, settings: dict[str, float], wine: tuple[str, dict[str, str]]
 ) -> subprocess.CompletedProcess[str]:
-    """What an importer compiled for the platform prints of 5 s; Windows' runs in wine."""
+    """Return the output of an importer compiled for the platform, of 5 s; Windows' runs in wine."""
     windows = platform == "win64"
     importer = folder / ("host.exe" if windows else "host")
     if not importer.exists():

@@ -205,7 +205,7 @@ NO_ORIENTATION = "quat_des = 0, 0, 0, 0 is no orientation; (0, 0, 0, 1) turns no
 
 
 def refused(page: Page, code: str, *arguments: object) -> str:
-    """What is said of something that is refused."""
+    """Return the message on a refused value."""
     words = "{ try { %s; } catch (error) { return error.message; } }"
     return str(page.evaluate(f"([a, b]) => {words % code}", [*arguments, None, None][:2]))
 

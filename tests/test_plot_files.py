@@ -22,7 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
-from recordings import LINK, Recording, chain_urdf, elsewhere, long_run, waves
+from recordings import LINK, Recording, chain_urdf, long_run, third_party_bag, waves
 
 import twodof
 from twodof.cli.main import main
@@ -44,24 +44,24 @@ def test_figures_are_legible(
     (tmp_path / "ur5.urdf").write_text(ur5)
     (tmp_path / "chain.urdf").write_text(chain_urdf("zyX" * 5 + "z", 0.1, low=-3.07, high=2.35))
     names = [f"j{i + 1}" for i in range(16)]
-    chain = elsewhere(tmp_path / "chain", names, *waves(16))
+    chain = third_party_bag(tmp_path / "chain", names, *waves(16))
     long = [f"left_front_{part}_of_the_gripper_joint" for part in ("upper", "lower", "middle")]
     for figure in (
         plot(*(recording.bag for recording in gains.values())),
         plot(changing.bag, gains[50].bag),
         plot(foreign, urdf=tmp_path / "ur5.urdf"),
         plot(chain, urdf=tmp_path / "chain.urdf"),
-        plot(elsewhere(tmp_path / "long", long, *waves(3))),
+        plot(third_party_bag(tmp_path / "long", long, *waves(3))),
         plot(*[foreign] * 9),
-        plot(*(elsewhere(tmp_path / (c * 140), ["a"], *waves(1)) for c in "abc")),
-        plot(elsewhere(tmp_path / ("d" * 200), ["a"], *waves(1))),
+        plot(*(third_party_bag(tmp_path / (c * 140), ["a"], *waves(1)) for c in "abc")),
+        plot(third_party_bag(tmp_path / ("d" * 200), ["a"], *waves(1))),
     ):
         assert_legible(figure)
 
 
 def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     """A dollar sign would begin a formula."""
-    bag = elsewhere(tmp_path / "a$b$_c^", ["$q$", "x_{1}"], *waves(2))
+    bag = third_party_bag(tmp_path / "a$b$_c^", ["$q$", "x_{1}"], *waves(2))
     figure = plot(bag)
     FigureCanvasAgg(figure).draw()
     named = [text for text in figure.findobj(Text) if "$" in text.get_text()]
@@ -319,7 +319,7 @@ def test_what_else_is_wrong_is_named(default: Recording, tmp_path: Path, monkeyp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
     with pytest.raises(PlotError, match=r"^there is no URDF 'gone\.urdf'"):
         plot(default.bag, urdf="gone.urdf")
-    none = elsewhere(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
+    none = third_party_bag(tmp_path / "bag", ["a"], np.zeros(2), np.zeros((2, 0)), None)
     with pytest.raises(PlotError, match=r"'.*bag' has 0 positions for 1 joints"):
         plot(none)
     with pytest.raises(TwoDofError, match="gone"):

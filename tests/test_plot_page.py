@@ -77,7 +77,7 @@ def test_a_page_of_an_hour_is_small_and_says_what_it_leaves_out(default: Recordi
 
 
 class Links(HTMLParser):
-    """What a page would load or run."""
+    """Resources that a page would load or run."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Figures of other robots and of bags from elsewhere: against Pinocchio, and what is refused."""
+"""Figures of other robots and of third-party bags: against Pinocchio, and what is refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from figures import heights, legend_of, lines, only, panels, points, texts
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from recordings import LINK, UR5_JOINTS, Recording, bare, build, chain_urdf, elsewhere, record, waves
+from recordings import LINK, UR5_JOINTS, Recording, bare, build, chain_urdf, record, third_party_bag, waves
 
 import twodof
 from twodof.bag.provenance import Provenance
@@ -30,9 +30,9 @@ ARM = Path(__file__).parents[1] / "urdf/2dof.urdf"
 
 
 def seen(folder: Path, urdf: str, names: Sequence[str], *motion: Any, frame: str | None = None) -> Figure:
-    """A bag from elsewhere, drawn with a robot."""
+    """A bag from third_party_bag, drawn with a robot."""
     (folder / "robot.urdf").write_text(urdf)
-    bag = elsewhere(folder / "bag", names, *motion)
+    bag = third_party_bag(folder / "bag", names, *motion)
     return plot(bag, urdf=folder / "robot.urdf", frame=frame)
 
 
@@ -157,7 +157,7 @@ def test_many_joints_fit_on_a_page(count: int, low: float, high: float, tmp_path
     assert len(panels(figure).q) == len(panels(figure).v) == count
 
 
-# --- bags from elsewhere ---
+# --- third-party bags ---
 
 
 def test_a_bag_from_elsewhere_is_drawn_as_far_as_it_goes(foreign: Path) -> None:
@@ -215,7 +215,7 @@ def test_bags_without_velocities_or_with_gaps(tmp_path: Path) -> None:
     q[10:20, 0] = math.nan
     q[:, 1] = math.nan
     q[3, 1] = math.inf
-    figure = plot(elsewhere(tmp_path / "bag", ["a", "b"], t, q, None))
+    figure = plot(third_party_bag(tmp_path / "bag", ["a", "b"], t, q, None))
     found = panels(figure)
     assert (len(found.q), found.v) == (2, [])
     drawn = only(found.q[0], "bag")[:, 1]
@@ -306,7 +306,7 @@ def test_a_urdf_that_is_wrong_is_named(
 ) -> None:
     path = tmp_path / "u.urdf"
     path.write_bytes(urdf if isinstance(urdf, bytes) else urdf.encode())
-    bag = elsewhere(tmp_path / "bag", ["j1", "j2"], *waves(2))
+    bag = third_party_bag(tmp_path / "bag", ["j1", "j2"], *waves(2))
     with pytest.raises(PlotError, match=message) as caught:
         plot(bag, urdf=path, **options)
     assert "\n" not in str(caught.value)
@@ -318,7 +318,7 @@ def test_a_joint_at_infinity_is_nowhere(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(chain_urdf("zXy"))
     t, q, v = waves(3)
     q[3:6] = np.diag([np.inf, -np.inf, np.inf])
-    bag = elsewhere(tmp_path / "bag", ["j1", "j2", "j3"], t, q, v)
+    bag = third_party_bag(tmp_path / "bag", ["j1", "j2", "j3"], t, q, v)
     track = read_tracks([bag], urdf=tmp_path / "arm.urdf")[0]
     assert track.motion is not None
     np.testing.assert_array_equal(np.isnan(track.motion.path).any(axis=1).nonzero()[0], [3, 4, 5])

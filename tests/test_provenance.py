@@ -281,7 +281,7 @@ CHANGES = [[0.02, {"x_des[1]": 0.1, "x_des[2]": 0.2}], [0.04, {"Kp[2]": 80.0}]]
 def test_provenance_has_each_change_of_an_input_that_a_loop_sends(
     native_path: Path, tmp_path: Path, storage: str
 ) -> None:
-    """Of which it writes every third sample."""
+    """The bag has every third sample."""
     run = twodof.experiment(native_path, stop_time=math.inf)
     steps = twodof.samples(run)
     with twodof.Bag(tmp_path / "bag", storage=storage).begin(run) as bag:

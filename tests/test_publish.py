@@ -241,7 +241,7 @@ def test_without_a_network_the_run_goes_on(native_path: Path, tmp_path: Path, nu
 
 
 def packets(process: subprocess.Popen[str]) -> int:
-    """How many left the cable's end in the network of a process."""
+    """Return the number of packets that left the cable's end in the network of a process."""
     command = ["nsenter", "--net", "--target", str(process.pid), "ip", "-j", "-s", "link"]
     links = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     (link,) = [link for link in links if link["ifname"] == "cable0"]

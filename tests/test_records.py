@@ -70,7 +70,7 @@ MCAPS = {
 
 
 def refused(capsys: pytest.CaptureFixture[str], bag: Path) -> str:
-    """What ``info`` says: one line that names the bag."""
+    """Return the error of ``info``: one line that names the bag."""
     assert main(["info", str(bag)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("twodof: error:") and str(bag) in line

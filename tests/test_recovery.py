@@ -146,7 +146,7 @@ def test_mcap_ending_in_zeros_after_a_power_loss_is_recovered(run: Experiment, t
 
 @pytest.mark.parametrize("part", [0.95, 0.5])
 def test_sqlite3_file_without_its_end_keeps_what_comes_before(run: Experiment, tmp_path: Path, part: float) -> None:
-    """What SQLite itself reads once its header has the number of pages that there are."""
+    """The kept part is what SQLite itself reads once its header has the right number of pages."""
     bag = tmp_path / "bag"
     with twodof.Bag(bag, storage="sqlite3").begin(run) as sink:
         for k in range(3000):
@@ -233,7 +233,7 @@ def test_sqlite3_transaction_that_was_cut_is_rolled_back(run: Experiment, tmp_pa
 
 
 def super_journal(path: Path) -> bytes:
-    """What ends the journal of a transaction over several databases, from SQLite's pager.c."""
+    """Return the end of the journal of a transaction over several databases, from SQLite's pager.c."""
     name = os.fsencode(path)
     magic = bytes.fromhex("d9d505f920a163d7")
     return struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name)) + magic

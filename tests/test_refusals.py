@@ -1,4 +1,4 @@
-"""What is wrong gets one line that names the culprit, and leaves nothing."""
+"""Invalid input gets one line that names the culprit, and leaves nothing."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class Transform(NamedTuple):
 
 
 def transforms_of(scene: Scene, joints: Iterable[Joint], q: np.ndarray) -> list[list[Transform]]:
-    """Of some joints, at each of N positions; all of a scene's at once, as a bag has them."""
+    """Return transforms of some joints at each of N positions, as a bag has them."""
     each = [np.broadcast_to(part, (len(q), 7)) for part in scene.transforms(joints, q)]
     return [
         [
@@ -208,7 +208,7 @@ def fmu_urdf(fmu_path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def messages(fmu_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Messages:
-    """Of a run of the default arm whose target jumps after 0.5 s."""
+    """Return the messages of a run of the default arm whose target jumps after 0.5 s."""
     folder = tmp_path_factory.mktemp("scene")
     inputs = folder / "inputs.csv"
     inputs.write_text("time,x_des[1],x_des[2]\n0,0.2,0.05\n0.5,0.1,0.2\n")
@@ -290,7 +290,7 @@ def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def outside(shape: ET.Element, points: np.ndarray) -> float:
-    """How far points reach out of a box or cylinder in the middle of their frame, m."""
+    """Return the distance by which points are outside of a box or cylinder about their origin, m."""
     if shape.tag == "box":
         half = np.array([float(word) for word in shape.get("size", "").split()]) / 2
         return float((np.abs(points) - half).max())
@@ -417,7 +417,7 @@ def test_fit_finds_the_axis_of_a_cylinder(axis: int) -> None:
 
 
 def fitted_shape(mesh: trimesh.Trimesh, urdf: str = "") -> tuple[ET.Element, np.ndarray]:
-    """What stands for a mesh in the description of a URDF, which holds it, and where it is."""
+    """Return the shape that stands for a mesh in a robot description, and its pose."""
     content, urdf = mesh.export(file_type="stl"), urdf or with_mesh()
     assert isinstance(content, bytes)
     description = Scene(urdf, [], "thing", lambda _: content).description

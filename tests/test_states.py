@@ -222,7 +222,7 @@ def carry_out(fmu, folder, program):
 
 
 class Expected(NamedTuple):
-    """What an operation leads to."""
+    """Expected result of an operation."""
 
     history: tuple  # operations, this one among them where it counts
     refused: bool
@@ -274,7 +274,7 @@ def is_legal(operation, history):
 
 
 def is_right(flavour, operation, expected, answer):
-    """Whether statuses and log are as they are to be.
+    """Return True if statuses and log are as expected.
 
     The native flavour refuses by fmi2Error. The Python one cannot: it logs, and discards the next
     step, which is then taken at the second attempt.
@@ -300,7 +300,7 @@ class EscapeError(Exception):
 
 
 def run(fresh, flavour, program):
-    """What is read after the operations of a program: (index, history, values by group).
+    """Return the values read after the operations of a program: (index, history, values by group).
 
     ``fresh`` gives the answers of a fresh instance to a program.
 
@@ -321,7 +321,7 @@ def run(fresh, flavour, program):
 
 
 def states(fresh, flavour, program):
-    """What all histories of a program lead to, each run alone; the program is checked by it.
+    """Return the states to which the histories of a program lead, each run alone.
 
     Values by group by history, None before initialisation mode.
     """
@@ -388,7 +388,7 @@ class Arm(NamedTuple):
     quat: tuple
 
     def keeps_away(self, history, before, after):
-        """Whether the last operation keeps away from singularities, which a J⁺ has.
+        """Return True if the last operation keeps away from the singularities of J⁺.
 
         σ_min/σ_max of J is at least 2.5 rcond where it ends, and so it is anywhere within the angle
         of a step at the speeds of its ends, as it changes by about 1 per radian at most.
@@ -676,7 +676,7 @@ CONTAINED = (
 
 
 def features(arm, program, values):
-    """What a program contains, given the values that its histories lead to."""
+    """Return the features of a program, given the values of its histories."""
     since: dict[int, set[str]] = {}  # since each state was saved: what happened to it
     found: set[str] = set()
     history: tuple[tuple, ...] = ()

@@ -44,7 +44,7 @@ def file_of(bag: Path) -> Path:
 
 
 def statistics_of(content: bytes | bytearray) -> tuple[int, int]:
-    """Where the summary begins, and the record of statistics in it."""
+    """Return the offsets of the summary and of its statistics."""
     (start,) = struct.unpack_from("<Q", content, len(content) - FOOTER)
     place = start
     while content[place] != 11:
@@ -129,7 +129,7 @@ def test_numbers_that_contradict_each_other_are_not_believed(bag: Path, field: i
 def test_a_summary_that_metadata_contradicts_is_told_and_mended(
     bag: Path, whose: str, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Whichever of them is wrong: 12,006 messages are in the file."""
+    """Either may be wrong: the file has 12,006 messages."""
     if whose == "summary":
         file = file_of(bag)
         content = bytearray(file.read_bytes())

@@ -29,7 +29,7 @@ from twodof.sweeps.batches import MOST_DEATHS
 
 
 def doors(process: int) -> list[str]:
-    """What the kernel says of its sockets that others could connect or send to."""
+    """Return the kernel's list of its sockets that others could connect or send to."""
     own = set()
     for entry in Path(f"/proc/{process}/fd").iterdir():
         with suppress(OSError):
@@ -219,7 +219,7 @@ def asleep(fmu_path: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str]
 
 
 def test_a_signal_ends_a_sweep_in_the_midst_of_a_long_run(fmu_path: Path, tmp_path: Path) -> None:
-    """What is done is stored, and nothing is left running."""
+    """Finished runs are stored, and no process is left."""
     with asleep(fmu_path, tmp_path) as (process, workers):
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=120)

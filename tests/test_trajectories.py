@@ -74,7 +74,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def held(fmu: Path, bag: Path, step: float, count: int, **options: Any) -> np.ndarray:
-    """What the inputs are from each of so many communication points on: q, v, a of both joints."""
+    """Return the inputs from each communication point on: q, v, a of both joints."""
     now: dict[str, float] = {}
     changes, k, table = twodof.read_commands(fmu, bag, step=step, **options), 0, []
     for i in range(count):

@@ -104,7 +104,7 @@ def pause(page: Page) -> None:
 
 
 def scrub(page: Page, time: float) -> dict[str, str]:
-    """What the page says after its slider was moved."""
+    """Return the page's text after its slider was moved."""
     page.get_by_label("time, s").evaluate(
         "(slider, t) => { slider.value = t; slider.dispatchEvent(new Event('input')); }", f"{time}"
     )
@@ -187,7 +187,7 @@ def test_speed_is_that_of_the_wall_clock(page: Page, speed: float = 0.25) -> Non
 
 
 def slope(page: Page) -> float:
-    """How fast time goes on the page, in s per s."""
+    """Return the speed of time on the page, s per s."""
     scrub(page, 0.5)
     press(page, "Play")
     until(page, lambda found: numbers(found["time"])[0] > 0.5)
@@ -310,7 +310,7 @@ def test_bag_from_elsewhere_is_drawn_as_far_as_it_goes(shown: Browser, folder: P
 
 
 class Done(NamedTuple):
-    """How a command ended, and what it wrote."""
+    """The end of a command, and its output."""
 
     returncode: int
     stdout: str

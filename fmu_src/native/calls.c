@@ -75,14 +75,14 @@ static const char *call_name(Call call)
     return RULE[call].name;
 }
 
-/* Whether an instance of a kind can be in a phase. */
+/* True if an instance of a kind can be in a phase. */
 static int can_be_in(Kind kind, int phase)
 {
     const int other = kind == MODEL_EXCHANGE ? PHASE(STEP) | PHASE(STEP_FAILED) : PHASE(EVENT) | PHASE(CONTINUOUS_TIME);
     return phase >= 0 && phase < N_PHASES && !(other >> phase & 1);
 }
 
-/* Whether a call is allowed in the instance's phase; where not, logs it. */
+/* True if a call is allowed in the instance's phase; log a refusal. */
 static int allowed(Instance *instance, Call call, const char *culprit)
 {
     const int phase = instance->state.phase;
@@ -117,7 +117,7 @@ static Instance *enter(void *component, Call call, int has_pointers)
     return NULL;
 }
 
-/* Where the call is allowed, what it does is to change the phase. */
+/* Change the phase, if the call is allowed. */
 static Status move_on(void *component, Call call, Phase phase)
 {
     Instance *instance = enter(component, call, 1);

@@ -59,7 +59,7 @@ static void find_efforts(Step *step, double passed, double effort[N_JOINTS])
     evaluate(step, y, a, effort, NULL);
 }
 
-/* How far an effort that holds a joint is within its bound on a side. */
+/* The distance of an effort that holds a joint to its bound on a side. */
 static double grip_of(const Step *step, int i, double effort, int side)
 {
     return grip(step->plant, &step->stops, i, step->y[i], effort, side);
@@ -167,7 +167,7 @@ static double first_crossing(Step *step, Margin *margin, int component)
     return HUGE_VAL;
 }
 
-/* Whether the effort that holds a joint may pass its bound on a side within the step. */
+/* True if the effort that holds a joint may pass its bound on a side within the step. */
 static int may_pass(const Step *step, int joint, int side)
 {
     double low = HUGE_VAL, high = -HUGE_VAL;
@@ -197,7 +197,7 @@ static void fit(const double p[LOOKS + 1], double c[LOOKS + 1])
     c[4] = 256.0 * (fourth / 24.0);
 }
 
-/* Where the polynomial through the looks at a margin has minima that may be below zero; how many. */
+/* Find minima, possibly below zero, of the polynomial through sampled values of a margin; return their number. */
 static int doubtful_minima(const double p[LOOKS + 1], double x[LOOKS])
 {
     double c[LOOKS + 1], slope[LOOKS], low = p[0], high = p[0];
@@ -253,7 +253,7 @@ static double first_release(Step *step, double before)
     return HUGE_VAL;
 }
 
-/* Whether the velocity of a joint that slips may pass zero within the step. */
+/* True if the velocity of a joint that slips may pass zero within the step. */
 static int may_be_arrested(const Step *step, int joint)
 {
     const int i = N_JOINTS + joint;

@@ -39,7 +39,7 @@ static void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
-/* Whether a variable may have a value; a refusal is logged. */
+/* True if a variable may have a value; a refusal is logged. */
 static Status check_range(Instance *instance, int variable, double value)
 {
     for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
@@ -52,7 +52,7 @@ static Status check_range(Instance *instance, int variable, double value)
     return OK;
 }
 
-/* Whether the control law can follow the inputs; a refusal is logged. */
+/* True if the control law can follow the inputs; a refusal is logged. */
 static Status check_inputs(Instance *instance)
 {
 #if N_ROWS > N_AXES
@@ -66,7 +66,7 @@ static Status check_inputs(Instance *instance)
     return OK;
 }
 
-/* Whether the period of the controller is one that its delay and its sensors can have. */
+/* True if the period of the controller is one that its delay and its sensors can have. */
 static Status check_sampling(Instance *instance)
 {
     const double *value = instance->state.plant.value;
@@ -95,7 +95,7 @@ static Status check_sampling(Instance *instance)
     return OK;
 }
 
-/* Whether the joints' limits make ranges, and parameters of sampling go together; a refusal is logged. */
+/* True if the joints' limits make ranges, and parameters of sampling go together; a refusal is logged. */
 static Status check_parameters(Instance *instance)
 {
     const double *value = instance->state.plant.value;

@@ -43,7 +43,7 @@ static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
 }
 
-/* Whether nothing changes any more: inputs are held, and all joints. */
+/* True if nothing changes any more: inputs are held, and all joints. */
 static int all_rest(const Step *step)
 {
     int rest = 1;

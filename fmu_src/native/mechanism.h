@@ -13,7 +13,7 @@ static inline int never(void)
     return no;
 }
 
-/* Where a joint is: cosine and sine of its angle; of one that slides its displacement, as c. */
+/* Position of a joint: cosine and sine of its angle; of a prismatic joint its displacement, as c. */
 typedef struct {
     double c, s;
 } JointPosition;

@@ -35,7 +35,7 @@ static void begin_passage(Passage *passage, const Plant *plant, double time)
         passage->begun &= isfinite(rate[i]) != 0;
 }
 
-/* Whether a joint reversed outside its limits, or so near them that the quintic cannot tell. */
+/* True if a joint reversed outside its limits, or so near them that the quintic cannot tell. */
 static int reversed_outside(const Passage *start, const Passage *end, const Plant *plant, int i)
 {
     const double h = end->time - start->time, low = plant->value[Q_MIN + i];

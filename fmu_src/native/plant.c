@@ -33,13 +33,13 @@ static void body(const double value[N_VARIABLES], int as_known, EndBody *end_bod
     load_end_body(payload, &value[PAYLOAD_COM], end_body);
 }
 
-/* Whether the effort that acts is the output tau, held until a sampled controller commands another. */
+/* True if the effort that acts is the output tau, held until a sampled controller commands another. */
 static int is_held(const double value[N_VARIABLES])
 {
     return value[CONTROL_PERIOD] != 0.0;
 }
 
-/* Whether the law knows the robot as it is, so that what it wants is what comes. */
+/* True if the law's model equals the robot, so that the commanded acceleration is the actual one. */
 static int knows_all(const double value[N_VARIABLES])
 {
 #if COMMANDS_ACCELERATION
@@ -71,7 +71,7 @@ static void limit_effort(const double value[N_VARIABLES], double tau[N_JOINTS])
         tau[i] = saturated(tau[i], EFFORT[i]);
 }
 
-/* Whether a torque that has been commanded may be beyond its limit, without computing it. */
+/* True if a torque that has been commanded may be beyond its limit, without computing it. */
 static int may_saturate(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                         const double v[N_JOINTS], const double a[N_JOINTS])
 {

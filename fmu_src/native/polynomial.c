@@ -11,7 +11,8 @@ static double polynomial(const double c[], int degree, double x)
     return sum;
 }
 
-/* Where a polynomial of degree 4 or less changes its sign in (0, 1), in ascending order; how often. Between the
+/* Find the points in (0, 1) at which a polynomial of degree 4 or less changes its sign, in ascending order; return
+   their number. Between the
    turning points, at which its derivative does so, it is monotonic. */
 static int sign_changes(const double c[], int degree, double root[])
 {

@@ -111,7 +111,7 @@ static int settle(Sampling *sampling, Plant *plant, double time)
     return 1;
 }
 
-/* Whether there are samples: of a controller, or of sensors without one at communication points. */
+/* True if there are samples: of a controller, or of sensors without one at communication points. */
 static int are_samples(const double value[N_VARIABLES])
 {
     int any = value[CONTROL_PERIOD] != 0.0;
@@ -154,7 +154,7 @@ static int advance_sampled(Sampling *sampling, Plant *plant, double time, double
     return 1;
 }
 
-/* Whether the state, its numbers whatever they are, is one that a plant can be in at a time. */
+/* True if the state, its numbers whatever they are, is one that a plant can be in at a time. */
 static int is_sampling(const Sampling *sampling, const Plant *plant, double time)
 {
     const double k = sampling->k, period = plant->value[CONTROL_PERIOD];

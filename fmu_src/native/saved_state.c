@@ -10,7 +10,7 @@ static const char FOREIGN[] = "the state is not one of this FMU";
 static const char UNSOUND[] = "the state is none that an instance can be in";
 static const char OTHER_KIND[] = "the state is one of the FMU's other kind of instance";
 
-/* Whether a state, or its bytes, begin as those of this FMU do. */
+/* True if a state, or its bytes, begin as those of this FMU do. */
 static int is_own(const void *state)
 {
     return memcmp(state, MODEL_GUID, sizeof MODEL_GUID) == 0;
@@ -29,7 +29,7 @@ static uint64_t checksum(const void *bytes)
 
 enum { SERIALIZED_SIZE = sizeof(State) + sizeof(uint64_t) };
 
-/* Whether integers are whole, and truth values 0 or 1; the table has the range of integers. */
+/* True if integers are whole, and truth values 0 or 1; the table has the range of integers. */
 static int are_whole(const double value[])
 {
     for (int i = FIRST_INTEGER; i < N_VARIABLES; i++)
@@ -54,7 +54,7 @@ static int are_stops(Stops *stops)
     return sound;
 }
 
-/* Whether an importer's step is one that can be. */
+/* True if an importer's step is valid. */
 static int is_passage(const Passage *passage)
 {
     int sound = isfinite(passage->time) && isfinite(passage->stop_time) && passage->joint >= 0

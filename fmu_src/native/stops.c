@@ -41,7 +41,7 @@ static void find_contacts(const Plant *plant, const double q[N_JOINTS], const in
     }
 }
 
-/* Whether the stop of a joint acts on what has a rate, a velocity or an acceleration. */
+/* True if the stop of a joint acts on a rate: a velocity or an acceleration. */
 static int is_pressed(const Contact *contact, double rate)
 {
     return contact->there && (contact->fixed ? rate != 0.0 : contact->side * rate < 0.0);
@@ -225,7 +225,7 @@ int is_above(const Plant *plant, double q, int i)
     return RE(plant->value[Q_MAX + i] - q) <= RE(q - plant->value[Q_MIN + i]);
 }
 
-/* What holds joints by a reaction takes their accelerations. */
+/* Make the accelerations of joints 0 that a reaction holds. */
 static int reacts(const Stops *stops, int i)
 {
     return stops->held[i] == STUCK || stops->held[i] == STOPPED;

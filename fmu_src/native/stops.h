@@ -5,8 +5,8 @@
 #include "internal.h"
 #include "plant.h"
 
-/* How a joint rests: by its friction, at a limit by a stop that pushes (with its friction), or at a limit by a
-   clamp, which has no reaction on the other joints. */
+/* The cause of a joint's rest: its friction, a stop at a limit that pushes (with its friction), or a clamp at a
+   limit, which has no reaction on the other joints. */
 typedef enum { FREE, STUCK, STOPPED, CLAMPED } Rest;
 
 /* The regime of the motion, which only an event changes: how joints rest, those of them that are free once the
@@ -29,7 +29,7 @@ INTERNAL void impact(const Plant *plant, double y[N_STATES], const int anti_chat
 INTERNAL void find_regime(const Plant *plant, const double y[N_STATES], const int kept[N_JOINTS], int rank,
                           Stops *stops, double a[N_JOINTS], double effort[N_JOINTS], double *margin);
 
-/* How far the effort that holds a joint is within its bounds: on the side of −1 or of 1, HUGE_VAL where that has
+/* The distance of the effort that holds a joint to its bounds: on the side of −1 or of 1, HUGE_VAL where that has
    no bound; a joint that is watched is free where one is negative. */
 INTERNAL double grip(const Plant *plant, const Stops *stops, int i, double q, double effort, int side);
 
@@ -40,7 +40,7 @@ INTERNAL double rounding_of(const Stops *stops, const double effort[N_JOINTS]);
 /* The directions of slip in a regime, NULL where no joint slips. */
 INTERNAL const int *slip_of(const Stops *stops);
 
-/* Whether a joint is nearer to its upper limit than to its lower one. */
+/* True if a joint is nearer to its upper limit than to its lower one. */
 INTERNAL int is_above(const Plant *plant, double q, int i);
 
 /* Make the acceleration of held joints 0; the effort that holds each, of a clamp the negative acceleration. */

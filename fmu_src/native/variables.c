@@ -16,7 +16,7 @@ static size_t size_of(Reference vr)
     return (size_t)(PLACE[vr + 1] - PLACE[vr]);
 }
 
-/* Whether the references are of variables of a type, of so many values in all. */
+/* True if the references are of variables of a type, of so many values in all. */
 static int known(Instance *instance, Call call, Type type, const Reference vr[], size_t count,
                  const void *values, size_t n_values)
 {
@@ -53,7 +53,7 @@ static int is_state(int variable)
     return variable >= Q && variable < X;
 }
 
-/* Whether a variable may be set now. */
+/* True if a variable may be set now. */
 static int settable(Instance *instance, Call call, int variable)
 {
     const int phase = instance->state.phase;
@@ -144,7 +144,7 @@ static double number_in(Type type, const void *values, size_t i)
     return type == INTEGER ? (double)((const Integer *)values)[i] : (double)(((const Boolean *)values)[i] != 0);
 }
 
-/* Of a type that the FMU does not have any reference is refused, none is fine. */
+/* Refuse any reference to a type that the FMU does not have; a call without references is valid. */
 static Status get_values(void *component, Call call, const Reference vr[], size_t count, void *values, size_t n_values)
 {
     Instance *instance = enter(component, call, 1);
@@ -172,7 +172,7 @@ static Status get_values(void *component, Call call, const Reference vr[], size_
     return OK;
 }
 
-/* Whether a variable may have a value now. */
+/* True if a variable may have a value now. */
 static int accepts(Instance *instance, Call call, int variable, double value)
 {
     if (!settable(instance, call, variable))

@@ -1,4 +1,4 @@
-/** Where the scene is seen from. A robot that moves in a plane is seen from the front. */
+/** The camera. It shows a planar robot from the front. */
 
 const FIELD_OF_VIEW = 0.6; // rad, vertical
 const ROOM = 1.45, ROOM_ASKEW = 1.1; // of the picture to what is in it, which is less across than its diagonal
@@ -88,7 +88,7 @@ class Camera {
     return unit(plus(plus(right, (0.5 - y) * f, this.up), -1, this.back));
   }
 
-  /** Where the ray through a point of the picture meets a plane; null where they are nearly parallel. */
+  /** The intersection of the ray through a point of the picture with a plane; null if they are nearly parallel. */
   /** @type {(x: number, y: number, point: Numbers, normal: Numbers) => number[] | null} */
   meet(x, y, point, normal) {
     const ray = this.ray(x, y), along = dot(ray, normal);

@@ -95,7 +95,7 @@ class Controls {
     return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
   }
 
-  /** What a slider goes from and to. */
+  /** The range of a slider. */
   /** @type {(name: string, value: number) => [number, number]} */
   range(name, value) {
     const [group, number] = name.replace("]", "").split("["), i = Number(number) - 1;
@@ -150,7 +150,7 @@ function unitsOf(joints) {
 /** @type {(joints: JointFacts[]) => string[]} */
 function shortNames(joints) {
   const words = joints.map(({ name }) => name.split(/([^_/]*[_/])/).filter(Boolean)), [first] = words;
-  /** Whether all begin, or end, with one word, and have others. */
+  /** True if all begin, or end, with one word, and have others. */
   /** @type {(at: (own: string[]) => string) => boolean} */
   const alike = (at) => words.length > 1 && words.every((own) => own.length > 1 && at(own) === at(first));
   while (alike((own) => own[0])) words.forEach((own) => own.shift());

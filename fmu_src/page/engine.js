@@ -31,7 +31,7 @@ class Engine {
     return new Engine((await WebAssembly.instantiate(module, {})).instance);
   }
 
-  /** What the FMU has logged. */
+  /** The last message that the FMU logged. */
   message() {
     const bytes = new Uint8Array(this.memory.buffer, this.calls.engine_message());
     return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));

@@ -1,4 +1,4 @@
-/** What is dragged in the scene: the target, rings that turn it, and else the view. */
+/** Dragging in the scene: the target, rings that rotate it, or the view. */
 
 const KEYS = /** @type {Record<string, [number, number]>} */ ({ ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] });
 const STEP = 0.04; // of the picture, by a key

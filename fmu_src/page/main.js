@@ -76,13 +76,13 @@ class App {
     return new Camera(view, flat, points.filter((point) => point.every(Number.isFinite)));
   }
 
-  /** Where the end effector is in sample k. */
+  /** The position of the end effector in sample k. */
   /** @type {(k: number) => number[]} */
   end(k) {
     return this.robot.end(this.session.at("q", k));
   }
 
-  /** Where the target is: on an axis that is not controlled, where the end effector is. */
+  /** The position of the target; on uncontrolled axes that of the end effector. */
   target(k = this.session.now) {
     const { session } = this, place = this.end(k), given = session.target("x_des", k);
     if (given.length) session.axes.forEach((axis, i) => (place[axis] = given[i]));
@@ -241,7 +241,7 @@ class App {
     if (byId("message").textContent !== text) byId("message").textContent = text;
   }
 
-  /** What the readout tells of sample k beside the joints, m. */
+  /** The readout of sample k besides the joints, m. */
   /** @type {(k: number) => Record<string, number[]>} */
   places(k) {
     const { groups, facts } = this.session;
@@ -266,7 +266,7 @@ class App {
     return shadow;
   }
 
-  /** What is drawn beside the robot. */
+  /** Everything drawn besides the robot. */
   /** @type {(scene: Scene, k: number, links: Float64Array[]) => void} */
   addTrail(scene, k, links) {
     const { session, robot, camera } = this, { facts } = session, size = camera.size;
@@ -313,7 +313,7 @@ function spread(count, some) {
   return Array.from({ length: most }, (_, i) => Math.round((i * (count - 1)) / Math.max(most - 1, 1)));
 }
 
-/** What moves the robot: an engine or samples in this page, or else its server. */
+/** The source of motion: an engine or samples in this page, or its server. */
 /** @type {(facts: Facts) => Promise<Session | Replay | Remote>} */
 async function makeSession(facts) {
   if (byId("engine")) return new Session(facts, await Engine.load(new Uint8Array(await unpacked("engine"))));

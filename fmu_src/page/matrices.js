@@ -89,7 +89,7 @@ function base(axis) {
   return [0, 1, 2].map((i) => Number(i === axis));
 }
 
-/** Where a frame is. */
+/** The position of a frame. */
 /** @type {(m: Numbers) => number[]} */
 function originOf(m) {
   return [m[12], m[13], m[14]];

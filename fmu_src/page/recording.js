@@ -51,7 +51,7 @@ class Bytes {
     this.length = 0;
   }
 
-  /** Where room for so many bytes is. */
+  /** The offset of free room for a number of bytes. */
   /** @type {(size: number) => number} */
   room(size) {
     if (this.length + size > this.view.byteLength) {
@@ -154,7 +154,7 @@ function point(stamp, frame, place, quat) {
   return headed(stamp, frame).align(8).doubles(place).doubles(quat).content;
 }
 
-/** Where the session comes from, as a bag's run.json has it. */
+/** The provenance of the session, as in a bag's run.json. */
 /** @type {(session: Session) => string} */
 function provenance(session) {
   return JSON.stringify({

@@ -50,7 +50,7 @@ class Remote extends Samples {
     this.socket = socket;
   }
 
-  /** That of this page's server, once its first sample is there. */
+  /** Return the session of this page's server, after its first sample. */
   /** @type {(facts: Facts) => Promise<Remote>} */
   static connect(facts) {
     const socket = connection();

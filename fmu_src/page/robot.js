@@ -6,7 +6,7 @@ class Robot {
     this.facts = facts;
   }
 
-  /** Where all links are in the root frame, at positions in rad or m. */
+  /** Transforms of all links in the root frame, at joint positions in rad or m. */
   /** @type {(q: Numbers) => Float64Array[]} */
   links(q) {
     /** @type {Float64Array[]} */
@@ -19,13 +19,13 @@ class Robot {
     return places;
   }
 
-  /** Where the task frame is. */
+  /** The transform of the task frame. */
   /** @type {(links: Float64Array[]) => Float64Array} */
   frame(links) {
     return links[this.facts.frameLink];
   }
 
-  /** Where the end effector is. */
+  /** The position of the end effector. */
   /** @type {(q: Numbers) => number[]} */
   end(q) {
     return originOf(this.frame(this.links(q)));

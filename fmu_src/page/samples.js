@@ -93,7 +93,7 @@ class Samples {
     return new Map(settable.map((v) => [v.name, /** @type {Value} */ (v.start)]));
   }
 
-  /** What is to be set, element by element; a number by a vector's name sets all of its elements. */
+  /** The values to set, element by element; a number for a vector sets all of its elements. */
   /** @type {(name: string, value: Value | number[]) => [string, Value][]} */
   checked(name, value) {
     const names = this.groups.get(name) ?? [name];

@@ -191,7 +191,7 @@ class Scene {
 }
 
 /**
- * What is drawn of a mesh: places, each with its normal and padded to four numbers, and the corners of
+ * The drawn parts of a mesh: points, each with its normal and padded to four numbers, and the corners of
  * triangles among them. A vertex is there once for each normal that it has, which is the mean of the faces
  * about it that are not at a sharp edge to the corner's own.
  * @param {Uint16Array} places
@@ -238,7 +238,7 @@ function facesOf(places, triangles) {
   return faces;
 }
 
-/** Of the angle between two faces; NaN where one has no area. */
+/** The cosine of the angle between two faces; NaN if one has no area. */
 /** @type {(faces: Float64Array, f: number, g: number) => number} */
 function cosine(faces, f, g) {
   const [x, y, z] = [faces[f], faces[f + 1], faces[f + 2]], [u, v, w] = [faces[g], faces[g + 1], faces[g + 2]];

@@ -1,4 +1,4 @@
-"""A place for commands on files from elsewhere.
+"""A place for commands on untrusted files.
 
 Each is a process with limits of time and memory, in a folder tree where it may write below one
 folder alone.
@@ -37,7 +37,7 @@ SECRET = b"not for the FMU"
 
 
 class Outcome(NamedTuple):
-    """How a command ended.
+    """The end of a command.
 
     Attributes:
         status: its exit status, −N where it died of signal N.

@@ -445,7 +445,7 @@ def raw_zip(members: Iterable[tuple[str, bytes, int, int]]) -> bytes:
 
 
 def deflated_zeros(size: int) -> bytes:
-    """That many zeros, a multiple of 1 MiB, without compressing them all."""
+    """Return a number of deflated zeros, a multiple of 1 MiB, without compressing all."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
     return block * (size // 2**20) + zlib.compressobj(9, zlib.DEFLATED, -15).flush()
@@ -564,7 +564,7 @@ def _mcap_records(rng: Random, data: bytes) -> bytes:
 
 
 def _mcap_chunk(rng: Random, data: bytes) -> bytes:
-    """What is in a chunk, which then has no checksum."""
+    """Mutate the content of a chunk, which then has no checksum."""
     records = mcap_records(data)
     chunks = [i for i, record in enumerate(records) if record[:1] == CHUNK and len(record) > 49]
     if not chunks:

@@ -1,4 +1,4 @@
-"""Files from elsewhere, damaged: whatever is in them, a command ends well or with one clear line.
+"""Untrusted files, damaged: whatever is in them, a command ends well or with one clear line.
 
 Case i of a kind is made by ``random.Random(i)``, so that one that fails runs again on its own: its
 seed is in its name.
@@ -14,7 +14,7 @@ from random import Random
 
 import mutations
 import pytest
-from bags import SECOND, joint_message, write_elsewhere
+from bags import SECOND, joint_message, write_third_party
 from jail import SECRET, Jail, Outcome, check_reading
 from jail import jail as jail
 from jail import the_jail as the_jail
@@ -152,7 +152,7 @@ def write_foreign_bag(path: Path, storage: StoragePlugin, *, zstd: bool) -> None
         for k in range(40)
         for topic in ("/arm/joint_states", "/joint_states")
     )
-    write_elsewhere(path, messages, storage_plugin=storage, zstd=zstd)
+    write_third_party(path, messages, storage_plugin=storage, zstd=zstd)
 
 
 def test_mutated_bag(seed: int, jail: Jail, bags: dict[str, Path]) -> None:

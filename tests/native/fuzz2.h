@@ -1,4 +1,4 @@
-/* What random calls of FMI 2.0 alone do. */
+/* Random calls of FMI 2.0 alone. */
 enum { MANY = 6 };
 
 static void log_message(fmi2ComponentEnvironment environment, fmi2String name, fmi2Status status,

@@ -1,4 +1,4 @@
-/* What random calls of FMI 3.0 alone do: its arrays have wrong sizes too. */
+/* Random calls of FMI 3.0 alone, also with arrays of wrong sizes. */
 enum { MANY = 4, MOST_VALUES = N_VARIABLES };
 
 static void log_message(fmi3InstanceEnvironment environment, fmi3Status status,

@@ -121,7 +121,7 @@ FMI2_Export void probe_outputs(double value[])
     compute_effort((Plant *)value, ANY_RANK);
 }
 
-/* How all computed variables change where q, v and inputs do. */
+/* The changes of all computed variables for changes of q, v and inputs. */
 FMI2_Export void probe_differentiate(const double value[], const int held[], const int slip[],
                                      const double change[], double derivative[])
 {

@@ -47,7 +47,7 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 
 def _default_arm(verb: str, *, native: bool = False) -> Path:
-    """Return the default arm's FMU, built on demand; refuse to guess beside other FMUs."""
+    """Return the default arm's FMU, built on demand; refuse to guess if the folder has other FMUs."""
     from ..export.package import is_default_arm, is_fmu
 
     there = [path for path in sorted(Path().glob("*.fmu")) if is_fmu(path)]

@@ -119,7 +119,7 @@ def given_options(options: argparse.Namespace, *names: str) -> Keywords:
 def check_company(
     options: argparse.Namespace, needs: dict[str, str] | None = None, excludes: dict[str, str] | None = None
 ) -> None:
-    """Refuse options that have no effect without, or beside, another one; name both."""
+    """Refuse an option that has no effect without, or together with, another one; name both."""
     for option, other in (needs or {}).items():
         if _given(options, option) and not _given(options, other):
             raise CommandLineError(f"{option} does nothing without {other}")

@@ -93,7 +93,7 @@ def _program() -> str:
 
 @contextmanager
 def busy(what: str, *, silent: bool = False) -> Iterator[None]:
-    """Print what takes longer than a moment; on a terminal with its seconds, elsewhere unless it is to be silent."""
+    """Print the name of a slow task; on a terminal with its seconds, elsewhere only if it is not ``silent``."""
     done, begin, live = Event(), perf_counter(), sys.stderr is not None and sys.stderr.isatty()
 
     def show() -> None:

@@ -148,7 +148,7 @@ def best_facts(table: DataFrame, cost: Expression | None = None) -> dict[str, ob
 
 
 def print_best(table: DataFrame, cost: Expression | None = None) -> None:
-    """Print the best runs with units; no run is called best that equals others, and impossible ones are marked."""
+    """Print the best runs with units; report ties, and mark runs that exceed the URDF's limits."""
     from ..simulation.verdict import METRICS
     from ..sweeps.ranking import RANKED, beyond_limits, equals, ranked, remark
 

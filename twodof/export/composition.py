@@ -156,7 +156,7 @@ class _Variables(NamedTuple):
 
 
 def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:
-    """Return the start values that are given; ``rest`` has the start positions of joints that are not named."""
+    """Return the given start values; ``rest`` has the start positions of all other joints."""
     settings = dict(options.settings)
     for key, given in (("gravity", options.gravity), ("q_start", options.q_start)):
         if given is None:

@@ -25,7 +25,7 @@ ENDS = ("tool0", "ee_link", "end_effector", "link_tcp")
 
 
 def stock_robots() -> dict[str, Path]:
-    """Return the URDFs of installed packages, by the name of the file, and where two have one by its package too."""
+    """Return the URDFs of installed packages, by file name, or by package/name where several have one name."""
     found: list[Path] = []
     with suppress(importlib.metadata.PackageNotFoundError):
         files = importlib.metadata.files(PACKAGE) or []

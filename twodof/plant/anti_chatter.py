@@ -1,4 +1,4 @@
-"""Holds of joints, and of the rank of J⁺, that would else change to and fro without end."""
+"""Anti-chatter: holds of joints, and of the rank of J⁺, that would otherwise switch without end."""
 
 from dataclasses import dataclass
 from math import inf

@@ -1,4 +1,4 @@
-"""Sampled control: when the controller measures, what it sees, and when its efforts act.
+"""Sampled control: sampling times, measured values, and the delay of efforts.
 
     t_k    = start + k T                              an exact integer k, T = control_period
     q_meas = ρ round(q/ρ) + noise                     at t_k; ρ = q_resolution, ties to even

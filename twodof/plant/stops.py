@@ -1,4 +1,4 @@
-"""Joints at rest: which ones rest at a limit or by their friction, what holds them, and when it lets them go.
+"""Joints at rest at a limit or by friction: the efforts that hold them, and their release.
 
 A stop is plastic and unilateral: a joint that reaches it loses its velocity there, and rests there
 while it is pressed into it. Without a reaction, as a clamp, that is all: it is pressed while its

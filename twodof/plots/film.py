@@ -116,7 +116,7 @@ def _frames(track: Track, times: Array) -> Iterator[bytes]:
 
 
 def _draw(track: Track, figure: Figure) -> None:
-    """Draw what stands still, and of each view the arm as its last line, which does not."""
+    """Draw the static parts, and the arm of each view as its last line, which moves."""
     room = draw_head(figure, title([track]), [common_settings([track]), *outcome(track)[:1]], SIZE)
     figure.set_size_inches(SIZE)
     every = views([track], {(0, ""): looks([track.name])[0]})

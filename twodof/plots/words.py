@@ -66,7 +66,7 @@ def _setting(key: str, text: str) -> str:
 
 
 def outcome(track: Track) -> list[str]:
-    """Return the lines of a run's verdict, and how far it is off the closed form."""
+    """Return the lines of a run's verdict, and its deviation from the closed form."""
     task = track.task
     if task is None or task.off is None:
         return [*track.verdict.lines]

@@ -1,4 +1,4 @@
-"""Causes of a run that did not do what it was asked to, the root first."""
+"""Causes of a run's failure, the root cause first."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -154,7 +154,7 @@ def _gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def _late(judge: Judge, inside: NDArray[np.bool_]) -> float:
-    """Return the share of the last quarter of samples, or of all with a target that moves, at which something is so."""
+    """Return the share of the last quarter of samples, or of all for a moving target, at which a condition holds."""
     return float(inside[0 if judge.changes > MANY_CHANGES else -(len(inside) // 4 + 1) :].mean())
 
 
@@ -260,7 +260,7 @@ def _singular(judge: Judge) -> Iterator[Cause]:
 
 
 def _slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    """Say how long errors that shrink will take, by their rate at the end."""
+    """Yield the time that shrinking errors will still take, by their rate at the end."""
     t = judge.history()
     for name in missed:
         aim = judge.aims[name]

@@ -1,4 +1,4 @@
-"""Expressions of metrics, as of a cost or a condition, read without running code.
+"""Expressions of metrics, for example a cost or a condition, evaluated without running code.
 
 Numbers, names, + − * / **, comparisons, and abs, min and max of two values.
 """
@@ -43,7 +43,7 @@ class Expression(NamedTuple):
 
 
 def full_name(name: str, known: Iterable[str]) -> str:
-    """Return the known name that a name is, begins, or is with "final_" before it; "" if none or several."""
+    """Return the known name that equals a name, begins with it, or equals "final_" + name; "" if none or several."""
     names = [*known]
     for candidate in (name, f"final_{name}"):
         if candidate in names:

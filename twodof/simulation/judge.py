@@ -38,7 +38,7 @@ class Aim:
         self.began, self.outside, self.first, self.last, self.past, self.way = t, t, size, size, 0.0, e
 
     def add(self, t: Array, e: Array, size: Array) -> None:
-        """Add N samples of the way."""
+        """Add N samples of the move."""
         if size.max() > BAND * self.first:
             self.outside = t[np.flatnonzero(size > BAND * self.first)[-1]]
         if self.way.size and self.first >= SMALLEST_MOVE:
@@ -152,7 +152,7 @@ class Judge:
         self.count, self.last, self._time = self.count + len(rows), rows[-1], float(t[-1])
 
     def _change(self, t: Array, targets: Mapping[str, Array]) -> int:
-        """Return the first row of the way to the last target: 0 where that began in an earlier block."""
+        """Return the first row of the move to the last target: 0 where that began in an earlier block."""
         if self.count and targets is self._same:
             return 0
         start, self._same = 0, targets
