@@ -25,6 +25,7 @@ class ControlledPlant:
     if TYPE_CHECKING:
 
         def __getattr__(self, group: str) -> Any: ...
+        def __setattr__(self, group: str, value: Any) -> None: ...
 
 
 class ControlLaw(Protocol):

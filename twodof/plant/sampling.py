@@ -13,13 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Any
 
+from .control_law import ControlledPlant
 from .integrator import Budget, advance
 from .noise import normal_pair
 
-Plant = Any
-"""A plant.Plant, whose module imports this one."""
 MOST_PERIODS = 10
 """Longest delay, in periods."""
 TIME_TOLERANCE = 1e-9
@@ -60,7 +58,7 @@ class Sampling:
         pending = [list(still) for _ in range(MOST_PERIODS + 1)]
         return cls(start, start, 0, 0, list(still), list(still), list(still), pending)
 
-    def settled(self, plant: Plant, time: float) -> Sampling:
+    def settled(self, plant: ControlledPlant, time: float) -> Sampling:
         """Return the state after all that is due at a time, s, at the plant's state and inputs.
 
         Raises:
@@ -73,28 +71,28 @@ class Sampling:
             after._measure(plant, time)
         return after
 
-    def is_sound(self, plant: Plant) -> bool:
+    def is_sound(self, plant: ControlledPlant) -> bool:
         """Return whether the state is one that a plant can be in at its time, given finite numbers."""
         if not 0 <= self.count <= min(self.k, MOST_PERIODS) or self.k >= WHOLE:
             return False
         period = plant.control_period
         return abs(self._instant(plant, self.k) - plant.time) <= 2.0 * period if period else not self.count
 
-    def next_event(self, plant: Plant) -> float:
+    def next_event(self, plant: ControlledPlant) -> float:
         """Return the time at which the next sample is taken or the next effort acts, s; infinite without samples."""
         if not plant.control_period:
             return inf
         return min(self._instant(plant, self.k), self._due(plant))
 
-    def _instant(self, plant: Plant, k: int) -> float:
+    def _instant(self, plant: ControlledPlant, k: int) -> float:
         return float(self.start + k * plant.control_period)
 
-    def _due(self, plant: Plant) -> float:
+    def _due(self, plant: ControlledPlant) -> float:
         """Return when the oldest pending effort acts, s."""
         first = self.k - self.count
         return self._instant(plant, first) + float(plant.control_delay) if self.count else inf
 
-    def _sample(self, plant: Plant, time: float) -> None:
+    def _sample(self, plant: ControlledPlant, time: float) -> None:
         by = time + slack(plant, time)
         if self._instant(plant, self.k) <= by:
             self._measure(plant, time)
@@ -110,7 +108,7 @@ class Sampling:
             self.pending.append([0.0] * len(self.effort))
             self.count -= 1
 
-    def _measure(self, plant: Plant, time: float) -> None:
+    def _measure(self, plant: ControlledPlant, time: float) -> None:
         """Take a sample of the sensors."""
         before, elapsed = self.q_meas, plant.control_period or time - self.time
         q_meas, v_meas = list(plant.q), list(plant.v)
@@ -125,7 +123,7 @@ class Sampling:
         self.q_meas, self.v_meas, self.time, self.k = q_meas, v_meas, time, self.k + 1
 
 
-def advance_sampled(plant: Plant, h: float) -> None:
+def advance_sampled(plant: ControlledPlant, h: float) -> None:
     """Advance a plant's q, v and samples by h seconds, from one sample or change of effort to the next.
 
     Raises:
@@ -153,12 +151,12 @@ def rounded(q: float, resolution: float) -> float:
     return resolution * round(steps) if abs(steps) < WHOLE else q
 
 
-def slack(plant: Plant, time: float) -> float:
+def slack(plant: ControlledPlant, time: float) -> float:
     """Return the difference within which times are equal, s; 0 without samples."""
     return min(TIME_TOLERANCE * max(1.0, abs(time)), PART_OF_PERIOD * float(plant.control_period))
 
 
-def sampling_refusal(plant: Plant, of_points: bool) -> str:
+def sampling_refusal(plant: ControlledPlant, of_points: bool) -> str:
     """Return why the parameters of sampling are invalid, "" where they are valid.
 
     Args:
