@@ -12,6 +12,7 @@ import twodof
 from twodof.cli.main import main
 from twodof.errors import BagError
 
+SIZE = 300 * 1024**2  # bytes, more than a robot's meshes may have
 SECRET = "a word that must not get out"
 
 
@@ -93,3 +94,21 @@ def test_linked_metadata_is_not_read(linked: Path) -> None:
     recovered = twodof.recover(linked)
     assert recovered.original is not None
     assert not (linked / "metadata.yaml").is_symlink()
+
+
+def test_meshes_without_end_are_not_copied(linked: Path) -> None:
+    """A file of zeros takes no room on the disk, until it is copied."""
+    (linked / "meshes").mkdir()
+    with (linked / "meshes/x.stl").open("wb") as file:
+        file.truncate(SIZE)
+    recovered = twodof.recover(linked)
+    assert recovered.damage == f"meshes of {SIZE} bytes in 'meshes'"
+    assert recovered.counts == {"/joint_states": 11}
+    assert not (linked / "meshes").exists()
+
+
+@pytest.mark.parametrize("name", ["%2E", "%2E%2E", "%2F", "a%2F%2E%2E"])
+def test_names_of_robots_are_no_paths(name: str, linked: Path) -> None:
+    (linked / "run.json").rename(linked / f"run.{name}.json")
+    assert twodof.recover(linked).counts == {"/joint_states": 11}
+    assert [path.name for path in linked.iterdir() if path.suffix == ".json"] == []

@@ -34,7 +34,7 @@ from tools import needs
 
 import twodof
 from twodof.bag.storage import BagWriter
-from twodof.errors import BagError
+from twodof.errors import BagError, BuildError
 from twodof.files import is_being_written
 from twodof.simulation.experiments import Experiment
 
@@ -188,7 +188,7 @@ def test_folder_that_cannot_be_written_is_refused(
 
 
 @both_storages
-@pytest.mark.parametrize(("error", "n"), [(RuntimeError, 0), (KeyboardInterrupt, 137)])
+@pytest.mark.parametrize(("error", "n"), [(RuntimeError, 1), (KeyboardInterrupt, 137)])
 def test_exception_leaves_a_bag_with_every_sample_so_far(
     run: Experiment, tmp_path: Path, storage: str, error: type[BaseException], n: int
 ) -> None:
@@ -200,6 +200,13 @@ def test_exception_leaves_a_bag_with_every_sample_so_far(
         raise error("enough")
     assert assert_consistent(path, storage) == n
     assert read_with_rosbags(path) == [joint_state(k, sample(run, k)) for k in range(n)]
+
+
+@both_storages
+def test_a_run_that_fails_before_its_first_sample_leaves_no_bag(run: Experiment, tmp_path: Path, storage: str) -> None:
+    with pytest.raises(BuildError, match="enough"), twodof.Bag(tmp_path / "bag", storage=storage).begin(run):
+        raise BuildError("enough")
+    assert not (tmp_path / "bag").exists()
 
 
 def fill(bag: twodof.Bag, run: Experiment) -> tuple[str, int]:

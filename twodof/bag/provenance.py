@@ -171,7 +171,8 @@ def robots_of(folder: Path) -> list[str]:
         return [""]
     names = (file.name for file in folder.glob("run.*.json"))  # "run.left (1).json" is a copy
     matches = (re.fullmatch(r"run\.([\w%]+)\.json", name, re.ASCII) for name in names)
-    return sorted(unquote(match[1]) for match in matches if match) or [""]
+    robots = (unquote(match[1]) for match in matches if match)
+    return sorted(robot for robot in robots if re.fullmatch(r"\w+(/\w+)*", robot, re.ASCII)) or [""]
 
 
 def robot_in(path: Path) -> tuple[Path, str]:

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import Reader, ReaderError, WriterError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from ..bounds import MAX_DEFINITION, MAX_PROFILES, MAX_PROVENANCE
+from ..bounds import MAX_DEFINITION, MAX_MESHES, MAX_PROFILES, MAX_PROVENANCE
 from ..errors import BagError, no_such
 from ..files import lock, read_file, sync
 from . import provenance
@@ -174,7 +174,12 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
     for kept_folder in {Path(robot).parts[0] if robot else "meshes" for robot in robots}:  # of meshes
-        if (folder / kept_folder).is_dir() and not (folder / kept_folder).is_symlink():
+        if not (folder / kept_folder).is_dir() or (folder / kept_folder).is_symlink():
+            continue
+        size = sum(file.lstat().st_size for file in (folder / kept_folder).rglob("*"))
+        if size > MAX_MESHES * len(robots):  # a few bytes on the disk can be a terabyte
+            damage.append(f"meshes of {size} bytes in '{kept_folder}'")
+        else:
             shutil.copytree(folder / kept_folder, new / kept_folder, symlinks=True)
     for name, content in kept.items():
         (new / name).write_bytes(content)

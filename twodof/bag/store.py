@@ -133,7 +133,7 @@ class Store:
         self._wait(lambda: self._stores > before)
 
     def leave(self, exception: object) -> None:
-        """End one robot's part; the last one closes the bag.
+        """End one robot's part; the last one closes the bag, and removes it where a run failed without a sample.
 
         A full disk or a lost folder is a BagError, unless such an exception is on its way already.
         """
@@ -146,6 +146,9 @@ class Store:
         self._begin()
         self._wait(lambda: False)  # if this is interrupted, the thread still ends its work
         self._names = {part.namespace for part in self._parts}
+        sound = self._closed and self._failure is None
+        if sound and isinstance(exception, Exception) and not any(part.stored() for part in self._parts):
+            shutil.rmtree(self.path, ignore_errors=True)  # the FMU failed before its first sample
         self._parts.clear()
         if self._failure is not None and not isinstance(exception, BagError):
             raise self._error(self._failure) from self._failure
