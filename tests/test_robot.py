@@ -90,6 +90,7 @@ REFUSED = {
     "two links of one name": (arm(link("tip")), "two links named 'tip'"),
     "two joints of one name": (arm(link("x"), joint("elbow", "tip", "x")), "two joints .*'elbow'"),
     "no links": (robot(), "no links"),
+    "3 million elements": (robot("<a/>" * 3_000_000), "the URDF has .* characters; at most 8388608 are supported"),
     "no moving joint": (robot(link("base"), link("a"), joint("weld", "base", "a", kind="fixed")), "no moving joint"),
     "one link only": (robot(link("base")), "no moving joint"),
     "missing parent": (arm(elbow=joint("elbow", "ghost", "tip")), "'elbow'.* parent .*'ghost'"),

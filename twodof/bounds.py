@@ -19,7 +19,6 @@ MAX_SOURCE = 16 * MIB  # a C file
 MIN_STEP = 1e-6  # s, communication step: a run of 1e-300 has no end
 
 # robots
-MAX_URDF = 8 * MIB
 MAX_XACRO_MEMORY = 1024 * MIB  # address space
 MAX_XACRO_SECONDS = 8
 MAX_XACRO_WAIT = 60  # s by the clock

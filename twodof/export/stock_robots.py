@@ -9,10 +9,9 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-from ..bounds import MAX_URDF
 from ..errors import BuildError, choice
 from ..files import read_file, refusing
-from ..plant.urdf import RobotError, Urdf, read_urdf
+from ..plant.urdf import MAX_URDF, RobotError, Urdf, read_urdf
 from .fmu_options import FmuOptions
 from .urdf_source import last_links, read_text
 

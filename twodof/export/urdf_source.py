@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bounds import MAX_URDF
 from ..errors import BuildError, choice, kind_of, no_such
 from ..files import read_file, refusing
-from ..plant.urdf import RobotError, Urdf, read_urdf
+from ..plant.urdf import MAX_URDF, RobotError, Urdf, read_urdf
 from .mesh_files import places_of
 from .xacro_file import expand
 

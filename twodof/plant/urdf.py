@@ -16,6 +16,7 @@ UNBOUNDED = 1.7976931348623157e308
 NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 SHAPES = ("visual", "collision")
+MAX_URDF = 8 * 1024**2  # bytes of a file, characters of a text
 MAX_LINKS = 1000
 MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
 MAX_SHAPES = 5000  # visuals and collisions; a page holds each
@@ -157,6 +158,8 @@ def _listed(what: str, names: Sequence[str]) -> str:
 
 
 def _parse(urdf: str) -> ET.Element:
+    if len(urdf) > MAX_URDF:  # its elements take thirty times the memory
+        raise RobotError(f"the URDF has {len(urdf)} characters; at most {MAX_URDF} are supported")
     if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
         raise RobotError("the URDF has a document type declaration; remove it")
     try:
