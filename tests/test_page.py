@@ -668,3 +668,9 @@ def test_the_scripts_are_typed_and_short() -> None:
                 assert i - begin < 60, f"{name}:{begin + 1}"
     done = subprocess.run([needs("tsc"), "-p", str(ROOT / "tests/tsconfig.json")], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
+
+
+def test_a_script_uses_what_it_declares_or_imports_alone() -> None:
+    command = [needs("eslint"), "-c", "tests/eslint.config.js", "fmu_src/page", "twodof/plots"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr

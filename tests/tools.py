@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 if TYPE_CHECKING:
     import pytest
 
-PACKAGES = Path(__file__).with_name("node_modules") / "@foxglove"
+NODE = Path(__file__).with_name("node_modules")
+INSTALL = "npm install --no-package-lock --prefix tests"
 
 
 class Tool(NamedTuple):
@@ -38,9 +39,8 @@ TOOLS = {
     "disks": Tool("full disks", names=("mount",), remedy="run as root, where tmpfs can be mounted"),
     "fastdds": Tool("ROS 2 networks with Fast DDS", "libfastrtps-dev", ("/usr/include/fastdds/dds",)),
     "fastddsgen": Tool("ROS 2 networks with Fast DDS", "fastddsgen"),
-    "foxglove": Tool(
-        "Foxglove's own client", names=(str(PACKAGES),), remedy="npm install --no-package-lock --prefix tests"
-    ),
+    "eslint": Tool("rules of the pages' scripts", names=(str(NODE / ".bin" / "eslint"),), remedy=INSTALL),
+    "foxglove": Tool("Foxglove's own client", names=(str(NODE / "@foxglove"),), remedy=INSTALL),
     "g++": Tool("ROS 2 networks with Fast DDS", "g++", ("g++", "c++")),
     "gcc": Tool("the engine's inner functions in C", "gcc", ("gcc", "cc", "clang")),
     "ip": Tool("separate networks", "iproute2"),

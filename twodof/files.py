@@ -1,6 +1,5 @@
 """Size-limited reads of untrusted files, atomic writes, folder locks and temporary folders."""
 
-import base64
 import errno
 import fcntl
 import io
@@ -13,7 +12,6 @@ import sys
 import tempfile
 import time
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, count
@@ -283,11 +281,6 @@ def free_name(name: str, ending: str = "", replaceable: Callable[[Path], bool] =
     """Return the name, or the name with the first number from 2 on, that no file has."""
     names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
     return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
-
-
-def packed(content: bytes) -> str:
-    """Return data compressed (zlib, which browsers call deflate) as base64, for a page."""
-    return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
 def sync(*paths: Path) -> None:

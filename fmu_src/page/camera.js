@@ -1,9 +1,11 @@
 /** The camera. It shows a planar robot from the front. */
 
+import { cross, dot, multiply, plus, transform, turn, unit } from "./matrices.js";
+
 const FIELD_OF_VIEW = 0.6; // rad, vertical
 const ROOM = 1.45, ROOM_ASKEW = 1.1; // of the picture to what is in it, which is less across than its diagonal
 
-class Camera {
+export class Camera {
   touched = false;
   distance = 1;
   size = 1;
@@ -35,12 +37,10 @@ class Camera {
     this.distance = ((this.flat ? ROOM : ROOM_ASKEW) * this.size) / 2 / Math.tan(FIELD_OF_VIEW / 2);
   }
 
-  /** @returns {number[]} */
   get right() {
     return unit(cross(this.view.vertical, this.back));
   }
 
-  /** @returns {number[]} */
   get up() {
     return cross(this.back, this.right);
   }
@@ -71,8 +71,7 @@ class Camera {
     return multiply(projection, seen);
   }
 
-  /** A point in the picture: x to the right and y downwards, each from 0 to 1. */
-  /** @type {(p: Numbers) => number[]} */
+  /** @type {(p: Numbers) => number[]} A point in the picture: x to the right and y downwards, each from 0 to 1. */
   project(p) {
     const m = this.matrix();
     const w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
@@ -80,8 +79,7 @@ class Camera {
     return [0.5 + x / w / 2, 0.5 - y / w / 2];
   }
 
-  /** Direction of the ray through a point of the picture. */
-  /** @type {(x: number, y: number) => number[]} */
+  /** @type {(x: number, y: number) => number[]} Direction of the ray through a point of the picture. */
   ray(x, y) {
     const f = 2 * Math.tan(FIELD_OF_VIEW / 2);
     const right = plus([0, 0, 0], (x - 0.5) * f * this.aspect, this.right);
@@ -96,8 +94,7 @@ class Camera {
     return plus(this.eye, dot(plus([point[0], point[1], point[2]], -1, this.eye), normal) / along, ray);
   }
 
-  /** Move around by a part of the picture. */
-  /** @type {(dx: number, dy: number) => void} */
+  /** @type {(dx: number, dy: number) => void} Move around by a part of the picture. */
   orbit(dx, dy) {
     this.touched = true;
     const { vertical } = this.view;
@@ -106,8 +103,7 @@ class Camera {
     if (Math.abs(dot(tilted, unit(vertical))) < 0.995) this.back = tilted;
   }
 
-  /** Move along the picture by a part of it. */
-  /** @type {(dx: number, dy: number) => void} */
+  /** @type {(dx: number, dy: number) => void} Move along the picture by a part of it. */
   pan(dx, dy) {
     this.touched = true;
     const height = 2 * this.stretched * Math.tan(FIELD_OF_VIEW / 2);
@@ -120,8 +116,7 @@ class Camera {
     this.distance = Math.min(Math.max(this.distance * factor, this.size / 20), this.size * 20);
   }
 
-  /** Step back, where what moves has left the picture and the user has not chosen it. */
-  /** @type {(p: number[]) => void} */
+  /** @type {(p: number[]) => void} Step back, where what moves has left the picture and the user has not chosen it. */
   follow(p) {
     const [x, y] = this.project(p);
     if (!this.touched && !(Math.min(x, y) > 0.03 && Math.max(x, y) < 0.97) && this.distance < 9 * this.size)

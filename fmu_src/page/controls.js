@@ -1,4 +1,9 @@
-/** The panel: what the FMU has to set, a readout, and buttons. All text is text. */
+/** Sliders of what the FMU has to set. */
+
+import { byId, element } from "./elements.js";
+import { shortNames } from "./robot.js";
+
+/** @typedef {import("./samples.js").Samples} Samples */
 
 const GAINS = ["Kp", "Kd", "Kp_rot", "Kd_rot", "Kn"];
 const JOINTS = ["friction", "damping", "armature"];
@@ -15,21 +20,7 @@ const GROUPS = /** @type {[string, boolean, string[]][]} */ ([
   ["sampling (a change restarts the simulation)", false, ["control_period", "control_delay", "v_from_q", ...SENSORS]],
 ]);
 
-/** An element with text, and what it holds. */
-/** @type {(tag: string, text: string, ...inner: Node[]) => HTMLElement} */
-function element(tag, text, ...inner) {
-  const made = document.createElement(tag);
-  made.textContent = text;
-  made.append(...inner);
-  return made;
-}
-
-/** @type {(id: string) => any} */
-function byId(id) {
-  return document.getElementById(`arm-${id}`);
-}
-
-class Controls {
+export class Controls {
   /**
    * @param {Samples} session
    * @param {{centre: number[], radius: number}} reach
@@ -51,8 +42,7 @@ class Controls {
     }
   }
 
-  /** The sliders of a group: one for all gains, else one for each element. */
-  /** @type {(group: string) => HTMLElement[]} */
+  /** @type {(group: string) => HTMLElement[]} The sliders of a group: one for all gains, else one for each element. */
   rows(group) {
     const names = /** @type {string[]} */ (this.session.groups.get(group));
     if (GAINS.includes(group)) return [this.row(group, names[0])];
@@ -60,8 +50,7 @@ class Controls {
     return PER_JOINT.includes(group) ? [element("div", group), ...rows] : rows;
   }
 
-  /** The row of a variable or group, which shows the value of its first. */
-  /** @type {(name: string, first: string) => HTMLElement} */
+  /** @type {(name: string, first: string) => HTMLElement} Row of a variable or group, with the value of its first. */
   row(name, first) {
     const { session } = this, variable = session.variable(first);
     const value = session.values.get(first);
@@ -85,8 +74,7 @@ class Controls {
     return row;
   }
 
-  /** A variable's name, with that of its joint or axis in place of its number. */
-  /** @type {(name: string) => string} */
+  /** @type {(name: string) => string} A variable's name, with that of its joint or axis in place of its number. */
   label(name) {
     const [group, number] = name.replace("]", "").split("["), { axes } = this.session.facts;
     if (number === undefined) return name;
@@ -95,8 +83,7 @@ class Controls {
     return `${group} ${(PER_AXIS.includes(group) ? axes : "xyzw")[i]}`;
   }
 
-  /** The range of a slider. */
-  /** @type {(name: string, value: number) => [number, number]} */
+  /** @type {(name: string, value: number) => [number, number]} The range of a slider. */
   range(name, value) {
     const [group, number] = name.replace("]", "").split("["), i = Number(number) - 1;
     const { reach, session } = this, { joints } = session.facts, joint = joints[i];
@@ -132,94 +119,7 @@ class Controls {
   }
 }
 
-/** An FMI unit as people write it: 1/s2 is s⁻². */
-/** @param {string} unit */
+/** @type {(unit: string) => string} An FMI unit as people write it: 1/s2 is s⁻². */
 function unitText(unit) {
   return unit.replace("1/s2", "s⁻²").replace("1/s", "s⁻¹").replace("2", "²").replace(/\./g, "·");
-}
-
-/** Units of position, velocity and effort. */
-/** @type {(joints: JointFacts[]) => string[]} */
-function unitsOf(joints) {
-  const slide = joints.some(({ prismatic }) => prismatic), turns = joints.some(({ prismatic }) => !prismatic);
-  if (slide && turns) return ["rad or m", "rad/s or m/s", "N·m or N"];
-  return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
-}
-
-/** Names without the whole words that all of them begin and end with. */
-/** @type {(joints: JointFacts[]) => string[]} */
-function shortNames(joints) {
-  const words = joints.map(({ name }) => name.split(/([^_/]*[_/])/).filter(Boolean)), [first] = words;
-  /** True if all begin, or end, with one word, and have others. */
-  /** @type {(at: (own: string[]) => string) => boolean} */
-  const alike = (at) => words.length > 1 && words.every((own) => own.length > 1 && at(own) === at(first));
-  while (alike((own) => own[0])) words.forEach((own) => own.shift());
-  while (alike((own) => own[own.length - 1])) words.forEach((own) => own.splice(-2, 2, own[own.length - 2].slice(0, -1)));
-  return words.map((own) => own.join(""));
-}
-
-/** A number to be read, no zero with a sign. */
-/** @type {(value: number) => string} */
-function digits(value) {
-  if (!Number.isFinite(value)) return "\u2013";
-  const rounded = value.toFixed(Math.abs(value) < 10 ? 4 : 2);
-  return rounded.replace(/^-(?=[0.]+$)/, "").replace("-", "\u2212");
-}
-
-class Readout {
-  /** @type {Map<string, HTMLElement>} cells of the values beside the joints, by name */
-  more = new Map();
-
-  /**
-   * @param {Samples} session
-   * @param {Curves} curves
-   */
-  constructor(session, curves) {
-    this.session = session;
-    const table = byId("readout"), { joints } = session.facts;
-    const names = shortNames(joints);
-    table.append(element("tr", "", ...["", ...unitsOf(joints)].map((unit) => element("th", unit))));
-    this.cells = joints.map((joint, i) => {
-      const swatch = document.createElement("input");
-      Object.assign(swatch, { type: "checkbox", checked: true, className: "swatch" });
-      swatch.style.accentColor = COLOURS[i % COLOURS.length];
-      swatch.setAttribute("aria-label", `curves of ${joint.name}`);
-      swatch.addEventListener("change", () => curves.hidden[swatch.checked ? "delete" : "add"](i));
-      const name = element("td", "", element("label", "", swatch, document.createTextNode(names[i])));
-      name.title = joint.name;
-      const cells = ["q", "v", "tau"].map(() => element("td", ""));
-      cells[0].dataset.value = joint.name;
-      table.append(element("tr", "", name, ...cells));
-      return cells;
-    });
-  }
-
-  /** @type {(name: string, text: string) => void} */
-  tell(name, text) {
-    let cell = this.more.get(name);
-    if (!cell) {
-      cell = element("td", "");
-      Object.assign(cell, { colSpan: 3 }).dataset.value = name;
-      this.more.set(name, cell);
-      byId("readout").append(element("tr", "", element("td", name), cell));
-    }
-    cell.textContent = text;
-  }
-
-  /** Sample k, the joints that are at a limit, places by their names, m, and the orientation's error, rad. */
-  /** @type {(k: number, stopped: JointFacts[], places: Record<string, number[]>, turn: number) => void} */
-  show(k, stopped, places, turn) {
-    const { session } = this, { joints } = session.facts;
-    joints.forEach((joint, i) => {
-      ["q", "v", "tau"].forEach((group, c) => (this.cells[i][c].textContent = digits(session.value(group, k, i))));
-      this.cells[i][0].className = stopped.includes(joint) ? "limit" : "";
-    });
-    for (const [name, place] of Object.entries(places)) this.tell(name, `(${place.map(digits).join(", ")}) m`);
-    const error = session.error(k), unit = session.groups.has("x_des") ? "m" : unitsOf(joints)[0];
-    const errors = /** @type {[number, string][]} */ ([[error, unit], [turn, "rad"]]);
-    const texts = errors.filter(([value]) => !Number.isNaN(value))
-      .map(([value, of]) => `${Number((value < SMALLEST ? 0 : value).toPrecision(4))} ${of}`);
-    if (session.follows) this.tell("error", texts.join(", ") || "\u2013");
-    for (const [name, text] of session.remarks()) this.tell(name, text);
-  }
 }

@@ -1,26 +1,13 @@
-/**
- * Curves over time, panels with one time axis: zoom, a cursor over all, and lines that are switched.
- *
- * @typedef {Object} Panel
- * @property {string} title
- * @property {(k: number, line: number) => number} value
- * @property {number[]} lines which of the names it has
- * @property {boolean} log whether its axis is logarithmic
- * @property {(line: number) => (number | null)[]} limits of a line
- *
- * @typedef {{line: number, points: number[][]}} Outline
- */
+/** Curves over time, panels with one time axis: zoom, a cursor over all, and lines that are switched. */
+
+/** @typedef {import("./samples.js").Samples} Samples */
 
 const MARGIN = { left: 58, right: 8, top: 20, bottom: 18 };
-const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c", "#9467bd"];
-const SMALLEST = 1e-12; // what is below is rounding
+export const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c", "#9467bd"];
+export const SMALLEST = 1e-12; // what is below is rounding
 
-class Curves {
-  /**
-   * @param {Samples} session
-   * @param {Panel[]} panels
-   * @param {HTMLElement} parent
-   */
+export class Curves {
+  /** @param {Samples} session @param {PanelFacts[]} panels @param {HTMLElement} parent */
   constructor(session, panels, parent) {
     this.session = session;
     /** @type {Set<number>} */
@@ -38,8 +25,7 @@ class Curves {
     });
   }
 
-  /** The times that are shown, s. */
-  /** @returns {[number, number]} */
+  /** @returns {[number, number]} The times that are shown, s. */
   get shown() {
     return this.chosen ?? this.session.span;
   }
@@ -170,8 +156,7 @@ function stroke(context, points) {
   context.stroke();
 }
 
-/** Round values between two, some so many of them. */
-/** @type {(low: number, high: number, count: number) => number[]} */
+/** @type {(low: number, high: number, count: number) => number[]} Round values between two, some so many of them. */
 function ticks(low, high, count) {
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = power * ([1, 2, 5, 10].find((factor) => factor * power >= rough) ?? 10);

@@ -1,13 +1,18 @@
 /** Dragging in the scene: the target, rings that rotate it, or the view. */
 
+import { base, circle, compose, cross, dot, plus, rotation, transform, unit } from "./matrices.js";
+
+/** @typedef {import("./camera.js").Camera} Camera */
+/** @typedef {import("./samples.js").Samples} Samples */
+
 const KEYS = /** @type {Record<string, [number, number]>} */ ({ ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] });
 const STEP = 0.04; // of the picture, by a key
 const GRIP = 26, GRIP_OF_RING = 12; // pixels
 const RING = 0.16; // of the size of the scene
 const RING_POINTS = 48;
-const AXIS_COLOURS = [[0.84, 0.22, 0.2], [0.2, 0.62, 0.3], [0.2, 0.42, 0.85]];
+export const AXIS_COLOURS = [[0.84, 0.22, 0.2], [0.2, 0.62, 0.3], [0.2, 0.42, 0.85]];
 
-class Handle {
+export class Handle {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {Camera} camera
@@ -56,8 +61,7 @@ class Handle {
     return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
   }
 
-  /** Pixels from a point of the picture to one of the scene. */
-  /** @type {(at: number[], p: Numbers) => number} */
+  /** @type {(at: number[], p: Numbers) => number} Pixels from a point of the picture to one of the scene. */
   distance(at, p) {
     const [x, y] = this.camera.project(p);
     return Math.hypot((x - at[0]) * this.canvas.clientWidth, (y - at[1]) * this.canvas.clientHeight);
@@ -108,8 +112,7 @@ class Handle {
     };
   }
 
-  /** The points of the ring about an axis of the target. */
-  /** @type {(axis: number) => number[][]} */
+  /** @type {(axis: number) => number[][]} The points of the ring about an axis of the target. */
   ring(axis) {
     const orientation = rotation(this.session.held("quat_des"));
     const [one, two] = [1, 2].map((i) => transform(orientation, base((axis + i) % 3)));
@@ -124,8 +127,7 @@ class Handle {
     return least < GRIP_OF_RING * grip ? distances.indexOf(least) : -1;
   }
 
-  /** Turn the target about one of its axes. */
-  /** @type {(at: number[], axis: number) => (x: number, y: number) => void} */
+  /** @type {(at: number[], axis: number) => (x: number, y: number) => void} Turn the target about one of its axes. */
   turn(at, axis) {
     const place = this.place(), start = this.session.held("quat_des"), orientation = rotation(start);
     const normal = transform(orientation, base(axis)), one = transform(orientation, base((axis + 1) % 3));

@@ -4,39 +4,9 @@
  * Sources: the MCAP specification, version 0; OMG, "DDS-XTypes" 1.3, section 7.4.1, plain CDR.
  */
 
-const TIME = `MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec`;
-const HEADER = `MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id`;
-const POINT = `MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z`;
-const QUATERNION = `MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w`;
-const POSE = `MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation`;
-/** @param {...string} parts */
-const definition = (...parts) => `${parts.join(`\n${"=".repeat(80)}\n`)}\n`;
-/** @type {Record<string, string>} */
-const DEFINITIONS = {
-  "sensor_msgs/msg/JointState": definition(
-    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort", HEADER, TIME),
-  "geometry_msgs/msg/PointStamped": definition(
-    "std_msgs/Header header\ngeometry_msgs/Point point", HEADER, TIME, POINT),
-  "geometry_msgs/msg/PoseStamped": definition(
-    "std_msgs/Header header\ngeometry_msgs/Pose pose", HEADER, TIME, POSE, POINT, QUATERNION),
-};
-const QOS = `- {history: 1, depth: 10, reliability: 1, durability: 2, deadline: {sec: 9223372036, nsec: 854775807},
-  lifespan: {sec: 9223372036, nsec: 854775807}, liveliness: 1,
-  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}, avoid_ros_namespace_conventions: false}
-`;
+/** @typedef {import("./robot.js").Robot} Robot */
+/** @typedef {import("./session.js").Session} Session */
+
 const MAGIC = [0x89, 0x4d, 0x43, 0x41, 0x50, 0x30, 0x0d, 0x0a];
 const CHUNK = 1 << 20; // bytes
 const OP = {
@@ -51,8 +21,7 @@ class Bytes {
     this.length = 0;
   }
 
-  /** The offset of free room for a number of bytes. */
-  /** @type {(size: number) => number} */
+  /** @type {(size: number) => number} The offset of free room for a number of bytes. */
   room(size) {
     if (this.length + size > this.view.byteLength) {
       const longer = new Uint8Array(2 * (this.length + size));
@@ -67,8 +36,7 @@ class Bytes {
     return new Uint8Array(this.view.buffer, 0, this.length);
   }
 
-  /** Whole numbers of so many bits. */
-  /** @type {(size: number, ...values: (number | bigint)[]) => Bytes} */
+  /** @type {(size: number, ...values: (number | bigint)[]) => Bytes} Whole numbers of so many bits. */
   put(size, ...values) {
     for (const value of values) {
       const at = this.room(size / 8);
@@ -96,8 +64,7 @@ class Bytes {
     return this;
   }
 
-  /** A text behind its length. */
-  /** @type {(text: string, end?: string) => Bytes} */
+  /** @type {(text: string, end?: string) => Bytes} A text behind its length. */
   text(text, end = "") {
     const content = new TextEncoder().encode(text + end);
     return this.put(32, content.length).raw(content);
@@ -122,8 +89,7 @@ function textMap(entries) {
   return new Bytes().put(32, content.length).raw(content.content);
 }
 
-/** A message's beginning; its stamp in ns. */
-/** @type {(stamp: bigint, frame: string) => Bytes} */
+/** @type {(stamp: bigint, frame: string) => Bytes} A message's beginning; its stamp in ns. */
 function headed(stamp, frame) {
   const second = 1000000000n;
   return new Bytes().raw([0, 1, 0, 0]).put(32, stamp / second, stamp % second).text(frame, "\0");
@@ -140,7 +106,7 @@ function* messages(session, robot) {
     for (const name of names) state.align(4).text(name, "\0");
     for (const group of ["q", "v", "tau"]) state.align(4).put(32, names.length).align(8).doubles(session.at(group, k));
     yield { topic: "/joint_states", stamp, data: state.content };
-    const place = robot.end(session.at("q", k));
+    const place = robot.end(k);
     yield { topic: "/end_effector", stamp, data: point(stamp, root, place, session.at("quat", k)) };
     if (session.groups.has("x_des")) {
       session.axes.forEach((axis, i) => (place[axis] = session.at("x_des", k)[i]));
@@ -154,26 +120,16 @@ function point(stamp, frame, place, quat) {
   return headed(stamp, frame).align(8).doubles(place).doubles(quat).content;
 }
 
-/** The provenance of the session, as in a bag's run.json. */
-/** @type {(session: Session) => string} */
-function provenance(session) {
-  return JSON.stringify({
-    format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
-    command_line: "a page in the browser", input_changes: session.changes,
-  });
-}
-
-/** The session as an MCAP file. */
-/** @type {(session: Session, robot: Robot) => Uint8Array} */
-function mcap(session, robot) {
+/** @type {(session: Session, robot: Robot) => Uint8Array} The session as an MCAP file. */
+export function mcap(session, robot) {
   const pose = session.groups.has("quat") ? "geometry_msgs/msg/PoseStamped" : "geometry_msgs/msg/PointStamped";
   const topics = ["/joint_states", "/end_effector", ...(session.groups.has("x_des") ? ["/target"] : [])];
-  const types = ["sensor_msgs/msg/JointState", pose], described = new Bytes();
+  const types = ["sensor_msgs/msg/JointState", pose], described = new Bytes(), { definitions, qos } = session.facts;
   types.forEach((type, i) =>
-    described.record(OP.schema, new Bytes().put(16, i + 1).text(type).text("ros2msg").text(DEFINITIONS[type])));
+    described.record(OP.schema, new Bytes().put(16, i + 1).text(type).text("ros2msg").text(definitions[type])));
   topics.forEach((topic, i) =>
     described.record(OP.channel, new Bytes().put(16, i + 1, i ? 2 : 1).text(topic).text("cdr")
-      .raw(textMap({ offered_qos_profiles: QOS, topic_type_hash: "" }).content)));
+      .raw(textMap({ offered_qos_profiles: qos, topic_type_hash: "" }).content)));
   const file = new Bytes().raw(MAGIC).record(OP.header, new Bytes().text("ros2").text("twodof")).raw(described.content);
   const indexes = new Bytes();
   let chunks = 0, chunk = new Chunk(topics);
@@ -188,8 +144,11 @@ function mcap(session, robot) {
     if (chunk.records.length > CHUNK) flush();
   }
   flush();
-  const at = file.length, content = new Bytes().text("twodof").raw(textMap({ "run.json": provenance(session) }).content);
-  file.record(OP.metadata, content);
+  const at = file.length, origin = JSON.stringify({
+    format: 1, ...session.facts.provenance, start_time: 0, start_values: session.startValues,
+    command_line: "a page in the browser", input_changes: session.changes,
+  });
+  file.record(OP.metadata, new Bytes().text("twodof").raw(textMap({ "run.json": origin }).content));
   const metadata = new Bytes().put(64, at, file.length - at).text("twodof");
   file.record(OP.dataEnd, new Bytes().put(32, 0));
   const summary = file.length, statistics = new Bytes();
@@ -220,8 +179,7 @@ class Chunk {
     this.records.record(OP.message, new Bytes().put(16, channel).put(32, 0).put(64, stamp, stamp).raw(data));
   }
 
-  /** Append it and its indexes; the record of where they are. */
-  /** @type {(file: Bytes) => Bytes} */
+  /** @type {(file: Bytes) => Bytes} Append it and its indexes; the record of where they are. */
   write(file) {
     const { records, places } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
     const content = new Bytes().put(64, start, end, records.length).put(32, 0).text("").put(64, records.length);

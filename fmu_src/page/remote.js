@@ -1,20 +1,6 @@
-/**
- * An FMU that is stepped by the server of this page: orders go up, samples come down.
- *
- * @typedef {Object} News what has happened
- * @property {number} run number of the run
- * @property {number} t of the latest sample, s; there may be more than there was room for
- * @property {number} received number of this page's requests received before it was sent
- * @property {number[][]} rows samples, each with its time first
- * @property {Record<string, Value>} values inputs and parameters
- * @property {boolean} playing
- * @property {number} recorded
- * @property {number} missed
- * @property {number} steps
- * @property {number} worst s
- * @property {string[]} notes the latest of all
- * @property {number} noted how many there were
- */
+/** An FMU that is stepped by the server of this page: orders go up, samples come down. */
+
+import { MOST_NUMBERS, Samples } from "./samples.js";
 
 const NOTED = 8000; // ms that a note is shown
 const PACE_WINDOW = 1000; // ms over which the real-time factor is taken
@@ -32,7 +18,7 @@ function seek() {
   socket.onclose = () => setTimeout(seek, RETRY);
 }
 
-class Remote extends Samples {
+export class Remote extends Samples {
   without = ["scrub", "loops", "pace", "download"];
   sent = 0; // requests
   run = -1;
@@ -41,17 +27,13 @@ class Remote extends Samples {
   /** @type {[number, number][]} by the clock, ms, and of the robot, s */
   past = [];
 
-  /**
-   * @param {Facts} facts
-   * @param {WebSocket} socket
-   */
+  /** @param {Facts} facts @param {WebSocket} socket */
   constructor(facts, socket) {
     super(facts, true);
     this.socket = socket;
   }
 
-  /** Return the session of this page's server, after its first sample. */
-  /** @type {(facts: Facts) => Promise<Remote>} */
+  /** @type {(facts: Facts) => Promise<Remote>} Return the session of this page's server, after its first sample. */
   static connect(facts) {
     const socket = connection();
     const remote = new Remote(facts, socket);

@@ -1,17 +1,16 @@
 /** A bag that is replayed: all samples are there from the beginning. */
 
+import { Samples } from "./samples.js";
+
 const LONGEST = 1; // s of a frame that count: the page may not have been shown meanwhile
 
-class Replay extends Samples {
+export class Replay extends Samples {
   without = ["defaults", "download", "record"];
   steered = false;
   moment = 0; // s
   loops = false;
 
-  /**
-   * @param {Facts} facts
-   * @param {ArrayBuffer} samples
-   */
+  /** @param {Facts} facts @param {ArrayBuffer} samples */
   constructor(facts, samples) {
     super(facts, true);
     this.data = new Float64Array(samples);
@@ -23,8 +22,7 @@ class Replay extends Samples {
     return this.nearest(this.moment);
   }
 
-  /** All of it. */
-  /** @returns {[number, number]} */
+  /** @returns {[number, number]} All of it. */
   get span() {
     return [0, this.duration || this.facts.step];
   }
@@ -35,8 +33,7 @@ class Replay extends Samples {
     if (on && this.moment >= this.duration) this.moment = 0;
   }
 
-  /** Go on by s of the clock. */
-  /** @type {(passed: number, speed: number) => void} */
+  /** @type {(passed: number, speed: number) => void} Go on by s of the clock. */
   advance(passed, speed) {
     this.moment += Math.min(passed, LONGEST) * speed;
     if (this.moment < this.duration) return;

@@ -1,14 +1,23 @@
-/** The robot's geometry: where its links are, and how far it reaches. */
+/** The robot in the samples of a session: links, end effector and target. */
 
-class Robot {
-  /** @param {Facts} facts */
-  constructor(facts) {
-    this.facts = facts;
+import { angleBetween, multiply, originOf, placed, plus, rotation, turn } from "./matrices.js";
+
+/** @typedef {import("./samples.js").Samples} Samples */
+
+export class Robot {
+  /** @param {Samples} session */
+  constructor(session) {
+    this.session = session;
+    this.facts = session.facts;
   }
 
-  /** Transforms of all links in the root frame, at joint positions in rad or m. */
-  /** @type {(q: Numbers) => Float64Array[]} */
-  links(q) {
+  /** Transforms of all links in sample k, in the root frame. */
+  links(k = this.session.now) {
+    return this.linksAt(this.session.at("q", k));
+  }
+
+  /** @type {(q: Numbers) => Float64Array[]} The same at positions in rad or m. */
+  linksAt(q) {
     /** @type {Float64Array[]} */
     const places = [placed([0, 0, 0])];
     for (const { parent, place, axis, prismatic, column, ratio, offset } of this.facts.links.slice(1)) {
@@ -19,24 +28,35 @@ class Robot {
     return places;
   }
 
-  /** The transform of the task frame. */
-  /** @type {(links: Float64Array[]) => Float64Array} */
-  frame(links) {
-    return links[this.facts.frameLink];
+  /** @type {(k: number) => Float64Array} The transform of the task frame in sample k. */
+  frame(k) {
+    return this.links(k)[this.facts.frameLink];
   }
 
-  /** The position of the end effector. */
-  /** @type {(q: Numbers) => number[]} */
-  end(q) {
-    return originOf(this.frame(this.links(q)));
+  /** @type {(k: number) => number[]} The position of the end effector in sample k. */
+  end(k) {
+    return originOf(this.frame(k));
+  }
+
+  /** The position of the target; on uncontrolled axes that of the end effector. */
+  target(k = this.session.now) {
+    const { session } = this, place = this.end(k), given = session.target("x_des", k);
+    if (given.length) session.axes.forEach((axis, i) => (place[axis] = given[i]));
+    return place;
+  }
+
+  /** @type {(k: number) => number} Angle from the target orientation in sample k, rad; NaN without a target. */
+  turnError(k) {
+    const { session } = this;
+    if (!session.groups.has("quat_des")) return NaN;
+    return angleBetween(this.frame(k), rotation(session.target("quat_des", k)));
   }
 
   /**
    * A ball outside of which no target can be reached: about the first joint that moves the frame, as
    * far as all that follow are long; and the links to the frame.
-   * @param {Float64Array[]} links
    */
-  reach(links) {
+  reach() {
     const chain = [];
     for (let i = this.facts.frameLink; i > 0; i = this.facts.links[i].parent) chain.unshift(i);
     const first = chain.findIndex((i) => this.facts.links[i].column >= 0);
@@ -50,12 +70,12 @@ class Robot {
         radius += Math.max(Math.abs(low ?? Infinity), Math.abs(high ?? Infinity));
       }
     }
-    return { centre: originOf(links[chain[first]]), radius };
+    return { centre: originOf(this.links()[chain[first]]), radius };
   }
 
-  /** Joints that are at a limit. */
-  /** @type {(q: Numbers, values: Map<string, Value>) => JointFacts[]} */
-  atLimit(q, values) {
+  /** @type {(k: number) => JointFacts[]} Joints that are at a limit in sample k. */
+  stopped(k) {
+    const q = this.session.at("q", k), { values } = this.session;
     return this.facts.joints.filter((_, i) =>
       ["q_min", "q_max"].some((side) => {
         const limit = Number(values.get(`${side}[${i + 1}]`));
@@ -64,9 +84,26 @@ class Robot {
     );
   }
 
-  /** Joints that their friction holds: only these have a velocity of exactly 0. */
-  /** @type {(v: Numbers, values: Map<string, Value>) => JointFacts[]} */
-  sticking(v, values) {
+  /** @type {(k: number) => JointFacts[]} Joints that their friction holds: only these have a velocity of exactly 0. */
+  sticking(k) {
+    const v = this.session.at("v", k), { values } = this.session;
     return this.facts.joints.filter((_, i) => v[i] === 0 && Number(values.get(`friction[${i + 1}]`)) > 0);
   }
+}
+
+/** @type {(joints: JointFacts[]) => string[]} Units of position, velocity and effort. */
+export function unitsOf(joints) {
+  const slide = joints.some(({ prismatic }) => prismatic), turns = joints.some(({ prismatic }) => !prismatic);
+  if (slide && turns) return ["rad or m", "rad/s or m/s", "N·m or N"];
+  return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
+}
+
+/** @type {(joints: JointFacts[]) => string[]} Names without the whole words that all of them begin and end with. */
+export function shortNames(joints) {
+  const words = joints.map(({ name }) => name.split(/([^_/]*[_/])/).filter(Boolean)), [first] = words;
+  /** @type {(at: (own: string[]) => string) => boolean} True if all begin, or end, with one word, and have others. */
+  const alike = (at) => words.length > 1 && words.every((own) => own.length > 1 && at(own) === at(first));
+  while (alike((own) => own[0])) words.forEach((own) => own.shift());
+  while (alike((own) => own[own.length - 1])) words.forEach((own) => own.splice(-2, 2, own[own.length - 2].slice(0, -1)));
+  return words.map((own) => own.join(""));
 }

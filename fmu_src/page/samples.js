@@ -1,46 +1,9 @@
-/**
- * Samples of a robot's motion: inputs and outputs, from any source.
- *
- * @typedef {Object} JointFacts
- * @property {string} name
- * @property {boolean} prismatic
- * @property {number | null} low
- * @property {number | null} high
- * @property {number | null} effort
- *
- * @typedef {Object} Link
- * @property {number} parent
- * @property {number[]} place
- * @property {number[]} axis
- * @property {boolean} prismatic
- * @property {number} column
- * @property {number} ratio
- * @property {number} offset
- *
- * @typedef {Object} Facts
- * @property {string} name
- * @property {string} robot
- * @property {string} frame
- * @property {string} axes
- * @property {string} control
- * @property {number} step
- * @property {string[]} recorded groups of variables that a sample holds, in its order
- * @property {string[]} remarks what is not as it should be
- * @property {JointFacts[]} joints
- * @property {Variable[]} variables
- * @property {Link[]} links
- * @property {number} frameLink
- * @property {{link: number, place: number[], colour: number[]}[]} shapes
- * @property {{low: number[], size: number, vertices: number, triangles: number}[]} meshes
- * @property {Record<string, unknown>} provenance
- *
- * @typedef {number | boolean} Value
- */
+/** Samples of a robot's motion: inputs and outputs, from any source. */
 
 const WINDOW = 10; // s that are shown of a run that goes on
-const MOST_NUMBERS = 2 ** 24; // 128 MiB: an hour of an arm of seven joints at 100 Hz
+export const MOST_NUMBERS = 2 ** 24; // 128 MiB: an hour of an arm of seven joints at 100 Hz
 
-class Samples {
+export class Samples {
   count = 0;
   playing = true;
   steered = true; // by its inputs
@@ -86,8 +49,7 @@ class Samples {
     return variable;
   }
 
-  /** Inputs and parameters as they are at first. */
-  /** @returns {Map<string, Value>} */
+  /** @returns {Map<string, Value>} Inputs and parameters as they are at first. */
   defaults() {
     const settable = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
     return new Map(settable.map((v) => [v.name, /** @type {Value} */ (v.start)]));
@@ -114,8 +76,7 @@ class Samples {
     return pairs;
   }
 
-  /** Take one sample more. */
-  /** @type {(sample: Numbers) => void} */
+  /** @type {(sample: Numbers) => void} Take one sample more. */
   append(sample) {
     if ((this.count + 1) * this.width > this.data.length) {
       const longer = new Float64Array(2 * this.data.length);
@@ -136,8 +97,7 @@ class Samples {
     return this.data[k * this.width];
   }
 
-  /** Number of the sample that is nearest to a time, s. */
-  /** @type {(t: number) => number} */
+  /** @type {(t: number) => number} Number of the sample that is nearest to a time, s. */
   nearest(t) {
     let first = 0, last = this.count - 1;
     while (first < last) {
@@ -153,41 +113,35 @@ class Samples {
     return this.count - 1;
   }
 
-  /** Times that are of interest, s. */
-  /** @returns {[number, number]} */
+  /** @returns {[number, number]} Times that are of interest, s. */
   get span() {
     const end = this.time(this.now);
     return [Math.max(0, end - WINDOW), Math.max(end, WINDOW)];
   }
 
-  /** More to tell beside the samples, names and texts. */
-  /** @returns {[string, string][]} */
+  /** @returns {[string, string][]} More to tell beside the samples, names and texts. */
   remarks() {
     return [];
   }
 
-  /** A number of sample k; not one where there is none. */
-  /** @type {(group: string, k: number, i: number) => number} */
+  /** @type {(group: string, k: number, i: number) => number} A number of sample k; not one where there is none. */
   value(group, k, i) {
     const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
     return i < size ? this.data[k * this.width + begin + i] : NaN;
   }
 
-  /** A vector of sample k, empty where there is none. */
-  /** @type {(group: string, k?: number) => Float64Array} */
+  /** @type {(group: string, k?: number) => Float64Array} A vector of sample k, empty where there is none. */
   at(group, k = this.now) {
     const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
     return this.data.subarray(k * this.width + begin, k * this.width + begin + size);
   }
 
-  /** A vector of inputs or parameters as they are set now. */
-  /** @type {(group: string) => number[]} */
+  /** @type {(group: string) => number[]} A vector of inputs or parameters as they are set now. */
   held(group) {
     return (this.groups.get(group) ?? []).map((name) => Number(this.values.get(name)));
   }
 
-  /** A target in sample k: of the latest, what is set by now. */
-  /** @type {(group: string, k: number) => number[]} */
+  /** @type {(group: string, k: number) => number[]} A target in sample k: of the latest, what is set by now. */
   target(group, k) {
     return this.steered && k === this.count - 1 ? this.held(group) : [...this.at(group, k)];
   }

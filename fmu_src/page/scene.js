@@ -1,5 +1,9 @@
 /** The scene in 3D, by WebGL 2: triangles with a colour, and lines of some pixels. */
 
+import { plus, unit } from "./matrices.js";
+
+/** @typedef {import("./camera.js").Camera} Camera */
+
 const SOLID = [
   `#version 300 es
   uniform mat4 view, model; uniform vec3 low; uniform float size;
@@ -40,7 +44,7 @@ const LINES = [
 const CREASE = 0.8; // cosine of the angle between faces from which on their edge is sharp
 const LINE_SIZE = 11; // numbers of one
 
-class Scene {
+export class Scene {
   /** @type {number[]} to be drawn next */
   lines = [];
   /** @type {number[]} likewise, below all else */

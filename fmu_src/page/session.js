@@ -1,9 +1,13 @@
 /** A run of the FMU's engine in this very page. */
 
+import { MOST_NUMBERS, Samples } from "./samples.js";
+
+/** @typedef {import("./engine.js").Engine} Engine */
+
 const LATE = 0.25; // s behind the clock above which the session falls behind real time
 const BUSY = 0.012, SHARE = 0.5; // s of a frame, or its share, in which the plant is stepped
 
-class Session extends Samples {
+export class Session extends Samples {
   without = ["scrub", "loops", "record"];
   k = 0;
   begun = 0;
@@ -13,10 +17,7 @@ class Session extends Samples {
   /** @type {[number, Record<string, Value>][]} */
   changes = [];
 
-  /**
-   * @param {Facts} facts
-   * @param {Engine} engine
-   */
+  /** @param {Facts} facts @param {Engine} engine */
   constructor(facts, engine) {
     super(facts, false);
     this.engine = engine;
@@ -25,18 +26,17 @@ class Session extends Samples {
     this.startAgain();
   }
 
-  /** Restart; inputs and parameters keep their values, or take the FMU's. */
-  /** @type {(all?: boolean) => void} */
+  /** @type {(all?: boolean) => void} Restart; inputs and parameters keep their values, or take the FMU's. */
   startAgain(all = false) {
     if (all) this.values = this.defaults();
-    this.engine.reset();
+    this.engine.call("engine_reset");
     this.apply([...this.values]);
-    this.engine.initialise();
+    this.engine.call("engine_initialise");
     this.startValues = Object.fromEntries(this.values);
     this.k = this.count = this.due = 0;
     this.changes = [];
     this.begun = Date.now();
-    this.record();
+    this.append(this.engine.get(this.places));
   }
 
   /** Groups of inputs and parameters that differ from the FMU's, as the fragment of a URL. */
@@ -65,18 +65,14 @@ class Session extends Samples {
 
   /** @param {[string, Value][]} pairs */
   apply(pairs) {
-    this.engine.set(
-      pairs.map(([name]) => this.variable(name).place),
-      pairs.map(([, value]) => Number(value)),
-    );
+    const places = pairs.map(([name]) => this.variable(name).place);
+    this.engine.set(places, pairs.map(([, value]) => Number(value)));
   }
 
-  /** Set an input from the next step on; a parameter restarts the simulation. */
-  /** @type {(name: string, value: Value | number[]) => void} */
+  /** @type {(name: string, value: Value | number[]) => void} Set inputs from the next step on; parameters restart it. */
   set(name, value) {
     const pairs = this.checked(name, value);
-    /** @type {Map<string, Value>} */
-    const before = this.values;
+    const before = /** @type {Map<string, Value>} */ (this.values);
     const restarts = this.variable(pairs[0][0]).causality === "parameter";
     this.values = new Map([...before, ...pairs]);
     try {
@@ -117,8 +113,7 @@ class Session extends Samples {
     return k * this.facts.step;
   }
 
-  /** ns since the epoch of a sample. */
-  /** @type {(k: number) => bigint} */
+  /** @type {(k: number) => bigint} ns since the epoch of a sample. */
   stamp(k) {
     return BigInt(this.begun) * 1000000n + BigInt(Math.round(this.time(k) * 1e9));
   }
@@ -130,9 +125,9 @@ class Session extends Samples {
     for (let i = 0; i < count; i++) {
       if ((this.count + 1) * this.width > MOST_NUMBERS)
         throw new Error("the recording is full: download it, then reset");
-      this.engine.step(this.time(this.k), this.facts.step);
+      this.engine.call("engine_step", this.time(this.k), this.facts.step);
       this.k += 1;
-      this.record();
+      this.append(this.engine.get(this.places));
     }
   }
 

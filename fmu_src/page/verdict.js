@@ -1,5 +1,9 @@
 /** The verdict of a run so far: whether its target is reached, and the causes where it is not, the root first. */
 
+import { base, originOf } from "./matrices.js";
+
+/** @typedef {import("./robot.js").Robot} Robot */
+
 const BAND = 0.02, FLOOR = 1e-4; // share of the way, and m or rad: an error within one of them has reached the target
 const SETTLE = 1; // s after a change of the target before which only causes that no wait can mend are named
 const LOOKED_AT = 400, OFTEN = 0.05; // samples, and the share of them from which on a state is a cause
@@ -8,27 +12,23 @@ const SINGULAR = 0.02; // ratio of the smallest to the largest singular value
 const CREEPING = 1e-5; // rad/s or m/s
 const FEWEST = 0.2; // damping ratio below which the damping is too little
 
-class Verdict {
+export class Verdict {
   began = 0; // sample at which the target was changed
   target = "";
   way = [0, 0]; // errors at that time, m or rad, and rad
   asked = ""; // target and limits of the latest search, and what it found
   best = { point: [0], distance: 0 };
 
-  /**
-   * @param {Samples} session
-   * @param {Robot} robot
-   */
-  constructor(session, robot) {
-    this.session = session;
+  /** @param {Robot} robot */
+  constructor(robot) {
+    this.session = robot.session;
     this.robot = robot;
-    this.joints = session.facts.joints;
+    this.joints = robot.facts.joints;
   }
 
-  /** Lines of the verdict at the latest sample, whose error of orientation is `turn`, rad or NaN. */
-  /** @type {(turn: number) => string[]} */
-  lines(turn) {
-    const { session } = this, last = session.count - 1;
+  /** @returns {string[]} Lines of the verdict at the latest sample. */
+  lines() {
+    const { session } = this, last = session.count - 1, turn = this.robot.turnError(last);
     if (!session.follows) return this.atLimits();
     const errors = [session.error(), Number.isNaN(turn) ? 0 : turn];
     const target = ["x_des", "quat_des", "q_des"].map((group) => session.held(group).join()).join(";");
@@ -68,7 +68,7 @@ class Verdict {
       return by > 1e-9 && !this.degrees().length ? [`the target ${short(value)} ${unit} of joint '${name}' is out of reach by ${short(by)} ${unit}`] : [];
     });
     if (!wanted.length || !missed) return outside;
-    const ball = robot.reach(robot.links(session.at("q"))) ?? { centre: [0, 0, 0], radius: Infinity };
+    const ball = robot.reach() ?? { centre: [0, 0, 0], radius: Infinity };
     const far = Math.hypot(...wanted.map((value, i) => value - ball.centre[session.axes[i]])) > ball.radius;
     if (!far && !waited) return outside;
     const { point, distance } = this.nearest(wanted);
@@ -80,7 +80,7 @@ class Verdict {
   /** Position of the end effector along the task axes. */
   /** @type {(q: number[]) => number[]} */
   place(q) {
-    const end = this.robot.end(q);
+    const { robot } = this, end = originOf(robot.linksAt(q)[robot.facts.frameLink]);
     return this.session.axes.map((axis) => end[axis]);
   }
 
@@ -156,7 +156,7 @@ class Verdict {
 
   atLimits() {
     const { session } = this, q = session.at("q"), wanted = session.held("q_des");
-    return this.robot.atLimit(q, session.values).flatMap((joint) => {
+    return this.robot.stopped(session.now).flatMap((joint) => {
       const i = this.joints.indexOf(joint), [low, high] = this.limits(i), side = 2 * q[i] < low + high ? "lower" : "upper";
       return wanted[i] === (side === "lower" ? low : high) ? [] : [`joint '${joint.name}' is at its ${side} limit`];
     });
@@ -166,8 +166,8 @@ class Verdict {
     const { session } = this;
     return session.held("friction").flatMap((size, i) => {
       const still = size > 0 && this.shares((k) => Math.abs(session.value("v", k, i)) < CREEPING)[1] > 0.9;
-      const off = !session.groups.has("q_des") || session.value("q", session.count - 1, i) !== session.held("q_des")[i];
-      return still && off ? [`joint '${this.joints[i].name}' sticks: its friction of ${short(size)} holds it`] : [];
+      const astray = !session.groups.has("q_des") || session.value("q", session.count - 1, i) !== session.held("q_des")[i];
+      return still && astray ? [`joint '${this.joints[i].name}' sticks: its friction of ${short(size)} holds it`] : [];
     });
   }
 

@@ -18,8 +18,10 @@ from typing import Final, Literal
 from zlib import crc32
 
 import numpy as np
+from rosbags.interfaces import Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionMode
+from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.rosbag2.storage_mcap import McapWriter, PendingChunk
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
@@ -205,6 +207,11 @@ class BagWriter(Writer):
         if not self.storage.path.exists():  # what has lost its name can be written for ever
             raise FileNotFoundError(errno.ENOENT, REMOVED)
         self.storage.flush(self._fsync)
+
+
+def profile(qos: Qos) -> str:
+    """Return a topic's quality of service as bags have it."""
+    return dump_qos_v8([qos])
 
 
 def check_path(path: Path, storage: str) -> None:

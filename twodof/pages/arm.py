@@ -19,19 +19,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..bag.provenance import provenance_of
+from ..bag.storage import profile
 from ..bounds import MAX_HEAD, MAX_SOURCE
 from ..errors import PageError
 from ..export.compiler import compile_web_module, standard_headers
-from ..files import data_file, head_of, packed, read_member, refusing, write_file
+from ..files import data_file, head_of, read_member, refusing, write_file
 from ..fmu import Fmu, opened, read_resource
 from ..geometry.kinematics import Kinematics, Placement
 from ..geometry.shapes import Shape, link_shapes, sphere
 from ..plant.urdf import UNBOUNDED, Joint, RobotError, Urdf, read_urdf
+from ..plots.scripts import packed, script
+from ..ros.messages import JOINT_STATE, POINT, POSE, STREAM, definition
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 
-FIRST, LAST = "samples.js", "main.js"
-"""Scripts whose class others extend, and that starts the page; of the others the order does not matter."""
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables that a sample holds, in its order."""
 GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
@@ -101,7 +102,9 @@ def page_of(run: Experiment) -> bytes:
     provenance = provenance_of(run, "")
     provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses no other package
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
-    return arm_page(arm.title, arm, engine, allowed, provenance=provenance)
+    recorded = {kind: definition(kind) for kind in (JOINT_STATE, POINT, POSE)}
+    topics = {"definitions": recorded, "qos": profile(STREAM)}
+    return arm_page(arm.title, arm, engine, allowed, provenance=provenance, **topics)
 
 
 def is_page(path: Path) -> bool:
@@ -164,10 +167,8 @@ def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "",
     """
     known, meshes = _facts(arm)
     data = json.dumps({**known, **facts}, sort_keys=True).replace("<", "\\u003c")
-    others = {path.name for path in data_file("fmu_src", "page").glob("*.js")} - {FIRST, LAST}
-    script = "".join(map(_asset, [FIRST, *sorted(others), LAST]))
-    script = f'(() => {{ "use strict";\n{script}}})();\n'
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    code = script("fmu_src", "page", "main.js")
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
     policy = POLICY.format(script=digest, more=allowed)
     parts = {"facts": data, "meshes": packed(meshes), **source}.items()
     blocks = "\n".join(f'<script type="application/json" id="arm-{name}">{text}</script>' for name, text in parts)
@@ -177,7 +178,7 @@ def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "",
         f"<title>{html.escape(title)} - twodof</title>\n"
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         f'<link rel="icon" href="data:,">\n<style>\n{_asset("arm.css")}</style>\n</head>\n'
-        f"<body>\n{_asset('arm.html')}{blocks}\n<script>{script}</script>\n</body>\n</html>\n"
+        f"<body>\n{_asset('arm.html')}{blocks}\n<script>{code}</script>\n</body>\n</html>\n"
     )
     return page.encode("utf-8", "replace")  # names of files need not be text
 

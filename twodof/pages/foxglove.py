@@ -16,7 +16,7 @@ from ..errors import InputError, PageError, PublishError
 from ..plant.variables import GAINS
 from ..ros.cdr import Rows
 from ..ros.commands import warner
-from ..ros.messages import Messages, store_of
+from ..ros.messages import Messages, definition
 from ..signatures import ignore, never
 from ..simulation.experiments import Experiment
 from ..simulation.input_values import Value, check_going_on, resolve
@@ -83,8 +83,7 @@ class Foxglove(Sink):
         context = self._context = Context()  # which its channels do not keep
         self._channels = {}
         for name, topic in self._messages.topics.items():
-            text, _ = store_of(topic.type).generate_msgdef(topic.type, ros_version=2)
-            schema = Schema(name=topic.type, encoding="ros2msg", data=text.encode())
+            schema = Schema(name=topic.type, encoding="ros2msg", data=definition(topic.type).encode())
             self._channels[name] = Channel(name, schema=schema, message_encoding="cdr", context=context)
         hidden = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
         try:

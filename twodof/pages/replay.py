@@ -14,7 +14,7 @@ from ..bag.recording import Recording
 from ..errors import BuildError, FmuError, PageError
 from ..export.mesh_files import collect_meshes
 from ..export.urdf_source import read_text
-from ..files import data_file, packed, refusing, write_file
+from ..files import data_file, refusing, write_file
 from ..fmu import load_fmu, read_resource
 from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
@@ -22,6 +22,7 @@ from ..geometry.shapes import Shape, link_shapes
 from ..plant.urdf import RobotError, read_urdf
 from ..plots.film import PICTURES as PICTURES
 from ..plots.film import film
+from ..plots.scripts import packed
 from ..plots.track import Track, read_tracks
 from ..signatures import check_keywords, ignore, never, with_keywords_of
 from .arm import RECORDED, Arm, arm_page

@@ -1,6 +1,7 @@
 // Unpacks the library and the figures, draws them, and joins them to a legend: its boxes switch
 // joints and bags in all figures, its columns have the values under the cursor.
-"use strict";
+
+import { plotlyContent } from "../../fmu_src/page/unpack.js";
 
 /** @typedef {{bag: number, joint: string, label: string, colour: string, dashes: string}} Row */
 /** @typedef {{data: {meta: [number, string, string]}, fullData: {x: ArrayLike<number>}, pointNumber: number, x: number, y: number}} Hovered */
@@ -72,11 +73,8 @@ class Legend {
 }
 
 async function drawPlots() {
-  const script = document.createElement("script");
-  script.textContent = await unpackedText("library");
-  document.head.append(script);
   /** @type {{figures: Chart[], rows: Row[]}} */
-  const { figures, rows } = JSON.parse(await unpackedText("content"));
+  const { figures, rows } = await plotlyContent();
   const place = /** @type {HTMLElement} */ (document.getElementById("plots"));
   const shown = new Set(figures[0].data.map((trace) => trace.meta[2]));
   const kinds = Object.keys(UNITS_OF).filter((kind) => shown.has(kind));

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import PlotError
-from ..files import data_file, packed
 from ..version import needing
 from .closed_form import Array
 from .panels import CURVE, HELD, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
+from .scripts import packed, script
 from .strokes import GREY, HAIR, INK, Stroke, looks
 from .track import Track
 from .words import labels
@@ -74,11 +74,10 @@ def _verdicts(tracks: Sequence[Track]) -> str:
 
 def scripts(name: str, library: str, content: object) -> str:
     """Return the HTML of plotly's library and a page's content, both packed, and of the script that draws it."""
-    code = "".join(data_file("plots", file).read_text("utf-8") for file in ("unpack.js", name))
     return (
         f'<script type="text/plain" id="library">{packed(library.encode())}</script>\n'
         f'<script type="text/plain" id="content">{packed(json.dumps(content).encode())}</script>\n'
-        f"<script>\n{code}</script>\n"
+        f"<script>\n{script('plots', name)}</script>\n"
     )
 
 

@@ -1,5 +1,6 @@
 // Draws a sweep: two maps side by side, a Pareto front of two metrics, and what is known of the run that is clicked.
-"use strict";
+
+import { plotlyContent } from "../../fmu_src/page/unpack.js";
 
 /** @typedef {{varied: string[], metrics: Record<string, string>, units: Record<string, string>, columns: Record<string, (number | null)[]>, outcome: string[], beyond: boolean[], best: number[], fmu: string, settings: string[], curves: Record<string, {verdict: string, lines: Record<string, [number[], number[]]>}>}} Sweep */
 
@@ -93,16 +94,12 @@ class SweepPage {
       map.removeAllListeners("plotly_click");
       map.on("plotly_click", (/** @type {any} */ event) => {
         const point = event.points.find((/** @type {any} */ each) => each.curveNumber === 0);
-        if (point) this.choose(point.pointNumber);
+        if (!point) return;
+        this.chosen = point.pointNumber;
+        this.draw();
       });
     }
     this.tell();
-  }
-
-  /** @param {number} k */
-  choose(k) {
-    this.chosen = k;
-    this.draw();
   }
 
   /** Show the run that is chosen: its numbers, how to repeat it, and its curves where there is a bag. */
@@ -127,11 +124,8 @@ class SweepPage {
 }
 
 async function drawMaps() {
-  const script = document.createElement("script");
-  script.textContent = await unpackedText("library");
-  document.head.append(script);
   const place = /** @type {HTMLElement} */ (document.getElementById("maps"));
-  Object.assign(window, { sweepPage: new SweepPage(JSON.parse(await unpackedText("content")), place) });
+  Object.assign(window, { sweepPage: new SweepPage(await plotlyContent(), place) });
   place.dataset.ready = "";
 }
 

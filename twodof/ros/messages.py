@@ -76,6 +76,11 @@ def store_of(kind: str) -> Typestore:
     return _STORE
 
 
+def definition(kind: str) -> str:
+    """Return the definition of a type and of its parts, as bags have it."""
+    return store_of(kind).generate_msgdef(kind, ros_version=2)[0]
+
+
 def check_name(argument: str, name: str) -> None:
     """Refuse an invalid ROS 2 name.
 

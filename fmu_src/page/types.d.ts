@@ -1,0 +1,99 @@
+/** Types of the page's scripts: what Python writes into a page. */
+
+type Numbers = ArrayLike<number>;
+type Value = number | boolean;
+
+interface JointFacts {
+  name: string;
+  prismatic: boolean;
+  low: number | null;
+  high: number | null;
+  effort: number | null;
+}
+
+interface Link {
+  parent: number;
+  place: number[];
+  axis: number[];
+  prismatic: boolean;
+  column: number;
+  ratio: number;
+  offset: number;
+}
+
+/** A variable of the FMU. */
+interface Variable {
+  name: string;
+  /** Index among the FMU's variables; elements of a vector follow each other. */
+  place: number;
+  causality: string;
+  type: "Real" | "Integer" | "Boolean";
+  unit: string;
+  start: Value | null;
+  description: string;
+}
+
+interface Facts {
+  name: string;
+  robot: string;
+  frame: string;
+  axes: string;
+  control: string;
+  step: number;
+  /** Groups of variables that a sample holds, in its order. */
+  recorded: string[];
+  /** Warnings. */
+  remarks: string[];
+  joints: JointFacts[];
+  variables: Variable[];
+  links: Link[];
+  frameLink: number;
+  shapes: { link: number; place: number[]; colour: number[] }[];
+  meshes: { low: number[]; size: number; vertices: number; triangles: number }[];
+  /** Of a page with an engine: what its bags say of their origin, and of their topics. */
+  provenance: Record<string, unknown>;
+  definitions: Record<string, string>;
+  qos: string;
+}
+
+/** What the server of a page has to tell. */
+interface News {
+  /** Number of the run. */
+  run: number;
+  /** Time of the latest sample, s; there may be more samples than there was room for. */
+  t: number;
+  /** Number of this page's requests received before it was sent. */
+  received: number;
+  /** Samples, each with its time first. */
+  rows: number[][];
+  /** Inputs and parameters. */
+  values: Record<string, Value>;
+  playing: boolean;
+  recorded: number;
+  missed: number;
+  steps: number;
+  /** s */
+  worst: number;
+  /** The latest of all notes. */
+  notes: string[];
+  /** How many notes there were. */
+  noted: number;
+}
+
+/** A panel of curves. */
+interface PanelFacts {
+  title: string;
+  value: (k: number, line: number) => number;
+  /** Which of the joints it has a line of. */
+  lines: number[];
+  /** Whether its axis is logarithmic. */
+  log: boolean;
+  /** Limits of a line. */
+  limits: (line: number) => (number | null)[];
+}
+
+/** A line that is drawn. */
+interface Outline {
+  line: number;
+  points: number[][];
+}
