@@ -13,6 +13,7 @@ import twodof
 
 PAGE = "arm.html"
 PICTURE = 'src="arm.png"'
+DOTS = '</mrow><mo style="font-size: 1.5em">'  # of time derivatives, which are too small to be read as accents
 FRAME = (
     f'<iframe src="{PAGE}" title="the default arm, alive" loading="lazy"'
     ' style="width: 100%; height: 34rem; border: 0"></iframe>'
@@ -21,7 +22,12 @@ FRAME = (
 
 def on_page_markdown(text: str, **_: Any) -> str:
     """Put MathML, which browsers draw without a script, in place of equations in LaTeX."""
-    return re.sub(r"^```math\n(.*?)^```$", lambda found: convert(found[1], display="block"), text, flags=re.M | re.S)
+
+    def typeset(found: re.Match[str]) -> str:
+        equation = re.sub(r"</mrow><mo>(?=&#x000A8;|&#x002D9;)", DOTS, convert(found[1], display="block"))
+        return f'<div style="overflow-x: auto; padding: .3em 0">{equation}</div>'
+
+    return re.sub(r"^```math\n(.*?)^```$", typeset, text, flags=re.M | re.S)
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:

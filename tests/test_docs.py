@@ -213,6 +213,9 @@ def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
     assert 'id="twodof.simulate"' in api
     assert '<iframe src="arm.html"' in (tmp_path / "index.html").read_text("utf-8")
     assert b'id="arm-engine"' in (tmp_path / "arm.html").read_bytes()
+    plant, equations = (tmp_path / "plant" / "index.html").read_text("utf-8"), (DOCS / "plant.md").read_text("utf-8")
+    assert plant.count("</math>") == equations.count("```math") > 5
+    assert not re.search(r"\\\\|\\[a-z]|<mi>&amp;</mi>", "".join(re.findall(r"<math.*?</math>", plant, re.S)))
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")) + PAGES[1:], ids=lambda page: page.name)
