@@ -257,7 +257,13 @@ class Driver:
     def set(self, **values):
         """``x_des=(0.1, 0.2)`` sets a vector, ``Kn=1.0`` a scalar."""
         for group, value in values.items():
-            setter = "setBoolean" if isinstance(value, bool) else "setInteger" if group == "seed" else "setReal"
+            setter = (
+                "setBoolean"
+                if isinstance(value, bool)
+                else "setInteger"
+                if group in ("seed", "integrator")
+                else "setReal"
+            )
             elements = value if isinstance(value, tuple | list) else [value]
             self.call(setter, self.references(group), list(elements))
 

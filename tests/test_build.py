@@ -75,6 +75,7 @@ def test_every_name_unit_and_start_is_as_designed(fmu_path):
             "rtol": "0.001",
             "atol": "1e-06",
             "seed": "0",
+            "integrator": "0",
             "v_from_q": "false",
             "limit_effort": "false",
             "rigid_stops": "false",
@@ -375,6 +376,7 @@ PERTURBATION = {
     "q_noise": 0.01,
     "v_noise": 0.01,
     "seed": 1,
+    "integrator": 1,
     "friction": 0.05,
     "damping": 0.1,
     "armature": 0.01,
@@ -485,7 +487,8 @@ def candidates(name, start):
         return [x for x in near if (x <= high if group == "q_min" else x >= low)]
     if group == "rcond":
         return [0.9]
-    lower = [] if value < PERTURBATION[group] and group in (*NEEDS_A_PERIOD, "seed") else [value - PERTURBATION[group]]
+    positive = group in (*NEEDS_A_PERIOD, "seed", "integrator")
+    lower = [] if value < PERTURBATION[group] and positive else [value - PERTURBATION[group]]
     return [value + PERTURBATION[group], *lower]
 
 
@@ -552,9 +555,9 @@ def test_what_the_description_excludes_is_refused_and_nothing_else(flavour, fmu_
         for side in ((float(v.min or -np.inf), -np.inf), (float(v.max or np.inf), np.inf))
         if np.isfinite(side[0]) and v.causality != "output"
     }
-    assert len(ranged) == 25
+    assert len(ranged) == 26
     for name, (end, beyond) in ranged.items():
-        whole = name == "seed"  # its upper end is the type's
+        whole = name in ("seed", "integrator")  # the upper end of the seed is the type's
         for value in (int(end), -1) if whole else (end, float(np.nextafter(end, beyond))):
             driver.log.clear()
             driver.initialise(**{name: value})

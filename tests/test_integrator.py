@@ -6,7 +6,7 @@ from scipy.integrate import RK45
 
 from twodof.plant import dormand_prince, integrator
 from twodof.plant.equations import Equations
-from twodof.plant.integrator import StepError
+from twodof.plant.step_error import StepError
 from twodof.plant.stops import Stops
 
 FREE = [(-np.inf, np.inf)]

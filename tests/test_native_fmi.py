@@ -357,6 +357,7 @@ FORGERIES = {
     "waiting": ((1, -1, 11, 2**31 - 1), UNSOUND),  # where no controller is sampled
     "x_des[1]": ((np.nan, np.inf), UNSOUND),
     "seed": ((0.5, np.nan), UNSOUND),
+    "integrator": ((0.5, np.nan), UNSOUND),
     "control_delay": ((0.01,), "control_delay = 0.01 needs a control_period > 0"),
     "Kn": ((-np.inf,), UNSOUND),
     "q[1]": ((np.nan, np.inf, 3.2, -3.2), UNSOUND),

@@ -29,7 +29,7 @@ def radau(plant: Plant, seconds: float) -> np.ndarray:
     model, n = robot.model.copy(), len(robot.joints)
     model.gravity.linear = np.array(plant.gravity)
     data, axes = model.createData(), ["xyz".index(axis) for axis in robot.axes]
-    x_des, Kp, Kd, D = map(np.array, (plant.x_des, plant.Kp, plant.Kd, robot.damping))
+    x_des, Kp, Kd, D = map(np.array, (plant.x_des, plant.Kp, plant.Kd, plant.damping))
 
     def rates(_t: float, y: np.ndarray) -> np.ndarray:
         q, v = y[:n], y[n:]
@@ -69,15 +69,14 @@ def damped_motion(damping: float, gains: tuple[float, float], steps: int) -> np.
 @pytest.mark.parametrize("tolerances", [TIGHT, DEFAULT], ids=["tight", "default"])
 @pytest.mark.parametrize("gains", [(50.0, 40.0), (4000.0, 100.0)], ids=["soft", "hard"])
 @pytest.mark.parametrize("damping", [1.0, 600.0, 10_000.0])
-def test_damped_arms_move_as_an_implicit_solver_says(damping, gains, tolerances, length):
+def test_damped_arms_move_as_an_implicit_solver_says(damping, gains, tolerances):
     of, (rtol, atol) = damped_arm(damping), tolerances
     plant = shipped(of, rtol=rtol, atol=atol, **both_axes(gains))
     expected = damped_motion(damping, gains, 5)
     assert np.abs(advanced(of, plant, 5) - expected).max() <= WITHIN[tolerances]
-    if damping <= length(10_000, 600):  # Python needs a millisecond for each of D
-        plant.step(STEP)
-        expected = damped_motion(damping, gains, 1)
-        assert np.abs(plant.q - expected).max() <= WITHIN[tolerances]
+    plant.step(STEP)
+    expected = damped_motion(damping, gains, 1)
+    assert np.abs(plant.q - expected).max() <= WITHIN[tolerances]
 
 
 def test_no_step_of_a_strongly_damped_arm_is_refused(length):
@@ -92,7 +91,7 @@ def test_no_step_of_a_strongly_damped_arm_is_refused(length):
 
 def test_a_motion_beyond_the_budget_is_refused_with_its_joint_and_rate(length):
     of = damped_arm(1e6)
-    plant = shipped(of)
+    plant = shipped(of, integrator=1)
     values = of.values(plant)
     before = values.copy()
     assert of.call("advance", values, STEP) == 0

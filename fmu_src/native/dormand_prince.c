@@ -38,10 +38,21 @@ void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double e
         restrain(step->plant, &step->stops, y, a, effort);
 }
 
-double dormand_prince(Step *step)
+double error_norm(const Step *step, const double error[N_STATES])
 {
     const double rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
-    double *y_new = step->y_new, sum = 0.0;
+    double sum = 0.0;
+    for (int i = 0; i < N_STATES; i++) {
+        const double size = fabs(step->y[i]), size_new = fabs(step->y_new[i]);
+        const double ratio = error[i] / (atol + rtol * (size > size_new ? size : size_new));
+        sum += ratio * ratio;
+    }
+    return sqrt(sum / N_STATES);
+}
+
+double dormand_prince(Step *step)
+{
+    double *y_new = step->y_new, error[N_STATES];
     for (int stage = 1; stage <= STAGES; stage++) {
         double weight[STAGES];
         for (int s = 0; s < stage; s++)
@@ -57,15 +68,14 @@ double dormand_prince(Step *step)
                  stage == STAGES ? &step->margin_new : NULL);
     }
     for (int i = 0; i < N_STATES; i++) {
-        double error = 0.0;
+        error[i] = 0.0;
         for (int s = 0; s <= STAGES; s++)
-            error += E[s] * step->K[s][i];
-        const double size = fabs(step->y[i]), size_new = fabs(y_new[i]);
-        const double ratio =
-            step->size * error / (atol + rtol * (size > size_new ? size : size_new));
-        sum += ratio * ratio;
+            error[i] += E[s] * step->K[s][i];
+        error[i] *= step->size;
     }
-    return sqrt(sum / N_STATES);
+    step->stages = STAGES;
+    step->P = P;
+    return error_norm(step, error);
 }
 
 void interpolate(Step *step)
@@ -73,8 +83,8 @@ void interpolate(Step *step)
     for (int i = 0; i < N_STATES; i++)
         for (int k = 0; k < 4; k++) {
             step->Q[i][k] = 0.0;
-            for (int s = 0; s <= STAGES; s++)
-                step->Q[i][k] += step->K[s][i] * P[s][k];
+            for (int s = 0; s <= step->stages; s++)
+                step->Q[i][k] += step->K[s][i] * step->P[s][k];
         }
 }
 

@@ -8,13 +8,16 @@
 
 enum { STAGES = 6 }; /* evaluations of the equations of motion that it costs */
 
-/* One integration step, from y to y_new, in one regime. At each stage, the last of which is y_new: */
+/* One integration step, from y to y_new, in one regime, by this method or another: the derivatives K that weigh its
+   dense output, which those at the ends begin and end, and at each stage, the last of which is y_new, */
 typedef struct {
     const Plant *plant;
     double size;                           /* s */
     double y[N_STATES], y_new[N_STATES];
-    double K[STAGES + 1][N_STATES];        /* the derivatives, */
-    double effort[STAGES + 1][N_JOINTS];   /* and the efforts that hold joints at rest */
+    int stages;                            /* of the method, at most STAGES */
+    const double (*P)[4];                  /* weights of the derivatives in its dense output */
+    double K[STAGES + 1][N_STATES];
+    double effort[STAGES + 1][N_JOINTS];   /* the efforts that hold joints at rest */
     long evaluations;                      /* of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */
     double margin, margin_new;             /* of the rank at y and y_new */
@@ -26,13 +29,16 @@ typedef struct {
 INTERNAL void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS],
                        double effort[N_JOINTS], double *margin);
 
-/* Fill y_new and K[1…6] from y and K[0]; the norm of the error, which passes where below 1. */
+/* Root mean square of the errors over their tolerances. */
+INTERNAL double error_norm(const Step *step, const double error[N_STATES]);
+
+/* Fill y_new, K[1…6] and P from y and K[0]; the norm of the error, which passes where below 1. */
 INTERNAL double dormand_prince(Step *step);
 
 /* Fill Q, for dense_output. */
 INTERNAL void interpolate(Step *step);
 
-/* A component of the state at a time within the step, by the fourth-order interpolant. */
+/* A component of the state at a time within the step. */
 INTERNAL double dense_output(const Step *step, double passed, int component);
 
 #endif

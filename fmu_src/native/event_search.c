@@ -15,8 +15,8 @@
 #include "control.h"
 #endif
 
-/* Weights of the stages in Dormand and Prince's interpolant: the largest sum of
-   the weights' magnitudes, and that of their rates. */
+/* Weights of the derivatives in Dormand and Prince's interpolant: the largest sum of the weights' magnitudes, and that
+   of their rates. Those of the cubic are less, 1.07 and 2. */
 static const double REACH = 1.66, PACE = 3.72;
 /* The margin of an effort falls below what the stages show of it by less than its range there. It is
    looked at this often in a step where that may be below zero, and again at a minimum of the polynomial
@@ -171,7 +171,7 @@ static double first_crossing(Step *step, Margin *margin, int component)
 static int may_pass(const Step *step, int joint, int side)
 {
     double low = HUGE_VAL, high = -HUGE_VAL;
-    for (int stage = 0; stage <= STAGES; stage++) {
+    for (int stage = 0; stage <= step->stages; stage++) {
         const double margin = grip_of(step, joint, step->effort[stage][joint], side);
         low = fmin(low, margin);
         high = fmax(high, margin);
@@ -225,7 +225,7 @@ static double first_release(Step *step, double before)
     if (!doubt)
         return HUGE_VAL;
     memcpy(effort[0], step->effort[0], sizeof *effort);
-    memcpy(effort[LOOKS], step->effort[STAGES], sizeof *effort);
+    memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
     for (int k = 1; k < LOOKS; k++)
         find_efforts(step, step->size * k / LOOKS, effort[k]);
     for (int i = 0; i < N_JOINTS; i++)
@@ -258,7 +258,7 @@ static int may_be_arrested(const Step *step, int joint)
 {
     const int i = N_JOINTS + joint;
     double largest = 0.0;
-    for (int stage = 0; stage <= STAGES; stage++)
+    for (int stage = 0; stage <= step->stages; stage++)
         largest = fabs(step->K[stage][i]) > largest ? fabs(step->K[stage][i]) : largest;
     return !(step->stops.slip[joint] * step->y[i] > REACH * step->size * largest);
 }
@@ -269,7 +269,7 @@ static double sweep(const Step *step, int near[N_STATES])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
     double fastest[N_JOINTS] = {0}, change = 0.0;
-    for (int stage = 0; stage <= STAGES; stage++)
+    for (int stage = 0; stage <= step->stages; stage++)
         for (int i = 0; i < N_JOINTS; i++) { /* quicker than fmax, which minds NaN */
             const double speed = fabs(step->K[stage][i]);
             fastest[i] = speed > fastest[i] ? speed : fastest[i];

@@ -4,6 +4,7 @@
 #include "dormand_prince.c"
 #include "polynomial.c"
 #include "event_search.c"
+#include "rosenbrock.c"
 #include "integrator.c"
 #include "noise.c"
 #include "sampling.c"

@@ -14,6 +14,8 @@
 #include "event_search.h"
 #include "stops.h"
 
+/* Values of the parameter integrator. */
+enum { AUTOMATIC, DORMAND_PRINCE, STIFF };
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
 /* Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held
    there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
@@ -54,7 +56,7 @@ static int all_rest(const Step *step)
 
 static int is_finite(const Step *step)
 {
-    for (int stage = 0; stage <= STAGES; stage++)
+    for (int stage = 0; stage <= step->stages; stage++)
         for (int i = 0; i < N_STATES; i++)
             if (!isfinite(step->K[stage][i]))
                 return 0;
@@ -85,7 +87,7 @@ static void find_fastest(Step *step, Failure *failure)
 
 /* Integrate from the time t, at y, until an event or until the end: the time reached, y being the
    state there; NaN where that cannot be done. */
-static double until_event(Step *step, double t, double end, int rank_held, Event *event,
+static double until_event(Step *step, double t, double end, int rank_held, int *integrator, Event *event,
                           Failure *failure)
 {
     const double max_step = step->plant->value[MAX_STEP];
@@ -95,8 +97,8 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
-        const double norm = dormand_prince(step);
-        double factor = norm > 0.0 ? SAFETY * pow(norm, -0.2) : MAX_FACTOR;
+        const double norm = *integrator == STIFF ? rosenbrock(step) : dormand_prince(step);
+        double factor = norm > 0.0 ? SAFETY * pow(norm, *integrator == STIFF ? -1.0 / 3.0 : -0.2) : MAX_FACTOR;
         if (norm < 1.0) {
             const double passed = first_event(step, rank_held, event);
             memcpy(step->y, step->y_new, sizeof step->y);
@@ -105,12 +107,14 @@ static double until_event(Step *step, double t, double end, int rank_held, Event
             if (passed > 0.0)
                 return t + passed;
             t += step->size;
-            memcpy(step->K[0], step->K[STAGES], sizeof step->K[0]);
+            memcpy(step->K[0], step->K[step->stages], sizeof step->K[0]);
             if (step->stops.any_held)
-                memcpy(step->effort[0], step->effort[STAGES], sizeof step->effort[0]);
+                memcpy(step->effort[0], step->effort[step->stages], sizeof step->effort[0]);
             step->margin = step->margin_new;
             next = fmin(max_step, step->size * fmax(MIN_FACTOR, fmin(growth, factor)));
             growth = MAX_FACTOR;
+        } else if (*integrator == AUTOMATIC && damping_limits(step, fmin(max_step, end - t))) {
+            *integrator = STIFF; /* to the end of the communication step */
         } else {
             next = step->size * (isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
@@ -171,6 +175,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
     Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0}, stuck[N_JOINTS];
     int anti_chatter[N_JOINTS] = {0}, chattering[N_JOINTS] = {0}, kept[N_JOINTS];
     Event event = {{0}, {0}, {0}};
+    int integrator = (int)plant->value[INTEGRATOR];
     Step step;
     double t = 0.0;
     step.plant = plant;
@@ -215,7 +220,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
             hold_for_a_while(&rank, t, short_time, chatter_time);
             continue;
         }
-        t = until_event(&step, t, end, rank_held, &event, failure);
+        t = until_event(&step, t, end, rank_held, &integrator, &event, failure);
         for (int i = 0; i < N_JOINTS; i++) {
             chattering[i] = event.stopped[i] && t - left[i] < joint_time;
             if (event.arrested[i] && t - slipped[i] < FIRST_HOLD * chatter_time)

@@ -166,14 +166,15 @@ void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
     }
 }
 #else
-void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double free[N_JOINTS],
-                   const double given[N_JOINTS], double a[N_JOINTS], double reaction[N_JOINTS])
+void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
+                   const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],
+                   double reaction[N_JOINTS])
 {
     JointPosition joint[N_BODIES];
     EndBody end_body;
     place_joints(q, joint);
     body(plant->value, 0, &end_body);
-    hybrid_dynamics(joint, &end_body, &plant->value[ARMATURE], free, given, a, reaction);
+    hybrid_dynamics(joint, &end_body, armature, free, given, a, reaction);
 }
 #endif
 

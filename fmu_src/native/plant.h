@@ -28,8 +28,8 @@ INTERNAL void inverse_mass(const Plant *plant, const double q[N_JOINTS], int cou
                            const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS]);
 #else
 /* a and λ of M(q) a = τ + λ, as hybrid_dynamics has them. */
-INTERNAL void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double free[N_JOINTS],
-                            const double given[N_JOINTS], double a[N_JOINTS],
+INTERNAL void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
+                            const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],
                             double reaction[N_JOINTS]);
 #endif
 

@@ -86,7 +86,7 @@ static int complementary(const Plant *plant, const double q[N_JOINTS], Contact c
         count = 0;
         for (int i = 0; i < N_JOINTS; i++)
             given[i] = free[i] == 0.0 ? -rate[i] : bound(&contact[i]);
-        hybrid_motion(plant, q, free, given, change, z);
+        hybrid_motion(plant, q, &plant->value[ARMATURE], free, given, change, z);
         for (int i = 0; i < N_JOINTS; i++)
             largest = fmax(largest, free[i] == 0.0 ? fabs(z[i]) : 0.0);
         for (int i = 0; i < N_JOINTS; i++) {
@@ -152,7 +152,7 @@ static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *
         any |= given[i] != 0.0;
     }
     if (any)
-        hybrid_motion(plant, y, free, given, change, none);
+        hybrid_motion(plant, y, &plant->value[ARMATURE], free, given, change, none);
     for (int i = 0; any && i < N_JOINTS; i++)
         a[i] += change[i];
 }
@@ -271,7 +271,7 @@ static void add_reactions(const Plant *plant, const Stops *stops, const double q
         free[i] = reacts(stops, i) ? 0.0 : 1.0;
         given[i] = reacts(stops, i) ? -a[i] : 0.0;
     }
-    hybrid_motion(plant, q, free, given, change, reaction);
+    hybrid_motion(plant, q, &plant->value[ARMATURE], free, given, change, reaction);
     for (int i = 0; i < N_JOINTS; i++)
         a[i] += change[i];
 }

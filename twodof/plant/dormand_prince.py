@@ -9,7 +9,9 @@ from functools import lru_cache
 from math import sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 State = list[float]
 """(q, v), 2n values. Plain floats: at this size a call of numpy costs more than the arithmetic."""
 
@@ -80,8 +82,8 @@ def error_norm(K: list[State], y: State, y_new: State, step: float, rtol: float,
     return sqrt(total / len(y))
 
 
-def interpolant(y: State, y_new: State, K: list[State], step: float) -> Callable[[float], State]:
-    """Return the fourth-order interpolant of a step, as a function of the time within it."""
+def interpolant(y: State, y_new: State, K: list[State], P: Array, step: float) -> Callable[[float], State]:
+    """Return the dense output of a step, as a function of the time within it; P weighs the derivatives K."""
     start, Q = np.array(y), np.array(K).T.dot(P)
 
     def state(passed: float) -> State:

@@ -26,9 +26,11 @@ class Equations:
         ratios: singular values of J that decide its rank.
         rcond: up to which J⁺ drops them.
         swing: per joint, a bound on how fast it changes them, 1/rad or 1/m.
+        damping: of the joints, N·m·s/rad or N·s/m, n values; empty without.
     """
 
     acceleration: Response
     ratios: Ratios
     rcond: float
     swing: Sequence[float]
+    damping: Sequence[float] = ()

@@ -10,7 +10,7 @@ next one begins in another regime. A step is accepted only if its error test pas
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import chain, product
+from itertools import chain
 from math import inf, isfinite, isnan, nan, ulp
 from struct import Struct
 
@@ -21,14 +21,17 @@ from .anti_chatter import CHATTER_TIME, FIRST_HOLD, HOLD_OF_ALL, SHORT_CHATTER_T
 from .dormand_prince import P, State, dormand_prince, error_norm, interpolant
 from .equations import Equations
 from .pseudo_inverse import rank_margin
+from .rosenbrock import CUBIC, damping_limits, rosenbrock
+from .step_error import StepError, fastest_joint
 from .stops import STUCK, Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
+AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
+"""Integrators, as the parameter names them."""
 BUDGET = 2_000_000
 """Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
 MOST_ROWS = 6
 """Rows of a task's Jacobian at most: three axes and three of an orientation."""
-NUDGE = 1e-6  # rad, m and per s: of the difference quotients that tell how fast a joint is
 
 
 @dataclass
@@ -36,20 +39,6 @@ class Budget:
     """Evaluations of the right-hand side that parts of a communication step have in common."""
 
     spent: int = 0
-
-
-class StepError(ArithmeticError):
-    """A communication step that fails the tolerances or exceeds the budget.
-
-    Attributes:
-        too_fine: no integration step was small enough, so that a larger budget would not help.
-        joint: index of the joint that changes fastest.
-        rate: of its change, 1/s.
-    """
-
-    def __init__(self, *, too_fine: bool, joint: int, rate: float) -> None:
-        super().__init__(f"joint {joint} changes at a rate of {rate:g} 1/s")
-        self.too_fine, self.joint, self.rate = too_fine, joint, rate
 
 
 class _Motion:
@@ -62,7 +51,9 @@ class _Motion:
         grips, margins: those of ``Stops.restrain``, and the margin of the rank, at each stage of the present step.
     """
 
-    def __init__(self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float) -> None:
+    def __init__(
+        self, equations: Equations, stops: Stops, rtol: float, atol: float, max_step: float, integrator: int
+    ) -> None:
         n = len(stops.limits)
         self._equations = equations
         state = np.empty(2 * n)
@@ -70,6 +61,9 @@ class _Motion:
         self._buffer, self._q, self._v = state.data, state[:n], state[n:]
         self.n, self.evaluations = n, 0
         self.stops, self.rtol, self.atol, self.max_step = stops, rtol, atol, max_step
+        self._damping = np.array(equations.damping) if len(equations.damping) else np.zeros(n)
+        self._automatic = integrator == AUTOMATIC and bool(len(equations.damping))
+        self._stiff = integrator == STIFF
         self.rank = MOST_ROWS
         self.rank_held = False
         self.grips: list[list[float]] = []
@@ -134,11 +128,15 @@ class _Motion:
             if last:
                 step = end - t
             del self.grips[1:], self.margins[1:]
-            y_new, K = dormand_prince(self.rates, y, step, rates)
-            norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
+            if self._stiff:
+                mobility, tolerances = self.stops.mobility(y[: self.n]), (self.rtol, self.atol)
+                y_new, K, norm = rosenbrock(self.rates, mobility, self._damping, y, step, rates, *tolerances)
+            else:
+                y_new, K = dormand_prince(self.rates, y, step, rates)
+                norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
             factor = MIN_FACTOR
             if isfinite(norm):
-                factor = SAFETY * norm**-0.2 if norm > 0.0 else MAX_FACTOR
+                factor = SAFETY * norm ** (-1 / 3 if self._stiff else -0.2) if norm > 0.0 else MAX_FACTOR
             if norm < 1.0:
                 found = self._first_event(y, y_new, step, K)
                 if found is not None:
@@ -150,6 +148,10 @@ class _Motion:
                 self.grips[0], self.margins[0] = self.grips[-1], self.margins[-1]
                 step = min(self.max_step, step * max(MIN_FACTOR, min(growth, factor)))
                 growth = MAX_FACTOR
+            elif self._automatic and damping_limits(
+                self.stops.mobility(y[: self.n]), self._damping, K, step, min(self.max_step, end - t)
+            ):
+                self._stiff, self._automatic = True, False  # to the end of the communication step
             else:
                 step *= max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
@@ -164,15 +166,7 @@ class _Motion:
                 raise self._too_fast(y, too_fine=False)
 
     def _too_fast(self, y: State, *, too_fine: bool) -> StepError:
-        """Return the error that names the joint whose acceleration is most sensitive to its own state."""
-        a, _, _ = self.acceleration(y)
-        rates = []
-        for i, order in product(range(self.n), (2, 1)):  # |∂q̈ᵢ/∂qᵢ|½ and |∂q̈ᵢ/∂vᵢ|
-            nudged = y.copy()
-            nudged[i + self.n * (order == 1)] += NUDGE
-            change = abs(self.acceleration(nudged)[0][i] - a[i]) / NUDGE
-            rates.append((change ** (1 / order) if isfinite(change) else inf, i))
-        rate, joint = max(rates)
+        joint, rate = fastest_joint(lambda at: self.acceleration(at)[0], y)
         return StepError(too_fine=too_fine, joint=joint, rate=rate)
 
     def _first_event(
@@ -192,10 +186,11 @@ class _Motion:
         doubtful = [i for i, grips in enumerate(zip(*self.grips)) if events.may_vanish(grips)]
         if not near and not near_rank and not doubtful:
             return None
-        state = interpolant(y, y_new, K, step)
+        weights = CUBIC if self._stiff else P
+        state = interpolant(y, y_new, K, weights, step)
         first = inf
         for i in near:
-            slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(P).tolist())]
+            slope = [(k + 1) * c for k, c in enumerate(np.array([k[i] for k in K]).dot(weights).tolist())]
             first = min(first, events.first_crossing(self._margin_of(i, state), slope, step))
 
         def grips(passed: float) -> list[float]:
@@ -272,6 +267,7 @@ def advance(
     rtol: float,
     atol: float,
     max_step: float,
+    integrator: int = AUTOMATIC,
     budget: Budget | None = None,
 ) -> tuple[list[float], list[float]]:
     """Integrate the state over one communication step, or a part of it.
@@ -283,6 +279,7 @@ def advance(
         stops: at the joints' limits, and their friction.
         rtol, atol: tolerances of the error test on the state (q, v).
         max_step: largest integration step, s.
+        integrator: Dormand–Prince, that for stiff damping, or AUTOMATIC: the latter once a step fails by its stiffness.
         budget: what the parts before have spent; None: there are none.
 
     Returns:
@@ -292,7 +289,7 @@ def advance(
         FloatingPointError: the equations gave a value that is not finite.
         StepError: they change too fast.
     """
-    n, budget, motion = len(q), budget or Budget(), _Motion(equations, stops, rtol, atol, max_step)
+    n, budget, motion = len(q), budget or Budget(), _Motion(equations, stops, rtol, atol, max_step, integrator)
     motion.evaluations = budget.spent
     y = _regimes(motion, [*q, *v], h)
     budget.spent = motion.evaluations

@@ -20,11 +20,12 @@ from . import effort_control, joint_control, task_control
 from .control_law import ControlLaw, ControlledPlant
 from .dormand_prince import STAGES
 from .equations import Answer, Array, Equations, Law, Response
-from .integrator import BUDGET, StepError
+from .integrator import BUDGET
 from .mechanism import Mechanism
 from .orientation import quaternion
 from .robot import Robot
 from .sampling import Sampling, advance_sampled, sampling_refusal
+from .step_error import StepError
 from .stops import Stops
 from .variables import CONTROLS, RANGES, Variable
 
@@ -252,7 +253,7 @@ class Plant(ControlledPlant):
         command, ratios = held if self.control_period else self._law(self)
         acceleration = self._acceleration(command)
         rcond = self.rcond if "rcond" in CONTROLS[self.control].parameters else 0.0
-        return Equations(acceleration, ratios, rcond, self._swing)
+        return Equations(acceleration, ratios, rcond, self._swing, self.damping if any(self.damping) else ())
 
     def _acceleration(self, command: Law) -> Response:
         """Return q̈ under a control law."""

@@ -138,9 +138,9 @@ def advance_sampled(plant: ControlledPlant, h: float) -> None:
         last = not next_event < end - slack(plant, end)
         if not last or t != plant.time:
             length = (end if last else next_event) - t
-        tolerances = plant.rtol, plant.atol, plant.max_step
+        settings = plant.rtol, plant.atol, plant.max_step, plant.integrator
         plant.q, plant.v = advance(
-            plant.equations_of_motion(), plant.q, plant.v, length, stops, *tolerances, budget=budget
+            plant.equations_of_motion(), plant.q, plant.v, length, stops, *settings, budget=budget
         )
         t = next_event
 

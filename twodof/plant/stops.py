@@ -149,6 +149,15 @@ class Stops:
             a[i] = 0.0
         return [grip for i in self.watched for grip in self._grips(i, y[i], efforts[i])]
 
+    def mobility(self, q: Sequence[float]) -> Array:
+        """Return the accelerations that unit efforts cause in the regime: M⁻¹, n × n, with joints at rest held."""
+        W = np.array(self._inverse_mass(q))
+        reacting = [i for i in self.held if self.rest[i] != CLAMPED]
+        if reacting:
+            W -= W[:, reacting] @ np.linalg.solve(W[np.ix_(reacting, reacting)], W[reacting])
+        W[self.held] = 0.0
+        return W
+
     def at_limits(self, y: Sequence[float]) -> list[bool]:
         """Return for each joint whether it is at a limit, in the state (q, v)."""
         return [not low < q < high for (low, high), q in zip(self.limits, y)]

@@ -39,6 +39,7 @@ RANGES = {
     "rcond": Range(0.0, math.nextafter(1.0, 0.0), "in [0, 1)"),
     **dict.fromkeys(("control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), NOT_NEGATIVE),
     "seed": Range(0, 2**31 - 1, "in [0, 2147483647]"),
+    "integrator": Range(0, 2, "0 (automatic), 1 (Dormand-Prince) or 2 (stiff joints)"),
 }
 """Valid ranges by group; other variables may be any number. The FMU refuses values outside."""
 
@@ -185,6 +186,7 @@ ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ..
     ("q_noise", "parameter", "joint", "m|rad", 0.0, "standard deviation of the position sensor's noise"),
     ("v_noise", "parameter", "joint", "m/s|rad/s", 0.0, "standard deviation of the velocity sensor's noise"),
     ("seed", "parameter", "", "", 0, "seed of the sensors' noise"),
+    ("integrator", "parameter", "", "", 0, "integrator: 0 automatic, 1 Dormand-Prince, 2 for stiff joints"),
     ("v_from_q", "parameter", "", "", False, "the controller's velocities are differences of its positions"),
     ("limit_effort", "parameter", "", "", False, "limit the control effort to the URDF's effort limits"),
     ("rigid_stops", "parameter", "", "", None, "joint stops act on the other joints too"),

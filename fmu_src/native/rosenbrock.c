@@ -1,0 +1,140 @@
+/* The rules are those of plant/rosenbrock.py. The method is of its order with any approximation T of the Jacobian,
+   and L-stable for the part that is in T. Here that is the damping D of the joints and q̇ = v,
+
+       T = [ 0      1   ]        (1 − h γ T) uᵢ = h γ f(y + Σ aᵢⱼ uⱼ) + γ Σ cᵢⱼ uⱼ,    j < i
+           [ 0   −M⁻¹D  ]        y_new = y + Σ mᵢ uᵢ
+
+   where (1 + h γ M⁻¹D) x = r is x = r − (M + h γ D)⁻¹ h γ D r, with h γ D in the place of an armature. The velocity of
+   the dense output begins with the acceleration, so that a joint which begins to slip does so in the right direction;
+   where that is stiff it is the rate of the position's, for small errors of v are large ones of q̈ there.
+
+   Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of
+   index 1", BIT 45(4), 2005, in the form without products by T of Hairer & Wanner, "Solving ODEs II", IV.7. */
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "dormand_prince.h"
+
+enum { N_INCREMENTS = 4 };
+static const double GAMMA = 0.435866521508459;
+/* Row i weighs the increments u of the stages before i; the last row and the last increment are the solution. */
+static const double WEIGHT[N_INCREMENTS][N_INCREMENTS] = {
+    {0, 0, 0, 0},
+    {2, 0, 0, 0},
+    {1.4192173174557647, -0.2592322116729697, 0, 0},
+    {4.18476048231916, -0.28519201735549593, 2.294280360279042, 0},
+};
+static const double COUPLING[N_INCREMENTS][N_INCREMENTS] = {
+    {0, 0, 0, 0},
+    {-4.588560720558084, 0, 0, 0},
+    {-4.18476048231916, 0.28519201735549593, 0, 0},
+    {-6.368179200128358, -6.795620944466836, 2.870098604331056, 0},
+};
+static const double ESTIMATE[N_INCREMENTS] = {0.2777499476479681, -1.403239895175999, 1.7726301276675507, 0.5};
+/* Weights of the derivatives in the dense output, a cubic by the values and derivatives at both ends. */
+static const double CUBIC[N_INCREMENTS + 1][4] = {
+    {0, 0, 0, 0}, {1, -2, 1, 0}, {0, 3, -2, 0}, {0, -1, 1, 0}, {0, 0, 0, 0}};
+/* Rates of damping times a step: up to which Dormand–Prince is stable, and times the largest step from which on the
+   other method is the cheaper one. */
+static const double STABLE = 3.3, WORTH = 12.0;
+
+/* x of (M + s D) x = τ at y, joints at rest being held. */
+static void damped_motion(const Step *step, double s, const double tau[N_JOINTS], double x[N_JOINTS])
+{
+    const double *value = step->plant->value;
+    double inertia[N_JOINTS], free[N_JOINTS], given[N_JOINTS], reaction[N_JOINTS];
+    for (int i = 0; i < N_JOINTS; i++) {
+        const Rest held = step->stops.held[i];
+        free[i] = held == FREE || held == CLAMPED;
+        given[i] = held == FREE ? tau[i] : 0.0;
+        inertia[i] = value[ARMATURE + i] + (held == FREE ? s * value[DAMPING + i] : 0.0);
+    }
+    hybrid_motion(step->plant, step->y, inertia, free, given, x, reaction);
+    for (int i = 0; i < N_JOINTS; i++)
+        x[i] = step->stops.held[i] ? 0.0 : x[i];
+}
+
+/* Solve (1 − h γ T) u = r in place. */
+static void solve(const Step *step, double u[N_STATES])
+{
+    const double scale = step->size * GAMMA, *damping = &step->plant->value[DAMPING];
+    double effort[N_JOINTS], change[N_JOINTS];
+    for (int i = 0; i < N_JOINTS; i++)
+        effort[i] = scale * damping[i] * u[N_JOINTS + i];
+    damped_motion(step, scale, effort, change);
+    for (int i = 0; i < N_JOINTS; i++) {
+        u[N_JOINTS + i] -= change[i];
+        u[i] += scale * u[N_JOINTS + i];
+    }
+}
+
+/* Sum of the first increments, with weights. */
+static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_INCREMENTS], int count, int i)
+{
+    double sum = 0.0;
+    for (int j = 0; j < count; j++)
+        sum += weight[j] * u[j][i];
+    return sum;
+}
+
+/* Fill y_new, K and P from y and K[0]; the norm of the error, which passes where below 1. */
+INTERNAL double rosenbrock(Step *step)
+{
+    const double h = step->size, rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
+    double u[N_INCREMENTS][N_STATES], k[N_STATES], error[N_STATES], *y_new = step->y_new;
+    memcpy(k, step->K[0], sizeof k);
+    memcpy(y_new, step->y, sizeof k);
+    for (int stage = 0; stage <= N_INCREMENTS; stage++) {
+        for (int i = 0; i < N_STATES && stage > 0; i++)
+            y_new[i] = stage < N_INCREMENTS ? step->y[i] + weighted(u, WEIGHT[stage], stage, i)
+                                            : y_new[i] + u[N_INCREMENTS - 1][i];
+        if (stage > 0) {
+            memcpy(k, y_new + N_JOINTS, N_JOINTS * sizeof *k);
+            evaluate(step, y_new, k + N_JOINTS, step->effort[stage],
+                     stage == N_INCREMENTS ? &step->margin_new : NULL);
+        }
+        if (stage < N_INCREMENTS) {
+            for (int i = 0; i < N_STATES; i++)
+                u[stage][i] = GAMMA * (h * k[i] + weighted(u, COUPLING[stage], stage, i));
+            solve(step, u[stage]);
+        }
+    }
+    for (int i = 0; i < N_STATES; i++) {
+        error[i] = weighted(u, ESTIMATE, N_INCREMENTS, i);
+        step->K[2][i] = (weighted(u, WEIGHT[N_INCREMENTS - 1], N_INCREMENTS - 1, i) + u[N_INCREMENTS - 1][i]) / h;
+    }
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double v = step->y[N_JOINTS + i], v_new = y_new[N_JOINTS + i], mean = step->K[2][i];
+        const double first = (6.0 * mean - 4.0 * v - 2.0 * v_new) / h;
+        const double last = (2.0 * v + 4.0 * v_new - 6.0 * mean) / h;
+        const double a = step->K[0][N_JOINTS + i], a_new = k[N_JOINTS + i];
+        const double tolerance = atol + rtol * fmax(fabs(v), fabs(v_new));
+        step->K[1][i] = v;
+        step->K[1][N_JOINTS + i] = v == 0.0 || h * fabs(a - first) <= tolerance ? a : first;
+        step->K[3][i] = v_new;
+        step->K[3][N_JOINTS + i] = h * fabs(a_new - last) <= tolerance ? a_new : last;
+    }
+    step->stages = N_INCREMENTS;
+    step->P = CUBIC;
+    memcpy(step->K[N_INCREMENTS], k, sizeof k);
+    return error_norm(step, error);
+}
+
+/* Whether damping makes a step of Dormand–Prince that failed unstable, and steps of the largest size, s, are worth this
+   method. */
+INTERNAL int damping_limits(const Step *step, double largest)
+{
+    double effort[N_JOINTS], answer[N_JOINTS], power = 0.0, rate = 0.0;
+    for (int i = 0; i < N_JOINTS; i++) {
+        const double change = step->K[STAGES][i] - step->K[STAGES - 1][i];
+        effort[i] = step->plant->value[DAMPING + i] * change;
+        power += effort[i] * change;
+    }
+    if (!(power > 0.0))
+        return 0;
+    damped_motion(step, 0.0, effort, answer);
+    for (int i = 0; i < N_JOINTS; i++)
+        rate += effort[i] * answer[i] / power; /* a Rayleigh quotient of M⁻¹D: the fastest mode prevails */
+    return rate * step->size > STABLE && rate * largest > WORTH;
+}

@@ -1,0 +1,187 @@
+"""The integrator for stiff joints in both flavours, against Radau, the other integrator and order conditions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from native_models import Engine, engine, from_urdf, shipped
+from scipy.integrate import solve_ivp
+from test_stiffness import radau
+
+from twodof.plant import rosenbrock
+from twodof.plant.dormand_prince import interpolant
+from twodof.plant.integrator import AUTOMATIC, DORMAND_PRINCE, STIFF
+from twodof.plant.plant import Plant
+
+STEP = 0.01
+TIGHT = {"rtol": 1e-9, "atol": 1e-12}
+PENDULUM = """<robot name="pendulum"><link name="base"/>
+<link name="rod"><inertial><origin xyz="0.3 0 0"/><mass value="0.4"/>
+<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="tip"><inertial><origin xyz="0.02 0 0"/><mass value="0.01"/>
+<inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="swing" type="revolute"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="0" velocity="0"/></joint>
+<joint name="finger" type="revolute"><parent link="rod"/><child link="tip"/><origin xyz="0.6 0 0"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="0" velocity="0"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Engine:
+    return Engine(from_urdf(PENDULUM, "tip", "xz", "effort"))
+
+
+def started(of: Engine, integrator: int, **changes: object) -> Plant:
+    plant = of.model.plant()
+    for name, value in {"integrator": integrator, **changes}.items():
+        setattr(plant, name, value)
+    plant.initialise()
+    return plant
+
+
+def both(of: Engine, plant: Plant, steps: int, h: float = STEP) -> np.ndarray:
+    """q and v after communication steps of the Python flavour, checked against the native one."""
+    values = of.values(plant)
+    for _ in range(steps):
+        plant.step(h)
+        assert of.call("advance", values, h) == 1
+    found = np.array([*plant.q, *plant.v])
+    native = np.concatenate([of.group(values, "q"), of.group(values, "v")])
+    assert (np.abs(native - found) <= 1e-9 * np.maximum(1.0, np.abs(found))).all()
+    return found
+
+
+def evaluations(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Evaluations of the right-hand side in a communication step."""
+    count, equations = [0], plant.equations_of_motion()
+
+    def acceleration(*arguments):
+        count[0] += 1
+        return equations.acceleration(*arguments)
+
+    monkeypatch.setattr(plant, "equations_of_motion", lambda: replace(equations, acceleration=acceleration))
+    plant.step(STEP)
+    return count[0]
+
+
+def test_coefficients_satisfy_the_order_conditions_of_a_w_method_and_damp_what_is_stiff():
+    """Hairer & Wanner, "Solving ODEs II", IV.7: order 3 and 2 with any T; R(∞) = 0."""
+    g = rosenbrock.GAMMA
+    lower = np.zeros((4, 4))
+    coupling, a = lower.copy(), lower.copy()
+    for i, (row, c) in enumerate(zip(rosenbrock.A, rosenbrock.C), start=1):
+        a[i, :i], coupling[i, :i] = row, c
+    gamma = np.linalg.inv(np.eye(4) / g - coupling)
+    alpha, m = a @ gamma, np.array([*rosenbrock.A[-1], 1.0])
+    b = m @ gamma
+    ones, nodes = np.ones(4), alpha.sum(1)
+    for weights, order in ((b, 3), ((m - rosenbrock.E) @ gamma, 2)):
+        sums = [(weights @ ones, 1.0), (weights @ nodes, 1 / 2), (weights @ gamma @ ones, 0.0)]
+        if order == 3:
+            sums += [(weights @ nodes**2, 1 / 3), (weights @ alpha @ nodes, 1 / 6)]
+            sums += [(weights @ x @ y @ ones, 0.0) for x, y in ((alpha, gamma), (gamma, alpha), (gamma, gamma))]
+        assert [found for found, _ in sums] == pytest.approx([wanted for _, wanted in sums], abs=1e-13)
+    assert 1.0 - b @ np.linalg.inv(alpha + gamma) @ ones == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("integrator", [AUTOMATIC, STIFF])
+@pytest.mark.parametrize("damping", [0.1, 10.0, 600.0, 1e4, 1e6])
+def test_damped_arms_move_as_an_implicit_solver_says(damping, integrator):
+    of, changes = engine("twodof"), {"damping": [damping] * 2}
+    expected = radau(shipped(of, **changes), STEP)
+    found = both(of, shipped(of, **changes, integrator=integrator), 1)
+    assert np.abs(found[:2] - expected).max() <= 1e-5
+
+
+@pytest.mark.parametrize("damping", [1.0, 30.0, 100.0, 1e3, 1e5, 1e6])
+def test_a_step_of_a_damped_arm_costs_few_evaluations(damping, monkeypatch):
+    undamped, damped = (shipped(engine("twodof"), damping=[D] * 2) for D in (0.0, damping))
+    assert evaluations(damped, monkeypatch) <= 5 * evaluations(undamped, monkeypatch)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.1, 0.5])
+def test_joints_that_are_not_stiff_move_as_by_dormand_prince_to_the_bit(damping):
+    of, changes = engine("twodof"), {"damping": [damping] * 2}
+    one, other = (both(of, shipped(of, **changes, integrator=i), 20) for i in (AUTOMATIC, DORMAND_PRINCE))
+    assert (one == other).all()
+
+
+def test_the_error_falls_with_the_third_power_of_the_step(pendulum):
+    """Of a stiff finger on a swing, at a tolerance that accepts all steps."""
+    errors = []
+    changes = {"damping": [0.0, 0.05], "q_start": [0.3, 0.2], "v_start": [1.0, 0.0], "gravity": [0.0, 0.0, -9.81]}
+    reference = both(pendulum, started(pendulum, DORMAND_PRINCE, **changes, rtol=1e-11, atol=1e-13), 1, 0.2)
+    for max_step in (0.02, 0.01, 0.005):
+        plant = started(pendulum, STIFF, **changes, rtol=10.0, atol=10.0, max_step=max_step)
+        errors.append(abs(both(pendulum, plant, 1, 0.2)[0] - reference[0]))
+    assert errors[0] / errors[1] > 6.0 and errors[1] / errors[2] > 6.0, errors
+
+
+@pytest.mark.parametrize("rigid", [False, True], ids=["clamp", "rigid"])
+@pytest.mark.parametrize("friction", [[0.0, 0.0], [0.2, 1e-4]], ids=["smooth", "friction"])
+def test_stops_and_friction_are_those_of_the_other_integrator(pendulum, rigid, friction):
+    """The swing falls onto its stop and the finger to and fro between its own, at tight tolerances."""
+    ends = []
+    for integrator in (DORMAND_PRINCE, STIFF):
+        plant = started(
+            pendulum,
+            integrator,
+            **TIGHT,
+            q_min=[-1.0, -0.1],
+            q_max=[0.6, 0.1],
+            v_start=[0.5, -3.0],
+            damping=[0.01, 1e-4],
+            friction=friction,
+            rigid_stops=rigid,
+            tau_cmd=[0.0, 1e-3],
+        )
+        path = [both(pendulum, plant, 4) for _ in range(10)]
+        ends.append(np.array(path))
+    stopped = np.isin(ends[0][:, :2], [0.6, 0.1, -0.1, -1.0])
+    assert stopped[:, 0].any() and (stopped[:, 1].any() or any(friction))
+    assert np.abs(ends[0] - ends[1]).max() <= 1e-6
+
+
+def test_a_stiff_joint_rests_on_its_stop_and_leaves_it(pendulum):
+    """As by Dormand–Prince, which takes many more steps; M⁻¹D is 1e5 1/s."""
+    changes = {"damping": [0.1, 0.5], "q_max": [2.0, 0.01], "q_start": [0.0, 0.0], "friction": [0.01, 0.02], **TIGHT}
+    plants = [started(pendulum, i, **changes) for i in (AUTOMATIC, DORMAND_PRINCE)]
+    for effort in (3.0, 0.01, -1.5):
+        for plant in plants:
+            plant.tau_cmd = [0.1, effort]
+        one, other = (both(pendulum, plant, 2, 0.005) for plant in plants)
+        assert np.abs(one - other).max() <= 1e-7
+        if effort > 0.0:
+            assert one[1] == 0.01 and one[3] == 0.0
+    assert one[1] < 0.01
+
+
+def test_samples_of_a_controller_are_taken_at_their_times(pendulum):
+    """A saw of efforts by a sampled joint controller on stiff joints."""
+    of = Engine(from_urdf(PENDULUM, "tip", "xz", "joint"))
+    changes = {"damping": [0.5, 0.05], "control_period": 0.004, "control_delay": 0.0013, "q_des": [0.4, -0.3]}
+    tight = both(of, started(of, DORMAND_PRINCE, **changes, **TIGHT), 1, 6 * STEP)
+    for integrator in (AUTOMATIC, STIFF):
+        assert both(of, started(of, integrator, **changes), 1, 6 * STEP)[:2] == pytest.approx(tight[:2], abs=1e-5)
+        plant = started(of, integrator, **changes)
+        for _ in range(6):
+            plant.step(STEP)
+        assert plant.q == pytest.approx(tight[:2], abs=1e-5)
+
+
+def test_dense_output_is_of_third_order_and_velocities_begin_with_the_acceleration():
+    """Of an oscillator with damping, from rest, whose solution SciPy has."""
+
+    def rates(y):
+        return [y[1], -40.0 * y[0] - 3.0 * y[1]]
+
+    y, worst = [0.7, 0.0], []
+    exact = solve_ivp(lambda t, y: rates(y), (0, 0.1), y, "DOP853", rtol=1e-12, atol=1e-14, dense_output=True).sol
+    for h in (0.04, 0.02):
+        y_new, K, _ = rosenbrock.rosenbrock(rates, np.eye(1), np.array([3.0]), y, h, rates(y), 1e-3, 1e-6)
+        state = interpolant(y, y_new, K, rosenbrock.CUBIC, h)
+        worst.append(np.max([np.abs(np.subtract(state(t), exact(t))) for t in np.linspace(0.0, h, 9)], axis=0))
+        assert (state(1e-9 * h)[1] - y[1]) / (1e-9 * h) == pytest.approx(rates(y)[1], rel=1e-6)
+    assert (worst[0] > 6.0 * worst[1]).all() and (worst[1] < 3e-4).all()

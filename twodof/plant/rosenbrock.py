@@ -1,0 +1,108 @@
+"""One step of ROS34PW2, a Rosenbrock-W method of order 3(2) for stiff joint damping, and its dense output.
+
+The method is of its order with any approximation T of the Jacobian, and L-stable for the part that is in T. Here that
+is the damping D of the joints and q̇ = v,
+
+    T = [ 0      1   ]        (1 − h γ T) uᵢ = h γ f(y + Σ aᵢⱼ uⱼ) + γ Σ cᵢⱼ uⱼ,    j < i
+        [ 0   −M⁻¹D  ]        y_new = y + Σ mᵢ uᵢ
+
+with M⁻¹ at y, of joints at rest that of their regime. The dense output of q is the cubic through the positions and
+velocities at both ends. That of v is a cubic with the accelerations at the ends, so that a joint which begins to slip
+does so in the right direction; one that differs from the rate of q's by more than the tolerance is stiff, where small
+errors of v make large ones of q̈, and q's is taken.
+
+Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of index
+1", BIT 45(4), 2005, in the form without products by T of Hairer & Wanner, "Solving ODEs II", IV.7.
+"""
+
+from collections.abc import Callable
+from math import sqrt
+from operator import mul
+
+import numpy as np
+
+from .dormand_prince import Array, State
+
+GAMMA = 0.435866521508459
+A = ((2.0,), (1.4192173174557647, -0.2592322116729697), (4.18476048231916, -0.28519201735549593, 2.294280360279042))
+"""Row i weighs the increments u of the stages before i + 1."""
+M = (*A[-1], 1.0)
+C = (
+    (-4.588560720558084,),
+    (-4.18476048231916, 0.28519201735549593),
+    (-6.368179200128358, -6.795620944466836, 2.870098604331056),
+)
+E = (0.2777499476479681, -1.403239895175999, 1.7726301276675507, 0.5)
+CUBIC = np.array([[0, 0, 0, 0], [1, -2, 1, 0], [0, 3, -2, 0], [0, -1, 1, 0], [0, 0, 0, 0]], float)
+"""Weights, in the dense output, of the derivatives that ``rosenbrock`` returns: a cubic by both ends."""
+STABLE, WORTH = 3.3, 12.0
+"""Rates of damping times a step: up to which Dormand–Prince is stable, and times the largest step from which on this
+method is the cheaper one."""
+
+
+def rosenbrock(
+    rates: Callable[[State], State],
+    mobility: Array,
+    damping: Array,
+    y: State,
+    step: float,
+    k1: State,
+    rtol: float,
+    atol: float,
+) -> tuple[State, list[State], float]:
+    """Take one step from y with the derivative k1.
+
+    Args:
+        rates: ẏ at a state.
+        mobility: M⁻¹ at y, n × n, without rows of joints at rest.
+        damping: D, n values, N·m·s/rad or N·s/m.
+        y: the state (q, v).
+        step: s.
+        k1: ẏ at y.
+        rtol, atol: tolerances of the state.
+
+    Returns:
+        y_new, the derivatives for ``CUBIC``, of which the last is ẏ at y_new, and the norm of the error.
+    """
+    n = len(damping)
+    solve = np.linalg.inv(np.eye(n) + step * GAMMA * mobility * damping)
+    k, at, U = k1, y, list[State]()
+    for a, c in zip((*A, ()), ((), *C)):
+        columns = list(zip(*U)) or [()] * len(y)
+        r = [GAMMA * (step * rate + sum(map(mul, c, u))) for rate, u in zip(k, columns)]
+        u_v = solve.dot(r[n:]).tolist()
+        U.append([p + step * GAMMA * s for p, s in zip(r, u_v)] + u_v)
+        if a:
+            at = [x + sum(map(mul, a, u)) for x, u in zip(y, zip(*U))]
+            k = rates(at)
+    y_new = [x + u for x, u in zip(at, U[-1])]
+    k_new = rates(y_new)
+    mean = [sum(map(mul, M, u)) / step for u in zip(*U)]  # differences of states are rounded in short steps
+    v, v_new = y[n:], y_new[n:]
+    first, last = k1[n:], k_new[n:]
+    for i, (s, p, q) in enumerate(zip(mean, v, v_new)):
+        a, b = (6.0 * s - 4.0 * p - 2.0 * q) / step, (2.0 * p + 4.0 * q - 6.0 * s) / step
+        tolerance = atol + rtol * max(abs(p), abs(q))
+        first[i] = first[i] if p == 0.0 or step * abs(first[i] - a) <= tolerance else a
+        last[i] = last[i] if step * abs(last[i] - b) <= tolerance else b
+    errors = [sum(map(mul, E, u)) for u in zip(*U)]
+    ratios = np.divide(errors, atol + rtol * np.maximum(np.abs(y), np.abs(y_new)))
+    return y_new, [k1, v + first, mean, v_new + last, k_new], sqrt(ratios.dot(ratios) / len(y))
+
+
+def damping_limits(mobility: Array, damping: Array, K: list[State], step: float, largest: float) -> bool:
+    """Return whether damping made a step of Dormand–Prince unstable that failed, so that this method is cheaper.
+
+    Its rate is a Rayleigh quotient of M⁻¹D, at the difference of the last two stages' velocities: where the step is
+    unstable, the fastest mode prevails there.
+
+    Args:
+        mobility, damping: those of ``rosenbrock``.
+        K: derivatives at the stages of the step.
+        step, largest: its size and the largest that is allowed, s.
+    """
+    change = np.subtract(K[-1], K[-2])[: len(damping)]
+    effort = damping * change
+    power = float(effort @ change)
+    rate = float(effort @ mobility @ effort) / power if power > 0.0 else 0.0
+    return rate * step > STABLE and rate * largest > WORTH
