@@ -79,7 +79,7 @@ static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_I
 }
 
 /* Fill y_new, K and P from y and K[0]; the norm of the error, which passes where below 1. */
-INTERNAL double rosenbrock(Step *step)
+static double rosenbrock(Step *step)
 {
     const double h = step->size, rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
     double u[N_INCREMENTS][N_STATES], k[N_STATES], error[N_STATES], *y_new = step->y_new;
@@ -123,7 +123,7 @@ INTERNAL double rosenbrock(Step *step)
 
 /* Whether damping makes a step of Dormand–Prince that failed unstable, and steps of the largest size, s, are worth this
    method. */
-INTERNAL int damping_limits(const Step *step, double largest)
+static int damping_limits(const Step *step, double largest)
 {
     double effort[N_JOINTS], answer[N_JOINTS], power = 0.0, rate = 0.0;
     for (int i = 0; i < N_JOINTS; i++) {
