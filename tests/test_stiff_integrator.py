@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness import Driver, in_child_process
 from native_models import Engine, engine, from_urdf, shipped
 from scipy.integrate import solve_ivp
 from test_stiffness import radau
@@ -169,6 +170,24 @@ def test_samples_of_a_controller_are_taken_at_their_times(pendulum):
         for _ in range(6):
             plant.step(STEP)
         assert plant.q == pytest.approx(tight[:2], abs=1e-5)
+
+
+@in_child_process
+@pytest.mark.parametrize("damping", [0.1, 1e4])
+def test_a_restored_fmu_goes_on_to_the_bit_in_both_flavours(damping, fmu_path, native_path):
+    """As an FMU that took all the steps, whichever integrator the automatic choice takes."""
+    runs = []
+    for path in (fmu_path, native_path):
+        driver = Driver(path).initialise(damping=[damping] * 2, friction=[0.05, 0.0], q_max=[0.51, 3.0])
+        driver.run(2)
+        blob = driver.call("serializeFMUState", driver.call("getFMUState"))
+        runs.append(driver.run(4, start=2))
+        driver.call("reset")
+        driver.initialise()
+        driver.call("setFMUState", driver.call("deSerializeFMUstate", blob))
+        assert driver.run(4, start=2) == runs[-1]
+        driver.free()
+    assert np.array(runs[0]) == pytest.approx(np.array(runs[1]), abs=1e-9, rel=1e-9)
 
 
 def test_dense_output_is_of_third_order_and_velocities_begin_with_the_acceleration():
