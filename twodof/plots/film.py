@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from .figure import Drawing, draw_head, drawn
 from .panels import title
 from .runs import draw_view
 from .settings import number
-from .strokes import GREY, looks
+from .strokes import GREY, Style, looks
 from .track import Track, read_tracks
 from .words import common_settings, outcome
 from .workspace import views
@@ -32,7 +31,7 @@ from matplotlib.image import imsave
 
 SIZE, DOTS = (8.0, 4.5), 160  # inches, and pixels in one of them: 1280 × 720
 PALETTE = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"
-FILMS: dict[str, dict[str, Any]] = {
+FILMS: dict[str, Style] = {
     ".mp4": dict(
         fps=30, codec="libx264", output_params=["-crf", "23", "-preset", "veryfast", "-movflags", "+faststart"]
     ),

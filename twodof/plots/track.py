@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -259,7 +258,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
     axes = ["xyz".index(axis) for axis in linkage.axes]
     x, target = path[:, axes], bag.target
 
-    def vector(values: Mapping[str, Any], group: str) -> tuple[float, ...]:
+    def vector(values: Mapping[str, float | bool], group: str) -> tuple[float, ...]:
         return tuple(float(values[f"{group}[{i + 1}]"]) for i in range(len(axes)))
 
     with np.errstate(over="ignore", invalid="ignore"):

@@ -87,7 +87,7 @@ def _compiled(node: ast.expr, names: list[str], condition: bool = False) -> Call
     if isinstance(node, ast.Compare) != condition:
         raise ValueError
     parts: list[ast.expr] = []
-    kind: Any = None
+    kind: object = None
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         number = np.float64(node.value)  # type: ignore[arg-type]
         return lambda values: number
