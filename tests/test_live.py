@@ -526,7 +526,7 @@ def test_a_page_whose_server_ends_goes_on_with_the_next(
                 assert page.evaluate("arm.held('Kp')") == [100, 100]
                 names = page.locator("#arm-readout td:first-child").all_text_contents()
                 assert names[:2] == ["_slide", "swing"]
-                assert told(page) == ""
+                assert told(page) == "drag the ball: it is the target"
                 type_into(page, "Kd, 1/s", 20.0)
                 type_into(page, "x_des[1], m", 0.4)
                 type_into(page, "x_des[2], m", 0.1)
