@@ -27,7 +27,7 @@ from twodof.cli.main import VERBS
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-FENCES = {"sh", "python", "console", "text"}
+FENCES = {"math", "sh", "python", "console", "text"}
 MAX_README = 10 * 1024  # bytes
 SECONDS = 900  # by the clock: a guard against hanging
 
