@@ -96,6 +96,14 @@ def test_an_interrupt_does_not_disturb_what_another_one_ends(monkeypatch: pytest
         signals.interrupt(signal.SIGINT, None)
 
 
+def test_what_ends_a_run_on_request_takes_its_time() -> None:
+    with signals.asked_to_stop() as asked:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getitimer(signal.ITIMER_REAL)[0] > 0.0  # a step that hangs is interrupted
+        assert asked()
+        assert signal.getitimer(signal.ITIMER_REAL)[0] == 0.0
+
+
 LOOP = """
 import sys
 import twodof

@@ -44,7 +44,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Return whether a signal asked the run to end; read between steps, so that no step is cut.
 
     SIGINT, SIGTERM, and SIGHUP of a closed terminal. A second signal interrupts at once, and so does a
-    time-out where the first has no effect; further ones are ignored while the bag is closed.
+    time-out where the first is not read; further ones are ignored while the bag is closed.
     """
     asked = False
 
@@ -58,9 +58,14 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
         asked = True
         signal.setitimer(signal.ITIMER_REAL, STOP_TIMEOUT)
 
+    def is_asked() -> bool:
+        if asked:  # it has its effect: what ends the run may take its time
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        return asked
+
     before = {number: signal.signal(number, ask) for number in SIGNALS}
     try:
-        yield lambda: asked
+        yield is_asked
     except SimulationError as error:
         if asked:  # the Python flavour discards a step that is interrupted
             raise KeyboardInterrupt from error
