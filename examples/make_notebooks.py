@@ -110,7 +110,7 @@ The first line says whether the target was reached, and if not, why.""",
 print(reached.verdict)""",
     """too_far = twodof.run(fmu, twodof.Bag("too_far"), stop_time=3, settings={"x_des": (0.6, 0.2, 0.4), "Kp": 60})
 print(too_far.verdict)""",
-    "twodof.plot(twodof.read_bag('too_far'))",
+    'twodof.plot(twodof.read_bag("too_far"))',
 )
 MY_CONTROLLER = (
     """# My controller
@@ -173,11 +173,11 @@ table.sort_values("cost")[["Kp", "Kd", "cost", "settling_time", "overshoot", "pe
     """## The map
 
 A click on a run opens its curves. The map is drawn where this cell is run, and is not stored in the file.""",
-    "twodof.show('gains')",
+    'twodof.show("gains")',
     """## Between two gains
 
 Two runs in one figure: Kp = 80 with Kd = 5 and with Kd = 20. Critical damping is Kd² = 4 Kp.""",
-    "twodof.plot('gains/bags/000008', 'gains/bags/000010')",
+    'twodof.plot("gains/bags/000008", "gains/bags/000010")',
 )
 LINEAR_MODEL = (
     """# Linear model

@@ -189,7 +189,7 @@ def test_reprs_are_one_line(native_path: Path, tmp_path: Path) -> None:
     last = twodof.Sample(500, 5.0, (-0.5, 1.25), (0.0, -1e-5), (0.2, 0.05), (0.5, 0.25), {}, 0.0, 0)
     assert repr(last) == "<Sample 500 at 5 s: q=(-0.5, 1.25), v=(0, -1e-05), x=(0.2, 0.05), tau=(0.5, 0.25)>"
     long = (-1.2345e-05,) * 30
-    assert len(repr(last._replace(k=10**6, t=10000.25, q=long, v=long, x=long[:3], tau=long))) <= 160
+    assert len(repr(last._replace(k=10**6, t=10000.25, q=long, v=long, x=long[:3], tau=long))) <= 170
     assert repr(run) == f"<Experiment: {native_path.name} from 0 s to 0.05 s in steps of 0.01 s>"
     assert repr(bag) == f"<Recording '{tmp_path / 'bag'}': 6 samples in 0.05 s of joint1, joint2>"
 

@@ -131,7 +131,7 @@ def test_a_mesh_that_is_not_finite_is_not_drawn(number: float, caplog: pytest.Lo
         assert all(np.isfinite(shape.vertices).all() for shape in shapes)
 
 
-SMALL: ViewportSize = {"width": 450, "height": 280}
+SMALL: ViewportSize = {"width": 600, "height": 280}
 
 
 def test_a_replay_shows_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,8 +75,7 @@ def test_pages_are_shown_inline_without_a_network(native_path: Path, tmp_path: P
             page.set_content(f"<!DOCTYPE html><html><body>{html}</body></html>")
             page.frame_locator("iframe").locator(ready).wait_for(timeout=1e3 * browser.TIMEOUT)
             if html is shown[0]:
-                frame = page.frames[-1]
-                frame.wait_for_function("arm.k > 5", timeout=1e3 * browser.TIMEOUT)
+                browser.until(page, lambda k: k > 5, lambda page: page.frames[-1].evaluate("arm.k"))
         assert asked == ["about:srcdoc"] * len(asked)
 
 

@@ -308,7 +308,7 @@ def test_what_the_buttons_and_keys_do(page) -> None:
     assert page.evaluate("[arm.k, ...arm.held('Kp')]") == [0, 77, 77]
     press(page, "Defaults")
     assert page.evaluate("[arm.k, ...arm.held('Kp')]") == [0, 50, 50]
-    page.evaluate("arm.set('x_des', [0.25, 1.2])")
+    page.evaluate("arm.set('x_des', [0.25, 0.8])")
     until(page, lambda text: "target out of reach" in text, said)
     until(page, lambda count: count > 5, ball)  # which is followed
     page.evaluate("arm.set('x_des', [0.2, 0.05]); arm.set('q_max[1]', 0.5)")

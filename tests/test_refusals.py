@@ -183,7 +183,7 @@ BAD: dict[str, Case] = {
         "'a': its in",
     ),
     "inertia missing": (text("arm.urdf", urdf(link=re.sub("<inertia .*?/>", "", GOOD_LINK))), BUILD, "link 'a'"),
-    "q-start NaN": (nothing, ["build", "--q-start", "nan", "0"], "q_start .*nan.* finite"),
+    "q-start NaN": (nothing, ["build", "--q-start", "nan", "0"], "q_start.*nan.* finite"),
     "name that leaves the folder": (nothing, ["build", "--name", "../x"], "name '../x'"),
     "output below a file": (text("file", "x"), ["build", "-o", "file/x.fmu"], "cannot write 'file/x.fmu': Not a direc"),
     "output a folder": (nothing, ["build", "-o", "."], "cannot write '.'"),

@@ -351,9 +351,9 @@ def test_a_limit_that_is_touched_between_two_ends_of_a_step_stops_the_joint(max_
         start["v_start"] = [-a[0] * max_step * rng.uniform(0.1, 0.4), 0.02 / max_step]
         q = [Oracle(shipped(of, **start)).after(part * max_step)[:2] for part in np.arange(20) / 20]
         first, second = np.transpose(q)
-        low, high = [-3.0, -3.0], [3.0, second[19]]
+        low, high = [-3.0, -3.0], [3.0, float(second[19])]
         turn = (first.max if a[0] < 0.0 else first.min)()
-        (low if a[0] > 0.0 else high)[0] = first[0] + rng.uniform(0.1, 0.9) * (turn - first[0])
+        (low if a[0] > 0.0 else high)[0] = float(first[0] + rng.uniform(0.1, 0.9) * (turn - first[0]))
         plant = shipped(of, **start, q_min=low, q_max=high, rigid_stops=False, max_step=max_step)
         expected = Oracle(plant, max_step=max_step / 50).after(max_step)
         np.testing.assert_allclose(both(of, plant, 1, max_step), [expected] * 2, atol=1e-4, rtol=1e-4)

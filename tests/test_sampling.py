@@ -248,7 +248,7 @@ int main(void)
 def test_every_platform_has_the_same_noise_to_the_bit(machine, tmp_path):
     """Compiled with the flags of FMUs; run by qemu and wine."""
     (tmp_path / "main.c").write_text(NOISE)
-    sources, program = Path(twodof.__file__).parents[1] / "fmu_src/native", tmp_path / "noise.exe"
+    sources, program = Path(__file__).parents[1] / "fmu_src/native", tmp_path / "noise.exe"
     if machine == "ARM":
         emulator = [needs("qemu"), "-L", str(Path(needs("libc-arm64")).parents[1])]
         compiler = [*ZIG, *TARGETS["aarch64-linux"]]
