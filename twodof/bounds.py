@@ -12,6 +12,7 @@ MAX_FOLDERS_DEEP = 50  # folders in folders
 # FMUs
 MAX_DESCRIPTION = 8 * MIB  # some 50,000 variables
 MAX_ELEMENTS = 50_000  # of all arrays of FMI 3.0 and of their aliases together
+MAX_NAME = 1000  # characters of a variable's name
 MAX_DIMENSIONS = 16  # of an array of FMI 3.0; a matrix has 2
 MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB

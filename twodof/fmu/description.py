@@ -20,7 +20,7 @@ import fmpy
 import numpy as np
 from fmpy.model_description import ModelDescription, ModelVariable
 
-from ..bounds import MAX_DESCRIPTION, MAX_DIMENSIONS, MAX_ELEMENTS, MAX_RESOURCE
+from ..bounds import MAX_DESCRIPTION, MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
 from ..export.compiler import host_platform
 from ..export.start_values import groups_of, vector
@@ -288,18 +288,20 @@ def _is_plain_xml(xml: bytes) -> bool:
 
 
 def _check_arrays(root: ET.Element) -> None:
-    """Raise ValueError for arrays of FMI 3.0 of invalid sizes, or with too many elements, aliases counted."""
+    """Raise ValueError for long names, which elements repeat, invalid sizes, and too many elements, aliases counted."""
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
     room = MAX_ELEMENTS
     for variable in root.iterfind("ModelVariables/*"):
-        name, dimensions = variable.get("name"), variable.findall("Dimension")
+        names = [each.get("name", "") for each in (variable, *variable.iterfind("Alias"))]
+        if any(len(name) > MAX_NAME for name in names):
+            raise ValueError(f"a variable has a name of more than {MAX_NAME} characters: '{names[0][:40]}'…")
+        name, dimensions = names[0], variable.findall("Dimension")
         texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
         if len(texts) > MAX_DIMENSIONS:
             raise ValueError(f"variable '{name}' has more than {MAX_DIMENSIONS} dimensions")
         if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
             raise ValueError(f"variable '{name}' has a dimension of no known size")
-        elements, aliases = math.prod(max(1, int(text)) for text in texts), len(variable.findall("Alias"))
-        room -= elements * (1 + aliases) if dimensions else aliases
+        room -= math.prod(max(1, int(text)) for text in texts) * len(names) if dimensions else len(names) - 1
         if room < 0:
             raise ValueError(f"with variable '{name}' its arrays have more than {MAX_ELEMENTS} elements")
 
@@ -333,13 +335,11 @@ def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
 def _scalars(variable: ModelVariable) -> Iterator[Scalar]:
     """Return a scalar variable itself, or the elements of an array."""
     kind = {"Float64": "Real", "Int32": "Integer"}.get(variable.type, variable.type)
-    rest = (variable.causality, kind, variable.unit)
-    text = variable.description or ""
+    rest, text = (variable.causality, kind, variable.unit), variable.description or ""
     if not variable.dimensions:
         yield Scalar(variable.name, *rest, variable.start, text, variable.valueReference)
         return
-    starts: list[str | None] = list((variable.start or "").split())
-    starts = starts or [None]
+    starts: list[str | None] = [*(variable.start or "").split()] or [None]
     if kind == "Real" and len(starts) not in (1, prod(variable.shape)):
         raise FmuError(f"{variable.name} has {len(starts)} start values, not one or one an element")
     inner = re.fullmatch(r"der\((.*)\)", variable.name)
