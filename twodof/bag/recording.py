@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from ..simulation.setup import Setup, robot_of
 from ..simulation.setup import setup as setup_of
 from ..simulation.verdict import SHAPE, judged, verdict_in
 from ..simulation.verdict import Verdict as Verdict
-from .provenance import KNOWN_UNTIL, Provenance
+from .provenance import KNOWN_UNTIL, MAX_TAIL, Provenance
 from .records import Stamps
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ class Recording:
     def stored_verdict(self) -> Verdict | None:
         """Verdict of the run that made the bag; None where it was broken off, or samples are missing."""
         facts = self.provenance.get("verdict")
-        if facts is None or not fits(facts, SHAPE):
+        if facts is None or not fits(facts, SHAPE) or len(json.dumps(facts)) > MAX_TAIL:  # no writer stores more
             return None
         whole = facts["samples"] == self.count and abs(facts["duration"] - float(self.t[-1])) < TIME_TOLERANCE
         return verdict_in(facts) if whole else None
