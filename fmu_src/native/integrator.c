@@ -149,29 +149,18 @@ static int is_at_limit(const Step *step, int i)
     return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
 }
 
-/* The time within which a change back is chatter, and the longest hold, s: in neither does a joint move further
-   than the error test allows. */
-static void hold_times(const Step *step, double chatter_time, double *soon, double *longest)
-{
-    const double *value = step->plant->value;
-    *longest = chatter_time;
-    for (int i = 0; i < N_JOINTS; i++)
-        *longest = fmin(*longest, (value[ATOL] + value[RTOL] * fabs(step->y[i])) / fabs(step->y[N_JOINTS + i]));
-    *soon = fmin(SHORT_CHATTER_TIME * chatter_time, *longest);
-}
-
 /* Hold the joints that chatter at t; long holds cover all joints at limits. */
 static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *hold, double t,
-                        double soon, double longest, int anti_chatter[N_JOINTS])
+                        double joint_time, double chatter_time, int anti_chatter[N_JOINTS])
 {
     int any = 0;
     for (int i = 0; i < N_JOINTS; i++)
         any |= chattering[i];
     if (any)
-        hold_for_a_while(hold, t, soon, longest);
+        hold_for_a_while(hold, t, joint_time, chatter_time);
     else if (hold->until > t)
         return;
-    const int all = any && hold->length >= HOLD_OF_ALL * longest;
+    const int all = any && hold->length >= HOLD_OF_ALL * chatter_time;
     for (int i = 0; i < N_JOINTS; i++)
         anti_chatter[i] = all ? is_at_limit(step, i) : chattering[i];
 }
@@ -179,7 +168,8 @@ static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *
 int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N_JOINTS], Failure *failure)
 {
     const double chatter_time = CHATTER_TIME * fmin(plant->value[MAX_STEP], h);
-    const int rigid = plant->value[RIGID_STOPS] != 0.0;
+    const double short_time = SHORT_CHATTER_TIME * chatter_time;
+    const double joint_time = plant->value[RIGID_STOPS] != 0.0 ? chatter_time : short_time;
     double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
     double slipped[N_JOINTS]; /* when each began to slip */
     Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0}, stuck[N_JOINTS];
@@ -187,7 +177,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
     Event event = {{0}, {0}, {0}};
     int integrator = (int)plant->value[INTEGRATOR];
     Step step;
-    double t = 0.0, soon, longest;
+    double t = 0.0;
     step.plant = plant;
     step.evaluations = *evaluations;
     step.stops.rank = N_ROWS;
@@ -198,13 +188,11 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
         if (stopped_at)
             stopped_at[i] = HUGE_VAL;
     }
-    hold_times(&step, chatter_time, &soon, &longest);
     while (t < h) {
         const int before = step.stops.rank, rank_held = rank.until > t;
         double end = rank_held ? fmin(h, rank.until) : h;
         int again = 0;
-        hold_joints(&step, chattering, &joints, t, rigid ? chatter_time : soon, rigid ? chatter_time : longest,
-                    anti_chatter);
+        hold_joints(&step, chattering, &joints, t, joint_time, chatter_time, anti_chatter);
         if (joints.until > t)
             end = fmin(end, joints.until);
         for (int i = 0; i < N_JOINTS; i++) {
@@ -219,7 +207,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
             if (!step.stops.held[i] && step.stops.slip[i] && step.y[N_JOINTS + i] == 0.0)
                 slipped[i] = t;
             if (held_again && step.stops.held[i] == STUCK)
-                hold_for_a_while(&stuck[i], t, soon, longest);
+                hold_for_a_while(&stuck[i], t, short_time, chatter_time);
             chattering[i] = held_again && step.stops.held[i] != STUCK;
             again |= held_again;
         }
@@ -228,16 +216,15 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
             continue;
         if (step.stops.rank > before)
             risen = t;
-        if (step.stops.rank < before && t - risen < soon) {
-            hold_for_a_while(&rank, t, soon, longest);
+        if (step.stops.rank < before && t - risen < short_time) {
+            hold_for_a_while(&rank, t, short_time, chatter_time);
             continue;
         }
         t = until_event(&step, t, end, rank_held, &integrator, &event, failure);
-        hold_times(&step, chatter_time, &soon, &longest);
         for (int i = 0; i < N_JOINTS; i++) {
-            chattering[i] = event.stopped[i] && t - left[i] < (rigid ? chatter_time : soon);
-            if (event.arrested[i] && t - slipped[i] < FIRST_HOLD * longest)
-                hold_for_a_while(&stuck[i], t, soon, longest);
+            chattering[i] = event.stopped[i] && t - left[i] < joint_time;
+            if (event.arrested[i] && t - slipped[i] < FIRST_HOLD * chatter_time)
+                hold_for_a_while(&stuck[i], t, short_time, chatter_time);
             if (stopped_at && event.stopped[i])
                 stopped_at[i] = fmin(stopped_at[i], t);
         }
