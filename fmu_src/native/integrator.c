@@ -25,7 +25,7 @@ static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
    soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
    never held, because its J⁺ is unbounded. A joint whose friction holds it again at the instant in which it was
    released, or that stops sooner than FIRST_HOLD after it, is held likewise, for a time of its own: there
-   rounding decides. All but joints at rigid stops are held no longer than the error test allows for their speeds. */
+   rounding decides. */
 static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 16777216.0, HOLD_GROWTH = 8.0,
                     HOLD_OF_ALL = 1.0 / 512.0;
 /* Part of CHATTER_TIME that replaces it for the rank, and for joints whose stops have no reaction: near a

@@ -11,8 +11,7 @@ other's limits, would release and stop joints without end. The rank of J⁺ is h
 rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded. Rank, and stops
 without reaction, use a SHORT_CHATTER_TIME: near a singularity ordinary gains whip joints within microseconds. So do
 joints, each for itself, that their friction holds again at the instant of their release, or that stop within FIRST_HOLD
-of it: there rounding decides. All but joints at rigid stops are held no longer than the error test allows for their
-speeds."""
+of it: there rounding decides."""
 
 
 @dataclass

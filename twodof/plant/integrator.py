@@ -104,16 +104,6 @@ class _Motion:
         self.margins.append(margin)
         return y[self.n :] + a
 
-    def hold_times(self, y: State, chatter_time: float) -> tuple[float, float]:
-        """Return the time within which a change back is chatter, and the longest hold, s.
-
-        In neither does a joint move further than the error test allows.
-        """
-        q, v = y[: self.n], y[self.n :]
-        still = ((self.atol + self.rtol * abs(x)) / abs(rate) for x, rate in zip(q, v) if rate)
-        longest = min([chatter_time, *still])
-        return min(SHORT_CHATTER_TIME * chatter_time, longest), longest
-
     def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
         """Integrate from t until an event or the end; return the time, the state and the event.
 
@@ -300,15 +290,16 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     """Return the state after h, integrated from event to event."""
     n, stops, t = motion.n, motion.stops, 0.0
     chatter_time = CHATTER_TIME * min(motion.max_step, h)
-    soon, longest = motion.hold_times(y, chatter_time)
+    short_time = SHORT_CHATTER_TIME * chatter_time
+    joint_time = chatter_time if stops.rigid else short_time
     joint_hold, rank_hold, stuck = Hold(), Hold(), [Hold() for _ in range(n)]
     left, slipped, risen = [-inf] * n, [-inf] * n, -inf  # when joints left limits or began to slip, the rank rose
     event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):
-            joint_hold.again(t, *((chatter_time, chatter_time) if stops.rigid else (soon, longest)))
+            joint_hold.again(t, joint_time, chatter_time)
             anti_chatter = chattering
-            if joint_hold.length >= HOLD_OF_ALL * (chatter_time if stops.rigid else longest):
+            if joint_hold.length >= HOLD_OF_ALL * chatter_time:
                 anti_chatter = stops.at_limits(y)
         elif joint_hold.until <= t:
             anti_chatter = [False] * n
@@ -325,22 +316,21 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
         held_again = [i for i in event.released if i in stops.watched]  # by rounding
         for i in held_again:
             if stops.rest[i] == STUCK:
-                stuck[i].again(t, soon, longest)
+                stuck[i].again(t, short_time, chatter_time)
         chattering = [i in held_again and stops.rest[i] != STUCK for i in range(n)]
         event = events.Event()
         if held_again:
             continue
         if motion.rank > rank:
             risen = t
-        if motion.rank < rank and t - risen < soon:
-            rank_hold.again(t, soon, longest)
+        if motion.rank < rank and t - risen < short_time:
+            rank_hold.again(t, short_time, chatter_time)
             continue
         t, y, event = motion.until_event(y, rates, t, min(end, h))
-        soon, longest = motion.hold_times(y, chatter_time)
-        chattering = [i in event.stopped and t - left[i] < (chatter_time if stops.rigid else soon) for i in range(n)]
+        chattering = [i in event.stopped and t - left[i] < joint_time for i in range(n)]
         for i in event.arrested:
-            if t - slipped[i] < FIRST_HOLD * longest:
-                stuck[i].again(t, soon, longest)
+            if t - slipped[i] < FIRST_HOLD * chatter_time:
+                stuck[i].again(t, short_time, chatter_time)
     if joint_hold.until <= h:
         anti_chatter = [False] * n
     stops.impact(y, anti_chatter)
