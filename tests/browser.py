@@ -162,13 +162,16 @@ class Served:
 
 @contextmanager
 def served(*arguments: str | Path, cwd: Path, port: int = 0) -> Iterator[Served]:
-    """A command that is killed at the end, if it still runs."""
+    """A command that is asked to end, if it still runs, and so removes its temporary folder."""
     command = Served(*arguments, cwd=cwd, port=port)
     try:
         yield command
     finally:
-        command.process.kill()
-        command.process.communicate()
+        try:
+            command.process.terminate()
+            command.process.communicate(timeout=TIMEOUT)
+        finally:
+            command.process.kill()
 
 
 def socket_of(url: str) -> str:

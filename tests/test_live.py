@@ -76,12 +76,13 @@ def arm(shown: Browser, command: Served) -> Iterator[Page]:
 
 @pytest.fixture
 def page(arm: Page) -> Page:
-    """A page whose arm is at its start, paused, with the inputs of the FMU."""
+    """A page whose arm is at its start, paused, with the inputs of the FMU, and seen as at first."""
     if arm.evaluate("arm.playing"):
         pause(arm)
     begin_anew(arm, "Defaults")
     until(arm, bool, lambda arm: arm.evaluate(AS_AT_FIRST))
     assert at_rest(arm)["time"] == "0.000 s"
+    press(arm, "View")
     return arm
 
 
@@ -145,6 +146,9 @@ def assert_follows(
 
 def test_target_is_dragged_and_followed_as_the_closed_form_says(page: Page) -> None:
     """Under gains of the sliders; time is kept, and the curves' samples are what is shown."""
+    page.reload()  # the scene as at first: a test before may have turned or enlarged it
+    page.wait_for_selector(browser.READY)
+    press(page, "View")
     (x, y), start = target_place(page), (0.2, 0.05)
     page.mouse.move(x, y)
     page.mouse.down()
