@@ -144,12 +144,13 @@ def assert_follows(
     assert x == pytest.approx(oracles.position(q), abs=2 * ROUNDED)
 
 
-def test_target_is_dragged_and_followed_as_the_closed_form_says(page: Page) -> None:
+def test_target_is_dragged_and_followed_as_the_closed_form_says(command: Served, page: Page) -> None:
     """Under gains of the sliders; time is kept, and the curves' samples are what is shown."""
-    page.reload()  # the scene as at first: a test before may have turned or enlarged it
-    page.wait_for_selector(browser.READY)
-    press(page, "View")
+    noted = page.evaluate("arm.noted")
+    latest(command, lambda news: news["noted"] == noted + 1, ["change", {browser.HOSTILE: 0}])
+    until(page, lambda text: "there is no variable" in text, told)  # a message that covers the ball
     (x, y), start = target_place(page), (0.2, 0.05)
+    y -= 10  # pixels: in the message, and on the ball's upper edge
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x - 60, y + 30, steps=5)
