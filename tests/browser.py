@@ -31,7 +31,7 @@ LINKS = (
     lambda r, g, b: (r < 110) & (g < 120) & (b < 130) & (b >= r),
     lambda r, g, b: (r > 190) & (g > 110) & (g < 180) & (b < 100),
 )
-"""What colours the default arm's two links have."""
+"""Colours of the default arm's two links."""
 TIMEOUT = 120.0  # s: a guard against hanging; a busy machine takes its time
 VIEWPORT: ViewportSize = {"width": 900, "height": 560}
 ARGUMENTS = (
@@ -49,7 +49,7 @@ HOSTILE = (
     "<iframe srcdoc=\"<script>parent.document.title='ran'</script>\"></iframe>"
     "[link](javascript:document.title='ran') &lt;"
 )
-"""What a page must show as it is."""
+"""Text that a page must show as it is."""
 COMMAND = [sys.executable, "-m", "twodof"]
 READY = "#arm-scene[data-ready]"
 ROWS = """() => ({
@@ -73,7 +73,7 @@ AT_REST = """async () => {
     for (let i = 0; i < 3; i++) await new Promise(requestAnimationFrame);
     return !arm.playing && asked() && arm.run === run && arm.count === count;
 }"""
-"""Whether the arm stands still for longer than a step, news of it and a picture of the numbers
+"""Script that tells whether the arm stands still for longer than a step, news of it and a picture of the numbers
 take, so that these are shown as they are now."""
 NOTES = ".arm .bar, .arm .message { visibility: hidden }"
 LATENCY = """([label, text, row]) => new Promise(resolve => {

@@ -160,7 +160,7 @@ class Recorded:
         def __getattr__(self, name: str) -> Any: ...
 
     def functions(self):
-        """Of FMI 2.0."""
+        """Return the callbacks of FMI 2.0."""
         self.messages = []
         return fmi2.fmi2CallbackFunctions(
             logger=fmi2.fmi2CallbackLoggerTYPE(lambda _, name, status, category, text: self.keep(status, text)),

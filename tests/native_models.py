@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[1]
 HERE = Path(__file__).parent / "native"
 GUID = "0123456789abcdef"
 SCRATCH = run_folder() / "native"
-"""What is compiled, for all processes of a run of the tests."""
+"""Folder of compiled programs, for all processes of a run of the tests."""
 
 
 def robots_folder() -> Path:

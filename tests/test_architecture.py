@@ -180,6 +180,9 @@ def test_a_docstring_begins_with_a_verb_or_is_a_noun_phrase() -> None:
     texts = [(ROOT / folder).rglob("*.py") for folder in ("docs", "benchmarks")]
     scripts = {path.relative_to(ROOT): ast.parse(path.read_text("utf-8")) for paths in texts for path in paths}
     found = [f"{path}: {line}" for path, tree in (PYTHON | scripts).items() for line in fragments(tree)]
+    for path in (ROOT / "tests").glob("*.py"):
+        lines = re.findall(r'^ *"""(\w+)[^\n]*', path.read_text("utf-8"), re.MULTILINE)
+        found += [f"{path.name}: a docstring begins with {word}" for word in lines if word in RIDDLES]
     assert not found, "\n".join(found)
 
 

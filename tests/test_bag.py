@@ -148,7 +148,7 @@ def test_start_of_the_stamps_is_exact(native_path: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("start", [-1.0, 2.0**31 - 3, float("nan"), float("inf")])
 def test_stamp_out_of_the_range_of_ros_is_refused(native_path: Path, start: float) -> None:
-    """That of the last sample too."""
+    """The last sample's too."""
     with pytest.raises(InputError, match="stamp"):
         twodof.experiment(native_path, stop_time=5.0, stamp_start=start)
 
@@ -341,7 +341,7 @@ def test_targets_are_known_where_they_are_in_one_frame(tmp_path: Path, frames: S
 
 
 def joint_states_of_another_writer(rng: np.random.Generator) -> Iterator[tuple[int, bytes]]:
-    """Of three joints, in frames of any length, with stamps in any order, either byte order, and
+    """Make messages of three joints, in frames of any length, with stamps in any order, either byte order, and
     anything in the gaps that CDR leaves: for these, the bytes that two serialisations differ in."""
     for k in rng.permutation(60).tolist():
         frame, names = "x" * (k // 10), ["a", "joint2", "ö"]

@@ -91,7 +91,7 @@ def test_mujoco_has_the_same_controller(benchmarks: SimpleNamespace, mujoco: Muj
 
 
 def test_mujoco_is_measured_without_its_python_package() -> None:
-    """That has the library ask for the time, at more than the cost of a step."""
+    """It makes the library ask for the time, at more than the cost of a step."""
     code = "import sys, engine; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True)
 

@@ -94,7 +94,7 @@ def test_whatever_the_axes_the_dynamics_are_pinocchios(seed):
 
 
 def test_frames_and_bodies_leave_few_constants():
-    """What rounding in a URDF (1.57079632679) makes of a right angle does not fill all of them."""
+    """A right angle that a URDF rounds (1.57079632679) does not fill all of them."""
     constants = joint_tree(model("panda").robot)
     end_body = constants.path[-1]
     for i, body in enumerate(constants.body):

@@ -72,7 +72,7 @@ def test_responses_are_exact_to_rounding(gains: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("gains", GAINS.values(), ids=list(GAINS))
 def test_responses_are_the_matrix_exponential(gains: tuple[float, float]) -> None:
-    """Of ẋ = v, v̇ = −Kp x − Kd v + a, ȧ = 0, over ten seconds."""
+    """The system is ẋ = v, v̇ = −Kp x − Kd v + a, ȧ = 0, over ten seconds."""
     Kp, Kd = gains
     t = np.linspace(0.0, 10.0, 21)
     phi, psi, gamma, psi_rate = responses(t, Kp, Kd)

@@ -75,8 +75,11 @@ def at_random(engine, rng, **settings):
 
 
 def derivatives(reduced: Reduced, q, v, effort):
-    """Of q̈ by q, v and τ: Pinocchio's of the forward dynamics, or where joints follow others those
-    of the inverse dynamics, in the coordinates of the joints that move on their own."""
+    """Return the derivatives of q̈ by q, v and τ.
+
+    They are Pinocchio's of the forward dynamics, or where joints follow others those of the inverse dynamics, in the
+    coordinates of the joints that move on their own.
+    """
     model, data, G = reduced.model, reduced.data, reduced.G
     if model.nv == len(q):
         by_q, by_v, by_tau = pin.computeABADerivatives(model, data, q, v, effort)

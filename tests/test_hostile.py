@@ -167,7 +167,7 @@ def test_hostile_fmu_is_refused(hostile_fmu: tuple[Callable[[], bytes], str], ja
     jail.run("run", path, "-o", jail.target / "bag", "--scene")
 
 
-def arrays(*dimensions: str, step: str = "0.01", aliases: int = 0, name: str = "q") -> str:
+def arrays(*dimensions: str, step: str = "0.01", aliases: int = 0, name: str = "q", more: str = "") -> str:
     """The modelDescription.xml of an FMU of FMI 3.0 whose output has these dimensions and so many other names."""
     output = ' causality="output" variability="continuous"'
     inside = "".join(f"<Dimension {dimension}/>" for dimension in dimensions)
@@ -179,7 +179,7 @@ def arrays(*dimensions: str, step: str = "0.01", aliases: int = 0, name: str = "
         '<UInt64 name="n" valueReference="9" causality="structuralParameter" variability="fixed"'
         f' start="1000000000"/><Float64 name="{name}" valueReference="1"{output}>{inside}</Float64>'
         f'<Float64 name="v" valueReference="2"{output}><Dimension start="2"/></Float64>'
-        "</ModelVariables><ModelStructure/></fmiModelDescription>"
+        f"{more}</ModelVariables><ModelStructure/></fmiModelDescription>"
     )
 
 
@@ -196,6 +196,7 @@ ARRAYS = {
     "40,000 names": (arrays('start="40000"', aliases=40_000), TOO_MANY),
     "300,000 names of a scalar": (arrays(aliases=300_000), TOO_MANY),
     "a name of 100,000 characters": (arrays('start="49000"', name="A" * 100_000), "name of more than 1000 characters"),
+    "100,000 variables without a name": (arrays(more="<Float64/>" * 100_000), "'name' is required"),
     "as many as there may be": (arrays('start="49998"'), "names|to log|cannot be loaded"),
     "a step of 1e-300 s": (arrays('start="2"', step="1e-300"), "at least 1e-06 s"),
 }

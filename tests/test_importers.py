@@ -126,7 +126,7 @@ SMALLEST_ARE_0 = """
 #include <xmmintrin.h>
 __attribute__((constructor)) static void begin(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }
 """
-"""What any library does that was linked with -ffast-math by a gcc before 13."""
+"""A library does this that was linked with -ffast-math by a gcc before 13."""
 
 
 @pytest.mark.parametrize("flavour", ["native", "python"])

@@ -219,7 +219,7 @@ ROWS = [
     (0.5, {"x_des[1]": 0.0, "Kp[2]": 0.0}),  # after the end: never
 ]
 SET_AT = {0: 0, 3: 1, 5: 2, 7: 4}
-"""Which of the rows a user would set by hand at which communication point."""
+"""Rows that a user would set by hand, by communication point."""
 N = 12
 
 

@@ -511,7 +511,7 @@ def test_seven_joints_without_a_mesh_to_a_pose(shown: Browser, panda: str, tmp_p
 def test_a_page_whose_server_ends_goes_on_with_the_next(
     shown: Browser, native_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Which steps another robot, whose joints have units of their own.
+    """The next server steps another robot, whose joints have units of their own.
 
     At rest J⁻ᵀ τ_ext is balanced by Kp: M (J⁻¹ Kp e) = τ_ext, with the textbook's M.
     """

@@ -204,7 +204,7 @@ def test_a_discarded_step_is_gone_on_from_at_rest(native_path):
 
 
 def test_what_a_run_goes_on_with_holds_since_then(native_path, monkeypatch):
-    """Where nothing was set before the step that is discarded."""
+    """Nothing was set before the step that is discarded."""
     fmu = twodof.load_fmu(native_path)
     broken: list[float] = []
     with instantiate(fmu) as instance:
@@ -351,7 +351,7 @@ def test_memory_is_flat_over_many_logged_steps(fmu_path, tmp_path):
     ids=["simulate", "urdf", "page", "sweep"],
 )
 def test_what_was_read_of_an_fmu_is_not_said_of_another(tmp_path, native_path, monkeypatch, use):
-    """That of two robots whose URDFs have one name, or one that is built anew meanwhile."""
+    """Two robots' URDFs have one name, or one is built anew meanwhile."""
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "arm.fmu"
     path.write_bytes(native_path.read_bytes())

@@ -101,6 +101,19 @@ def test_few_meshes_may_end_their_reader(caplog: pytest.LogCaptureFixture) -> No
     assert sum("others end their reader" in text for text in texts) == 50 - MAX_FATAL_MESHES
 
 
+def test_time_of_a_robots_meshes_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """Each of them takes less than one mesh may; a fresh reader has what the ones before it left."""
+    monkeypatch.setattr(meshes_module, "MAX_MESHES_SECONDS", 3)
+    names = [f"{i}.dae" for i in range(24)]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with Meshes(dict.fromkeys(names, doubling(11)).get) as meshes:
+        drawn = [len(meshes.scaled(name, ONE)) for name in names]
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert drawn[0] == 2**11 and drawn[-1] == 0
+    assert "have taken more than 3 s" in caplog.text
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 6
+
+
 def test_triangles_of_a_robot_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
     """A page of them would take gigabytes, whether of one file or of many uses of one."""
     many = MAX_TRIANGLES // 4
@@ -177,7 +190,7 @@ class forging:  # noqa: N801
     def __init__(self, answers: list[bytes]) -> None:
         self.answers = answers
 
-    def __call__(self, pipe: Connection, kind: str, folder: Path) -> None:
+    def __call__(self, pipe: Connection, kind: str, folder: Path, seconds: int) -> None:
         pipe.recv()
         for answer in self.answers:
             pipe.send_bytes(answer)

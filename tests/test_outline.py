@@ -71,7 +71,7 @@ def test_what_is_told_of_a_long_bag_is_told_of_all_its_samples(bag: Path) -> Non
 
 
 def test_a_target_on_a_topic_is_that_of_its_time(bag: Path, tmp_path: Path) -> None:
-    """Of a bag without provenance; repeated points are not kept."""
+    """The bag has no provenance; repeated points are not kept."""
     (bag / "run.json").rename(tmp_path / "run.json")
     try:
         whole, few = read_bag(bag), read_downsampled(bag, MOST, lambda part: [*part.target.T])

@@ -51,7 +51,7 @@ ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "fmu_src" / "page"
 
 Script = dict[int, dict[str, Any]]
-"""What is set before steps by number."""
+"""Settings before steps, by number."""
 
 
 @pytest.fixture(scope="module")

@@ -358,8 +358,7 @@ def test_speeds_beyond_all_bounds_are_told_by_the_exception_alone(gain: float) -
     ],
 )
 def test_a_matrix_without_an_inverse_discards_the_step(control, settings):
-    """Of the Panda, whose fingers are coupled; an exception of another kind ends the process of a
-    Python FMU."""
+    """The Panda's fingers are coupled; an exception of another kind ends the process of a Python FMU."""
     plant = model("panda", control).plant()
     vars(plant).update(settings)
     before = plant.q, plant.v

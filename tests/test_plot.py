@@ -179,7 +179,7 @@ def test_efforts_of_a_bare_plant_are_known_without_being_in_the_bag(tmp_path: Pa
 
 
 def test_targets_of_joints_are_dashed_lines(tmp_path: Path) -> None:
-    """Of each bag its own, in view, told, and legible beside limits and efforts; on a page too."""
+    """Each bag has its own, in view, told, and legible beside limits and efforts; on a page too."""
     fmu = build(tmp_path, chain_urdf("zz", low=-1.5), control="joint")
     (tmp_path / "in.csv").write_text("time,q_des[1],q_des[2]\n0,0.8,1\n0.2,1.2,-0.1\n")
     bags = [tmp_path / "one", tmp_path / "two"]
@@ -218,7 +218,7 @@ def test_stretches_in_which_friction_holds_a_joint_are_marked(tmp_path: Path) ->
 
 
 def test_targets_of_many_joints_are_legible(tmp_path: Path) -> None:
-    """Beside limits that are long to tell, and efforts; where they are is told once."""
+    """They stand beside limits with long names, and efforts; their place is named once."""
     fmu = build(tmp_path, chain_urdf("zyx" * 4, 0.1, low=-1.234, high=2.345), control="joint")
     bag, target = twodof.Bag(tmp_path / "bag", effort=True), {"q_des": 0.1}
     twodof.simulate(fmu, bag, stop_time=0.05, settings=target)

@@ -314,7 +314,7 @@ def test_a_urdf_that_is_wrong_is_named(
 
 @pytest.mark.filterwarnings("error")
 def test_a_joint_at_infinity_is_nowhere(tmp_path: Path) -> None:
-    """Whether it turns, slides or is followed: a gap in the path and on the replay, no warning."""
+    """It turns, slides or is followed: a gap in the path and on the replay, no warning."""
     (tmp_path / "arm.urdf").write_text(chain_urdf("zXy"))
     t, q, v = waves(3)
     q[3:6] = np.diag([np.inf, -np.inf, np.inf])

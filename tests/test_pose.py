@@ -317,7 +317,7 @@ time.sleep(60)
 def test_a_pose_on_the_network_is_the_target(
     fmus, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of four that come, one is in another frame, one has no orientation, one is not finite."""
+    """Four come: one is in another frame, one has no orientation, one is not finite."""
     from twodof.ros.publisher import Publisher
 
     monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))

@@ -79,7 +79,7 @@ def by_a_thinned_loop(fmu: Path, bag: Path, samples: Collector) -> None:
 
 
 def by_the_page(fmu: Path, bag: Path, samples: Collector) -> None:
-    """What the page's controls send, one order after some news; the recording begins midway."""
+    """Send what the page's controls do, one order after some news; the recording begins midway."""
     run = twodof.experiment(fmu, stop_time=math.inf)
     loop = Loop(run, bag=str(bag))
     loop.viewers = 1
@@ -218,7 +218,7 @@ def _renamed_root(urdf: Path) -> Path:
 
 
 def test_what_is_not_known_is_not_shown(native_path: Path, tmp_path: Path) -> None:
-    """Where the file of the changes was full, no distance is told from its end on."""
+    """The file of the changes was full: no distance is shown after its end."""
     bag = tmp_path / "bag"
     by_sending(native_path, bag, Collector())
     text = (bag / "run.json").read_text().strip()

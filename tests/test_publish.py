@@ -35,7 +35,7 @@ HASHES = {
     "tf2_msgs TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     "geometry_msgs PointStamped": ("4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"),
 }
-"""Of types, as 'ros2 topic info --verbose' tells them."""
+"""Hashes of types, as 'ros2 topic info --verbose' shows them."""
 TYPES = dict(
     joint_states="sensor_msgs JointState",
     robot_description="std_msgs String",

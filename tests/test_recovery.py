@@ -81,7 +81,7 @@ def streamed(file: Path) -> int:
 def test_killed_run_loses_a_second_at_most(
     native_path: Path, tmp_path: Path, storage: str, length: Callable[[int, int], int]
 ) -> None:
-    """Of the time in which it ran."""
+    """The bag has the time in which the run was recorded."""
     options = ["--stamp-start", str(START), "--storage", storage]
     undisturbed = tmp_path / "undisturbed"
     assert main(["run", str(native_path), "-o", str(undisturbed), "--stop-time=60", *options]) == 0
@@ -307,7 +307,7 @@ def test_mcap_of_another_writer_keeps_types_definitions_and_qos(tmp_path: Path, 
 
 
 def test_no_more_profiles_are_read_than_take_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of topics that have each its own; YAML is slow."""
+    """Each topic has a profile of its own; YAML is slow."""
     (tmp_path / "bag").mkdir()
     profiles = ["- {depth: [" + "1," * 300 + f"]}}#{i:02}" for i in range(50)]
     channels = [channel(i, f"/t{i}", qos) for i, qos in enumerate(profiles)]

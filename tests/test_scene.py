@@ -473,7 +473,7 @@ UP = "../" * 40  # from a temporary folder to the root
 
 
 def test_mesh_whose_geometry_is_in_another_file_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """What a page shows, and a file made of it, would have the secret's bytes as vertices."""
+    """A page, or a file made of it, would have the secret's bytes as vertices."""
     (tmp_path / "secret").write_bytes(struct.pack("<9f", *range(9)))
     content = {
         "asset": {"version": "2.0"},

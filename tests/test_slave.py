@@ -89,7 +89,7 @@ def test_different_fmus_run_one_after_the_other_and_interleaved(fmu_path, ur5_fm
 
 @in_child_process
 def test_an_fmu_runs_the_code_inside_its_own_zip(fmu_path, tmp_path):
-    """Beside a patched checkout, and beside another FMU whose code differs."""
+    """A patched checkout and another FMU whose code differs are in the same process."""
     sys.modules["twodof.plant.plant"].Plant.step = None
     other = changed_plant(fmu_path, tmp_path, "Plant.x = property(lambda self: [42.0, 42.0])\n")
     driver, changed = Driver(fmu_path).initialise(), Driver(other).initialise()

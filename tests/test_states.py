@@ -71,7 +71,7 @@ PARAMETERS = (
     "v_noise",
     *BOOLEANS,
 )
-"""Of all controls; an FMU has those of its own."""
+"""Groups of all controls; an FMU has those of its own."""
 TARGETS = {"task": "x_des", "pose": "x_des", "joint": "q_des", "effort": "tau_cmd"}
 
 
@@ -674,7 +674,7 @@ CONTAINED = (
     "refused damage",
     "refused fail_to_start",
 )
-"""What one program in fifty contains at least; most are in every second to fourth."""
+"""Calls that one program in fifty contains at least; most are in every second to fourth."""
 
 
 def features(arm, program, values):

@@ -110,7 +110,7 @@ def test_joints_that_are_not_stiff_move_as_by_dormand_prince_to_the_bit(damping)
 
 
 def test_the_error_falls_with_the_third_power_of_the_step(pendulum):
-    """Of a stiff finger on a swing, at a tolerance that accepts all steps."""
+    """A stiff finger is on a swing; the tolerance accepts all steps."""
     errors = []
     changes = {"damping": [0.0, 0.05], "q_start": [0.3, 0.2], "v_start": [1.0, 0.0], "gravity": [0.0, 0.0, -9.81]}
     reference = both(pendulum, started(pendulum, DORMAND_PRINCE, **changes, rtol=1e-11, atol=1e-13), 1, 0.2)
@@ -191,7 +191,7 @@ def test_a_restored_fmu_goes_on_to_the_bit_in_both_flavours(damping, fmu_path, n
 
 
 def test_dense_output_is_of_third_order_and_velocities_begin_with_the_acceleration():
-    """Of an oscillator with damping, from rest, whose solution SciPy has."""
+    """The system is an oscillator with damping, from rest, whose solution SciPy has."""
 
     def rates(y):
         return [y[1], -40.0 * y[0] - 3.0 * y[1]]

@@ -212,7 +212,7 @@ def test_ends_of_another_writer_in_any_order(tmp_path: Path, name: str) -> None:
 
 
 def test_messages_that_come_in_turns_or_not_keep_their_order(tmp_path: Path) -> None:
-    """Of three channels and few lengths at random, with runs of turns among them."""
+    """The messages have three channels and few lengths at random, with runs of turns among them."""
     chance, file = random.Random(5), tmp_path / "x.mcap"
     parts = [
         [(chance.randrange(3), chance.choice((4, 8, 9))) for _ in range(chance.randrange(1, 7))]

@@ -166,7 +166,7 @@ POINT = """run => {
     const box = div.getBoundingClientRect();
     return [box.x + xaxis._offset + xaxis.d2p(x[run]), box.y + yaxis._offset + yaxis.d2p(y[run])];
 }"""
-"""Where a run is in the first map, in the window."""
+"""Place of a run in the first map, in pixels of the window."""
 
 
 @pytest.mark.parametrize("width", [1200, 390])

@@ -128,7 +128,7 @@ def test_the_robot_does_exactly_what_is_held(arm: Path, tmp_path: Path) -> None:
     path = spline([0.0, 1.0, 1.5], [THERE, BACK, THERE])
 
     def mean(nu: int, k: int) -> Any:
-        """Of a derivative, over a step."""
+        """Return the mean of a derivative over a step."""
         if k >= 150:
             return np.array(THERE[nu])
         whole = (path.derivative(nu) if nu else path).antiderivative()
@@ -215,7 +215,7 @@ def test_it_begins_where_the_run_does(arm: Path, tmp_path: Path) -> None:
 
 
 def test_joints_of_another_robot_are_left_out(arm: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of a trajectory, and of a joint state."""
+    """Both a trajectory and a joint state may name them."""
     names, none = ["finger", "joint2", "elbow"], np.zeros(0)
     message = trajectory([(1.0, (0.1, 0.2, 0.3), (0.0, 0.5, 1.0))], names)
     state = HUMBLE.types[JOINT_STATE](message.header, names, np.array([0.1, 0.2, 0.3]), none, none)

@@ -132,7 +132,7 @@ def test_inertias_that_no_body_has_are_named_in_one_line() -> None:
 def test_a_urdf_is_run_by_one_command(
     robots: Path, panda_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of one end, which is controlled; what one needs to say of others, `build` takes."""
+    """They have one end, which is controlled; for others `build` takes what one needs to say."""
     monkeypatch.chdir(tmp_path)
     xarm = robots / "xarm_description/urdf/xarm7.urdf"
     assert main(["run", str(xarm), "-o", "bag", "--stop-time", "0.1"]) == 0

@@ -225,7 +225,7 @@ MARK = """(canvas) => {
     }
     return [dark.reduce((sum, x) => sum + x, 0) / dark.length, width - 58 - 8];
 }"""
-"""Where in a canvas a dark line goes from top to bottom, and how wide its axes are, pixels."""
+"""Places of a dark line in a canvas that goes from top to bottom, and the width of its axes, pixels."""
 
 
 @given(st.lists(st.floats(-1, 5), min_size=1, max_size=50))

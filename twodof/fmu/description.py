@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import codecs
 import io
-import math
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,13 +18,14 @@ import fmpy
 import numpy as np
 from fmpy.model_description import ModelDescription, ModelVariable
 
-from ..bounds import MAX_DESCRIPTION, MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME, MAX_RESOURCE
+from ..bounds import MAX_DESCRIPTION, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
 from ..export.compiler import host_platform
 from ..export.start_values import groups_of, vector
 from ..files import UnsafeArchiveError, check_archive, read_member, shown
 from ..notebook import card, picture
 from ..plant.urdf import RobotError, read_urdf
+from .validation import check_description, is_plain_xml
 
 NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": ("true", "1").__contains__}
 """Types of variables that have values here, and how their texts are read."""
@@ -179,7 +178,7 @@ def load_fmu(path: str | Path) -> Fmu:
         root = ET.fromstring(xml)
         if "fmiVersion" not in root.attrib:
             raise ValueError("it states no fmiVersion")
-        _check_arrays(root)
+        check_description(root, xml)
         alone = io.BytesIO()  # FMPy reads sources/buildDescription.xml too, whatever its size
         with zipfile.ZipFile(alone, "w") as archive:
             archive.writestr("modelDescription.xml", xml)
@@ -272,38 +271,9 @@ def _read(path: Path) -> tuple[bytes, dict[str, int]]:
         other = kind_of(path) not in ("", "FMU")
         why = f"'{path}' is no FMU: it is not a sound zip archive ({error})"
         raise FmuError(no_such("FMU", path) if other else why) from error
-    if not _is_plain_xml(xml):
+    if not is_plain_xml(xml):
         raise FmuError(f"'{path}': modelDescription.xml declares entities or is not UTF-8")
     return xml, _checksums(archive)
-
-
-def _is_plain_xml(xml: bytes) -> bool:
-    """Return whether XML declares no entities, in an encoding with an ASCII declaration."""
-    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
-    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
-    encoding = declared[1].lower() if declared else b"utf-8"
-    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
-    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
-    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
-
-
-def _check_arrays(root: ET.Element) -> None:
-    """Raise ValueError for long names, which elements repeat, invalid sizes, and too many elements, aliases counted."""
-    sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
-    room = MAX_ELEMENTS
-    for variable in root.iterfind("ModelVariables/*"):
-        names = [each.get("name", "") for each in (variable, *variable.iterfind("Alias"))]
-        if any(len(name) > MAX_NAME for name in names):
-            raise ValueError(f"a variable has a name of more than {MAX_NAME} characters: '{names[0][:40]}'…")
-        name, dimensions = names[0], variable.findall("Dimension")
-        texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
-        if len(texts) > MAX_DIMENSIONS:
-            raise ValueError(f"variable '{name}' has more than {MAX_DIMENSIONS} dimensions")
-        if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
-            raise ValueError(f"variable '{name}' has a dimension of no known size")
-        room -= math.prod(max(1, int(text)) for text in texts) * len(names) if dimensions else len(names) - 1
-        if room < 0:
-            raise ValueError(f"with variable '{name}' its arrays have more than {MAX_ELEMENTS} elements")
 
 
 def _checksums(archive: zipfile.ZipFile) -> dict[str, int]:

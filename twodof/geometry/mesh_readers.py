@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_MESH_MEMORY, MAX_MESH_SECONDS, MAX_MESHES_SECONDS, MAX_TRIANGLES
+from ..bounds import MAX_MESH_MEMORY, MAX_MESH_SECONDS, MAX_TRIANGLES
 from ..children import confine, limit_time
 
 Part = tuple[NDArray[np.float64], NDArray[np.uint32], "list[float] | None"]
@@ -23,13 +23,13 @@ Reader = Callable[[bytes, Path, "bytes | None"], list[Part]]
 NO_COLOUR = (-1, -1, -1)
 
 
-def serve(pipe: Connection, kind: str, folder: Path) -> None:
-    """Read the mesh files that the parent names over the pipe, one after another."""
+def serve(pipe: Connection, kind: str, folder: Path, seconds: int) -> None:
+    """Read the mesh files that the parent names over the pipe, one after another, in so much processor time."""
     try:
         read = {"shape": _coal, "colours": _trimesh}[kind]()
     except ImportError as missing:
         read = _refusing(f"{missing}; install the package '{missing.name}'")
-    confine(MAX_MESH_MEMORY, MAX_MESHES_SECONDS, [folder])
+    confine(MAX_MESH_MEMORY, seconds, [folder])
     while True:
         name, library = pipe.recv()
         limit_time(MAX_MESH_SECONDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import resource
 from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bounds import MAX_FATAL_MESHES, MAX_MESH_WAIT, MAX_SURFACES, MAX_TRIANGLES
+from ..bounds import MAX_FATAL_MESHES, MAX_MESH_WAIT, MAX_MESHES_SECONDS, MAX_SURFACES, MAX_TRIANGLES
 from ..children import Child
 from ..files import NUMBER, fits, parsed, temporary_folder
 from .kinematics import Array
@@ -65,6 +66,7 @@ class Meshes:
         self._stack = ExitStack()
         self._warned: set[str] = set()
         self._fatal = self._triangles = self._surfaces = 0
+        self._spent = 0.0  # processor time of readers that have ended
 
     def __enter__(self) -> Meshes:
         self._folder = self._stack.enter_context(temporary_folder())
@@ -144,18 +146,28 @@ class Meshes:
         while True:
             if self._fatal >= MAX_FATAL_MESHES:
                 raise _KilledError(f"{MAX_FATAL_MESHES} others end their reader")
+            before, left = _time_of_children(), int(MAX_MESHES_SECONDS - self._spent)
             if kind not in self._readers:
-                self._readers[kind] = Child(serve, kind, self._folder, environment=ONE_THREAD, output=DEVNULL)
+                if left < 1:
+                    raise _KilledError(f"the meshes before it have taken more than {MAX_MESHES_SECONDS} s")
+                self._readers[kind] = Child(serve, kind, self._folder, left, environment=ONE_THREAD, output=DEVNULL)
             reader = self._readers[kind]
             try:
                 reader.send((file.name, None if library is None else LIBRARY))
                 return _received(reader)
             except (EOFError, _AnswerError) as error:
                 self._readers.pop(kind).close()
+                self._spent += _time_of_children() - before
                 if fresh:
                     self._fatal += 1
                     raise _KilledError(f"it ends its reader: {error}") from None
                 fresh = True
+
+
+def _time_of_children() -> float:
+    """Return the processor time, s, of child processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _received(reader: Child) -> list[Surface]:

@@ -52,7 +52,7 @@ HEADERS = {
 }
 NOT_GET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n"
 ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
-"""Where this machine is found that listens on all of its addresses."""
+"""Address of this machine where a server listens on all of its addresses."""
 Connection = ServerConnection
 Talk = Callable[[Connection], Awaitable[None]]
 

@@ -38,7 +38,7 @@ FILMS: dict[str, Style] = {
     ".webp": dict(fps=30, codec="libwebp_anim", output_params=["-loop", "0", "-quality", "75"]),
     ".gif": dict(fps=25, codec="gif", pix_fmt_out="pal8", output_params=["-filter_complex", PALETTE]),
 }
-"""How FFmpeg writes each format, by the file's suffix; a GIF has whole hundredths of a second for a frame."""
+"""Options of FFmpeg by the file's suffix; a frame of a GIF takes whole hundredths of a second."""
 PICTURES = (*FILMS, ".png")
 """Suffixes of the formats; a PNG is the picture at the end."""
 

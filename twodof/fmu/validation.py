@@ -1,0 +1,59 @@
+"""Check a modelDescription.xml from elsewhere before FMPy reads it."""
+
+import codecs
+import math
+import re
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import fmpy
+import lxml.etree
+
+from ..bounds import MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME
+
+SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3": "fmi3/fmi3ModelDescription"}
+"""Files of FMPy's folder of schemas, by the major version of FMI."""
+
+
+def is_plain_xml(xml: bytes) -> bool:
+    """Return whether XML declares no entities, in an encoding with an ASCII declaration."""
+    text = xml.removeprefix(codecs.BOM_UTF8).lstrip()
+    declared = re.match(rb"""<\?xml[^>]*?encoding\s*=\s*["']([^"']*)""", text)
+    encoding = declared[1].lower() if declared else b"utf-8"
+    ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
+    entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
+    return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
+
+
+def check_description(root: ET.Element, xml: bytes) -> None:
+    """Check the sizes of names and arrays, and the schema.
+
+    FMPy checks the schema too, but of a parsed tree, where libxml2 takes time with the square of the number of errors.
+
+    Raises:
+        ValueError: a name or an array is too large.
+        lxml.etree.XMLSyntaxError: the schema does not allow the text.
+    """
+    _check_arrays(root)
+    if name := SCHEMAS.get(root.get("fmiVersion", "").partition(".")[0]):  # FMPy refuses other versions
+        schema = lxml.etree.XMLSchema(file=Path(fmpy.__file__).parent / "schema" / f"{name}.xsd")
+        lxml.etree.fromstring(xml, lxml.etree.XMLParser(schema=schema))
+
+
+def _check_arrays(root: ET.Element) -> None:
+    """Raise ValueError for long names, which elements repeat, invalid sizes, and too many elements, aliases counted."""
+    sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
+    room = MAX_ELEMENTS
+    for variable in root.iterfind("ModelVariables/*"):
+        names = [each.get("name", "") for each in (variable, *variable.iterfind("Alias"))]
+        if any(len(name) > MAX_NAME for name in names):
+            raise ValueError(f"a variable has a name of more than {MAX_NAME} characters: '{names[0][:40]}'…")
+        name, dimensions = names[0], variable.findall("Dimension")
+        texts = [d.get("start") or sizes.get(d.get("valueReference")) or "" for d in dimensions]
+        if len(texts) > MAX_DIMENSIONS:
+            raise ValueError(f"variable '{name}' has more than {MAX_DIMENSIONS} dimensions")
+        if not all(re.fullmatch(r"\s*[0-9]{1,18}\s*", text) for text in texts):
+            raise ValueError(f"variable '{name}' has a dimension of no known size")
+        room -= math.prod(max(1, int(text)) for text in texts) * len(names) if dimensions else len(names) - 1
+        if room < 0:
+            raise ValueError(f"with variable '{name}' its arrays have more than {MAX_ELEMENTS} elements")
