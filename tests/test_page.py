@@ -317,6 +317,7 @@ def test_what_the_buttons_and_keys_do(page) -> None:
 
 HINT = "drag the ball: it is the target"
 HELD = {"q_des": [0.5, 0.8], "q_max": [1.0, 0.6]}
+SEEN = "decodeURI(location.hash.slice(1)) === arm.state"  # the page has shown what was set
 SADDLED = {"payload": 9.0, "payload_known": True, "limit_effort": True, "gravity": [0.0, -9.81, 0.0]}
 
 
@@ -347,7 +348,7 @@ def test_the_verdict_names_the_cause(browser, arms, control, settings, words) ->
         if control == "joint" and "q_des" not in settings:
             settings = {"q_des": [0.9, 0.7], **settings}
         page.evaluate("settings => { for (const [k, v] of Object.entries(settings)) arm.set(k, v); }", settings)
-        page.wait_for_timeout(300)  # the page sees the target
+        until(page, bool, lambda page: page.evaluate(SEEN))
         page.evaluate("arm.step(500)")
         until(page, lambda text: text.splitlines()[:1] and words in text.splitlines()[0], said)
 

@@ -149,7 +149,7 @@ def test_the_nearest_point_of_a_panda_is_that_of_an_evolution() -> None:
 
 def test_the_verdict_takes_little_of_a_native_run(native_path: Path) -> None:
     """Processor time of a block's samples for the judge, and for the run without it: the least of many of each."""
-    run = twodof.experiment(native_path, stop_time=0.01 * 40 * BLOCK)
+    run = twodof.experiment(native_path, stop_time=0.01 * 16 * BLOCK)
     judge, steps = master.judge_of(run, None), twodof.samples(run)
     row = memoryview(bytes(8 * sum(len(run.fmu.vector(group)) for group in OUTPUTS)))
 
@@ -167,9 +167,9 @@ def test_the_verdict_takes_little_of_a_native_run(native_path: Path) -> None:
         what()
         return time.process_time() - begin
 
-    times = np.array([(taken(judged), taken(stepped)) for _ in range(39)])
+    times = np.array([(taken(judged), taken(stepped)) for _ in range(15)])
     with_judge, alone = times.min(axis=0)
-    assert judge.metrics()["peak_velocity"] == 0.0 and judge.count == 39 * BLOCK
+    assert judge.metrics()["peak_velocity"] == 0.0 and judge.count == 15 * BLOCK
     assert with_judge < 0.025 * alone
 
 
