@@ -19,7 +19,7 @@ BAND = 0.02
 """Band of the settling time, as a share of the initial error."""
 SMALLEST_MOVE = 1e-9  # m: below, a run that starts at its target has no band to settle in
 AT_LIMIT = 1e-9  # rad or m: a joint that the plant has stopped is at its limit to the last bit
-BLOCK = 16384  # samples that are judged at a time; a smaller block finds its code and data out of the cache
+BLOCK = 8192  # samples that are judged at a time; a smaller block finds its code and data out of the cache
 KEPT = 2048  # least samples of the whole run, and of its end, that are kept
 OUTPUTS = ("q", "v", "x", "tau", "quat")
 TARGETS = {"x": "x_des", "quat": "quat_des", "q": "q_des"}
