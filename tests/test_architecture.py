@@ -25,7 +25,7 @@ ROOMS = {
     "plant": "the equations and the URDF; goes into the FMU, which has none of what follows",
     "geometry": "of a URDF, for all that shows or transforms",
     "export": "makes an FMU of the plant, and runs none",
-    "fmu": "an FMU's file and an instance of it, whoever made it",
+    "fmu": "an FMU's file and an instance of it, whoever made it, checked",
     "simulation": "what an FMU is to do, checked, and the master that has it done",
     "linear": "an FMU's derivatives, at an operating point that is checked",
     "ros": "what ROS 2 is told of a run",
@@ -61,7 +61,7 @@ LIBRARIES = {
 }
 
 FOR_ALL = ("bounds", "notebook", "signatures", "version")
-MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 70
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_FILES, MOST_ARROWS = 350, 60, 10, 71
 
 
 def imported(path: Path) -> set[str]:

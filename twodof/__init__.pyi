@@ -13,6 +13,8 @@ from .export.package import build_fmu as build_fmu
 from .export.stock_robots import stock_robot as stock_robot
 from .fmu import Fmu as Fmu
 from .fmu import load_fmu as load_fmu
+from .fmu.checking import Check as Check
+from .fmu.checking import check as check
 from .linear import LinearModel as LinearModel
 from .linear import linearise as linearise
 from .pages.arm import page as page

@@ -17,6 +17,8 @@ MAX_DIMENSIONS = 16  # of an array of FMI 3.0; a matrix has 2
 MAX_RESOURCE = 256 * MIB
 MAX_WRAPPER = 16 * MIB  # pythonfmu's library; it has 0.3 MiB
 MAX_SOURCE = 16 * MIB  # a C file
+MAX_CALL_WAIT = 60  # s by the clock, a call of an FMU that is checked
+MAX_ROW = 64 * KIB  # a message of the process that checks it
 MIN_STEP = 1e-6  # s, communication step: a run of 1e-300 has no end
 
 # robots

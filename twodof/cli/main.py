@@ -17,7 +17,7 @@ from itertools import takewhile
 
 from ..errors import TwoDofError
 from ..version import __version__
-from . import build, export, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
+from . import build, check, export, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
 from .help import Parser, check_arguments, check_verb
 from .options import CommandLineError
 from .printing import CLEAR, in_options, say
@@ -28,6 +28,7 @@ VERBS = {
     run: "simulate an FMU and write a bag",
     publish: "step an FMU in real time on a ROS 2 network",
     layouts: "write layouts of a robot for RViz, PlotJuggler and Foxglove",
+    check: "check an FMU of any maker against the standard",
     info: "show what is in an FMU, a bag or a sweep",
     linearise: "show the linear model of a native FMU about an operating point",
     plot: "draw bags, or the map of a sweep, into one figure",

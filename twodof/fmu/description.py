@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,7 +15,7 @@ from xml.etree import ElementTree as ET
 
 import fmpy
 import numpy as np
-from fmpy.model_description import ModelDescription, ModelVariable
+from fmpy.model_description import ModelDescription, ModelVariable, ValidationError
 
 from ..bounds import MAX_DESCRIPTION, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
@@ -25,7 +24,7 @@ from ..export.start_values import groups_of, vector
 from ..files import UnsafeArchiveError, check_archive, read_member, shown
 from ..notebook import card, picture
 from ..plant.urdf import RobotError, read_urdf
-from .validation import check_description, is_plain_xml
+from .validation import is_plain_xml, read_description
 
 NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": ("true", "1").__contains__}
 """Types of variables that have values here, and how their texts are read."""
@@ -172,17 +171,31 @@ def load_fmu(path: str | Path) -> Fmu:
         FmuError: the file is missing, no zip, not FMI 2.0 or 3.0 co-simulation, unsafe to unzip, or
             has no outputs q[i] and v[i].
     """
+    fmu = load_any_fmu(path)
+    n = len(fmu.vector("q"))
+    if not fmu.joints:
+        fmu = replace(fmu, joints=tuple(f"joint{i + 1}" for i in range(n)))
+    logged = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
+    kinds = {(variable.causality, variable.type) for variable in logged}
+    if len(logged) != 2 * n or kinds != {("output", "Real")}:
+        raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
+    if len(fmu.joints) != n:
+        raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
+    _check_task(fmu)
+    return fmu
+
+
+def load_any_fmu(path: str | Path) -> Fmu:
+    """Read the description of a co-simulation FMU, which need not be a robot's; its joints may be none.
+
+    Raises:
+        FmuError: as of ``load_fmu``.
+    """
     path = Path(path)
     xml, members = _read(path)
     try:
         root = ET.fromstring(xml)
-        if "fmiVersion" not in root.attrib:
-            raise ValueError("it states no fmiVersion")
-        check_description(root, xml)
-        alone = io.BytesIO()  # FMPy reads sources/buildDescription.xml too, whatever its size
-        with zipfile.ZipFile(alone, "w") as archive:
-            archive.writestr("modelDescription.xml", xml)
-        description = fmpy.read_model_description(alone, validate=True)
+        description = read_description(root, xml)
     except Exception as error:  # FMPy raises bare exceptions of several libraries
         raise FmuError(f"'{path}': modelDescription.xml is not valid: {error!s:.300}") from error
     if not re.match(r"[23]\.0", description.fmiVersion) or description.coSimulation is None:
@@ -200,26 +213,32 @@ def load_fmu(path: str | Path) -> Fmu:
         platforms=_platforms(members, description.coSimulation.modelIdentifier),
         **_vendor_annotation(root),
     )
-    n = len(fmu.vector("q"))
-    if not fmu.joints:
-        fmu = replace(fmu, joints=tuple(f"joint{i + 1}" for i in range(n)))
-    logged = [fmu.variables[name] for name in fmu.vector("q") + fmu.vector("v")]
-    kinds = {(variable.causality, variable.type) for variable in logged}
-    if len(logged) != 2 * n or kinds != {("output", "Real")}:
-        raise FmuError(f"'{path}' has no outputs q[1], q[2], … and v[1], v[2], … to log")
-    if len(fmu.joints) != n:
-        raise FmuError(f"'{path}' names {len(fmu.joints)} joints but has {n} outputs q[i]")
-    _check_starts(fmu)
-    return fmu
-
-
-def _check_starts(fmu: Fmu) -> None:
-    """Refuse start values that are not numbers, and task vectors of a wrong length."""
     for name, variable in fmu.variables.items():
         try:
             _ = variable.start_value
         except ValueError:
-            raise FmuError(f"'{fmu.path}': start value of {name}, '{variable.start:.50}', is no number") from None
+            raise FmuError(f"'{path}': start value of {name}, '{variable.start:.50}', is no number") from None
+    return fmu
+
+
+def problems_of(path: Path) -> list[str]:
+    """Return what is wrong with an FMU's description: its schema, variables, units and model structure.
+
+    Raises:
+        FmuError: there is no description to read.
+    """
+    xml, _ = _read(path)
+    try:
+        read_description(ET.fromstring(xml), xml, validate_variable_names=True, validate_model_structure=True)
+    except ValidationError as error:
+        return [" ".join(problem.split()) for problem in error.problems]
+    except Exception as error:  # FMPy raises bare exceptions of several libraries
+        return [f"{error!s:.300}"]
+    return []
+
+
+def _check_task(fmu: Fmu) -> None:
+    """Refuse task vectors of a wrong length."""
     if len({*fmu.axes} & {*"xyz"}) < len(fmu.axes):
         raise FmuError(f"'{fmu.path}': its axes '{fmu.axes:.50}' are not different ones of 'xyz'")
     for group in ("x", "x_des") if fmu.axes else ():

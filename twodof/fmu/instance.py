@@ -1,5 +1,7 @@
 """Run an instance of an FMU; all uses of FMPy that run code are here."""
 
+from __future__ import annotations
+
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -66,10 +68,13 @@ class Instance:
     What is called at each step goes past FMPy, by functions of the library that know no types, with
     arguments that have theirs already: to convert those takes half of a call. Vectors of FMI 3.0 are
     set and read whole, and a variable of FMI 2.0 is a vector of one.
+
+    Attributes:
+        slave: FMPy's object, for calls that a run does not make.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
-        self._fmu = fmu
+        self.fmu = fmu
         self._said = ""
         self._fatal = False
         self._ends = c_bool()  # what doStep of FMI 3.0 says
@@ -82,10 +87,10 @@ class Instance:
         self._starts, self._vectors = starts, dict(starts)  # by type and value reference
         identifier = fmu.description.coSimulation.modelIdentifier
         try:
-            self._slave = self._instantiate(
+            self.slave = self._instantiate(
                 guid=fmu.guid, unzipDirectory=str(folder), modelIdentifier=identifier, instanceName=identifier
             )
-            self._component = c_void_p(self._slave.component)
+            self._component = c_void_p(self.slave.component)
             self._step_arguments = self._component, self._t, self._h, *self._rest
         except Exception as error:  # FMPy raises bare exceptions
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
@@ -111,22 +116,22 @@ class Instance:
         """Set start values and pass initialisation mode; the stop time may be infinite."""
         self.set(values)
         self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
-        self._accept(self._slave.exitInitializationMode)
+        self._accept(self.slave.exitInitializationMode)
 
     def _set_up(self, **times: float | None) -> None:
-        self._accept(self._slave.setupExperiment, **times)
-        self._accept(self._slave.enterInitializationMode)
+        self._accept(self.slave.setupExperiment, **times)
+        self._accept(self.slave.enterInitializationMode)
 
     def reset(self) -> None:
         """Reset to the state after instantiation."""
-        self._accept(self._slave.reset)
+        self._accept(self.slave.reset)
         self._vectors = dict(self._starts)
 
     def set(self, values: Mapping[str, float | bool]) -> None:
         """Set variables by name; other elements of a vector keep their last values."""
         changed: dict[tuple[str, int], list[float | bool]] = {}
         for name, value in values.items():
-            variable = self._fmu.variables[name]
+            variable = self.fmu.variables[name]
             key = variable.type, variable.reference
             changed.setdefault(key, list(self._vectors[key]))[variable.element] = value
         for kind, setter in self._setters.items():
@@ -145,7 +150,7 @@ class Instance:
 
     def _columns(self, names: Sequence[str]) -> tuple[list[int], list[int], int]:
         """Return references of Real variables, their places among all values of these, and how many these are."""
-        wanted = [self._fmu.variables[name] for name in names]
+        wanted = [self.fmu.variables[name] for name in names]
         vectors = list(dict.fromkeys((variable.type, variable.reference) for variable in wanted))
         *firsts, size = accumulate((len(self._starts[vector]) for vector in vectors), initial=0)
         first = dict(zip(vectors, firsts))
@@ -184,10 +189,10 @@ class Instance:
         """Return ∂unknown/∂known at the instance's state, one row for each unknown."""
         distinct, rows, size = self._columns(unknown)
         matrix = np.empty((size, len(known)))
-        for k, variable in enumerate(self._fmu.variables[name] for name in known):
+        for k, variable in enumerate(self.fmu.variables[name] for name in known):
             seed = np.eye(len(self._starts[variable.type, variable.reference]))[variable.element]
             try:
-                matrix[:, k] = self._slave.getDirectionalDerivative(
+                matrix[:, k] = self.slave.getDirectionalDerivative(
                     distinct, [variable.reference], seed, *self._of_size(size)
                 )
             except FMICallException as error:
@@ -199,8 +204,8 @@ class Instance:
         if self._fatal:
             return
         with suppress(FMICallException):  # it may have failed already, and is freed all the same
-            self._slave.terminate()
-        self._slave.freeInstance()
+            self.slave.terminate()
+        self.slave.freeInstance()
 
     def _refuse(self, status: int) -> NoReturn:
         """Raise the error of a call's status, with the FMU's own message where there is one."""
@@ -208,6 +213,22 @@ class Instance:
         outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
         reason = f"a call failed, status {status}" if status > WARNING else "the FMU ends the run"
         raise SimulationError(self._said or reason, outcome=outcome)
+
+    def another(self) -> Instance:
+        """Return a second instance, of the same loaded library."""
+        return type(self)(self.fmu, Path(self.slave.unzipDirectory))
+
+    def refuses(self, call: Callable[[], object]) -> bool:
+        """Return whether the FMU answers a call with a status of an error, or logs one."""
+        self._said = ""
+        try:
+            call()
+        except FMICallException as error:
+            self._fatal = error.status == fmi2.fmi2Fatal
+            return True
+        except SimulationError:
+            return True
+        return bool(self._said)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
         """Make a call that must log no error: pythonfmu's wrapper cannot return a status."""
@@ -240,7 +261,7 @@ class Instance3(Instance):
         return slave
 
     def _set_up(self, **times: float | None) -> None:
-        self._accept(self._slave.enterInitializationMode, **times)
+        self._accept(self.slave.enterInitializationMode, **times)
 
     def _of_size(self, size: int) -> tuple[int, ...]:
         return (size,)

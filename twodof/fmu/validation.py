@@ -1,13 +1,16 @@
 """Check a modelDescription.xml from elsewhere before FMPy reads it."""
 
 import codecs
+import io
 import math
 import re
+import zipfile
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import fmpy
 import lxml.etree
+from fmpy.model_description import ModelDescription
 
 from ..bounds import MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME
 
@@ -23,6 +26,21 @@ def is_plain_xml(xml: bytes) -> bool:
     ascii_based = re.fullmatch(rb"utf-8|us-ascii|iso-8859-\d+|windows-125\d", encoding)
     entities = re.search(rb"<!\s*(DOCTYPE|ENTITY)", text)
     return bool(text[:1] == b"<" and b"\0" not in text and ascii_based and not entities)
+
+
+def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescription:
+    """Return FMPy's model description of a modelDescription.xml, with more of its checks.
+
+    Raises:
+        Exception: the description is not valid; a bare exception of one of several libraries.
+    """
+    if "fmiVersion" not in root.attrib:
+        raise ValueError("it states no fmiVersion")
+    check_description(root, xml)
+    alone = io.BytesIO()  # FMPy reads sources/buildDescription.xml too, whatever its size
+    with zipfile.ZipFile(alone, "w") as archive:
+        archive.writestr("modelDescription.xml", xml)
+    return fmpy.read_model_description(alone, validate=True, **more)
 
 
 def check_description(root: ET.Element, xml: bytes) -> None:

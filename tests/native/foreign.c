@@ -1,0 +1,103 @@
+/* An FMI 2.0 FMU of another maker, ẋ = u − x by Euler's method, y = x + 2 u; with one fault where FAULT names one. */
+#include <math.h>
+#include <stdlib.h>
+#include <unistd.h>
+#include "fmi2Functions.h"
+
+enum { NONE, KEEPS, SHARES, RESTORES_NOTHING, LOSES_BYTES, WRONG_SLOPE, CRASHES, NOT_FINITE, DISCARDS, HANGS };
+typedef struct { double u, x, p; int phase; } M;
+static double shared;
+static void start(M *m) { *m = (M){0.0, 1.0, 1.0, 0}; }
+static double y_of(M *m) { return (FAULT == SHARES ? shared : m->x) + 2.0 * m->u; }
+
+fmi2Component fmi2Instantiate(fmi2String n, fmi2Type t, fmi2String g, fmi2String r, const fmi2CallbackFunctions *f,
+                              fmi2Boolean v, fmi2Boolean l) {
+    M *m = malloc(sizeof *m);
+    start(m);
+    return m;
+}
+void fmi2FreeInstance(fmi2Component c) { free(c); }
+fmi2Status fmi2Reset(fmi2Component c) {
+    double x = ((M *)c)->x;
+    if (FAULT == HANGS) for (;;) sleep(1);
+    start(c);
+    if (FAULT == KEEPS) ((M *)c)->x = x;
+    return fmi2OK;
+}
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return ((M *)c)->phase ? fmi2Error : fmi2OK; }
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) { shared = ((M *)c)->x; ((M *)c)->phase = 1; return fmi2OK; }
+fmi2Status fmi2Terminate(fmi2Component c) { ((M *)c)->phase = 2; return fmi2OK; }
+fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, const fmi2Real v[]) {
+    M *m = c;
+    for (size_t i = 0; i < n; i++) *(r[i] == 1 ? &m->u : r[i] == 2 ? &m->x : &m->p) = v[i];
+    return fmi2OK;
+}
+fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, fmi2Real v[]) {
+    M *m = c;
+    for (size_t i = 0; i < n; i++) {
+        double value[] = {0.0, m->u, m->x, m->u - m->x, FAULT == NOT_FINITE ? NAN : y_of(m), m->p};
+        if (r[i] > 5) return fmi2Error;
+        v[i] = value[r[i]];
+    }
+    return fmi2OK;
+}
+fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean s) {
+    M *m = c;
+    if (m->phase != 1) return fmi2Error;
+    if (FAULT == DISCARDS && t > 0.05) return fmi2Discard;
+    m->x += h * (m->u - m->x);
+    shared += h * (m->u - shared);
+    return fmi2OK;
+}
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *s) { *s = malloc(sizeof(M)); *(M *)*s = *(M *)c; return fmi2OK; }
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate s) {
+    if (FAULT == CRASHES) abort();
+    if (FAULT != RESTORES_NOTHING) *(M *)c = *(M *)s;
+    return fmi2OK;
+}
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *s) { free(*s); *s = NULL; return fmi2OK; }
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate s, size_t *n) { *n = sizeof(M); return fmi2OK; }
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate s, fmi2Byte b[], size_t n) {
+    for (size_t i = 0; i < n; i++) b[i] = ((char *)s)[i];
+    return fmi2OK;
+}
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte b[], size_t n, fmi2FMUstate *s) {
+    *s = malloc(n);
+    for (size_t i = 0; i < n; i++) ((char *)*s)[i] = FAULT == LOSES_BYTES && i >= sizeof(double) ? 0 : b[i];
+    ((M *)*s)->phase = 1;
+    return fmi2OK;
+}
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference z[], size_t nz,
+                                        const fmi2ValueReference v[], size_t nv, const fmi2Real dv[], fmi2Real dz[]) {
+    for (size_t i = 0; i < nz; i++) {
+        dz[i] = 0.0;
+        for (size_t k = 0; k < nv; k++) {
+            double of_y = v[k] == 1 ? 2.0 : 1.0, of_rate = v[k] == 1 ? 1.0 : -1.0;
+            dz[i] += dv[k] * (z[i] == 4 ? of_y * (FAULT == WRONG_SLOPE ? 1.00001 : 1.0) : of_rate);
+        }
+    }
+    return fmi2OK;
+}
+
+#define NOT_THERE(name, ...) fmi2Status name(fmi2Component c, ##__VA_ARGS__) { return fmi2Error; }
+fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean d, fmi2Real t, fmi2Real s, fmi2Boolean e, fmi2Real f) {
+    return fmi2OK;
+}
+fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean l, size_t n, const fmi2String k[]) { return fmi2OK; }
+const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
+const char *fmi2GetVersion(void) { return fmi2Version; }
+typedef const fmi2ValueReference R[];
+NOT_THERE(fmi2GetInteger, R r, size_t n, fmi2Integer v[])
+NOT_THERE(fmi2GetBoolean, R r, size_t n, fmi2Boolean v[])
+NOT_THERE(fmi2GetString, R r, size_t n, fmi2String v[])
+NOT_THERE(fmi2SetInteger, R r, size_t n, const fmi2Integer v[])
+NOT_THERE(fmi2SetBoolean, R r, size_t n, const fmi2Boolean v[])
+NOT_THERE(fmi2SetString, R r, size_t n, const fmi2String v[])
+NOT_THERE(fmi2SetRealInputDerivatives, R r, size_t n, const fmi2Integer o[], const fmi2Real v[])
+NOT_THERE(fmi2GetRealOutputDerivatives, R r, size_t n, const fmi2Integer o[], fmi2Real v[])
+NOT_THERE(fmi2CancelStep)
+NOT_THERE(fmi2GetStatus, const fmi2StatusKind k, fmi2Status *v)
+NOT_THERE(fmi2GetRealStatus, const fmi2StatusKind k, fmi2Real *v)
+NOT_THERE(fmi2GetIntegerStatus, const fmi2StatusKind k, fmi2Integer *v)
+NOT_THERE(fmi2GetBooleanStatus, const fmi2StatusKind k, fmi2Boolean *v)
+NOT_THERE(fmi2GetStringStatus, const fmi2StatusKind k, fmi2String *v)

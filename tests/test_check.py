@@ -1,0 +1,163 @@
+"""An FMU that is checked: of this project, and of another maker with one fault at a time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import zipfile
+from pathlib import Path
+
+import fmpy
+import pytest
+from tools import needs
+
+import twodof
+from twodof.cli.main import main
+from twodof.fmu import checking
+
+DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="Foreign" guid="1" numberOfEventIndicators="0">
+<CoSimulation modelIdentifier="Foreign" canHandleVariableCommunicationStepSize="true" canGetAndSetFMUstate="true"
+ canSerializeFMUstate="true" providesDirectionalDerivative="true"/>
+<DefaultExperiment startTime="0" stopTime="1" stepSize="0.01"/>
+<ModelVariables>
+<ScalarVariable name="u" valueReference="1" causality="input"><Real start="0"/></ScalarVariable>
+<ScalarVariable name="x" valueReference="2" initial="exact"><Real start="1"/></ScalarVariable>
+<ScalarVariable name="der(x)" valueReference="3"><Real derivative="2"/></ScalarVariable>
+<ScalarVariable name="y" valueReference="4" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="p" valueReference="5" causality="parameter" variability="fixed"><Real start="1"/></ScalarVariable>
+</ModelVariables>
+<ModelStructure>
+<Outputs><Unknown index="4"/></Outputs><Derivatives><Unknown index="3"/></Derivatives>
+<InitialUnknowns><Unknown index="3"/><Unknown index="4"/></InitialUnknowns>
+</ModelStructure>
+</fmiModelDescription>
+"""
+FAULTS = {
+    "KEEPS": ("reset", "after a reset: y is"),
+    "SHARES": ("two instances", "beside a second instance: y is"),
+    "RESTORES_NOTHING": ("state", "at the restored state: y is"),
+    "LOSES_BYTES": ("serialised state", "at the restored state: y is"),
+    "WRONG_SLOPE": ("derivatives", "∂y/∂u is 2, and it gives 2.00002"),
+    "CRASHES": ("state", "it ended its process at: restoring the state: Aborted"),
+    "NOT_FINITE": ("simulation", "y is nan after 1 steps"),
+    "DISCARDS": ("simulation", "a call failed, status 2"),
+}
+ALSO = {
+    "SHARES": ("state", "serialised state"),
+    "RESTORES_NOTHING": ("serialised state",),
+    "CRASHES": ("serialised state",),
+}
+REMARK = "it accepts the end of an initialisation that was not begun, a step of a negative size, a step from another"
+
+
+def foreign(folder: Path, fault: str = "NONE", description: str = DESCRIPTION) -> Path:
+    library, path = folder / "Foreign.so", folder / "Foreign.fmu"
+    headers = Path(fmpy.__file__).parent / "c-code"
+    source = Path(__file__).parent / "native" / "foreign.c"
+    command = [needs("gcc"), "-shared", "-fPIC", f"-DFAULT={fault}", f"-I{headers}", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", description)
+        archive.write(library, "binaries/linux64/Foreign.so")
+    return path
+
+
+def failed(check: twodof.Check) -> dict[str, str]:
+    return {row.name: row.text for row in check.rows if row.outcome == "failed"}
+
+
+@pytest.mark.parametrize("kind", ["python", "2", "3", "scalars"])
+def test_fmus_of_this_project_pass(kind: str, tmp_path: Path, fmu_path: Path, native_path: Path) -> None:
+    options = twodof.FmuOptions(native=True, fmi=3, arrays=kind == "3", control="pose")
+    paths = {"python": fmu_path, "2": native_path}
+    path = paths.get(kind) or twodof.build_fmu(tmp_path / "arm.fmu", options)
+    check = twodof.check(path)
+    outcomes = {row.name: row.outcome for row in check.rows}
+    assert {name for name, outcome in outcomes.items() if outcome != "passed"} == (
+        {"derivatives"} if kind == "python" else set()
+    ), str(check)
+    assert len(outcomes) == 10 and check.passed
+
+
+def test_an_fmu_of_another_maker_passes_with_a_remark(tmp_path: Path) -> None:
+    check = twodof.check(foreign(tmp_path))
+    assert [(row.name, row.outcome) for row in check.rows if row.outcome != "passed"] == [("call order", "remark")]
+    assert check.rows[-1].text.startswith(REMARK)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_fails_its_row(fault: str, tmp_path: Path) -> None:
+    """A crash leaves the other rows."""
+    row, text = FAULTS[fault]
+    check = twodof.check(foreign(tmp_path, fault))
+    assert failed(check)[row].startswith(text)
+    if fault not in ("NOT_FINITE", "DISCARDS"):
+        assert {*failed(check)} == {row, *ALSO.get(fault, ())}
+    assert not check.passed and len(check.rows) == 10
+
+
+def test_a_call_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checking, "MAX_CALL_WAIT", 2)
+    texts = failed(twodof.check(foreign(tmp_path, "HANGS")))
+    assert texts["reset"] == "it ended its process at: reset, which may take 2 s: Killed"
+    assert "state" not in texts
+
+
+def test_an_undeclared_dependency_fails(tmp_path: Path) -> None:
+    described = DESCRIPTION.replace('<Unknown index="4"/></InitialUnknowns>', '<Unknown index="4" dependencies="2"/>')
+    described = described.replace('dependencies="2"/>', 'dependencies="2"/></InitialUnknowns>')
+    texts = failed(twodof.check(foreign(tmp_path, description=described)))
+    assert texts == {"inputs": "y depends on u, and its InitialUnknown does not state it"}
+
+
+def test_what_the_description_does_not_claim_does_not_apply(tmp_path: Path) -> None:
+    described = DESCRIPTION
+    for claim in ("canHandleVariableCommunicationStepSize", "canGetAndSetFMUstate", "canSerializeFMUstate"):
+        described = described.replace(f'{claim}="true"', "")
+    described = described.replace('providesDirectionalDerivative="true"', 'canBeInstantiatedOnlyOncePerProcess="true"')
+    rows = {row.name: row for row in twodof.check(foreign(tmp_path, description=described)).rows}
+    left = {name: row.text for name, row in rows.items() if row.outcome == "does not apply"}
+    assert left == {
+        "two instances": "it states canBeInstantiatedOnlyOncePerProcess",
+        "state": "it does not state canGetAndSetFMUstate",
+        "serialised state": "it does not state canGetAndSetFMUstate",
+        "variable steps": "it does not state canHandleVariableCommunicationStepSize",
+        "derivatives": "it does not state providesDirectionalDerivative",
+    }
+
+
+def test_a_description_with_problems_fails(tmp_path: Path) -> None:
+    """The FMU runs all the same, where its schema holds."""
+    described = DESCRIPTION.replace('<Real derivative="2"/>', '<Real derivative="2" unit="furlong"/>')
+    check = twodof.check(foreign(tmp_path, description=described))
+    assert failed(check) == {"description": 'The unit "furlong" of variable "der(x)" (line 9) is not defined.'}
+    check = twodof.check(foreign(tmp_path, description=DESCRIPTION.replace("<ModelStructure>", "<Structure>")))
+    assert [row.outcome for row in check.rows] == ["failed"]
+
+
+def test_an_fmu_for_another_machine_is_not_run(tmp_path: Path) -> None:
+    path = foreign(tmp_path)
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(tmp_path / "other.fmu", "w") as other:
+        other.writestr("modelDescription.xml", archive.read("modelDescription.xml"))
+        other.writestr("binaries/win64/Foreign.dll", b"")
+    check = twodof.check(tmp_path / "other.fmu")
+    assert {row.outcome for row in check.rows[1:]} == {"does not apply"}
+    assert "only for: win64" in check.rows[1].text
+
+
+def test_the_command_prints_a_table_or_json(
+    tmp_path: Path, native_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(native_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:2] == ["passed", "description"] and lines[-1].endswith("passes")
+    assert main(["check", str(foreign(tmp_path, "KEEPS")), "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["kind"] == "check" and facts["passed"] is False
+    assert [row["name"] for row in facts["rows"] if row["outcome"] == "failed"] == ["reset"]
+    assert main(["check", str(tmp_path / "none.fmu")]) == 1
+    assert "there is no FMU" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        main(["check"])
+    assert ended.value.code == 2

@@ -1,0 +1,27 @@
+"""Verb check: check an FMU of any maker against the FMI standard."""
+
+import argparse
+
+from .options import add_options
+from .printing import busy, print_json, print_table, say
+
+
+def add(check: argparse.ArgumentParser) -> None:
+    """Add the options of the verb."""
+    check.description = "Check an FMU of any maker; exit status 1 if a row fails."
+    check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0")
+    add_options(check, "--json")
+
+
+def call(options: argparse.Namespace) -> int:
+    """Run the verb; return the exit status."""
+    from ..fmu.checking import check
+
+    with busy("checking", silent=True):
+        done = check(options.fmu)
+    if options.json:
+        print_json(kind="check", **done.facts())
+    else:
+        print_table(*((row.outcome, row.name, row.text) for row in done.rows))
+        say(f"\n'{done.path}' {'passes' if done.passed else 'fails'}")
+    return 0 if done.passed else 1

@@ -1,0 +1,127 @@
+"""Check an FMU of any maker: its description, and trials of it in a child process."""
+
+from __future__ import annotations
+
+import json
+import resource
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from subprocess import DEVNULL
+from typing import NamedTuple
+
+from ..bounds import MAX_CALL_WAIT, MAX_ROW
+from ..children import Child
+from ..errors import FmuError
+from ..notebook import card
+from .description import load_any_fmu, problems_of
+from .trials import TRIALS, Trial, UnpassedError
+
+
+class Row(NamedTuple):
+    """The result of one trial.
+
+    Attributes:
+        name: of the trial.
+        outcome: "passed"; "failed", which the standard does not allow; "remark", which it allows and a user would not
+            expect; or "does not apply".
+        text: a line on what held, what did not, or why it does not apply.
+    """
+
+    name: str
+    outcome: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """The results of a check.
+
+    Attributes:
+        path: the FMU.
+        rows: of its trials, in order.
+    """
+
+    path: Path
+    rows: tuple[Row, ...]
+
+    @property
+    def passed(self) -> bool:
+        """True if no row failed."""
+        return all(row.outcome != "failed" for row in self.rows)
+
+    def __str__(self) -> str:
+        return "\n".join(f"{row.outcome}: {row.name}: {row.text}" for row in self.rows)
+
+    def _repr_html_(self) -> str:
+        return card(f"Check of {self.path}", {row.name: f"{row.outcome}: {row.text}" for row in self.rows})
+
+    def facts(self) -> dict[str, object]:
+        """Return the check as JSON has it."""
+        return {**asdict(self), "path": str(self.path), "passed": self.passed, "rows": [r._asdict() for r in self.rows]}
+
+
+def check(fmu: str | Path) -> Check:
+    """Check an FMU of any maker: description, states, steps, derivatives, order of calls.
+
+    The FMU runs in a child process, whose crash is a failed row. It is a program all the same: check only an FMU that
+    you would run.
+
+    Args:
+        fmu: an FMI 2.0 or 3.0 co-simulation FMU with a binary for this machine.
+
+    Raises:
+        FmuError: the file is missing, no FMU, unsafe to unzip, or has no co-simulation.
+    """
+    path = Path(fmu)
+    problems = problems_of(path)
+    try:
+        known = load_any_fmu(path)
+    except FmuError as error:
+        if not problems:
+            raise
+        return Check(path, (Row("description", "failed", "; ".join(problems) or str(error)),))
+    described = f"{len(known.variables)} variables, FMI {known.description.fmiVersion}"
+    first = Row("description", *(("failed", "; ".join(problems)) if problems else ("passed", described)))
+    if known.platform not in known.platforms:
+        reason = f"it has no binary for this machine ({known.platform}), only for: {', '.join(known.platforms)}"
+        return Check(path, (first, *(Row(name, "does not apply", reason) for name in TRIALS)))
+    return Check(path, (first, *_tried(path, [*TRIALS])))
+
+
+def _tried(path: Path, names: Sequence[str]) -> Iterator[Row]:
+    """Yield a row of each trial; after a crash the rest is tried in a new process."""
+    todo = [*names]
+    while todo:
+        doing = "its start"
+        with Child(_serve, path, todo, output=DEVNULL) as child:
+            try:
+                while todo:
+                    kind, *words = json.loads(child.receive(MAX_ROW, MAX_CALL_WAIT))
+                    if kind == "row":
+                        yield Row(todo.pop(0), *words)
+                    else:
+                        (doing,) = words
+            except EOFError as end:
+                limit = f", which may take {MAX_CALL_WAIT} s" if str(end) == "Killed" else ""
+                yield Row(todo.pop(0), "failed", f"it ended its process at: {doing}{limit}: {end}")
+
+
+def _serve(pipe: Connection, path: Path, names: Sequence[str]) -> None:
+    """Do the trials in the child; send what is done next, and each result."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    def send(*words: str) -> None:
+        pipe.send_bytes(json.dumps(words).encode()[:MAX_ROW])
+
+    trial = Trial(load_any_fmu(path), lambda what: send("note", what))
+    for name in names:
+        outcome = "passed"
+        try:
+            text = TRIALS[name](trial)
+        except UnpassedError as unpassed:
+            outcome, text = unpassed.outcome, str(unpassed)
+        except Exception as error:  # whatever the FMU makes FMPy raise is the result of this trial
+            outcome, text = "failed", f"{error}" or type(error).__name__
+        send("row", outcome, text[:1000])

@@ -1,0 +1,313 @@
+"""Trials of a co-simulation FMU of any maker against what the FMI standard demands of it.
+
+Each takes a Trial and returns a line on what held. Equal means bit-identical. Sources: FMI 2.0.5, sections 2.1 and
+4.2; FMI 3.0.2, sections 2.2 and 4.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from math import inf, isfinite
+from typing import Any
+
+import numpy as np
+from fmpy.model_description import ModelVariable
+
+from ..errors import SimulationError
+from .description import Fmu
+from .instance import Instance, instantiate
+
+STEPS = 20
+SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
+"""Sizes of variable steps, of the default one."""
+MOST_KNOWNS = 200  # inputs and states by which is differentiated
+DELTA = 1e-4  # change of a variable, of its magnitude or of 1
+SMOOTH, EXACT = 1e-3, 1e-7
+"""Of a derivative's magnitude, or of 1: how far difference quotients of two widths may differ where it is compared,
+and how far it may be from them beside that."""
+UNKNOWN = 2**31 - 9  # a value reference that no variable has
+Outputs = tuple[float, ...]
+Calls = dict[str, tuple[str, Callable[[Instance], object]]]
+
+
+class UnpassedError(Exception):
+    """A trial has another outcome than "passed", and the FMU is not at fault: "remark" or "does not apply"."""
+
+    def __init__(self, outcome: str, text: str) -> None:
+        super().__init__(text)
+        self.outcome = outcome
+
+
+class Trial:
+    """An FMU with its default experiment.
+
+    Args:
+        fmu: the FMU.
+        note: called with what is done next, which a crash is reported with.
+
+    Attributes:
+        start, step: of its default experiment, s.
+        variables: FMPy's descriptions of real variables, by the names of their elements.
+        outputs, inputs: names of real outputs and continuous inputs.
+    """
+
+    def __init__(self, fmu: Fmu, note: Callable[[str], object]) -> None:
+        self.fmu, self.note, self.about = fmu, note, fmu.description
+        start, stop, step = (
+            getattr(self.about.defaultExperiment, name, None) for name in ("startTime", "stopTime", "stepSize")
+        )
+        self.start = float(start or 0.0)
+        self.step = float(step or (float(stop) - self.start if stop else 5.0) / 500)
+        described = {v.valueReference: v for v in self.about.modelVariables if v.type in ("Real", "Float64")}
+        self.variables: dict[str, ModelVariable] = {
+            name: described[v.reference] for name, v in fmu.variables.items() if v.type == "Real"
+        }
+        self.outputs = [name for name, v in self.variables.items() if v.causality == "output"]
+        inputs = [name for name, v in self.variables.items() if v.causality == "input"]
+        self.inputs = [name for name in inputs if self.variables[name].variability in (None, "continuous")]
+
+    def require(self, *claims: str) -> None:
+        """End a trial of what the description does not claim."""
+        for claim in claims:
+            if not getattr(self.about.coSimulation, claim):
+                raise UnpassedError("does not apply", f"it does not state {claim}")
+
+    @contextmanager
+    def instance(self, values: Mapping[str, float] | None = None) -> Iterator[Instance]:
+        """Instantiate and initialise the FMU."""
+        self.note("instantiation and initialisation")
+        with instantiate(self.fmu) as instance:
+            instance.initialise(self.start, inf, values or {})
+            yield instance
+
+    def begin_again(self, instance: Instance, values: Mapping[str, float] | None = None) -> None:
+        """Reset and initialise an instance."""
+        self.note("reset")
+        instance.reset()
+        instance.initialise(self.start, inf, values or {})
+
+    def rows(self, instance: Instance, count: int = STEPS, first: int = 0) -> list[Outputs]:
+        """Return the outputs after each of ``count`` steps from step ``first`` on."""
+        read, rows = instance.reader(self.outputs), []
+        for k in range(first, first + count):
+            self.note(f"step {k + 1}")
+            instance.step(self.start + k * self.step, self.step)
+            rows.append(tuple(read()))
+            for name, value in zip(self.outputs, rows[-1]):
+                if not isfinite(value):
+                    raise SimulationError(f"{name} is {value} after {k + 1} steps")
+        return rows
+
+    def compare(self, expected: Sequence[Outputs], rows: Sequence[Outputs], when: str) -> None:
+        """Refuse rows that are not equal, by the first output that differs."""
+        for k, pair in enumerate(zip(expected, rows)):
+            for name, x, y in zip(self.outputs, *pair):
+                if x != y:
+                    raise SimulationError(f"{when}: {name} is {y!r} instead of {x!r}, {k + 1} steps on")
+
+    def inside(self, name: str, change: float) -> float:
+        """Return a variable's start value plus a change, that far inside its range where the range is wide enough."""
+        variable, start = self.variables[name], self.fmu.variables[name].start_value or 0.0
+        low, high = (end if text is None else float(text) for text, end in ((variable.min, -inf), (variable.max, inf)))
+        margin = change if high - low > 2.0 * change else 0.0
+        return min(max(start + change, low + margin), high - margin)
+
+
+def simulation(trial: Trial) -> str:
+    """Step by the default experiment."""
+    with trial.instance() as instance:
+        trial.rows(instance)
+    return f"{STEPS} steps of {trial.step:g} s, {len(trial.outputs)} real outputs, all finite"
+
+
+def reset(trial: Trial) -> str:
+    """Run, reset and run again."""
+    with trial.instance() as instance:
+        once = trial.rows(instance)
+        trial.begin_again(instance)
+        trial.compare(once, trial.rows(instance), "after a reset")
+    return "the run after a reset is equal"
+
+
+def two_instances(trial: Trial) -> str:
+    """Step two instances of one library in turn."""
+    if trial.about.coSimulation.canBeInstantiatedOnlyOncePerProcess:
+        raise UnpassedError("does not apply", "it states canBeInstantiatedOnlyOncePerProcess")
+    with trial.instance() as first:
+        alone = trial.rows(first)
+        trial.note("a second instance")
+        pair = [first.another(), first.another()]
+        for instance in pair:
+            instance.initialise(trial.start, inf, {})
+        for k in range(STEPS):
+            for instance in pair:
+                trial.compare(alone[k : k + 1], trial.rows(instance, 1, k), "beside a second instance")
+        for instance in pair:
+            instance.free()
+    return "two instances, stepped in turn, are equal to one alone"
+
+
+def state(trial: Trial) -> str:
+    """Save the state, step, restore it and step again."""
+    trial.require("canGetAndSetFMUstate")
+    return _restored(trial, lambda slave, saved: saved)
+
+
+def serialised_state(trial: Trial) -> str:
+    """Restore a state that was serialised."""
+    trial.require("canGetAndSetFMUstate", "canSerializeFMUstate")
+    return _restored(trial, lambda slave, saved: slave.deserializeFMUState(bytes(slave.serializeFMUState(saved))))
+
+
+def _restored(trial: Trial, converted: Callable[[Any, Any], Any]) -> str:
+    half = STEPS // 2
+    with trial.instance() as instance:
+        trial.rows(instance, half)
+        trial.note("saving the state")
+        saved, read = instance.slave.getFMUState(), instance.reader(trial.outputs)
+        before = tuple(read())
+        once = trial.rows(instance, half, half)
+        trial.note("restoring the state")
+        instance.slave.setFMUState(converted(instance.slave, saved))
+        trial.compare([before], [tuple(read())], "at the restored state")
+        trial.compare(once, trial.rows(instance, half, half), "after the state was restored")
+        instance.slave.freeFMUState(saved)
+    return f"save, {half} steps, restore, {half} steps: equal"
+
+
+def variable_steps(trial: Trial) -> str:
+    """Take steps of different sizes, and compare their end with that of as many equal ones."""
+    trial.require("canHandleVariableCommunicationStepSize")
+    with trial.instance() as instance:
+        equal = trial.rows(instance, round(sum(SIZES)))[-1]
+        trial.begin_again(instance)
+        done, h = 0.0, trial.step
+        for size in SIZES:
+            trial.note(f"a step of {size * h:g} s")
+            instance.step(trial.start + done * h, size * h)
+            done += size
+        ends = tuple(instance.reader(trial.outputs)())
+    away = max((abs(a - b) for a, b in zip(equal, ends)), default=0.0)
+    if not isfinite(away):
+        raise SimulationError("with variable steps an output is not finite")
+    return f"steps of 1/4 to 3 times {h:g} s; outputs end at most {away:.2g} from those of equal steps"
+
+
+def inputs(trial: Trial) -> str:
+    """Change each continuous input; at the end of initialisation, outputs depend on no inputs but those they state."""
+    if not trial.inputs:
+        raise UnpassedError("does not apply", "it has no continuous real inputs")
+    stated = {u.variable: u.dependencies for u in trial.about.initialUnknowns if u.dependencies is not None}
+    with trial.instance() as instance:
+        read = instance.reader(trial.outputs)
+        start = tuple(read())
+        for name in trial.inputs:
+            changed = {name: trial.inside(name, DELTA)}
+            trial.begin_again(instance, changed)
+            for output, before, after in zip(trial.outputs, start, read()):
+                if before != after and trial.variables[name] not in stated.get(
+                    trial.variables[output], [trial.variables[name]]
+                ):
+                    raise SimulationError(f"{output} depends on {name}, and its InitialUnknown does not state it")
+            trial.begin_again(instance)
+            trial.rows(instance, 1)
+            trial.note(f"a change of {name}")
+            instance.set(changed)
+            trial.rows(instance, 1, 1)
+    return f"{len(trial.inputs)} inputs; outputs depend on no others than they state"
+
+
+def derivatives(trial: Trial) -> str:
+    """Compare directional derivatives with central differences over initial values."""
+    trial.require("providesDirectionalDerivative")
+    rates = [unknown.variable for unknown in trial.about.derivatives]
+    settable = [v.derivative for v in rates if v.derivative is not None and v.derivative.initial in ("exact", "approx")]
+    names = [*trial.inputs, *(name for name, v in trial.variables.items() if v in settable)]
+    starts = {name: trial.fmu.variables[name].start_value for name in names}
+    widths = {name: DELTA * max(1.0, abs(start)) for name, start in starts.items() if start is not None}
+    point = {name: trial.inside(name, 2.0 * width) for name, width in [*widths.items()][:MOST_KNOWNS]}
+    unknowns = [*trial.outputs, *(name for name, v in trial.variables.items() if v in rates)]
+    rough = 0
+    with trial.instance(point) as instance:
+        trial.note("directional derivatives")
+        stated, read = instance.derivatives(unknowns, [*point]), instance.reader(unknowns)
+
+        def slope(name: str, width: float) -> Any:
+            values = []
+            for delta in (-width, width):
+                trial.begin_again(instance, {**point, name: point[name] + delta})
+                values.append(np.array(read()))
+            return (values[1] - values[0]) / (2.0 * width)
+
+        for column, name in enumerate(point):
+            wide, narrow = slope(name, widths[name]), slope(name, 0.5 * widths[name])
+            best, doubt = (4.0 * narrow - wide) / 3.0, np.abs(narrow - wide)
+            scale = np.maximum(1.0, np.abs(best))
+            smooth = doubt <= SMOOTH * scale
+            rough += int((~smooth).sum())
+            wrong = smooth & ~(np.abs(stated[:, column] - best) <= doubt + EXACT * scale)
+            if wrong.any():
+                k = int(wrong.argmax())
+                raise SimulationError(f"∂{unknowns[k]}/∂{name} is {best[k]:.9g}, and it gives {stated[k, column]:.9g}")
+    if stated.size == rough:
+        raise UnpassedError("does not apply", "there is no output that is smooth in an input or state at the start")
+    left = f"; {rough} more at a jump were not compared" if rough else ""
+    return f"{stated.size - rough} agree with central differences{left}"
+
+
+def call_order(trial: Trial) -> str:
+    """Make calls that the standard forbids; an FMU need not detect them."""
+    calls = _forbidden(trial)
+    accepted = []
+    with trial.instance() as first:
+        for what, (phase, call) in calls.items():
+            trial.note(what)
+            instance = first.another()
+            if phase != "new":
+                instance.initialise(trial.start, inf, {})
+            if phase == "ended":
+                instance.slave.terminate()
+            if not instance.refuses(partial(call, instance)):
+                accepted.append(what)
+            instance.free()
+    if accepted:
+        raise UnpassedError("remark", f"it accepts {', '.join(accepted)}")
+    return f"{len(calls)} calls that the standard forbids are refused"
+
+
+def _forbidden(trial: Trial) -> Calls:
+    """Return forbidden calls by what they do, with the state they are made in: "new", "stepping" or "ended"."""
+    t, h = trial.start, trial.step
+    read = "getReal" if trial.fmu.version == 2 else "getFloat64"
+    fixed = [n for n, v in trial.variables.items() if v.causality == "parameter" and v.variability == "fixed"][:1]
+    again = {name: trial.fmu.variables[name].start_value or 0.0 for name in fixed}
+    calls: Calls = {
+        "a step before initialisation": ("new", lambda i: i.slave.doStep(t, h)),
+        "the end of an initialisation that was not begun": ("new", lambda i: i.slave.exitInitializationMode()),
+        "a second initialisation": ("stepping", lambda i: i.slave.enterInitializationMode()),
+        "a step of a negative size": ("stepping", lambda i: i.slave.doStep(t, -h)),
+        "a step from another time": ("stepping", lambda i: i.slave.doStep(t + 100.0 * h, h)),
+        "a read of a variable that does not exist": ("stepping", lambda i: getattr(i.slave, read)([UNKNOWN])),
+        "a fixed parameter set after initialisation": ("stepping", lambda i: i.set(again)),
+        "a step after the end": ("ended", lambda i: i.slave.doStep(t, h)),
+    }
+    return {what: call for what, call in calls.items() if again or "parameter" not in what}
+
+
+TRIALS: dict[str, Callable[[Trial], str]] = {
+    trial.__name__.replace("_", " "): trial
+    for trial in (
+        simulation,
+        reset,
+        two_instances,
+        state,
+        serialised_state,
+        variable_steps,
+        inputs,
+        derivatives,
+        call_order,
+    )
+}
+"""Trials by the name of their row, in order."""
