@@ -1,1 +1,1 @@
-"""The plant, which also runs inside the FMU; it needs numpy and Pinocchio alone."""
+"""The plant, which also runs inside the Python FMU; it imports only NumPy and Pinocchio."""

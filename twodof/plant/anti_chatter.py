@@ -1,22 +1,24 @@
-"""Anti-chatter: holds of joints, and of the rank of J⁺, that would otherwise switch without end."""
+"""Anti-chatter: temporary holds that prevent joints and the rank of J⁺ from switching without end."""
 
 from dataclasses import dataclass
 from math import inf
 
 CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-12, 2.0**-24, 8.0, 2.0**-9
-"""Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held there for
-FIRST_HOLD; each repetition lengthens the hold by HOLD_GROWTH, and one of HOLD_OF_ALL or more covers all joints at
-limits (parts of CHATTER_TIME). Otherwise an acceleration that grazes zero, or impacts that drive joints off each
-other's limits, would release and stop joints without end. The rank of J⁺ is held likewise where it drops soon after a
-rise: the motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded. Rank, and stops
-without reaction, use a SHORT_CHATTER_TIME: near a singularity ordinary gains whip joints within microseconds. So do
-joints, each for itself, that their friction holds again at the instant of their release, or that stop within FIRST_HOLD
-of it: there rounding decides."""
+"""Times of the anti-chatter rule. CHATTER_TIME is a fraction of the largest step; SHORT_CHATTER_TIME, FIRST_HOLD and
+HOLD_OF_ALL are fractions of CHATTER_TIME. A joint that returns to its limit within CHATTER_TIME is held there for
+FIRST_HOLD. Each repetition lengthens the hold by the factor HOLD_GROWTH. A hold of HOLD_OF_ALL or longer covers all
+joints at limits. Without holds, an acceleration that grazes zero, or joints that push each other off their limits,
+would release and stop joints without end. The rank of J⁺ is held in the same way if it drops soon after a rise: the
+motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded. SHORT_CHATTER_TIME applies to
+the rank and to stops without reaction, because near a singularity ordinary gains move joints back and forth within
+microseconds. It also applies to each joint that friction holds again at the instant of its release, or that stops
+within FIRST_HOLD of it: there, rounding decides.
+"""
 
 
 @dataclass
 class Hold:
-    """A hold of joints at their limits, of one by its friction, or of the rank of J⁺: its end and its length, s."""
+    """End and length, s, of a hold: of joints at limits, of a joint in friction, or of the rank of J⁺."""
 
     until: float = -inf
     length: float = 0.0

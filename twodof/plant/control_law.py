@@ -11,11 +11,11 @@ class ControlledPlant:
     """The parts of a plant that control laws read.
 
     Attributes:
-        robot, control: the robot and the name of its law, a key of ``CONTROLS``.
+        robot, control: the robot, and the name of its control law (a key of ``CONTROLS``).
         known: the robot as its control law knows it.
 
-    Each variable of the table is an attribute of its group's name: a list of floats of a vector, in SI units, task
-    vectors in the root frame; a float, int or bool of a scalar.
+    Each group of variables is an attribute of the same name, in SI units: a list of floats for a vector, and a float,
+    int or bool for a scalar. Task vectors are in the root frame.
     """
 
     robot: Robot
@@ -32,4 +32,4 @@ class ControlLaw(Protocol):
     """A module with a control law."""
 
     def command(self, plant: ControlledPlant, /) -> tuple[Law, Ratios]:
-        """Return q̈_cmd or τ as a function of the state, inputs held, and the singular values of its Jacobian."""
+        """Return q̈_cmd or τ as a function of the state with inputs held, and the singular values of its Jacobian."""

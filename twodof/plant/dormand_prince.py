@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 State = list[float]
-"""(q, v), 2n values. Plain floats: at this size a call of numpy costs more than the arithmetic."""
+"""State (q, v), 2n plain floats: at this size, a call of NumPy costs more than the arithmetic."""
 
 A = (
     (1 / 5,),
@@ -37,12 +37,12 @@ P = np.array(
     ]
 )
 STAGES = 6
-"""Evaluations of the right-hand side that a step costs."""
+"""Evaluations of the right-hand side in one step."""
 
 
-@lru_cache(maxsize=8)  # most steps are of one size
+@lru_cache(maxsize=8)  # most steps have the same size
 def _weights(step: float) -> list[list[float]]:
-    """Return the rows of A, and E, times the step."""
+    """Return the rows of A and the vector E, multiplied by the step."""
     return [[step * weight for weight in row] for row in (*A, E)]
 
 
@@ -70,7 +70,7 @@ def dormand_prince(rates: Callable[[State], State], y: State, step: float, k1: S
 
 
 def error_norm(K: list[State], y: State, y_new: State, step: float, rtol: float, atol: float) -> float:
-    """Return the root mean square of the error over its tolerance; a step passes below 1."""
+    """Return the root mean square of error/tolerance; a step passes if it is below 1."""
     a, _, b, c, d, e, f = _weights(step)[-1]
     k1, _, k3, k4, k5, k6, k7 = K
     total = 0.0
@@ -83,7 +83,7 @@ def error_norm(K: list[State], y: State, y_new: State, step: float, rtol: float,
 
 
 def interpolant(y: State, y_new: State, K: list[State], P: Array, step: float) -> Callable[[float], State]:
-    """Return the dense output of a step, as a function of the time within it; P weighs the derivatives K."""
+    """Return the dense output of a step as a function of the time within the step; P has the weights of K."""
     start, Q = np.array(y), np.array(K).T.dot(P)
 
     def state(passed: float) -> State:

@@ -11,12 +11,12 @@ from .equations import Array, Law, Ratios
 
 
 def command(plant: ControlledPlant) -> tuple[Law, Ratios]:
-    """Return τ as a function of the state, n values, inputs held; this law has no J⁺."""
+    """Return τ (n values) as a function of the state, with inputs held; this law has no J⁺."""
     return given_effort(plant.tau_cmd)
 
 
 def given_effort(tau: Sequence[float]) -> tuple[Law, Ratios]:
-    """Return a law that gives an effort, n values, at any state."""
+    """Return a control law whose effort (n values) is constant."""
     tau = list(tau)
 
     def effort(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:

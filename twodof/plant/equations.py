@@ -1,4 +1,4 @@
-"""The equations of motion of a plant as functions of its state, and control laws, which are parts of them."""
+"""Types of the equations of motion and of the control laws in them, as functions of the state."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,25 +8,25 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Answer = tuple[Sequence[float], int, float]
-"""Values of the joints, the rank of J⁺, and its margin, negative where the singular values give another."""
+"""A value for each joint, the rank of J⁺, and its margin, negative if the singular values give another rank."""
 Law = Callable[[Array, Array, int | None], Answer]
-"""At (q, v), with a J⁺ of a rank (None: that of its singular values): what a control law gives, n values."""
+"""A control law: from (q, v) and the rank of J⁺ (None: by its singular values) to n efforts or accelerations."""
 Response = Callable[[Array, Array, int | None, Sequence[int]], Answer]
-"""The same of the equations of motion, whose joints slip in directions: q̈, all joints at rest being free."""
+"""The equations of motion: from (q, v), the rank of J⁺ and the directions of slip to q̈. Joints at rest are free."""
 Ratios = Callable[[Array], list[float]]
-"""σ/σ_max of the task Jacobian at q, in descending order; none of a law without J⁺."""
+"""σ/σ_max of the task Jacobian at q, in descending order; empty for a law without J⁺."""
 
 
 @dataclass(frozen=True)
 class Equations:
-    """The equations of motion of a plant, inputs held.
+    """The equations of motion of a plant with its inputs held.
 
     Attributes:
         acceleration: q̈.
-        ratios: singular values of J that decide its rank.
-        rcond: up to which J⁺ drops them.
-        swing: per joint, a bound on how fast it changes them, 1/rad or 1/m.
-        damping: of the joints, N·m·s/rad or N·s/m, n values; empty without.
+        ratios: σ/σ_max of J, which decide its rank.
+        rcond: J⁺ drops singular values with ratios up to this one.
+        swing: for each joint, a bound on the derivative of the ratios with respect to its position, 1/rad or 1/m.
+        damping: viscous damping of the joints, N·m·s/rad or N·s/m, n values; empty without damping.
     """
 
     acceleration: Response

@@ -1,9 +1,9 @@
 """Locate the first event within an integration step, on its dense output.
 
-An event is where a margin becomes negative: the distance of a joint to a limit, the velocity of one that slips, the
-distance of the effort that holds a joint from its bounds, or the margin of the rank of J⁺. Positions and velocities
-are polynomials, whose turning points are known; the other margins are looked at as often as their rates of change ask
-for.
+An event is a time at which a margin becomes negative. Margins are the distance of a joint from a limit, the velocity of
+a joint that slips, the distance of a holding effort from its bounds, and the margin of the rank of J⁺. Positions and
+velocities are polynomials with known turning points. The other margins are sampled as often as their rates of change
+require.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,17 +13,19 @@ from math import inf
 import numpy as np
 
 Margin = Callable[[float], float]
-"""A value at a time within the step that is negative once the regime of the step has ended."""
+"""A function of the time within the step that is negative after the end of the step's regime."""
 
 REACH, PACE = 1.66, 3.72
-"""Bounds on Dormand and Prince's interpolant, which weighs the derivatives of the stages: the
-largest sum of the weights' magnitudes, and that of their rates."""
+"""Bounds on the weights of Dormand and Prince's interpolant: the largest sum of their magnitudes, and the largest sum
+of the magnitudes of their rates.
+"""
 LOOKS, DOUBT = 4, 0.25
-"""The margin of an effort falls below what the stages show of it by less than its range there.
-It is looked at this often in a step where that may be below zero, and again at a minimum of the
-polynomial through these looks that is lower than so much of their range."""
+"""Samples of an effort's margin in a step, and a fraction of their range. Between the stages, the margin falls below
+their smallest value by less than the range of their values. If it may therefore be below zero, it is sampled
+LOOKS equal intervals, and at each extremum of the polynomial through the samples that is below DOUBT times their range.
+"""
 HALVINGS = 7
-"""Halvings of a step in the search; a shorter excursion is none."""
+"""Halvings of a step in the search; shorter excursions are ignored."""
 TIME_RESOLUTION = 2.0**-52
 THROUGH_LOOKS = np.linalg.inv(np.vander(np.linspace(0.0, 1.0, LOOKS + 1), increasing=True))
 
@@ -33,9 +35,9 @@ class Event:
     """Event at the end of a step.
 
     Attributes:
-        stopped: joints that reached a limit, or are at one still and turn into it.
+        stopped: joints that reached a limit, or are still at one and turn towards it.
         arrested: joints that slipped and have no velocity left.
-        released: joints that are no longer held.
+        released: joints that are released from rest.
     """
 
     stopped: list[int] = field(default_factory=list)
@@ -46,11 +48,11 @@ class Event:
 def search(
     margin: Margin, rate: float, a: float, at_a: float, b: float, at_b: float, step: float, halvings: int = HALVINGS
 ) -> float:
-    """Return the first time in (a, b] at which a margin is negative, infinity where there is none.
+    """Return the first time in (a, b] at which a margin is negative, or infinity.
 
     Args:
         margin: the margin.
-        rate: its largest rate of change; with the values at the ends it says where the margin need not be looked at.
+        rate: its largest rate of change, which excludes intervals in which the margin cannot be negative.
         a, b: times within the step, s.
         at_a, at_b: the margin there.
         step: size of the step, s.
@@ -71,8 +73,8 @@ def search(
 def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: float) -> float:
     """Return the first time in (a, b] at which a margin is negative, given that it is at b.
 
-    The interpolation is kept near the middle, so that it never needs many more looks than bisection. Source: Oliveira
-    & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020.
+    The interpolation stays near the middle, so that it never needs many more evaluations than bisection. Source:
+    Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020.
 
     Args:
         margin: the margin.
@@ -81,7 +83,7 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: f
         step: size of the step, s.
     """
     resolution, k = TIME_RESOLUTION * step, 0.2 / (b - a)
-    slack = b - a  # of the interval, beyond what bisection would have left of it
+    slack = b - a  # how much longer the interval may be than after bisection
     while b - a > resolution:
         middle, half = 0.5 * (a + b), 0.5 * (b - a)
         x = (b * at_a - a * at_b) / (at_a - at_b) if at_a > at_b else middle
@@ -91,7 +93,7 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: f
             x = middle + (slack - half if x > middle else half - slack)
         if not a < x < b:
             x = middle
-        if not a < x < b:  # two neighbouring numbers
+        if not a < x < b:  # a and b are neighbouring numbers
             break
         at_x = margin(x)
         if at_x < 0.0:
@@ -103,7 +105,7 @@ def locate(margin: Margin, a: float, at_a: float, b: float, at_b: float, step: f
 
 
 def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float:
-    """Return the first time at which a position is past a limit or a velocity past 0, infinity where there is none.
+    """Return the first time at which a position is past a limit or a velocity past 0, or infinity.
 
     Args:
         margin: the distance to the limit or to 0.
@@ -121,9 +123,9 @@ def first_crossing(margin: Margin, slope: Sequence[float], step: float) -> float
 
 
 def sign_changes(coefficients: Sequence[float]) -> list[float]:
-    """Return the points in (0, 1) at which a polynomial changes its sign, in ascending order.
+    """Return the points in (0, 1) at which a polynomial changes sign, in ascending order.
 
-    Between the turning points, at which its derivative does so, it is monotonic.
+    The polynomial is monotonic between the sign changes of its derivative.
 
     Args:
         coefficients: in ascending order.
@@ -156,7 +158,7 @@ def _polynomial(coefficients: Sequence[float], x: float) -> float:
 
 
 def may_vanish(margins: Sequence[float]) -> bool:
-    """Return whether the margin of an effort may vanish within a step, from its values at the stages."""
+    """Return whether the margin of an effort may reach 0 within a step, given its values at the stages."""
     low, high = min(margins), max(margins)
     return low != inf and not low >= high - low
 
@@ -168,12 +170,12 @@ def first_release(
     step: float,
     before: float,
 ) -> float:
-    """Return the first time before another at which a joint is no longer held, else infinity.
+    """Return the first time before ``before`` at which a joint is released, or infinity.
 
     Args:
-        grips: how far the efforts that hold joints are from their bounds, at a time within the step.
+        grips: the distances of the holding efforts from their bounds, as a function of the time within the step.
         at_ends: the same at the start and the end of the step.
-        doubtful: those of them that may vanish.
+        doubtful: indices of the distances that may reach 0.
         step: size of the step, s.
         before: a time within the step, s.
     """
@@ -199,7 +201,7 @@ def first_release(
 
 
 def _doubtful_minima(margins: Sequence[float]) -> list[float]:
-    """Return the extrema, possibly below zero, of the polynomial through sampled values of a margin."""
+    """Return the extrema that may be below zero, of the polynomial through equidistant samples of a margin."""
     c = THROUGH_LOOKS.dot(margins).tolist()
     slope = [k * coefficient for k, coefficient in enumerate(c)][1:]
     bound = DOUBT * (max(margins) - min(margins))

@@ -1,10 +1,10 @@
 """Dormand–Prince 5(4) over one communication step, with located joint-limit stops.
 
 The step-size control is that of SciPy's ``RK45`` (Hairer, Nørsett & Wanner, "Solving ODEs I", II.4). Every
-communication step begins afresh with the step min(max_step, h), so that no integrator state outlives it.
+communication step restarts with the step min(max_step, h), so that the integrator has no state between them.
 
-A step is integrated in one regime: the joints that rest and the directions in which others slip (``stops``), and the
-rank of J⁺. What ends it is an event, located within the step (``event_search``), at which the step ends and the
+A step is integrated in one regime: the set of joints at rest, the directions in which the others slip (``stops``), and
+the rank of J⁺. An event ends the regime. It is located within the step (``event_search``); the step ends there, and the
 next one begins in another regime. A step is accepted only if its error test passes.
 """
 
@@ -27,28 +27,28 @@ from .stops import STUCK, Stops
 
 SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0
 AUTOMATIC, DORMAND_PRINCE, STIFF = range(3)
-"""Integrators, as the parameter names them."""
+"""Values of the parameter ``integrator``."""
 BUDGET = 2_000_000
-"""Evaluations of the right-hand side in one communication step; a stiff motion would need more."""
+"""Most evaluations of the right-hand side in one communication step; only a stiff motion would need more."""
 MOST_ROWS = 6
-"""Rows of a task's Jacobian at most: three axes and three of an orientation."""
+"""Largest number of rows of a task Jacobian: three axes, and three for an orientation."""
 
 
 @dataclass
 class Budget:
-    """Evaluations of the right-hand side that parts of a communication step have in common."""
+    """Count of the evaluations of the right-hand side in all parts of a communication step."""
 
     spent: int = 0
 
 
 class _Motion:
-    """The equations of motion as a system of first order in one regime.
+    """The equations of motion in one regime, as a system of first order.
 
     Attributes:
-        rank: of J⁺ in this regime.
-        rank_held: the rank does not rise in this regime.
-        evaluations: of the right-hand side so far.
-        grips, margins: those of ``Stops.restrain``, and the margin of the rank, at each stage of the present step.
+        rank: rank of J⁺ in this regime.
+        rank_held: whether the rank must not rise in this regime.
+        evaluations: evaluations of the right-hand side so far.
+        grips, margins: the result of ``Stops.restrain``, and the margin of the rank, at each stage of the present step.
     """
 
     def __init__(
@@ -74,8 +74,8 @@ class _Motion:
 
         Args:
             y: the state (q, v).
-            kept: joints that stay at rest whatever holds them.
-            rank_held: the rank stays what it is.
+            kept: joints that stay at rest even if the holding effort exceeds its bounds.
+            rank_held: whether the rank stays as it is.
         """
         self.rank_held = rank_held
         self.stops.slide(y[self.n :])
@@ -84,7 +84,7 @@ class _Motion:
         return y[self.n :] + a
 
     def acceleration(self, y: State) -> tuple[list[float], list[float], float]:
-        """Return q̈ at y in the regime, the grips of joints at rest, and the rank's margin."""
+        """Return q̈ at y in the regime, the result of ``Stops.restrain``, and the margin of the rank."""
         a, _, margin = self._acceleration(y, self.rank)
         return a, self.stops.restrain(y, a), margin
 
@@ -95,7 +95,7 @@ class _Motion:
         return list(a), rank, margin
 
     def rates(self, y: State) -> State:
-        """Return ẏ at a stage of a step; NaN where the equations have no solution there."""
+        """Return ẏ at a stage of a step; NaN if the equations have no solution there."""
         try:
             a, grips, margin = self.acceleration(y)
         except np.linalg.LinAlgError:
@@ -110,7 +110,7 @@ class _Motion:
         rates is ẏ at y.
         """
         if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
-            return end, y, events.Event()  # inputs are held, and all joints: nothing changes any more
+            return end, y, events.Event()  # inputs and all joints are held: nothing changes
         step = min(self.max_step, end - t)
         growth = MAX_FACTOR
         while True:
@@ -141,7 +141,7 @@ class _Motion:
             elif self._automatic and damping_limits(
                 self.stops.mobility(y[: self.n]), self._damping, K, step, min(self.max_step, end - t)
             ):
-                self._stiff, self._automatic = True, False  # to the end of the communication step
+                self._stiff, self._automatic = True, False  # until the end of the communication step
             else:
                 step *= max(MIN_FACTOR, factor)
                 growth = 1.0  # SciPy's rule: no growth right after a rejection
@@ -162,7 +162,7 @@ class _Motion:
     def _first_event(
         self, y: State, y_new: State, step: float, K: list[State]
     ) -> tuple[float, State, events.Event] | None:
-        """Return the time in (0, step] at which the regime ends, the state there, and the event; or None."""
+        """Return the time in (0, step] at which the regime ends, the state there, and the event; None without one."""
         n, stops = self.n, self.stops
         reach = [events.REACH * step * max(map(abs, speeds)) for speeds in zip(*(k[:n] for k in K))]
         near = [
@@ -201,14 +201,14 @@ class _Motion:
         return first, *self._event(state(first))
 
     def _may_be_arrested(self, i: int, y: State, step: float, K: list[State]) -> bool:
-        """Return whether the velocity of a joint that slips may pass 0 within a step."""
+        """Return whether the velocity of a slipping joint may cross 0 within a step."""
         slip, n = self.stops.slip[i], self.n
         if not slip or i in self.stops.held:
             return False
         return not slip * y[n + i] > events.REACH * step * max(abs(k[n + i]) for k in K)
 
     def _margin_of(self, component: int, state: Callable[[float], State]) -> events.Margin:
-        """Return the distance of a position to its limits, or a velocity in the direction of slip."""
+        """Return the distance of a position from its limits, or the velocity in the direction of slip."""
         if component >= self.n:
             slip = self.stops.slip[component - self.n]
             return lambda passed: slip * state(passed)[component]
@@ -221,7 +221,7 @@ class _Motion:
         return distance
 
     def _event(self, y: State) -> tuple[State, events.Event]:
-        """Return a state without what is beyond limits and velocities of 0, and the event there."""
+        """Return a state with positions clipped to limits and reversed velocities set to 0, and its event."""
         y, n, stops = list(y), self.n, self.stops
         event = events.Event()
         if stops.watched:
@@ -240,7 +240,7 @@ class _Motion:
         return y, event
 
     def _singular_margin(self, y: State) -> float:
-        """Return the margin of the rank; of a held rank, the margin against a lower one."""
+        """Return the margin of the rank; for a held rank, the margin to a lower rank only."""
         self.evaluations += 1
         ratios, rank = self._equations.ratios(np.array(y[: self.n])), self.rank
         if self.rank_held:
@@ -260,24 +260,25 @@ def advance(
     integrator: int = AUTOMATIC,
     budget: Budget | None = None,
 ) -> tuple[list[float], list[float]]:
-    """Integrate the state over one communication step, or a part of it.
+    """Integrate the state over one communication step or a part of it.
 
     Args:
-        equations: of motion; autonomous, as inputs are held over the step.
+        equations: the equations of motion, autonomous because inputs are held over the step.
         q, v: state at the beginning, n each; q within the limits.
         h: communication step, s, > 0.
-        stops: at the joints' limits, and their friction.
+        stops: stops at the joints' limits, and joint friction.
         rtol, atol: tolerances of the error test on the state (q, v).
         max_step: largest integration step, s.
-        integrator: Dormand–Prince, that for stiff damping, or AUTOMATIC: the latter once a step fails by its stiffness.
-        budget: what the parts before have spent; None: there are none.
+        integrator: DORMAND_PRINCE, STIFF, or AUTOMATIC, which changes to STIFF if a step fails because of stiff
+            damping.
+        budget: evaluations in earlier parts of the communication step; None if this is the first part.
 
     Returns:
-        q, v at the end; q within the limits to the last bit.
+        q and v at the end; q is within the limits to the last bit.
 
     Raises:
         FloatingPointError: the equations gave a value that is not finite.
-        StepError: they change too fast.
+            StepError: the state changes too fast.
     """
     n, budget, motion = len(q), budget or Budget(), _Motion(equations, stops, rtol, atol, max_step, integrator)
     motion.evaluations = budget.spent
@@ -293,7 +294,7 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
     short_time = SHORT_CHATTER_TIME * chatter_time
     joint_time = chatter_time if stops.rigid else short_time
     joint_hold, rank_hold, stuck = Hold(), Hold(), [Hold() for _ in range(n)]
-    left, slipped, risen = [-inf] * n, [-inf] * n, -inf  # when joints left limits or began to slip, the rank rose
+    left, slipped, risen = [-inf] * n, [-inf] * n, -inf  # last release, start of slip, and rise of the rank
     event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):
@@ -313,7 +314,7 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
                 left[i] = t
             if stops.slip[i] and y[n + i] == 0.0 and i not in stops.held:
                 slipped[i] = t
-        held_again = [i for i in event.released if i in stops.watched]  # by rounding
+        held_again = [i for i in event.released if i in stops.watched]  # because of rounding
         for i in held_again:
             if stops.rest[i] == STUCK:
                 stuck[i].again(t, short_time, chatter_time)

@@ -12,7 +12,7 @@ from .equations import Array, Law, Ratios
 
 
 def command(plant: ControlledPlant) -> tuple[Law, Ratios]:
-    """Return q̈_cmd as a function of the state, n values, inputs held; this law has no J⁺."""
+    """Return q̈_cmd (n values) as a function of the state, with inputs held; this law has no J⁺."""
     law = list(zip(plant.a_des, plant.v_des, plant.q_des, plant.Kd, plant.Kp))
 
     def commanded_acceleration(q: Array, v: Array, rank: int | None) -> tuple[list[float], int, float]:

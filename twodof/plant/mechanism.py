@@ -16,7 +16,7 @@ import pinocchio as pin
 from .equations import Array
 from .robot import Robot
 
-# looked up once: an attribute of the module costs as much as a call's arithmetic
+# looked up once, because a module attribute costs as much as the arithmetic of a call
 forward_kinematics = pin.forwardKinematics
 frame_jacobian = pin.computeFrameJacobian
 frame_acceleration = pin.getFrameClassicalAcceleration
@@ -30,8 +30,8 @@ class Mechanism:
         robot: the robot.
         gravity: in the root's axes, m/s².
         payload: the point mass, kg.
-        offset: its position in the task frame, m.
-        armature: inertias of the rotors, which M has on its diagonal, kg·m² or kg, n values.
+        offset: position of the payload in the task frame, m.
+        armature: rotor inertias, added to the diagonal of M, kg·m² or kg, n values.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Mechanism:
         self._model, self._data = model, model.createData()
         self._G, self._c = robot.coupling, robot.offset
         self._still = np.zeros(model.nv)
-        # both follow what Pinocchio computes
+        # both are views that Pinocchio updates
         self._placement: Any = self._data.oMf[self._frame]
         self._position: Array = self._placement.translation
 
@@ -64,7 +64,7 @@ class Mechanism:
         J = frame_jacobian(model, data, q, frame, WORLD_ALIGNED)
         if self._G is not None:
             J = J @ self._G
-        # with q̈ = 0 the frame's acceleration is the drift
+        # with q̈ = 0, the acceleration of the frame is the drift
         drift = frame_acceleration(model, data, frame, WORLD_ALIGNED)
         rows = J.tolist() if J.ndim == 2 else J.reshape(6, 1).tolist()  # one joint: a vector
         return self._position.tolist(), rows, drift.vector.tolist()

@@ -1,7 +1,7 @@
-"""Normal random numbers of a seed, a sample and a channel, bit-identical on every platform.
+"""Normal random numbers as a function of seed, sample and channel, bit-identical on every platform.
 
-The uniform numbers are those of Philox4x32-10, a function of a counter and a key, so that noise has no state. The
-polar method makes them normal, u √(−2 ln s / s) with s = u² + w² < 1; its logarithm has operations of IEEE 754 alone.
+Philox4x32-10 gives the uniform numbers. It is a function of a counter and a key, so that noise has no state. The polar
+method makes them normal: u √(−2 ln s / s) with s = u² + w² < 1. Its logarithm uses basic operations of IEEE 754 only.
 
 Sources: Salmon, Moraes, Dror & Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011; Marsaglia & Bray, "A
 convenient method for generating normal variables", SIAM Review 6(3), 1964.
@@ -18,7 +18,7 @@ TERMS = 11
 
 
 def philox(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return four random words of 32 bits, those of Philox4x32-10."""
+    """Return four random 32-bit words by Philox4x32-10."""
     a, b, c, d = counter
     k, m = key
     for _ in range(ROUNDS):
@@ -41,7 +41,7 @@ def logarithm(x: float) -> float:
 
 
 def normal_pair(seed: int, k: int, channel: int) -> tuple[float, float]:
-    """Return two independent standard normal numbers of a seed, a sample k < 2⁵³ and a channel."""
+    """Return two independent standard normal numbers for a seed, a sample k < 2⁵³ and a channel."""
     attempt = 0
     while True:
         a, b, c, d = philox((k & WORD, k >> 32, channel, attempt), (seed, 0))

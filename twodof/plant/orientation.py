@@ -21,10 +21,10 @@ def rotation_error(target: Sequence[float], rotation: Array) -> list[float]:
     Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 2.6 and 3.7.3.
 
     Args:
-        target: quaternion of R_des, not 0, of any length.
+        target: quaternion of R_des, of any length but 0.
         rotation: R.
     """
-    largest = max(map(abs, target))  # a length that neither overflows nor vanishes
+    largest = max(map(abs, target))  # scaling prevents overflow and underflow of the length
     ax, ay, az, aw = (component / largest for component in target)
     bx, by, bz, bw = quaternion(rotation)
     x = aw * -bx + ax * bw - ay * bz + az * by

@@ -3,8 +3,8 @@
     τ = M(q) q̈_cmd + h(q, v)                                    inverse dynamics (RNEA)
     q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − h(q, v) + λ)     forward dynamics (ABA)
 
-or τ itself, as the law gives it. λ is the effort of friction and stops (``stops``). M and h of the second have the
-payload, those of the first where ``payload_known``; M has the armature in both.
+A law of efforts gives τ itself. λ is the effort of friction and stops (``stops``). M and h include the payload in
+forward dynamics, and in inverse dynamics only with ``payload_known``. M includes the armature in both.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 5 and 7; here Pinocchio's.
 """
@@ -61,8 +61,8 @@ def refusing(kind: type[Exception]) -> Iterator[None]:
 class Plant(ControlledPlant):
     """A robot and its control law as a system with inputs, parameters, state and outputs.
 
-    Of its variables (``ControlledPlant``) ``q`` and ``v`` are the state; ``x``, ``xd``, ``tau`` and the state's
-    derivatives ``der_q`` and ``der_v`` are computed when read.
+    Its variables are attributes (``ControlledPlant``). ``q`` and ``v`` are the state. Reading ``x``, ``xd``, ``tau``,
+    ``der_q`` or ``der_v`` computes the value.
 
     Args:
         robot: the robot.
@@ -71,7 +71,7 @@ class Plant(ControlledPlant):
 
     Attributes:
         known: the robot as its control law knows it.
-        time: of the state, s.
+        time: time of the state, s.
         sampling: discrete state of the sampled controller and its sensors.
     """
 
@@ -131,15 +131,15 @@ class Plant(ControlledPlant):
             self.known = Mechanism(self.robot, self.gravity, 0.0, offset, armature)
 
     def step(self, h: float, time: float | None = None) -> None:
-        """Advance the state by one communication step of h seconds, inputs held.
+        """Advance the state by one communication step of h seconds with inputs held.
 
         Args:
             h: the step, s.
-            time: of the communication point at which it begins, s; None: the plant's own.
+            time: time of the communication point at which the step begins, s; None: the plant's own time.
 
         Raises:
-            DiscardError: the motion is too fast for the integrator, its values would no longer be finite, or an input
-                is none that the control law can follow; the state is left as it was.
+            DiscardError: the motion is too fast for the integrator, a value would not be finite, or the control law
+                cannot follow an input. The state is then unchanged.
         """
         self._check_target()
         limits = {"max_step": self.max_step, "control_period": self.control_period or inf}
@@ -152,7 +152,7 @@ class Plant(ControlledPlant):
         before = self.q, self.v, self.sampling, self.time
         self.time = self.time if time is None else time
         try:
-            # what overflows is refused, without a warning
+            # an overflow is refused, without a warning of NumPy
             with refusing(DiscardError), np.errstate(over="ignore", invalid="ignore"):
                 advance_sampled(self, h)
         except BaseException as error:
@@ -219,7 +219,7 @@ class Plant(ControlledPlant):
         return tau
 
     def _settled(self) -> Sampling:
-        """Return the samples as they are once all that is due at the present time has been done."""
+        """Return the sampled controller's state after all events that are due at the present time."""
         with refusing(DiscardError):
             return self.sampling.settled(self, self.time)
 
@@ -230,7 +230,7 @@ class Plant(ControlledPlant):
 
     @property
     def der_v(self) -> list[float]:
-        """Derivative of v at the current state and inputs, joints that rest included.
+        """Derivative of v at the current state and inputs; 0 for joints at rest.
 
         Raises:
             DiscardError: an input that the control law cannot follow.
@@ -259,7 +259,7 @@ class Plant(ControlledPlant):
         """Return q̈ under a control law."""
         damping, external = np.array(self.damping), np.array(self.tau_ext)
         force, friction = np.array(self.f_ext), np.array(self.friction)
-        # q̈ = q̈_cmd + M⁻¹(…): rounding of M q̈_cmd + h − h would move joints that are at rest
+        # q̈ = q̈_cmd + M⁻¹(…), because rounding of M q̈_cmd + h − h would move joints at rest
         cancels = self._commands == "acceleration" and self.known is self._real
         cancels = cancels and not self.limit_effort and not self.control_period
         if cancels and not (damping.any() or external.any() or force.any() or friction.any()):

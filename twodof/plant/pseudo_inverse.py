@@ -1,7 +1,7 @@
 """Truncated pseudo-inverse of a task Jacobian.
 
-With three rows or fewer a call into a linear-algebra library costs more than the arithmetic, so
-rows are plain lists of floats.
+Rows are plain lists of floats: with three rows or fewer, a call into a linear-algebra library costs more than the
+arithmetic.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,9 @@ import numpy as np
 WELL_CONDITIONED = 1e-3
 """Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12."""
 ORTHOGONAL = 2.0**-50
-"""Rows count as orthogonal where the cosine of their angle is below this, or the ratio of their
-lengths: the shorter is what rounding has left of a row that depends on others."""
+"""Two rows count as orthogonal if the cosine of their angle, or the ratio of their lengths, is below this. If the ratio
+is, the shorter row is the rounding error of a linearly dependent row.
+"""
 MAX_SWEEPS = 12
 PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 
@@ -21,7 +22,7 @@ PAIRS = {1: (), 2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}
 def apply_pseudo_inverse(
     rows: list[list[float]], b: list[float], rcond: float, rank: int | None = None
 ) -> tuple[list[float], int, float]:
-    """Return J⁺b with the largest singular values up to the given rank.
+    """Return J⁺b, in which J⁺ keeps as many of the largest singular values as the given rank.
 
     Args:
         rows: J, m rows of n.
@@ -30,8 +31,8 @@ def apply_pseudo_inverse(
         rank: of J⁺; None keeps σ > rcond·σ_max, the rule of ``numpy.linalg.pinv``.
 
     Returns:
-        n values, the least-squares solution of smallest norm; the rank; and its margin, that of
-        ``rank_margin`` or, where positive, a lower bound of it.
+        The least-squares solution of smallest norm, n values; the rank; and the rank's margin, which is
+        that of ``rank_margin`` or, if positive, a lower bound of it.
     """
     smallest = max(rcond * rcond, WELL_CONDITIONED)
     if rank is not None and rank < len(rows):
@@ -81,7 +82,7 @@ def apply_pseudo_inverse(
 def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
     """Return the distance of the singular values next to a rank from rcond, as ratios to σ_max.
 
-    It is negative where the rule σ > rcond·σ_max gives another rank.
+    It is negative if the rule σ > rcond·σ_max gives another rank.
 
     Args:
         ratios: σ/σ_max in descending order.
@@ -97,7 +98,7 @@ def rank_margin(ratios: Sequence[float], rcond: float, rank: int) -> float:
 
 
 def singular_ratios(rows: Sequence[Sequence[float]]) -> list[float]:
-    """Return σ/σ_max of a matrix in descending order; 0 where all are 0."""
+    """Return σ/σ_max of a matrix in descending order; all are 0 for a zero matrix."""
     orthogonal, _ = _orthogonal([list(row) for row in rows], [0.0] * len(rows))
     return _ratios([_dot(row, row) for row in orthogonal])
 

@@ -1,7 +1,7 @@
 """A checked URDF as a Pinocchio model and its independent joints.
 
-Pinocchio loads several things silently that this plant cannot simulate, so the XML is
-checked before Pinocchio sees it, and every refusal names the joint or the link.
+Pinocchio silently loads some features that this plant cannot simulate. Therefore the XML is checked first, and every
+refusal names the joint or the link.
 """
 
 import math
@@ -24,18 +24,18 @@ class Robot:
         name: the URDF's robot name.
         model: Pinocchio model of all joints that move, one coordinate each; its gravity is not
             used (see ``Mechanism``).
-        coupling, offset: positions of the model's joints are ``coupling @ q + offset``; no coupling
-            where no joint mimics another, and they are q.
+        coupling, offset: positions of the model's joints are ``coupling @ q + offset``; coupling is None, and the
+            positions are q, if no joint mimics another.
         joints: names of the n joints in the model's order.
-        prismatic: per joint, True where the coordinate is a length (m), else an angle (rad).
-        q_min, q_max: position limits, rad or m, with those of the joints that follow; ∓UNBOUNDED where there is none.
+        prismatic: for each joint, True if its coordinate is a length (m), False for an angle (rad).
+        q_min, q_max: position limits, rad or m, including limits of joints that mimic it; ∓UNBOUNDED without one.
         effort: effort limits, N·m or N; infinite where the URDF has 0 or none.
-        damping: viscous joint damping D, N·m·s/rad or N·s/m, with that of the joints that follow.
-        friction: Coulomb friction, N·m or N, with that of the joints that follow.
+        damping: viscous joint damping D, N·m·s/rad or N·s/m, including that of joints that mimic it.
+        friction: Coulomb friction, N·m or N, including that of joints that mimic it.
         frame: name of the task frame, and its Pinocchio index ``frame_id``.
         axes: task axes, a subset of "xyz" in the root frame, e.g. "xy"; m = len(axes).
         root: name of the URDF's root link, the frame in which positions are expressed.
-        warnings: what was read but has no effect, one line each.
+        warnings: URDF elements without effect, one line each.
     """
 
     name: str
@@ -63,16 +63,16 @@ class Robot:
         """Bound on how fast each joint changes σ/σ_max of the task Jacobian, 1/rad or 1/m.
 
         A joint i of a chain changes column j of the Jacobian by the cross product of an axis with
-        column max(i, j), so that ‖∂J/∂q_i‖ ≤ √n σ_max for n joints; by Weyl's inequality no
-        singular value changes by more, and their ratio by at most twice as much of σ_max. With
-        fewer than three task axes the columns are projections, and it is an estimate.
+        column max(i, j), so that ‖∂J/∂q_i‖ ≤ √n σ_max for n joints. By Weyl's inequality no singular value changes
+        faster, and no ratio σ/σ_max changes by more than 2 √n per unit. With fewer than three task axes, the columns
+        are projections, and the bound is an estimate.
         """
         path = self._path()
         bound = 2.0 * math.sqrt(len(path)) * np.abs(path).sum(axis=0)
         return tuple(bound.tolist())
 
     def _path(self) -> NDArray[np.float64]:
-        """Return the rows of the coupling of joints between the root and the task frame."""
+        """Return the coupling's rows for the joints between the root and the task frame."""
         support = list(self.model.supports[self.model.frames[self.frame_id].parentJoint])[1:]
         coupling = np.eye(len(self.joints)) if self.coupling is None else self.coupling
         return coupling[[i - 1 for i in support]]
@@ -141,7 +141,7 @@ def load_robot(text: str, frame: str, axes: str) -> Robot:
 def _coupling(
     moving: Sequence[Joint], joints: Sequence[Joint]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
-    """Return G and c of all joint positions G q + c; G is None where they equal q."""
+    """Return G and c, with which all joint positions are G q + c; G is None if they equal q."""
     offset = np.array([joint.offset for joint in moving])
     if len(moving) == len(joints):
         return None, offset
@@ -153,7 +153,7 @@ def _coupling(
 
 
 def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
-    """Return the range in which a joint and all its followers are within their limits."""
+    """Return the range in which a joint and all joints that mimic it are within their limits."""
     low, high = leader.low, leader.high
     for joint in moving:
         if joint.leader != leader.name or joint is leader or not joint.ratio:
@@ -173,7 +173,7 @@ def _limits(leader: Joint, moving: Sequence[Joint]) -> tuple[float, float]:
 
 
 def _mass(urdf: Urdf, joint: Joint, odd: list[str]) -> float:
-    """Return the mass of a moving body (a link with all links fixed to it), with a physical inertia."""
+    """Return the mass of a moving body, a link with all links fixed to it, after checking its inertia."""
     fixed = [other for other in urdf.joints.values() if not other.moves]
     body = [joint.child]
     for name in body:
@@ -205,7 +205,7 @@ _INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def _missing(inertial: ET.Element) -> str:
-    """Return the first element whose attributes are missing, and those attributes; "" where none is."""
+    """Return the first element with missing attributes, and these attributes; "" if there is none."""
     for tag, keys in (("mass", ("value",)), ("inertia", _INERTIA_KEYS)):
         element = inertial.find(tag)
         missing = [key for key in keys if element is None or element.get(key) is None]
@@ -217,8 +217,9 @@ def _missing(inertial: ET.Element) -> str:
 def _mechanism(urdf: Urdf) -> ET.Element:
     """Return a URDF reduced to inertias, joints and limits.
 
-    urdfdom drops or refuses a whole link or joint for flaws in parts that do not matter here, and takes a number with
-    a space behind it for 0. Continuous joints become revolute without limits, so that Pinocchio's state is the angle.
+    urdfdom drops or refuses a whole link or joint because of flaws in parts that have no effect here, and reads a
+    number with a trailing space as 0. Continuous joints become revolute without limits, so that Pinocchio's state is
+    the angle.
     """
     bare = ET.Element("robot", name=urdf.name or "robot")
     for link in urdf.tree.findall("link"):

@@ -1,15 +1,15 @@
 """One step of ROS34PW2, a Rosenbrock-W method of order 3(2) for stiff joint damping, and its dense output.
 
-The method is of its order with any approximation T of the Jacobian, and L-stable for the part that is in T. Here that
-is the damping D of the joints and q̇ = v,
+The method has its order with any approximation T of the Jacobian, and is L-stable for the terms in T. Here T contains
+the joint damping D and q̇ = v:
 
     T = [ 0      1   ]        (1 − h γ T) uᵢ = h γ f(y + Σ aᵢⱼ uⱼ) + γ Σ cᵢⱼ uⱼ,    j < i
         [ 0   −M⁻¹D  ]        y_new = y + Σ mᵢ uᵢ
 
-with M⁻¹ at y, of joints at rest that of their regime. The dense output of q is the cubic through the positions and
-velocities at both ends. That of v is a cubic with the accelerations at the ends, so that a joint which begins to slip
-does so in the right direction; one that differs from the rate of q's by more than the tolerance is stiff, where small
-errors of v make large ones of q̈, and q's is taken.
+with M⁻¹ at y, in which joints at rest are held. The dense output of q is the cubic through the positions and velocities
+at both ends. The dense output of v is a cubic with the accelerations at the ends, so that a joint begins to slip in the
+right direction. If an acceleration differs by more than the tolerance from that of q's cubic, the joint is stiff: small
+errors of v become large errors of q̈. The acceleration of q's cubic then replaces it.
 
 Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of index
 1", BIT 45(4), 2005, in the form without products by T of Hairer & Wanner, "Solving ODEs II", IV.7.
@@ -25,7 +25,7 @@ from .dormand_prince import Array, State
 
 GAMMA = 0.435866521508459
 A = ((2.0,), (1.4192173174557647, -0.2592322116729697), (4.18476048231916, -0.28519201735549593, 2.294280360279042))
-"""Row i weighs the increments u of the stages before i + 1."""
+"""Row i has the weights of the increments u of the stages before i + 1."""
 M = (*A[-1], 1.0)
 C = (
     (-4.588560720558084,),
@@ -34,10 +34,11 @@ C = (
 )
 E = (0.2777499476479681, -1.403239895175999, 1.7726301276675507, 0.5)
 CUBIC = np.array([[0, 0, 0, 0], [1, -2, 1, 0], [0, 3, -2, 0], [0, -1, 1, 0], [0, 0, 0, 0]], float)
-"""Weights, in the dense output, of the derivatives that ``rosenbrock`` returns: a cubic by both ends."""
+"""Weights in the dense output, a cubic by both ends, of the derivatives that ``rosenbrock`` returns."""
 STABLE, WORTH = 3.3, 12.0
-"""Rates of damping times a step: up to which Dormand–Prince is stable, and times the largest step from which on this
-method is the cheaper one."""
+"""Damping rate times step: up to STABLE, Dormand–Prince is stable; if the product with the largest step exceeds WORTH,
+this method is cheaper.
+"""
 
 
 def rosenbrock(
@@ -54,7 +55,7 @@ def rosenbrock(
 
     Args:
         rates: ẏ at a state.
-        mobility: M⁻¹ at y, n × n, without rows of joints at rest.
+        mobility: M⁻¹ at y, n × n, with zero rows for joints at rest.
         damping: D, n values, N·m·s/rad or N·s/m.
         y: the state (q, v).
         step: s.
@@ -62,7 +63,7 @@ def rosenbrock(
         rtol, atol: tolerances of the state.
 
     Returns:
-        y_new, the derivatives for ``CUBIC``, of which the last is ẏ at y_new, and the norm of the error.
+        y_new; the derivatives for ``CUBIC``, the last of which is ẏ at y_new; and the norm of the error.
     """
     n = len(damping)
     solve = np.linalg.inv(np.eye(n) + step * GAMMA * mobility * damping)
@@ -77,7 +78,7 @@ def rosenbrock(
             k = rates(at)
     y_new = [x + u for x, u in zip(at, U[-1])]
     k_new = rates(y_new)
-    mean = [sum(map(mul, M, u)) / step for u in zip(*U)]  # differences of states are rounded in short steps
+    mean = [sum(map(mul, M, u)) / step for u in zip(*U)]  # a difference of states loses digits in short steps
     v, v_new = y[n:], y_new[n:]
     first, last = k1[n:], k_new[n:]
     for i, (s, p, q) in enumerate(zip(mean, v, v_new)):
@@ -91,15 +92,15 @@ def rosenbrock(
 
 
 def damping_limits(mobility: Array, damping: Array, K: list[State], step: float, largest: float) -> bool:
-    """Return whether damping made a step of Dormand–Prince unstable that failed, so that this method is cheaper.
+    """Return whether a step of Dormand–Prince failed because of stiff damping, and this method is cheaper.
 
-    Its rate is a Rayleigh quotient of M⁻¹D, at the difference of the last two stages' velocities: where the step is
-    unstable, the fastest mode prevails there.
+    The damping rate is a Rayleigh quotient of M⁻¹D at the difference of the velocities at the last two stages. The
+    fastest mode dominates this difference if the step is unstable.
 
     Args:
-        mobility, damping: those of ``rosenbrock``.
+        mobility, damping: as in ``rosenbrock``.
         K: derivatives at the stages of the step.
-        step, largest: its size and the largest that is allowed, s.
+        step, largest: size of the step, and the largest permitted size, s.
     """
     change = np.subtract(K[-1], K[-2])[: len(damping)]
     effort = damping * change

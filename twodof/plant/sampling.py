@@ -21,11 +21,11 @@ from .noise import normal_pair
 MOST_PERIODS = 10
 """Longest delay, in periods."""
 TIME_TOLERANCE = 1e-9
-"""Times of communication points are equal within this part of max(1 s, |t|)."""
+"""Tolerance for equal times, relative to max(1 s, |t|)."""
 PART_OF_PERIOD = 1e-3
-"""Largest difference of equal times, as a part of the period."""
+"""Tolerance for equal times, relative to the period."""
 WHOLE = 2.0**53
-"""From here on all floating-point numbers are whole."""
+"""Doubles of this size or larger are integers."""
 
 
 @dataclass
@@ -36,9 +36,9 @@ class Sampling:
         start: t_0, s.
         time: time of the latest sample, s.
         k: number of samples so far.
-        count: of them, how many have commanded an effort that does not act yet.
+        count: number of efforts that were commanded and do not act yet.
         q_meas, v_meas: the latest sample, n values each, rad or m, rad/s or m/s.
-        effort: what acts, n values, N·m or N.
+        effort: the effort that acts now, n values, N·m or N.
         pending: efforts that do not act yet, the oldest first; MOST_PERIODS + 1 lists, of which ``count`` are used.
     """
 
@@ -59,7 +59,7 @@ class Sampling:
         return cls(start, start, 0, 0, list(still), list(still), list(still), pending)
 
     def settled(self, plant: ControlledPlant, time: float) -> Sampling:
-        """Return the state after all that is due at a time, s, at the plant's state and inputs.
+        """Return the state after all events that are due at a time, s, with the plant's state and inputs.
 
         Raises:
             FloatingPointError: an effort is not finite.
@@ -72,14 +72,14 @@ class Sampling:
         return after
 
     def is_sound(self, plant: ControlledPlant) -> bool:
-        """Return whether the state is one that a plant can be in at its time, given finite numbers."""
+        """Return whether the state is valid at the plant's time, if all its numbers are finite."""
         if not 0 <= self.count <= min(self.k, MOST_PERIODS) or self.k >= WHOLE:
             return False
         period = plant.control_period
         return abs(self._instant(plant, self.k) - plant.time) <= 2.0 * period if period else not self.count
 
     def next_event(self, plant: ControlledPlant) -> float:
-        """Return the time at which the next sample is taken or the next effort acts, s; infinite without samples."""
+        """Return the time of the next sample or of the next change of effort, s; infinite without samples."""
         if not plant.control_period:
             return inf
         return min(self._instant(plant, self.k), self._due(plant))
@@ -88,7 +88,7 @@ class Sampling:
         return float(self.start + k * plant.control_period)
 
     def _due(self, plant: ControlledPlant) -> float:
-        """Return when the oldest pending effort acts, s."""
+        """Return the time from which the oldest pending effort acts, s."""
         first = self.k - self.count
         return self._instant(plant, first) + float(plant.control_delay) if self.count else inf
 
@@ -152,16 +152,16 @@ def rounded(q: float, resolution: float) -> float:
 
 
 def slack(plant: ControlledPlant, time: float) -> float:
-    """Return the difference within which times are equal, s; 0 without samples."""
+    """Return the tolerance for equal times, s; 0 without samples."""
     return min(TIME_TOLERANCE * max(1.0, abs(time)), PART_OF_PERIOD * float(plant.control_period))
 
 
 def sampling_refusal(plant: ControlledPlant, of_points: bool) -> str:
-    """Return why the parameters of sampling are invalid, "" where they are valid.
+    """Return why the parameters of sampling are invalid, or "" if they are valid.
 
     Args:
         plant: the plant.
-        of_points: sensors without a control_period are sampled at communication points.
+        of_points: whether sensors without a control_period are sampled at communication points.
     """
     period, delay = plant.control_period, plant.control_delay
     if delay and not period:

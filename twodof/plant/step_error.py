@@ -1,19 +1,19 @@
-"""A communication step that the integrator cannot do, and the joint that is too fast for it."""
+"""Error for a communication step that the integrator cannot do; it names the joint that is too fast."""
 
 from collections.abc import Callable, Sequence
 from itertools import product
 from math import inf, isfinite
 
-NUDGE = 1e-6  # rad, m and per s: of the difference quotients
+NUDGE = 1e-6  # step of the difference quotients: rad, m, rad/s or m/s
 
 
 class StepError(ArithmeticError):
     """A communication step that fails the tolerances or exceeds the budget.
 
     Attributes:
-        too_fine: no integration step was small enough, so that a larger budget would not help.
+        too_fine: whether even the smallest integration step failed, so that a larger budget would not help.
         joint: index of the joint that changes fastest.
-        rate: of its change, 1/s.
+        rate: the joint's rate of change, 1/s.
     """
 
     def __init__(self, *, too_fine: bool, joint: int, rate: float) -> None:
@@ -22,7 +22,7 @@ class StepError(ArithmeticError):
 
 
 def fastest_joint(acceleration: Callable[[list[float]], Sequence[float]], y: list[float]) -> tuple[int, float]:
-    """Return the joint whose acceleration is most sensitive to its own state, and the rate of its change, 1/s.
+    """Return the joint whose acceleration is most sensitive to its own state, and its rate of change, 1/s.
 
     Args:
         acceleration: q̈ at a state (q, v).

@@ -1,16 +1,16 @@
 """Joints at rest at a limit or by friction: the efforts that hold them, and their release.
 
-A stop is plastic and unilateral: a joint that reaches it loses its velocity there, and rests there
-while it is pressed into it. Without a reaction, as a clamp, that is all: it is pressed while its
-own acceleration points into the limit, and the other joints move as if it were not there; what its friction does to
-them is that of a joint that slips into the limit. Rigid stops act on all joints, and friction F does. With E the unit
-vectors of joints at a limit, into the range, and λ the efforts on joints at rest,
+A stop is plastic and unilateral: a joint that reaches it loses its velocity and rests while it is pressed against it.
+There are two kinds. A clamp has no reaction: the joint rests while its own acceleration points into the limit, and the
+other joints move as if the joint moved on freely, with the friction of a joint that slips into the limit. A rigid stop
+acts on all joints, as friction F does. With the unit vectors E of joints at a limit, which point into the range, and
+the efforts λ on joints at rest,
 
     v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0                       at an impact
     q̈ = q̈_free + M⁻¹λ,        −F ≤ λ ≤ F, at a limit into the range without an upper bound;
                               q̈ > 0 only at the lower bound, q̈ < 0 only at the upper one
 
-A joint that moves slips, λ = −F sgn(v). Finite friction has no part in an impact.
+A moving joint slips: λ = −F sgn(v). Finite friction has no effect in an impact.
 
 Sources: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 11.1 to 11.5; Pfeiffer & Glocker, "Multibody
 Dynamics with Unilateral Contacts", 1996, chapter 5.
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Limits = Sequence[tuple[float, float]]
-"""Per joint (q_min, q_max)."""
+"""(q_min, q_max) of each joint, rad or m."""
 InverseMass = Callable[[Sequence[float]], Array]
 """M(q)⁻¹, n × n."""
 Bounds = Mapping[int, tuple[float, float]]
@@ -32,18 +32,18 @@ Bounds = Mapping[int, tuple[float, float]]
 
 MOST_PIVOTS, BLOCK_TRIES = 10_000, 5
 ROUNDING = 2.0**-40
-"""Rounding error of a sum that decides a sign, as a part of its terms."""
+"""Rounding error of a sum whose sign decides, relative to its terms."""
 FREE, STUCK, STOPPED, CLAMPED = range(4)
-"""States of a joint: not at rest, held by friction, held at a limit by a rigid stop, or there by a clamp."""
+"""States of a joint: moving, held by friction, held at a limit by a rigid stop, or held there by a clamp."""
 
 
 class Stops:
-    """Stops and friction of a robot, and the joints that rest by them.
+    """Stops and friction of a robot, and the joints that they hold at rest.
 
     Args:
         limits: of the joints.
         friction: of the joints, N·m or N, n values.
-        inverse_mass: not used without friction and rigid stops.
+        inverse_mass: function that returns M⁻¹; called only with friction or rigid stops.
         rigid: whether stops have a reaction.
 
     Attributes:
@@ -51,7 +51,7 @@ class Stops:
         rest: how each joint rests, or FREE.
         slip: direction in which each joint slips, −1 or 1; 0 without friction or at rest.
         held: joints at rest.
-        watched: those of them that are free when the effort that holds them is beyond its bounds.
+        watched: held joints that are released when the holding effort exceeds its bounds.
     """
 
     def __init__(self, limits: Limits, friction: Sequence[float], inverse_mass: InverseMass, *, rigid: bool) -> None:
@@ -65,8 +65,8 @@ class Stops:
 
         Args:
             y: the state; changed.
-            anti_chatter: joints that stop in both directions. Otherwise mutual impacts, as of the feet
-                of a rocking block, would repeat for ever in finite time (Zeno).
+            anti_chatter: joints that stop in both directions. Without them, mutual impacts could repeat without
+                end in finite time (Zeno), as those of the feet of a rocking block.
         """
         n = len(self.limits)
         sides = self._sides(y)
@@ -84,20 +84,19 @@ class Stops:
             y[n + i] = 0.0
 
     def slide(self, v: Sequence[float]) -> list[int]:
-        """Set and return the directions in which joints slip that move at v."""
+        """Set and return the directions of slip at the velocities v."""
         self.slip = [int(x > 0.0) - int(x < 0.0) if F else 0 for x, F in zip(v, self._friction)]
         return self.slip
 
     def hold(self, y: Sequence[float], a: list[float], kept: Sequence[bool]) -> list[float]:
-        """Find the joints that rest at (q, v) after an impact, and the directions of those that begin to slip.
+        """Find the joints that rest at (q, v) after an impact, and the directions in which others begin to slip.
 
-        Returns what ``restrain`` does.
+        Return the same as ``restrain``.
 
         Args:
             y: the state.
-            a: q̈ of joints that move in the directions of ``slide``, those at rest being free; changed to that with
-                what holds them.
-            kept: joints that stay at rest whatever holds them.
+            a: q̈ with joints at rest free, and slip in the directions of ``slide``; changed to q̈ with joints held.
+            kept: joints that stay at rest even if the holding effort exceeds its bounds.
         """
         n = len(self.limits)
         sides = self._sides(y)
@@ -131,10 +130,10 @@ class Stops:
         return self.restrain(y, a)
 
     def restrain(self, y: Sequence[float], a: list[float]) -> list[float]:
-        """Make the acceleration of held joints 0.
+        """Add the efforts that hold joints to the acceleration, so that it is 0 for held joints.
 
-        Returns how far the effort that holds each watched joint is from its lower and its upper bound, two values
-        each, infinite where there is no bound: the joint is free where one is negative. That of a clamp is −q̈.
+        Return two values for each watched joint: the distances of its holding effort from the lower and the upper
+        bound, infinite without a bound. The joint is released if one is negative. For a clamp the effort is −q̈.
         """
         if not self.held:
             return []
@@ -150,7 +149,7 @@ class Stops:
         return [grip for i in self.watched for grip in self._grips(i, y[i], efforts[i])]
 
     def mobility(self, q: Sequence[float]) -> Array:
-        """Return the accelerations that unit efforts cause in the regime: M⁻¹, n × n, with joints at rest held."""
+        """Return M⁻¹ with joints at rest held, n × n: the accelerations that unit efforts cause."""
         W = np.array(self._inverse_mass(q))
         reacting = [i for i in self.held if self.rest[i] != CLAMPED]
         if reacting:
@@ -174,7 +173,7 @@ class Stops:
         return low == high
 
     def _sides(self, y: Sequence[float]) -> dict[int, float]:
-        """Return the sign of the direction back into the range, by joint that is at a limit."""
+        """Return, for each joint at a limit, the sign of the direction into the range."""
         return {
             i: -1.0 if q >= high else 1.0
             for i, ((low, high), q) in enumerate(zip(self.limits, y))
@@ -185,12 +184,13 @@ class Stops:
 def _complementary(
     W: Array, b: Sequence[float], bounds: Bounds, fixed: Collection[int]
 ) -> tuple[Array, dict[int, int]]:
-    """Return z, n values, and whether that of each joint with bounds is at the lower (−1) or upper (1) one.
+    """Solve a linear complementarity problem; return z (n values) and its active bounds.
 
-    b + W z is above 0 only where z is at its lower bound, below only at the upper one; of ``fixed`` joints it is 0,
-    whatever z is. All that is wrong changes at a time; where that does not lessen its number for a while only the
-    last one does, which ends for every positive definite W. Sources: Júdice & Pires, Computers & Operations Research
-    21(5), 1994; Murty, Opsearch 11, 1974.
+    The active bound of a joint with bounds is −1 for the lower, 1 for the upper, and 0 for none. b + W z is above 0
+    only if z is at its lower bound, below 0 only if z is at its upper bound, and 0 for ``fixed`` joints, whose z has
+    no bounds. Each iteration changes all violated conditions (block pivoting). If their number does not decrease for
+    some iterations, only the last one changes, which terminates for every positive definite W. Sources: Júdice &
+    Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974.
     """
     if not np.isfinite(b).all():
         raise np.linalg.LinAlgError("not finite")

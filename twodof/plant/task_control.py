@@ -23,7 +23,7 @@ from .pseudo_inverse import apply_pseudo_inverse, singular_ratios
 
 
 def command(plant: ControlledPlant) -> tuple[Law, Ratios]:
-    """Return q̈_cmd as a function of the state, and the singular values of its J; inputs held."""
+    """Return q̈_cmd as a function of the state with inputs held, and the singular values of the task Jacobian."""
     observe = plant.known.observe
     axes = ["xyz".index(axis) for axis in plant.robot.axes]
     law = list(zip(axes, plant.xd_des, plant.xdd_des, plant.Kp, plant.Kd))

@@ -1,7 +1,7 @@
 """A URDF as a checked tree of links and joints.
 
-What only a simulation needs, masses and inertias, is checked where the model is made. Imports the
-standard library alone.
+Masses and inertias, which only a simulation needs, are checked in ``robot``. This module imports the standard library
+only.
 """
 
 import math
@@ -16,12 +16,12 @@ UNBOUNDED = 1.7976931348623157e308
 NUMERIC_TAGS = ("origin", "axis", "limit", "dynamics", "mass", "inertia")
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 SHAPES = ("visual", "collision")
-MAX_URDF = 8 * 1024**2  # bytes of a file, characters of a text
+MAX_URDF = 8 * 1024**2  # bytes of a file, or characters of a text
 MAX_LINKS = 1000
-MAX_JOINTS = 128  # that move; Pinocchio's memory grows with their third power
-MAX_SHAPES = 5000  # visuals and collisions; a page holds each
+MAX_JOINTS = 128  # moving joints; Pinocchio's memory grows with the cube of their number
+MAX_SHAPES = 5000  # visuals and collisions, all of which a page contains
 MAX_ELEMENTS = 100_000
-MAX_DEPTH = 100  # of elements in elements
+MAX_DEPTH = 100  # nested elements
 MAX_NAME = 1000  # characters; a string literal of C holds 4095 bytes
 LARGEST = 1e9  # metres, radians, kilograms: beyond it a URDF is a mistake, not a robot
 
@@ -40,14 +40,14 @@ class Joint:
         name: its name.
         type: "fixed", "revolute", "continuous" or "prismatic".
         parent, child: links.
-        xyz, rpy: of its frame in the parent's at q = 0, m and rad about the fixed axes x, y, z.
-        axis: in its frame, of length 1.
-        low, high: position limits, rad or m; ∓UNBOUNDED where there is none.
-        effort, velocity: limits, N·m or N, rad/s or m/s; infinite where the URDF has 0 or none.
+        xyz, rpy: pose of its frame in the parent's frame at q = 0, m, and rad about the fixed axes x, y, z.
+        axis: unit vector in the joint's frame.
+        low, high: position limits, rad or m; ∓UNBOUNDED without limits.
+        effort, velocity: limits, N·m or N, rad/s or m/s; infinite if the URDF has 0 or none.
         damping, friction: viscous, N·m·s/rad or N·s/m, and Coulomb friction, N·m or N.
-        leader: the joint that it mimics, and that mimics none: q = ratio·q_leader + offset; its
-            own name where it moves on its own.
-        ratio, offset: of that.
+        leader: the independent joint that it follows: q = ratio·q_leader + offset; its own name if it is
+            independent.
+        ratio, offset: constants of this equation.
     """
 
     name: str
@@ -83,12 +83,12 @@ class Urdf:
     """A robot as described by its URDF.
 
     Attributes:
-        name: the robot's.
+        name: name of the robot.
         root: the link without a parent.
-        links: names, in the order of the file.
-        joints: by name, in the order of the file.
+        links: link names, in the order of the file.
+        joints: joints by name, in the order of the file.
         tree: the XML, for all other facts.
-        warnings: what was read but has no effect, one line each.
+        warnings: elements without effect, one line each.
     """
 
     name: str
@@ -122,7 +122,7 @@ def read_urdf(text: str) -> Urdf:
     """Read a robot from the text of a URDF.
 
     Raises:
-        RobotError: anything that is not supported, naming the joint, link or attribute.
+        RobotError: an element is not supported; the message names the joint, link or attribute.
     """
     tree = _parse(text)
     links = _by_name(tree, "link")
@@ -158,7 +158,7 @@ def _listed(what: str, names: Sequence[str]) -> str:
 
 
 def _parse(urdf: str) -> ET.Element:
-    if len(urdf) > MAX_URDF:  # its elements take thirty times the memory
+    if len(urdf) > MAX_URDF:  # parsed elements take thirty times the memory of the text
         raise RobotError(f"the URDF has {len(urdf)} characters; at most {MAX_URDF} are supported")
     if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
         raise RobotError("the URDF has a document type declaration; remove it")
@@ -173,7 +173,7 @@ def _parse(urdf: str) -> ET.Element:
         depth, count = depth + 1, count + len(level)
         if count > MAX_ELEMENTS:
             raise RobotError(f"the URDF has more than {MAX_ELEMENTS} elements")
-        if depth > MAX_DEPTH:  # what writes XML goes down by recursion
+        if depth > MAX_DEPTH:  # XML writers descend by recursion
             raise RobotError(f"the URDF's elements are nested deeper than {MAX_DEPTH}")
     return tree
 
@@ -225,7 +225,7 @@ def _joint(name: str, element: ET.Element) -> Joint:
 
 
 def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
-    """Return a joint's leader, ratio and offset from <mimic>; nothing where there is none."""
+    """Return the fields leader, ratio and offset by a joint's <mimic>; without one, the joint is its own leader."""
     mimic = None if element is None else element.find("mimic")
     if mimic is None:
         return {"leader": name}
@@ -242,7 +242,7 @@ def _mimicry(name: str, element: ET.Element | None) -> dict[str, Any]:
 
 
 def _following(joint: Joint, joints: dict[str, Joint]) -> Joint:
-    """Return the joint with the leader at the end of its chain of <mimic> elements."""
+    """Return the joint with the leader at the end of its chain of <mimic> elements, which is independent."""
     seen = [joint.name]
     while joint.leader != seen[-1]:
         leader = joints.get(joint.leader)
@@ -292,12 +292,12 @@ def _check_numbers(element: ET.Element, owner: str) -> None:
                     raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not a number or vector")
                 if not all(abs(number) <= LARGEST for number in numbers):
                     if tag == "limit" and not any(map(math.isnan, numbers)):
-                        continue  # a huge limit is a common way to write "none"
+                        continue  # a huge value is a common way to write "no limit"
                     raise RobotError(f"{owner}: <{tag} {key}='{text}'> is not finite or too large")
 
 
 def number(word: str) -> float:
-    """Parse a number as other readers do: without Python's underscores and non-ASCII digits."""
+    """Parse a number without Python's underscores and non-ASCII digits, as other readers of URDFs do."""
     if not word.isascii() or "_" in word:
         raise ValueError(word)
     return float(word)

@@ -1,7 +1,7 @@
-"""The table of FMI variables, from which the slave and the XML of both flavours are made.
+"""The table of FMI variables, the source of the slave and of both flavours' XML.
 
-Names are FMI structured names with 1-based indices; a variable's place in the table, from 1 on, is
-its value reference.
+Names are FMI structured names with 1-based indices. The value reference of a variable is its 1-based index in the
+table.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .robot import Robot
 
 Value = float | bool
-EXACT = 1e-9  # relative: a saturated effort is at its limit, not beyond it
+EXACT = 1e-9  # relative tolerance within which an effort is at its limit, not beyond it
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Range:
 NO_RANGE = Range(-math.inf, math.inf, "")
 NOT_NEGATIVE = Range(0.0, math.inf, ">= 0")
 POSITIVE = Range(sys.float_info.min, math.inf, "> 0")
-"""From the smallest normal number on: C++ cannot read smaller ones, and processors may take them for 0."""
+"""The smallest normal number is the minimum: C++ cannot read smaller ones, and processors may flush them to 0."""
 GAINS = ("Kp", "Kd", "Kn", "Kp_rot", "Kd_rot")
 RANGES = {
     **dict.fromkeys((*GAINS, "payload", "friction", "damping", "armature"), NOT_NEGATIVE),
@@ -41,7 +41,7 @@ RANGES = {
     "seed": Range(0, 2**31 - 1, "in [0, 2147483647]"),
     "integrator": Range(0, 2, "0 (automatic), 1 (Dormand-Prince) or 2 (stiff joints)"),
 }
-"""Valid ranges by group; other variables may be any number. The FMU refuses values outside."""
+"""Valid ranges by group; the FMU refuses values outside them. Other variables have no range."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Variable:
             element, None for a scalar. "der_q" is the derivative of "q".
         causality: "input", "output", "local" (the derivatives of the states q and v) or
             "parameter" (all parameters are fixed).
-        unit: FMI unit name, "" where there is none.
-        start: start value; None for what is computed.
+        unit: FMI unit name, or "".
+        start: start value; None for computed variables.
         description: one line.
     """
 
@@ -74,7 +74,7 @@ class Variable:
 
     @property
     def derivative_of(self) -> str:
-        """Group of the state whose derivative this is, "" where it is none."""
+        """Group of the state whose derivative this is; "" for other variables."""
         return self.group.removeprefix("der_") if self.group.startswith("der_") else ""
 
     @property
@@ -83,7 +83,7 @@ class Variable:
         return "Boolean" if isinstance(self.start, bool) else "Integer" if isinstance(self.start, int) else "Real"
 
     def refusal(self, value: Value) -> str:
-        """Return why a value is invalid, "" where it is valid."""
+        """Return why a value is invalid, or "" if it is valid."""
         within = RANGES.get(self.group, NO_RANGE)
         fits = within.low <= value <= within.high
         return "" if fits else f"{self.name} = {value:g} must be {within.words}"
@@ -94,12 +94,12 @@ class Control:
     """A control law: the source of joint accelerations or efforts.
 
     Attributes:
-        title: in words, for "{frame}".
-        inputs: groups of variables that it has, in the table's order; τ depends on them directly.
-        parameters: groups of its parameters.
-        commands: what the law gives, "acceleration" (q̈_cmd, by inverse dynamics) or "effort" (τ).
-        rigid_stops: whether stops have a reaction, by default.
-        outputs: groups of outputs that other laws do not have.
+        title: description in words, with "{frame}" for the frame.
+        inputs: groups of inputs, in the table's order; τ depends on them directly.
+        parameters: groups of parameters.
+        commands: result of the law, "acceleration" (q̈_cmd, then inverse dynamics) or "effort" (τ).
+        rigid_stops: default of the parameter ``rigid_stops``.
+        outputs: groups of outputs that only this law has.
     """
 
     title: str
@@ -131,8 +131,9 @@ CONTROLS = {
     ),
     "effort": Control("effort control, the bare plant", ("tau_cmd",), (), "effort", True),
 }
-"""Control laws by name. The law is in the file <name>_control, of Python here and of C in the native engine;
-"pose" is "task" with three more rows."""
+"""Control laws by name. The module <name>_control here, and the C file of that name in the native engine, have the law.
+"pose" is "task" with three more rows.
+"""
 
 DISTURBANCES = ("tau_ext", "f_ext")
 OF_A_LAW = {group for law in CONTROLS.values() for group in (*law.outputs, *law.parameters)}
@@ -192,8 +193,9 @@ ROWS: tuple[tuple[str, str, str, str, Value | tuple[float, ...] | None, str], ..
     ("rigid_stops", "parameter", "", "", None, "joint stops act on the other joints too"),
     ("payload_known", "parameter", "", "", False, "the controller knows the payload"),
 )
-"""Group, causality, owners of the elements (none of a scalar), unit (of a joint that slides | that turns), start value
-(None of what is computed, of what the robot or its control law decides, and of targets) and description."""
+"""Group; causality; owners of the elements ("" for a scalar); unit, or units for a prismatic | a revolute joint; start
+value (None if it is computed, given by the robot or the control law, or a target); and description.
+"""
 
 Starts = Mapping[str, Value | tuple[float, ...]]
 
@@ -203,8 +205,8 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
 
     Args:
         robot: the robot; n joints and m task axes give the vectors' lengths.
-        starts: start values that differ from the defaults, by group; needs "q_start" (n values),
-            and "x_des" (m values) and "quat_des" (4) where there are such: no default suits all.
+        starts: start values that differ from the defaults, by group. "q_start" (n values) is required, and so are
+            "x_des" (m values) and "quat_des" (4 values) if the control law has them.
         control: the control law, a key of ``CONTROLS``.
     """
     law = CONTROLS[control]
@@ -232,7 +234,7 @@ def variable_table(robot: Robot, starts: Starts, control: str = "task") -> list[
 
 
 def _owners(robot: Robot, law: Control) -> dict[str, list[str]]:
-    """Return what the elements of vectors belong to, in words."""
+    """Return, for each kind of owner, a phrase for the description of each element."""
     joint = [f"joint {name}" for name in robot.joints]
     axis = [f"{robot.frame}, axis {letter}" for letter in robot.axes]
     return {
