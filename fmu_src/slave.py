@@ -39,7 +39,7 @@ ALLOWED = {
 COMPUTED = ("output", "local")  # causalities
 TIME_TOLERANCE = 1e-9
 MAX_STATE = 64 * 1024  # bytes, of a serialised state; that of 128 joints has half of them
-UNSOUND = "the state is none that an instance can be in"
+UNSOUND = "invalid FMU state"
 
 
 def import_plant(resources: Path, site_packages: list[str]):

@@ -1,5 +1,5 @@
-/* For a library that is linked with Windows' own C runtime alone: what mingw's headers leave to a
-   library of mingw's, which zig would compile first, for a minute. */
+/* Functions that mingw's headers expect in a library of mingw. A library for Windows is linked with Windows' own C
+   runtime only, because zig would compile mingw's library first, for a minute. */
 #include <stdarg.h>
 #include <stdio.h>
 

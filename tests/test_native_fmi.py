@@ -336,7 +336,7 @@ def fnv(content):
     return digest
 
 
-UNSOUND = "fmi2DeSerializeFMUstate: the state is none that an instance can be in"
+UNSOUND = "fmi2DeSerializeFMUstate: invalid FMU state"
 FORGERIES = {
     "held[1]": ((4, -1), UNSOUND),
     "slip[1]": ((2, -2), UNSOUND),

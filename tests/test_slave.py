@@ -178,7 +178,7 @@ def test_a_foreign_state_is_refused(fmu_path):
 
 
 NAN, INF = float("nan"), float("inf")
-UNSOUND = "the state is none that an instance can be in"
+UNSOUND = "invalid FMU state"
 FORGERIES = {
     "phase": (("flying", "", 2, None, ["step mode"]), UNSOUND),
     "time": ((NAN, INF, -INF, "0.03", 3, True, None, [0.03], 10**400), UNSOUND),

@@ -1,4 +1,4 @@
-/* The calls of the standard: their names, the phases in which each is allowed, and who is refused. */
+/* The calls of the standard: names, phases in which each is allowed, and refusals. */
 #include "instance.h"
 
 static const char *const PHASE_NAME[N_PHASES] = {
@@ -19,9 +19,8 @@ enum {
     SOLVES = PHASE(INITIALIZATION) | PHASE(EVENT) | PHASE(CONTINUOUS_TIME) | PHASE(TERMINATED)
 };
 
-/* A call's name, the phases in which it is allowed, and of which kind it is. A
-   refused call changes nothing, so there is no error phase.
-   FMI 2.0.4, sections 3.2.3 and 4.2.4; FMI 3.0.2, sections 2.3, 3.2 and 4.2. */
+/* Name of a call, the phases in which it is allowed, and the kind of instance. A refused call changes nothing, so there
+   is no error phase. FMI 2.0.4, sections 3.2.3 and 4.2.4; FMI 3.0.2, sections 2.3, 3.2 and 4.2. */
 static const struct {
     const char *name;
     int phases;
@@ -69,7 +68,7 @@ static const struct {
     [COUNT_STATES] = {CALL_NAME(GetNumberOf), ANY, MODEL_EXCHANGE},
 };
 
-/* Name of a call, as messages say it. */
+/* Name of a call in messages. */
 static const char *call_name(Call call)
 {
     return RULE[call].name;
@@ -105,8 +104,8 @@ static Status refuse(Instance *instance, Call call, const char *reason)
     return report(instance, ERROR, "%s: %s", call_name(call), reason);
 }
 
-/* The instance where the call is allowed and has the pointers that it needs, else NULL; a refusal is
-   logged. */
+/* The instance, if the call is allowed and has the pointers that it needs; otherwise NULL, and the refusal is logged.
+   */
 static Instance *enter(void *component, Call call, int has_pointers)
 {
     if (!component || !allowed(component, call, NULL))
@@ -127,7 +126,7 @@ static Status move_on(void *component, Call call, Phase phase)
     return OK;
 }
 
-/* Refuse a call of what the modelDescription says that there is not. Importers bind every name. */
+/* Refuse a call of a feature that modelDescription.xml excludes. Importers bind every name. */
 static Status unsupported(Instance *instance, const char *function)
 {
     if (instance)

@@ -5,15 +5,14 @@
 #include "internal.h"
 #include "mechanism.h"
 
-/* The law at a state, inputs held: accelerations q̈_cmd where COMMANDS_ACCELERATION, else efforts τ.
-   The rank of its J⁺ and the margin are those of apply_pseudo_inverse; 0 and 1 where it has none.
-   The margin may be NULL. */
+/* The law at a state with inputs held: accelerations q̈_cmd if COMMANDS_ACCELERATION is defined, otherwise efforts τ.
+   Rank and margin are those of apply_pseudo_inverse; they are 0 and 1 for a law without J⁺. The margin may be NULL. */
 INTERNAL int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                      const double q[N_JOINTS], const double v[N_JOINTS], int rank,
                      double given[N_JOINTS], double *margin);
 
 #ifdef HAS_RCOND
-/* The singular values of J at a position over the largest, which comes first. */
+/* σ/σ_max of J at a position, in descending order. */
 INTERNAL void conditioning(const double q[N_JOINTS], double ratio[N_ROWS]);
 #endif
 

@@ -2,8 +2,8 @@
 
        f(x + i h d) = f(x) + i h f'(x) d,   h = 1e-100
 
-   The engine's own files are compiled once more, their numbers complex. Parts that have no complex
-   numbers, of C compilers too, take central differences.
+   The engine's files are compiled a second time with complex numbers. Compilers without complex numbers use central
+   differences.
    Source: Squire & Trapp, SIAM Review 40(1), 1998. */
 #include <float.h>
 #include <math.h>
@@ -28,10 +28,10 @@ static Real largest_of(const Real change[], int count)
 #else
 #define COMPLEX 1
 #include <complex.h>
-#undef I     /* a name like others */
-#undef creal /* musl's macros are casts to double, which will be another type */
+#undef I     /* the engine uses this name */
+#undef creal /* musl's macros cast to double, which is redefined below */
 #undef cimag
-#ifdef __clang__ /* which functions a robot needs depends on it; a keyword will be a macro */
+#ifdef __clang__ /* a robot may not need all functions, and a keyword becomes a macro */
 #pragma clang diagnostic ignored "-Wunused-function"
 #pragma clang diagnostic ignored "-Wkeyword-macro"
 #endif
@@ -39,7 +39,7 @@ static Real largest_of(const Real change[], int count)
 static const Real STEP = 1e-100;
 static const double _Complex UNIT = (double _Complex)_Complex_I;
 
-/* x = a + i b; the expression multiplies out a product of i, 0 + 1 i. Source: C99, 6.2.5, paragraph 13. */
+/* x = a + i b, by C99's representation (6.2.5, paragraph 13): the expression would compute the product i b. */
 static inline void assign(double _Complex *x, Real a, Real b)
 {
     ((Real *)x)[0] = a;
@@ -68,8 +68,7 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
     return creal(a) < creal(b) ? b : a;
 }
 
-/* From here on the engine has complex numbers. The headers of the standard that it includes are there
-   already. */
+/* From here on, the engine has complex numbers. The standard headers that it includes are included above. */
 #define double double _Complex
 #define sqrt complex_sqrt
 #define atan2 complex_atan2
@@ -81,10 +80,10 @@ static inline double _Complex complex_fmax(double _Complex a, double _Complex b)
 #endif
 
 #undef INTERNAL
-#define INTERNAL static inline /* there is more than derivatives need */
+#define INTERNAL static inline /* derivatives do not need all functions */
 #include "engine.c"
 
-/* Compute what is wanted. */
+/* Compute the requested variables. */
 static void evaluate(Plant *plant, const int held[N_JOINTS], const int slip[N_JOINTS], int rank,
                      int wanted)
 {
@@ -93,7 +92,7 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], const int slip[N_JO
     if (wanted & WANTS_TAU)
         compute_effort(plant, rank);
     for (int i = 0; i < N_JOINTS && wanted & WANTS_SAMPLE && plant->value[CONTROL_PERIOD] == 0.0; i++) {
-        if (plant->value[Q_RESOLUTION + i] == 0.0) /* noise changes with no state */
+        if (plant->value[Q_RESOLUTION + i] == 0.0) /* noise does not depend on the state */
             plant->value[Q_MEAS + i] = plant->value[Q + i];
         if (plant->value[V_FROM_Q] == 0.0)
             plant->value[V_MEAS + i] = plant->value[V + i];
@@ -112,7 +111,7 @@ static void evaluate(Plant *plant, const int held[N_JOINTS], const int slip[N_JO
 void differentiate(const Real value[], const int held[], const int slip[], int rank, int wanted,
                    const Real change[], Real derivative[])
 {
-    const Real largest = largest_of(change, X); /* whatever its size, a step is small */
+    const Real largest = largest_of(change, X); /* scales the direction, so that every step is small */
     const Real inverse = 1.0 / largest, up = 1.0 / STEP;
     Plant plant;
     for (int i = 0; i < N_VARIABLES; i++)
@@ -124,7 +123,7 @@ void differentiate(const Real value[], const int held[], const int slip[], int r
         derivative[i] = cimag(plant.value[i]) * up * largest;
 }
 #else
-/* ∛ε: where the errors of truncation and rounding are alike. */
+/* ∛ε, for which truncation and rounding errors are of equal size. */
 static const Real NUDGE = 6e-6;
 
 void differentiate(const Real value[], const int held[], const int slip[], int rank, int wanted,

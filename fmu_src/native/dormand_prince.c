@@ -7,7 +7,7 @@
 #include <stddef.h>
 #include <string.h>
 
-/* Row s weighs the derivatives of stages 0…s; the last row is the fifth-order solution. */
+/* Row s has the weights of the derivatives of stages 0…s; the last row is the fifth-order solution. */
 static const double A[STAGES][STAGES] = {
     {1.0 / 5, 0, 0, 0, 0, 0},
     {3.0 / 40, 9.0 / 40, 0, 0, 0, 0},

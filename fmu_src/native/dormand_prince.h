@@ -6,21 +6,21 @@
 #include "plant.h"
 #include "stops.h"
 
-enum { STAGES = 6 }; /* evaluations of the equations of motion that it costs */
+enum { STAGES = 6 }; /* evaluations of the equations of motion in one step */
 
-/* One integration step, from y to y_new, in one regime, by this method or another: the derivatives K that weigh its
-   dense output, which those at the ends begin and end, and at each stage, the last of which is y_new, */
+/* One integration step from y to y_new in one regime, by Dormand–Prince or ROS34PW2. The first and the last of the
+   derivatives K are those at the ends; the last stage is y_new. */
 typedef struct {
     const Plant *plant;
     double size;                           /* s */
     double y[N_STATES], y_new[N_STATES];
-    int stages;                            /* of the method, at most STAGES */
-    const double (*P)[4];                  /* weights of the derivatives in its dense output */
+    int stages;                            /* number of stages, at most STAGES */
+    const double (*P)[4];                  /* weights of K in the dense output */
     double K[STAGES + 1][N_STATES];
     double effort[STAGES + 1][N_JOINTS];   /* the efforts that hold joints at rest */
-    long evaluations;                      /* of the equations of motion so far */
+    long evaluations;                      /* evaluations of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */
-    double margin, margin_new;             /* of the rank at y and y_new */
+    double margin, margin_new;             /* margins of the rank at y and y_new */
     Stops stops;
 } Step;
 
@@ -29,10 +29,10 @@ typedef struct {
 INTERNAL void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS],
                        double effort[N_JOINTS], double *margin);
 
-/* Root mean square of the errors over their tolerances. */
+/* Root mean square of error/tolerance. */
 INTERNAL double error_norm(const Step *step, const double error[N_STATES]);
 
-/* Fill y_new, K[1…6] and P from y and K[0]; the norm of the error, which passes where below 1. */
+/* Fill y_new, K[1…6] and P from y and K[0]; return the norm of the error. A step passes if it is below 1. */
 INTERNAL double dormand_prince(Step *step);
 
 /* Fill Q, for dense_output. */

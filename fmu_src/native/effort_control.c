@@ -1,4 +1,4 @@
-/* No control: joint efforts are inputs, for a controller of the user's own. */
+/* No control law: joint efforts are inputs, for an external controller. */
 #include "control.h"
 
 #include <string.h>

@@ -1,5 +1,5 @@
-/* The equations of motion under the control law. Compiled twice: with real numbers, and with complex ones
-   for derivatives. A file uses those before it. */
+/* The equations of motion under the control law. This file is compiled twice: with real numbers, and with complex
+   numbers for derivatives. A file uses the files included before it. */
 #include "turn.c"
 #include "mechanism.c"
 #if N_ROWS > N_AXES

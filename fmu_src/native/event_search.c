@@ -1,10 +1,10 @@
 /* Find the first event within an integration step, on its dense output. The rules are those of
    plant/event_search.py.
 
-   An event is where a margin becomes negative: the distance of a joint to a limit, the velocity of one that
-   slips, the distance of the effort that holds a joint from its bounds, or the margin of the rank of J⁺.
-   Positions and velocities are polynomials, whose turning points are known; the other margins are looked at
-   as often as their rates of change ask for. */
+   An event is a time at which a margin becomes negative. Margins are the distance of a joint from a limit, the velocity
+   of a joint that slips, the distance of a holding effort from its bounds, and the margin of the rank of J⁺. Positions
+   and velocities are polynomials with known turning points. The other margins are sampled as often as their rates of
+   change require. */
 #include "event_search.h"
 
 #include <math.h>
@@ -15,20 +15,20 @@
 #include "control.h"
 #endif
 
-/* Weights of the derivatives in Dormand and Prince's interpolant: the largest sum of the weights' magnitudes, and that
-   of their rates. Those of the cubic are less, 1.07 and 2. */
+/* Bounds on the weights of Dormand and Prince's interpolant: the largest sum of their magnitudes, and the largest sum
+   of the magnitudes of their rates. The cubic has smaller ones, 1.07 and 2. */
 static const double REACH = 1.66, PACE = 3.72;
-/* The margin of an effort falls below what the stages show of it by less than its range there. It is
-   looked at this often in a step where that may be below zero, and again at a minimum of the polynomial
-   through these looks that is lower than so much of their range. */
+/* Between the stages, the margin of an effort falls below their smallest value by less than the range of their values.
+   If it may therefore be below zero, it is sampled at the ends of LOOKS equal intervals, and at each minimum of the
+   polynomial through these samples that is below DOUBT times their range. */
 enum { LOOKS = 4 };
 static const double DOUBT = 0.25;
-/* Halvings of a step in the search; a shorter excursion is none. */
+/* Halvings of a step in the search; shorter excursions are ignored. */
 enum { HALVINGS = 7 };
 static const double TIME_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
-/* A margin, negative once a regime has ended, at a time within the step; of a component of the state, of whom
-   there is one each. */
+/* A margin at a time within the step, negative after the end of the regime. Some margins have one value for each
+   component of the state. */
 typedef double Margin(Step *step, double passed, int component);
 
 static void interpolated(const Step *step, double passed, double y[N_STATES])
@@ -59,7 +59,7 @@ static void find_efforts(Step *step, double passed, double effort[N_JOINTS])
     evaluate(step, y, a, effort, NULL);
 }
 
-/* The distance of an effort that holds a joint to its bound on a side. */
+/* Distance of a joint's holding effort from its bound on one side. */
 static double grip_of(const Step *step, int i, double effort, int side)
 {
     return grip(step->plant, &step->stops, i, step->y[i], effort, side);
@@ -82,7 +82,7 @@ static double release_margin(Step *step, double passed, int component)
     return least_grip(step, effort);
 }
 
-/* The margin of the rank; of one that is held only that against a lower one. */
+/* The margin of the rank; for a held rank, the margin to a lower rank only. */
 static double singular_margin(Step *step, double passed, int rank_held)
 {
 #ifdef HAS_RCOND
@@ -101,14 +101,14 @@ static double singular_margin(Step *step, double passed, int rank_held)
 #endif
 }
 
-/* First time in (a, b] at which a margin is negative, as it is at b, to the last bits of the step. The
-   interpolation is kept near the middle, so that it never needs many more looks than bisection.
+/* First time in (a, b] at which a margin is negative, to the last bits of the step; it is negative at b. The
+   interpolation stays near the middle, so that it never needs many more evaluations than bisection.
    Source: Oliveira & Takahashi, "An enhancement of the bisection method", ACM TOMS 47(1), 2020. */
 static double locate(Step *step, Margin *margin, int joint, double a, double at_a, double b,
                      double at_b)
 {
     const double resolution = TIME_RESOLUTION * step->size, k = 0.2 / (b - a);
-    double slack = b - a; /* of the interval, beyond what bisection would have left of it */
+    double slack = b - a; /* how much longer the interval may be than after bisection */
     while (b - a > resolution) {
         const double middle = 0.5 * (a + b), half = 0.5 * (b - a);
         double x = at_a > at_b ? (b * at_a - a * at_b) / (at_a - at_b) : middle;
@@ -118,7 +118,7 @@ static double locate(Step *step, Margin *margin, int joint, double a, double at_
             x = middle + (x > middle ? slack - half : half - slack);
         if (!(a < x && x < b))
             x = middle;
-        if (!(a < x && x < b)) /* two neighbouring numbers */
+        if (!(a < x && x < b)) /* a and b are neighbouring numbers */
             break;
         const double at_x = margin(step, x, joint);
         if (at_x < 0.0) {
@@ -133,8 +133,8 @@ static double locate(Step *step, Margin *margin, int joint, double a, double at_
     return b;
 }
 
-/* First time in (a, b] at which a margin is negative, HUGE_VAL where it is not. Its values at the ends
-   and its largest rate of change say where it need not be looked for. */
+/* First time in (a, b] at which a margin is negative, or HUGE_VAL. Its values at the ends and its largest rate of
+   change exclude intervals. */
 static double search(Step *step, Margin *margin, int joint, double rate, double a, double at_a,
                      double b, double at_b, int halvings)
 {
@@ -149,7 +149,7 @@ static double search(Step *step, Margin *margin, int joint, double rate, double 
     return first;
 }
 
-/* First time at which the margin of a component is negative, HUGE_VAL where it never is. */
+/* First time at which the margin of a component is negative, or HUGE_VAL. */
 static double first_crossing(Step *step, Margin *margin, int component)
 {
     const double *c = step->Q[component];
@@ -167,7 +167,7 @@ static double first_crossing(Step *step, Margin *margin, int component)
     return HUGE_VAL;
 }
 
-/* True if the effort that holds a joint may pass its bound on a side within the step. */
+/* True if the holding effort of a joint may exceed its bound on one side within the step. */
 static int may_pass(const Step *step, int joint, int side)
 {
     double low = HUGE_VAL, high = -HUGE_VAL;
@@ -215,7 +215,7 @@ static int doubtful_minima(const double p[LOOKS + 1], double x[LOOKS])
     return count;
 }
 
-/* First time before another at which a joint is no longer held, else HUGE_VAL. */
+/* First time before `before` at which a joint is released, or HUGE_VAL. */
 static double first_release(Step *step, double before)
 {
     double effort[LOOKS + 1][N_JOINTS], look[2 * LOOKS * N_JOINTS];
@@ -263,14 +263,14 @@ static int may_be_arrested(const Step *step, int joint)
     return !(step->stops.slip[joint] * step->y[i] > REACH * step->size * largest);
 }
 
-/* Positions that may be past a limit within the step, and velocities that may be past zero. Returns a bound on
-   the change of singular values. */
+/* Find the positions that may pass a limit and the velocities that may pass zero within the step. Return a bound on the
+   change of the singular values. */
 static double sweep(const Step *step, int near[N_STATES])
 {
     const double *low = &step->plant->value[Q_MIN], *high = &step->plant->value[Q_MAX];
     double fastest[N_JOINTS] = {0}, change = 0.0;
     for (int stage = 0; stage <= step->stages; stage++)
-        for (int i = 0; i < N_JOINTS; i++) { /* quicker than fmax, which minds NaN */
+        for (int i = 0; i < N_JOINTS; i++) { /* faster than fmax, which handles NaN */
             const double speed = fabs(step->K[stage][i]);
             fastest[i] = speed > fastest[i] ? speed : fastest[i];
         }

@@ -5,14 +5,14 @@
 #include "dormand_prince.h"
 #include "internal.h"
 
-/* The event at the end of a step: joints that reached a limit, joints that slipped and have no velocity left,
-   and joints that are no longer held. */
+/* The event at the end of a step: joints that reached a limit, joints that slipped and came to rest, and joints that
+   are released. */
 typedef struct {
     int stopped[N_JOINTS], arrested[N_JOINTS], released[N_JOINTS];
 } Event;
 
-/* First time in (0, size] at which the regime of the step ends, y_new becoming the state there; 0 where
-   it does not. With rank_held the rank of J⁺ is no matter. */
+/* First time in (0, size] at which the regime of the step ends; y_new becomes the state there. 0 if it does not end.
+   With rank_held, only a drop of the rank of J⁺ counts. */
 INTERNAL double first_event(Step *step, int rank_held, Event *event);
 
 #endif

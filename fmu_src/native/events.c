@@ -1,7 +1,7 @@
-/* State events of joint stops, of friction and of J⁺. A free joint's indicator is its distance to a place just
-   past the limit, that of a joint at rest how it is pressed into it; of friction it is the velocity in the
-   direction of slip, and of a joint that sticks how far the effort that holds it is within its bounds. Each
-   is off zero after its event. */
+/* State events of joint stops, of friction and of J⁺. The indicator of a limit is the distance of the joint from a
+   position just past the limit, or, for a joint at rest there, the effort that presses it against the limit. The
+   indicator of friction is the velocity in the direction of slip, or, for a joint that sticks, the distance of the
+   holding effort from its bounds. Offsets keep each indicator away from zero after its event. */
 #include "stops.h"
 
 #include <float.h>
@@ -12,20 +12,20 @@
 #include "control.h"
 #endif
 
-/* Distance of an event past a limit, as a part of max(1, |limit|): some hundred units in the last
-   place. */
+/* Distance of an event past a limit, relative to max(1, |limit|): some hundred units in the last place. */
 static const double PAST = 1e-13;
-/* s: what a joint gains in room for its speed away from a limit, and in velocity for its acceleration. */
+/* s: factor of the velocity away from a limit in the indicator of the limit, and of the acceleration in the indicator
+   of slip. */
 static const double CLEARING = 1.0;
-/* rad/s2, m/s2, N·m or N, and of friction a part of it: how a joint at rest is pulled off where its event is. */
+/* Excess over a bound at the release of a joint: rad/s2, m/s2, N·m or N at a limit, and relative for friction. */
 static const double PULL = 1e-9;
-/* rad/s or m/s: how far beyond zero a velocity is where its event is. */
+/* rad/s or m/s: velocity beyond zero at the event that ends slip. */
 static const double BACK = 1e-13;
-/* rad/s or m/s: an impact slower than this drives no other joint off that rests. Two joints that in
-   turn drive each other off would else have events without end. */
+/* rad/s or m/s: a slower impact moves no joint that rests at its limit. Otherwise two joints that push each other off
+   their limits in turn would have events without end. */
 static const double SLOW = 1e-4;
 
-/* The joints that rest at the plant's state, by the rules of stops.h. */
+/* Find the joints that rest at the plant's state, by the rules of stops.h. */
 static void find_stops(const Plant *plant, Stops *stops)
 {
     const int anti_chatter[N_JOINTS] = {0};
@@ -33,8 +33,8 @@ static void find_stops(const Plant *plant, Stops *stops)
     find_regime(plant, &plant->value[Q], anti_chatter, ANY_RANK, stops, a, effort, NULL);
 }
 
-/* Distance to a place past a limit, and more where a joint moves away from it, at v: there a solver's
-   error is no event. 1 where that is no limit. */
+/* Distance to a position past a limit, increased if the joint moves away at v, so that a solver's error is no event; 1
+   without a limit. */
 static double room(double limit, double distance, double v)
 {
     const double size = fabs(limit);
@@ -42,7 +42,7 @@ static double room(double limit, double distance, double v)
 }
 
 /* One indicator of each joint's upper limit, then of each lower one, of each joint's friction, then of the
-   singular values that J⁺ may drop, all but the largest. An event is where one changes its sign. */
+   singular values that J⁺ may drop, all but the largest. A change of sign is an event. */
 static void event_indicators(const Plant *plant, const Stops *stops, double indicator[N_INDICATORS])
 {
     const double *q = &plant->value[Q], *v = &plant->value[V];
@@ -59,7 +59,7 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
         *rubs = slip ? slip * v[i] + BACK + CLEARING * fmax(0.0, slip * a[i]) : 1.0;
         *at[0] = room(high[i], high[i] - q[i], -v[i]);
         *at[1] = room(low[i], q[i] - low[i], v[i]);
-        if (stops->held[i]) /* at rest where there is no range, for good */
+        if (stops->held[i]) /* a joint without a range stays at rest */
             *at[0] = *at[1] = 1.0;
         if (stops->watched[i] && stops->held[i] != STUCK)
             *at[side > 0 ? 0 : 1] = grip(plant, stops, i, q[i], effort[i], side) + PULL + rounding;
@@ -75,8 +75,8 @@ static void event_indicators(const Plant *plant, const Stops *stops, double indi
 #endif
 }
 
-/* Changes at an event: decided by the state alone, so that it is the same whether the importer came
-   early, late or for nothing. Whether the state is another now. */
+/* Handle an event; return whether the state changed. Only the state decides, so that the result does not depend on
+   whether the importer enters event mode early, late or needlessly. */
 static int handle_event(Plant *plant, Stops *stops)
 {
     const double *low = &plant->value[Q_MIN], *high = &plant->value[Q_MAX];
@@ -85,7 +85,7 @@ static int handle_event(Plant *plant, Stops *stops)
     memcpy(before, &plant->value[Q], sizeof before);
     memcpy(y, before, sizeof y);
     for (int i = 0; i < N_JOINTS; i++) {
-        if (stops->held[i] && stops->held[i] != STUCK) /* whatever a solver's rounding made of it */
+        if (stops->held[i] && stops->held[i] != STUCK) /* without the solver's rounding error */
             y[i] = is_above(plant, y[i], i) ? high[i] : low[i];
         if (stops->held[i] || stops->slip[i] * y[N_JOINTS + i] < 0.0)
             y[N_JOINTS + i] = 0.0;

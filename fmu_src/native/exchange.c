@@ -4,7 +4,7 @@
 
 #include "instance.h"
 
-/* The instance where the call is allowed and hands over so many values; its q and v are there. */
+/* The instance, if the call is allowed and passes the expected number of values, else NULL; computes q and v. */
 static Instance *enter_with(void *component, Call call, const void *values, size_t count,
                             size_t wanted)
 {
@@ -30,7 +30,7 @@ static Instance *enter_with(void *component, Call call, const void *values, size
     return instance;
 }
 
-/* Reports whether the states q and v have changed, and the time of the next event, HUGE_VAL where none is known. */
+/* Report whether the states q and v changed, and the time of the next time event, HUGE_VAL if there is none. */
 static Status update_discrete_states(void *component, Boolean *states_changed, double *next_event)
 {
     Instance *instance = enter_with(component, NEW_DISCRETE_STATES, states_changed, 1, 1);
@@ -42,7 +42,7 @@ static Status update_discrete_states(void *component, Boolean *states_changed, d
     update_stops(&draft);
     const int taken = take_passed_stop(&draft.passage, &draft.plant, &draft.stops, draft.time);
     const int changed = handle_event(&draft.plant, &draft.stops) || taken;
-    for (int i = 0; i < N_STATES; i++) /* an impact of speeds that are too large for numbers */
+    for (int i = 0; i < N_STATES; i++) /* the velocities of an impact may overflow */
         if (!isfinite(draft.plant.value[Q + i]))
             return report(instance, ERROR, "%s: %s would not be finite",
                           call_name(NEW_DISCRETE_STATES), VARIABLE_NAME[Q + i]);
@@ -115,7 +115,7 @@ Status STANDARD(SetContinuousStates)(void *component, const double x[], size_t c
         if (!isfinite(x[i]))
             return report(instance, ERROR, "%s: %s is not finite",
                           call_name(SET_CONTINUOUS_STATES), VARIABLE_NAME[Q + i]);
-    update_stops(state); /* what rests does so until an event */
+    update_stops(state); /* joints at rest stay at rest until an event */
     memcpy(&state->plant.value[Q], x, N_STATES * sizeof *x);
     state->has_x = state->has_tau = state->has_rates = 0;
     return OK;

@@ -1,4 +1,4 @@
-/* The functions of FMI 2.0 that 3.0 has not, or with other arguments. */
+/* The functions of FMI 2.0 that FMI 3.0 does not have, or has with other arguments. */
 #include <math.h>
 
 #include "instance.h"
@@ -92,7 +92,7 @@ fmi2Status fmi2CancelStep(fmi2Component component)
     return fmi2Error;
 }
 
-/* A status, where the kind that is asked for exists. */
+/* Return a status, if the requested kind exists. */
 #define STATUS(Name, Type, exists, answer)                                                            \
     fmi2Status fmi2Get##Name(fmi2Component component, const fmi2StatusKind kind, Type *value)         \
     {                                                                                                 \

@@ -1,4 +1,4 @@
-/* The functions of FMI 3.0 that 2.0 has not, or with other arguments. */
+/* The functions of FMI 3.0 that FMI 2.0 does not have, or has with other arguments. */
 #include <math.h>
 
 #include "instance.h"
@@ -139,7 +139,7 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *needs_up
     return status;
 }
 
-/* Hand over the size of a vector. */
+/* Return the size of a vector. */
 static fmi3Status tell(fmi3Instance instance, size_t size, size_t *count)
 {
     if (!enter(instance, COUNT_STATES, count != NULL))

@@ -1,5 +1,5 @@
-/* All of the FMU but the derivatives: its files together, for their functions are static. A file uses those before
-   it; headers have what is used before its file, and by the derivatives. */
+/* All files of the FMU except the derivatives in one unit, because their functions are static. A file uses the files
+   before it. Headers declare functions that are used before their file, or by the derivatives. */
 #include "engine.c"
 #include "dormand_prince.c"
 #include "polynomial.c"

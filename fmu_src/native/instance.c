@@ -1,4 +1,4 @@
-/* The life of an instance: its making, messages, and initialisation. */
+/* Instantiation, messages and initialisation of an instance. */
 #include "instance.h"
 
 #include <math.h>
@@ -7,13 +7,13 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* By status; all of them are on with the first. */
+/* Log categories by status; the first switches all of them on. */
 static const char *const CATEGORY[] = {
     "logAll", "logStatusWarning", "logStatusDiscard", "logStatusError", "logStatusFatal"};
 enum { N_CATEGORIES = sizeof CATEGORY / sizeof *CATEGORY, EVERY_CATEGORY = (1 << N_CATEGORIES) - 1 };
 
-/* Categories where logging is off: in FMI 3.0 none, in 2.0, where this is debug logging, all but
-   information. */
+/* Categories that are logged although logging is off: none in FMI 3.0; all but information in 2.0, where logging means
+   debug logging. */
 enum { CATEGORIES_OFF = FMI == 3 ? 0 : EVERY_CATEGORY - 1 };
 
 Status report(Instance *instance, Status status, const char *format, ...)
@@ -39,7 +39,7 @@ static void reset_state(State *state)
     state->phase = INSTANTIATED;
 }
 
-/* True if a variable may have a value; a refusal is logged. */
+/* Return OK if a variable may have a value; a refusal is logged. */
 static Status check_range(Instance *instance, int variable, double value)
 {
     for (size_t k = 0; k < sizeof RANGE / sizeof *RANGE; k++) {
@@ -66,7 +66,7 @@ static Status check_inputs(Instance *instance)
     return OK;
 }
 
-/* True if the period of the controller is one that its delay and its sensors can have. */
+/* True if the controller's period allows its delay and its sensors. */
 static Status check_sampling(Instance *instance)
 {
     const double *value = instance->state.plant.value;
@@ -95,7 +95,7 @@ static Status check_sampling(Instance *instance)
     return OK;
 }
 
-/* True if the joints' limits make ranges, and parameters of sampling go together; a refusal is logged. */
+/* True if joint limits form ranges and the parameters of sampling are consistent; a refusal is logged. */
 static Status check_parameters(Instance *instance)
 {
     const double *value = instance->state.plant.value;
@@ -106,8 +106,8 @@ static Status check_parameters(Instance *instance)
     return check_sampling(instance);
 }
 
-/* Check the parameters and set q and v to their start; a refusal is logged. With warn, what was
-   clamped is logged too. */
+/* Check the parameters and set q and v to their start; a refusal is logged. With warn, clamped values are logged too.
+   */
 static Status initialise(Instance *instance, int warn)
 {
     State *state = &instance->state;
@@ -135,8 +135,9 @@ static Status initialise(Instance *instance, int warn)
     return OK;
 }
 
-/* Compute the outputs q_meas and v_meas, and tau where it is held. A sample that is due is taken for them alone, for
-   inputs may still change; in continuous-time mode an event alone takes one. False where an effort is not finite. */
+/* Compute the outputs q_meas and v_meas, and a held tau. A sample that is due is taken for these outputs only and not
+   stored, because inputs may still change; in continuous-time mode only an event takes samples. False if an effort is
+   not finite. */
 static int show_samples(State *state)
 {
     Sampling draft = state->sampling;
@@ -144,7 +145,7 @@ static int show_samples(State *state)
     return (held && state->phase == CONTINUOUS_TIME) || settle(&draft, &state->plant, state->time);
 }
 
-/* Find the joints that rest, where that is yet to be done. */
+/* Find the joints at rest, unless they are known. */
 static void update_stops(State *state)
 {
     if (!state->has_stops)
@@ -152,7 +153,7 @@ static void update_stops(State *state)
     state->has_stops = 1;
 }
 
-/* Compute the output tau, where that is yet to be done. False where an effort of a sampled controller is not finite. */
+/* Compute the output tau, unless it is known. False if an effort of a sampled controller is not finite. */
 static int update_control(Instance *instance)
 {
     State *state = &instance->state;
@@ -161,20 +162,20 @@ static int update_control(Instance *instance)
         return 1;
     if (held && !show_samples(state))
         return 0;
-    if (!held && instance->kind == MODEL_EXCHANGE) /* where an event alone changes the rank */
+    if (!held && instance->kind == MODEL_EXCHANGE) /* there, only an event changes the rank */
         update_stops(state);
     compute_effort(&state->plant, instance->kind == MODEL_EXCHANGE ? state->stops.rank : ANY_RANK);
     state->has_tau = 1;
     return 1;
 }
 
-/* The same where tau is what acts: of a sampled controller. */
+/* Do the same for a sampled controller only, whose output tau is the acting effort. */
 static int update_held(Instance *instance)
 {
     return instance->state.plant.value[CONTROL_PERIOD] == 0.0 || update_control(instance);
 }
 
-/* Compute the derivatives, where that is yet to be done. */
+/* Compute the derivatives, unless they are known. */
 static void update_rates(State *state)
 {
     update_stops(state);
@@ -183,7 +184,7 @@ static void update_rates(State *state)
     state->has_rates = 1;
 }
 
-/* A new instance as the draft says; NULL where it has no name or another token. */
+/* Return a new instance, a copy of the draft; NULL if it has no name or a wrong token. */
 static Instance *instantiate(Instance draft, const char *token, int logging_on)
 {
     const char *function = call_name(INSTANTIATE), *name = draft.name;
@@ -239,7 +240,7 @@ Status STANDARD(SetDebugLogging)(void *component, Boolean on, size_t count,
     return OK;
 }
 
-/* Take over the times of the experiment; a tolerance is ignored, with a message. */
+/* Set the times of the experiment; a tolerance is ignored, with a message. */
 static Status set_up(Instance *instance, Call call, const double *tolerance, double start,
                      const double *stop)
 {

@@ -1,9 +1,8 @@
-/* One instance of the FMU, what every FMI function does first, and what the functions do that the
-   versions of FMI have with other arguments. All are given what the importer hands over, refuse what is
-   not allowed and log why.
+/* An instance of the FMU, and names that both versions of FMI share. Each function of the standard checks the
+   importer's arguments, refuses calls that are not allowed, and logs the reason.
 
-   A function that both versions have with the same arguments is where its subject is, under its name in
-   the version: STANDARD(Reset) is fmi2Reset or fmi3Reset. The faces, fmi2.c and fmi3.c, have the rest. */
+   A function with the same arguments in both versions is in the file of its subject, under its name in the version:
+   STANDARD(Reset) is fmi2Reset or fmi3Reset. The other functions are in fmi2.c and fmi3.c. */
 #ifndef INSTANCE_H
 #define INSTANCE_H
 
@@ -19,7 +18,7 @@
 #define INTEGER_NAME "Int32"
 #define OTHER_NAME "another type"
 #define TOKEN "instantiation token"
-/* The same names in another spelling. */
+/* Names that differ only in spelling. */
 #define DeSerializeFMUstate DeserializeFMUState
 #define FreeFMUstate FreeFMUState
 #define GetDerivatives GetContinuousStateDerivatives
@@ -36,13 +35,13 @@
 #define INTEGER_NAME "Integer"
 #define OTHER_NAME "a String"
 #define TOKEN "GUID"
-#ifdef PREFIX /* FMPy's copy of the header was changed to ignore it */
+#ifdef PREFIX /* FMPy's copy of the header ignores the prefix */
 #undef fmi2FullName
 #define fmi2FullName(name) PREFIXED(name)
 #endif
 #endif
 
-/* A name of the standard in this version, and as messages say it. */
+/* A name of the standard in this version, as an identifier and as text. */
 #define STANDARD(name) OF_VERSION(name)
 #define CALL_NAME(name) TEXT_OF_VERSION(name)
 
@@ -74,31 +73,31 @@ enum { AFTER_DISCARD = FMI == 3 ? STEP : STEP_FAILED };
 
 /* All that getFMUstate saves. Plain data without pointers. */
 typedef struct {
-    char guid[sizeof MODEL_GUID + 8 - sizeof MODEL_GUID % 8]; /* of the model that it belongs to */
+    char guid[sizeof MODEL_GUID + 8 - sizeof MODEL_GUID % 8]; /* GUID of the state's model */
     Plant plant;
     double time;      /* s */
-    double stop_time; /* s, HUGE_VAL where there is none */
+    double stop_time; /* s, HUGE_VAL without one */
     Passage passage;  /* in Model Exchange: the importer's step */
     Sampling sampling;
-    Stops stops;      /* in Model Exchange a discrete state, which events alone change */
+    Stops stops;      /* in Model Exchange a discrete state, which only events change */
     int phase;
-    int initialised;  /* the outputs q and v are those of the parameters and the state */
+    int initialised;  /* q and v agree with the parameters and the state */
     int has_x;        /* the output x is computed */
-    int has_tau;      /* the output tau is computed, with held efforts q_meas and v_meas too */
-    int has_stops;    /* the joints that rest are found */
+    int has_tau;      /* tau is computed; for a sampled controller also q_meas and v_meas */
+    int has_stops;    /* the joints at rest are known */
     int has_rates;    /* the derivatives are computed */
 } State;
 
 typedef struct {
     State state;
     Kind kind;
-    void (*log)(void); /* the importer's callback, as the face knows it */
-    void *environment; /* which that is given */
+    void (*log)(void); /* the importer's callback; fmi2.c and fmi3.c know its type */
+    void *environment; /* argument of the callback */
     const char *name;
-    int silent; /* the categories of messages that are off, a bit each; none before it is made */
+    int silent; /* bit mask of the log categories that are off; 0 before instantiation */
 } Instance;
 
-/* The calls; setting variables has three rows, by what they are. */
+/* The calls. Calls that set variables are also checked by the kind of variable: SET_INPUT, SET_PARAMETER, SET_Q_V. */
 typedef enum {
     INSTANTIATE, SET_DEBUG_LOGGING, SETUP_EXPERIMENT, ENTER_INITIALIZATION, EXIT_INITIALIZATION,
     TERMINATE, RESET, DO_STEP, CANCEL_STEP, GET_STATUS, GET_REAL, GET_BOOLEAN, GET_INTEGER,
@@ -112,11 +111,11 @@ typedef enum {
 static const char NO_EFFORT[] = "the control law gave an effort that is not finite: inputs, payload or speeds are too"
                                 " large";
 
-/* Hand a message, of less than 512 bytes, to the importer, as the face knows it. */
+/* Pass a message of less than 512 bytes to the importer, in the form of this version of FMI. */
 INTERNAL void hand_over(const Instance *instance, Status status, const char *category,
                         const char *text);
 
-/* Log a printf message, where the status's category is on. Returns the status. */
+/* Log a printf message if the status's category is on; return the status. */
 INTERNAL Status report(Instance *instance, Status status, const char *format, ...);
 
 #endif

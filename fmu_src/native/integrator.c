@@ -1,7 +1,7 @@
 /* Advance the plant over one communication step, with located events of stops and friction. The rules are
    those of plant/integrator.py.
 
-   Every communication step begins afresh with the step min(max_step, h).
+   Every communication step restarts with the step min(max_step, h).
 
    Source: Hairer, Nørsett & Wanner, "Solving ODEs I", II.4 and II.6. */
 #include "integrator.h"
@@ -17,25 +17,23 @@
 /* Values of the parameter integrator. */
 enum { AUTOMATIC, DORMAND_PRINCE, STIFF };
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
-/* Anti-chatter. A joint that returns to its limit sooner than CHATTER_TIME (part of the largest step) is held
-   there for FIRST_HOLD (part of CHATTER_TIME); each repetition lengthens the hold by HOLD_GROWTH. A hold of
-   HOLD_OF_ALL (part of CHATTER_TIME) or more covers all joints at limits. Otherwise an acceleration that grazes
-   zero, or impacts that drive joints off each other's limits, would release and stop joints without end. A
-   joint that returns once is held for some picoseconds. The rank of J⁺ is held in the same way where it drops
-   soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
-   never held, because its J⁺ is unbounded. A joint whose friction holds it again at the instant in which it was
-   released, or that stops sooner than FIRST_HOLD after it, is held likewise, for a time of its own: there
-   rounding decides. */
+/* Anti-chatter. CHATTER_TIME is a fraction of the largest step, FIRST_HOLD and HOLD_OF_ALL are fractions of
+   CHATTER_TIME. A joint that returns to its limit within CHATTER_TIME is held there for FIRST_HOLD. Each repetition
+   lengthens the hold by the factor HOLD_GROWTH. A hold of HOLD_OF_ALL or longer covers all joints at limits. Without
+   holds, an acceleration that grazes zero, or joints that push each other off their limits, would release and stop
+   joints without end. A joint that returns once is held for some picoseconds. The rank of J⁺ is held in the same way if
+   it drops soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
+   never held, because its J⁺ is unbounded. Each joint that friction holds again at the instant of its release, or that
+   stops within FIRST_HOLD of it, has a hold of its own: there, rounding decides. */
 static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 16777216.0, HOLD_GROWTH = 8.0,
                     HOLD_OF_ALL = 1.0 / 512.0;
-/* Part of CHATTER_TIME that replaces it for the rank, and for joints whose stops have no reaction: near a
-   singularity ordinary gains whip joints to and fro within microseconds, and no impact repeats there without
-   end. */
+/* Fraction of CHATTER_TIME that replaces it for the rank and for stops without reaction: near a singularity ordinary
+   gains move joints back and forth within microseconds, and without reaction no impact repeats without end. */
 static const double SHORT_CHATTER_TIME = 1.0 / 4096.0;
-/* rad, m and per s: of the difference quotients that tell how fast a joint is. */
+/* Step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s. */
 static const double NUDGE = 1e-6;
 
-/* Set out at y, where joints may rest. */
+/* Determine the regime at y, where joints may rest. */
 static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept[N_JOINTS], int rank_held)
 {
     impact(step->plant, step->y, anti_chatter);
@@ -45,7 +43,7 @@ static void set_out(Step *step, const int anti_chatter[N_JOINTS], const int kept
     memcpy(step->K[0], step->y + N_JOINTS, N_JOINTS * sizeof *step->y);
 }
 
-/* True if nothing changes any more: inputs are held, and all joints. */
+/* True if inputs and all joints are held, so that nothing changes. */
 static int all_rest(const Step *step)
 {
     int rest = 1;
@@ -63,8 +61,8 @@ static int is_finite(const Step *step)
     return 1;
 }
 
-/* Name the joint whose own acceleration answers most to its position or velocity at y: the rate is
-   the largest of |∂q̈ᵢ/∂vᵢ| and |∂q̈ᵢ/∂qᵢ|½. */
+/* Find the joint whose acceleration is most sensitive to its own position or velocity at y: the rate is the largest of
+   |∂q̈ᵢ/∂vᵢ| and |∂q̈ᵢ/∂qᵢ|½. */
 static void find_fastest(Step *step, Failure *failure)
 {
     double a[N_JOINTS], nudged[N_STATES], answer[N_JOINTS], effort[N_JOINTS];
@@ -85,8 +83,8 @@ static void find_fastest(Step *step, Failure *failure)
     }
 }
 
-/* Integrate from the time t, at y, until an event or until the end: the time reached, y being the
-   state there; NaN where that cannot be done. */
+/* Integrate from the time t and the state y until an event or the end; return the time, with y the state there, or NaN
+   on failure. */
 static double until_event(Step *step, double t, double end, int rank_held, int *integrator, Event *event,
                           Failure *failure)
 {
@@ -114,7 +112,7 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
             next = fmin(max_step, step->size * fmax(MIN_FACTOR, fmin(growth, factor)));
             growth = MAX_FACTOR;
         } else if (*integrator == AUTOMATIC && damping_limits(step, fmin(max_step, end - t))) {
-            *integrator = STIFF; /* to the end of the communication step */
+            *integrator = STIFF; /* until the end of the communication step */
         } else {
             next = step->size * (isfinite(norm) ? fmax(MIN_FACTOR, factor) : MIN_FACTOR);
             growth = 1.0; /* no growth right after a rejection */
@@ -130,12 +128,12 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
     return NAN;
 }
 
-/* A hold of joints at their limits, of one by its friction, or of the rank of J⁺. */
+/* A hold of joints at limits, of a joint in friction, or of the rank of J⁺. */
 typedef struct {
     double until, length;
 } Hold;
 
-/* Begin a hold at t, longer than the last one where that ended within the time `soon`. */
+/* Begin a hold at t, longer than the last one if that ended less than `soon` ago. */
 static void hold_for_a_while(Hold *hold, double t, double soon, double longest)
 {
     const int again = t - hold->until < soon;
@@ -149,7 +147,7 @@ static int is_at_limit(const Step *step, int i)
     return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
 }
 
-/* Hold the joints that chatter at t; long holds cover all joints at limits. */
+/* Hold the joints that chatter at t; a long hold covers all joints at limits. */
 static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *hold, double t,
                         double joint_time, double chatter_time, int anti_chatter[N_JOINTS])
 {
@@ -201,7 +199,7 @@ int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N
         }
         set_out(&step, anti_chatter, kept, rank_held);
         for (int i = 0; i < N_JOINTS; i++) {
-            const int held_again = step.stops.watched[i] && event.released[i]; /* by rounding */
+            const int held_again = step.stops.watched[i] && event.released[i]; /* because of rounding */
             if (!step.stops.held[i] && is_at_limit(&step, i))
                 left[i] = t;
             if (!step.stops.held[i] && step.stops.slip[i] && step.y[N_JOINTS + i] == 0.0)

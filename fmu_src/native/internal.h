@@ -1,6 +1,6 @@
-/* Declarations for all files of the FMU. Other code of the process, the C library and other FMUs among it, has
-   functions of the same names: those of the FMU are static, but those of the standard and
-   `twodof_differentiate`, which carry the prefix of a program that has the FMU as sources. */
+/* Declarations for all files of the FMU. The C library, other FMUs and the rest of the process may have functions of
+   the same names. Therefore the FMU's functions are static, except those of the standard and `twodof_differentiate`,
+   which have the prefix of a program that links the FMU's sources. */
 #ifndef INTERNAL_H
 #define INTERNAL_H
 
@@ -12,7 +12,7 @@
 #error "compile without -ffast-math, -ffinite-math-only and /fp:fast: they remove the checks for NaN and inf"
 #endif
 
-/* The prefix, by the rules of the standard's headers, of which older ones know no override. */
+/* The prefix, by the rules of the standard's headers; older headers have no override. */
 #if FMI == 3
 #if defined FMI3_FUNCTION_PREFIX && !defined FMI3_OVERRIDE_FUNCTION_PREFIX
 #define PREFIX FMI3_FUNCTION_PREFIX
@@ -39,10 +39,10 @@
 #define HIDDEN
 #endif
 
-/* As the rank of J⁺: that which its singular values give. */
+/* Argument for a rank of J⁺ that its singular values give. */
 enum { ANY_RANK = -1 };
 
-/* The real part of what is compared: numbers are complex where the engine is compiled for derivatives. */
+/* Real part of a number in a comparison; numbers are complex if the engine is compiled for derivatives. */
 #define RE(x) (x)
 
 #endif

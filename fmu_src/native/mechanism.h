@@ -1,30 +1,29 @@
-/* Kinematics and dynamics of the robot: what mechanism.c, generated from its URDF, computes. Joints
-   that mimic others follow them there; all else knows the joints that move on their own. */
+/* Kinematics and dynamics of the robot, which mechanism.c, generated from its URDF, computes. Joints that mimic others
+   follow them there; all other files know the independent joints only. */
 #ifndef MECHANISM_H
 #define MECHANISM_H
 
 #include "internal.h"
 #include "model.h"
 
-/* False, which no compiler can tell: the branches of mechanism.c on it end its basic blocks. */
+/* Always false, but not known to the compiler: branches on it end basic blocks of mechanism.c. */
 static inline int never(void)
 {
     static const volatile int no = 0;
     return no;
 }
 
-/* Position of a joint: cosine and sine of its angle; of a prismatic joint its displacement, as c. */
+/* Position of a joint: cosine and sine of its angle; for a prismatic joint, c is the displacement. */
 typedef struct {
     double c, s;
 } JointPosition;
 
-/* The task frame in the root's axes, in the rows of the task: its axes, then with an orientation
-   the turning about x, y and z. */
+/* The task frame in the root's axes. Rows are the task axes, and with an orientation the rotations about x, y and z. */
 typedef struct {
     double x[N_AXES];           /* position, m */
     double J[N_ROWS][N_JOINTS]; /* Jacobian */
     double xd[N_ROWS];          /* velocity J v, m/s and rad/s */
-    double drift[N_ROWS];       /* J̇ v, the acceleration where q̈ = 0, m/s2 and rad/s2 */
+    double drift[N_ROWS];       /* J̇ v, the acceleration for q̈ = 0, m/s2 and rad/s2 */
 #if N_ROWS > N_AXES
     double R[3][3];             /* orientation */
 #endif
@@ -36,7 +35,7 @@ typedef struct {
     double mass, moment[3], inertia[6];
 } EndBody;
 
-/* The position of a joint that turns. */
+/* The position of a revolute joint. */
 INTERNAL JointPosition turn(double angle);
 
 INTERNAL void place_joints(const double q[N_JOINTS], JointPosition joint[N_BODIES]);
@@ -45,28 +44,28 @@ INTERNAL void place_joints(const double q[N_JOINTS], JointPosition joint[N_BODIE
 INTERNAL void task_frame(const JointPosition joint[N_BODIES], const double v[N_JOINTS],
                          TaskFrame *task);
 
-/* τ = Jᵀ f, what a force at the task frame, N, in the root's axes, is at the joints. */
+/* τ = Jᵀ f, the joint efforts of a force at the task frame, N, in the root's axes. */
 INTERNAL void effort_of_force(const JointPosition joint[N_BODIES], const double force[3],
                               double tau[N_JOINTS]);
 
 /* The end_body with a point mass, kg, at an offset in the task frame, m. */
 INTERNAL void load_end_body(double payload, const double offset[3], EndBody *end_body);
 
-/* τ = M(q) a + h(q, v), joint efforts in N·m or N. The gravity is in the root's axes, m/s2. M has the
-   armature, kg·m2 or kg, on its diagonal. */
+/* τ = M(q) a + h(q, v), joint efforts in N·m or N. Gravity is in the root's axes, m/s2. The diagonal of M includes the
+   armature, kg·m2 or kg. */
 INTERNAL void inverse_dynamics(const JointPosition joint[N_BODIES], const EndBody *end_body,
                                const double armature[N_JOINTS], const double v[N_JOINTS],
                                const double a[N_JOINTS], const double gravity[3],
                                double tau[N_JOINTS]);
 
-/* Bounds of |τ| but for rounding, in fewer operations from a few joints on. */
+/* Upper bounds of |τ|, except for rounding; they take fewer operations than τ for robots of several joints. */
 INTERNAL void effort_bounds(const JointPosition joint[N_BODIES], const EndBody *end_body,
                             const double armature[N_JOINTS], const double v[N_JOINTS],
                             const double a[N_JOINTS], const double gravity[3],
                             double bound[N_JOINTS]);
 
-/* a and λ of M(q) a = τ + λ. Of free joints, 1, τ is given, and λ is 0; of the others, 0, a is given, and
-   τ is 0. Derivatives do without. */
+/* a and λ of M(q) a = τ + λ. For free joints (1), τ is given and λ is 0; for the others (0), a is given and τ is 0.
+   Derivatives do not need it. */
 #ifndef IS_COMPLEX
 INTERNAL void hybrid_dynamics(const JointPosition joint[N_BODIES], const EndBody *end_body,
                               const double armature[N_JOINTS], const double free[N_JOINTS],

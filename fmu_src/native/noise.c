@@ -1,5 +1,5 @@
-/* Normal random numbers of a seed, a sample and a channel, bit-identical to those of plant/noise.py: the
-   uniform numbers are those of Philox4x32-10, made normal by the polar method, with operations of IEEE 754 alone.
+/* Normal random numbers as a function of seed, sample and channel, bit-identical to those of plant/noise.py:
+   Philox4x32-10 and the polar method, with basic operations of IEEE 754 only.
 
    Sources: Salmon, Moraes, Dror & Shaw, SC 2011; Marsaglia & Bray, SIAM Review 6(3), 1964. */
 #include <math.h>
@@ -49,7 +49,7 @@ static double uniform(uint32_t high, uint32_t low)
     return (double)(((uint64_t)high << 32 | low) >> 11) / 4503599627370496.0 - 1.0;
 }
 
-/* Two independent standard normal numbers of a seed, a sample k < 2⁵³ and a channel. */
+/* Two independent standard normal numbers for a seed, a sample k < 2⁵³ and a channel. */
 static void normal_pair(double seed, double k, int channel, double pair[2])
 {
     const uint64_t sample = (uint64_t)k;

@@ -1,5 +1,5 @@
-/* Orientations as ROS has them: unit quaternions x, y, z, w. With the quaternion (a, w) of R_des Rᵀ the error is
-   2 atan2(|a|, w) a/|a|.
+/* Orientations as unit quaternions x, y, z, w, the order of ROS. With the quaternion (a, w) of R_des Rᵀ, the error is 2
+   atan2(|a|, w) a/|a|.
    Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 2.6 and 3.7.3. */
 #include "internal.h"
 
@@ -9,7 +9,7 @@
 INTERNAL void quaternion(double R[3][3], double q[4])
 {
     const double trace = R[0][0] + R[1][1] + R[2][2];
-    int i = 0; /* the largest of the axis' components */
+    int i = 0; /* index of the axis' largest component */
     if (RE(R[1][1]) > RE(R[0][0]))
         i = 1;
     if (RE(R[2][2]) > RE(R[i][i]))
@@ -33,14 +33,14 @@ INTERNAL void quaternion(double R[3][3], double q[4])
         q[c] *= sign;
 }
 
-/* log(R_des Rᵀ), rad about the root's axes: the short way from R to R_des, at most π. The target is
-   the quaternion of R_des, not 0, of any length. */
+/* log(R_des Rᵀ), the shortest rotation from R to R_des, rad about the root's axes, at most π. The target is the
+   quaternion of R_des, of any length but 0. */
 INTERNAL void rotation_error(const double target[4], double R[3][3], double error[3])
 {
     double a[4], b[4], largest = 0.0;
     for (int c = 0; c < 4; c++)
         largest = fmax(largest, fabs(target[c]));
-    for (int c = 0; c < 4; c++) /* a length that neither overflows nor vanishes */
+    for (int c = 0; c < 4; c++) /* scaling prevents overflow and underflow of the length */
         a[c] = target[c] / largest;
     quaternion(R, b);
     const double x = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1];

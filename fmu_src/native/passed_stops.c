@@ -1,6 +1,6 @@
-/* Find the stops that an importer's step has passed. The quintic through position, velocity and acceleration of both
-   ends shows whether a joint reversed near its limit or outside it; where one did, the engine takes the step
-   again, from its start, and its stops decide. */
+/* Find the stops that an importer's step passed unnoticed. The quintic through position, velocity and acceleration at
+   both ends shows whether a joint reversed near or outside its limit. If a joint did, the engine integrates the step
+   again from its start, and the engine's stops are the result. */
 
 #include <math.h>
 #include <string.h>
@@ -9,20 +9,20 @@
 
 /* A step of the importer. */
 typedef struct {
-    double time, y[N_STATES], a[N_JOINTS]; /* its start: s, the state and the accelerations */
-    double reached[N_STATES];              /* the state at time, of a step before that passed a stop */
-    double stop_time;                      /* s: when that stop was reached, */
-    int joint;                             /* by this joint, counted from 1; 0: no stop was passed */
-    int begun;                             /* whether there is a start */
+    double time, y[N_STATES], a[N_JOINTS]; /* at its start: time (s), state, accelerations */
+    double reached[N_STATES];              /* state at `time` after a stop that the step before passed */
+    double stop_time;                      /* s: when the stop was reached */
+    int joint;                             /* the stop's joint, from 1 on; 0: no stop was passed */
+    int begun;                             /* whether the start is known */
 } Passage;
 
-/* s: no polynomial follows a longer step. */
+/* s: a polynomial does not approximate a longer step. */
 static const double LONGEST_STEP = 1.0;
-/* The largest value of s²(1 − s)³/2: the quintic differs from the cubic, which knows no accelerations, by less
-   than this part of the difference of their accelerations. */
+/* Largest value of s²(1 − s)³/2. The quintic differs from the cubic through positions and velocities by less than this
+   factor times the difference of their accelerations. */
 static const double BULGE = 0.01728;
 
-/* Start a step of the importer at the plant's state, whose derivatives are computed. */
+/* Start a step of the importer at the plant's state; the derivatives must have been computed. */
 static void begin_passage(Passage *passage, const Plant *plant, double time)
 {
     const double *rate = &plant->value[DER_V];
@@ -63,8 +63,8 @@ static int reversed_outside(const Passage *start, const Passage *end, const Plan
     return 0;
 }
 
-/* Find a stop that the importer's step to the plant's state has passed, and start the next one there. Where
-   the engine cannot integrate the step, the joint, counted from 1, that reversed at its limit, else 0. */
+/* Find a stop that the importer's step to the plant's state passed, and start the next step there. If the engine cannot
+   integrate the step, return the joint that reversed at its limit, counted from 1; otherwise 0. */
 static int find_passed_stop(Passage *passage, const Plant *plant, const Stops *stops, double time)
 {
     const Passage start = *passage;
@@ -85,7 +85,7 @@ static int find_passed_stop(Passage *passage, const Plant *plant, const Stops *s
     long evaluations = 0;
     double stopped_at[N_JOINTS], first = HUGE_VAL;
     memcpy(&again.value[Q], start.y, sizeof start.y);
-    handle_event(&again, &at_start); /* a solver's rounding is no motion */
+    handle_event(&again, &at_start); /* removes the motion by the solver's rounding */
     if (!(STAGES * h <= BUDGET * plant->value[MAX_STEP])
         || !advance_plant(&again, h, &evaluations, stopped_at, &failure))
         return any;
@@ -99,14 +99,14 @@ static int find_passed_stop(Passage *passage, const Plant *plant, const Stops *s
     return 0;
 }
 
-/* At an event at the end of a step that passed a stop: put the plant where the stop has led. Whether it does. */
+/* If the step before the event passed a stop, set the plant to the state after the stop; return whether it did. */
 static int take_passed_stop(Passage *passage, Plant *plant, Stops *stops, double time)
 {
     const int takes = passage->joint && passage->time == time
                       && memcmp(passage->y, &plant->value[Q], sizeof passage->y) == 0;
     if (takes) {
         memcpy(&plant->value[Q], passage->reached, sizeof passage->reached);
-        *stops = (Stops){.rank = stops->rank}; /* the state says how joints are */
+        *stops = (Stops){.rank = stops->rank}; /* handle_event finds the joints at rest from the state */
     }
     passage->joint = 0;
     return takes;

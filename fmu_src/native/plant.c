@@ -1,4 +1,4 @@
-/* The motion that a control law causes:
+/* The plant's motion under its control law:
 
        τ = M̂(q) q̈_cmd + ĥ(q, v), or as the law gives it
        q̈ = M(q)⁻¹ (sat(τ) + tau_ext + Jᵀ f_ext − D v − F s − h(q, v))
@@ -20,7 +20,7 @@ static double saturated(double tau, double limit)
     return RE(tau) > RE(limit) ? limit : RE(tau) < -RE(limit) ? -limit : tau;
 }
 
-/* The robot as it is, or as its control law knows it. */
+/* The true robot, or the robot as its control law knows it. */
 static void body(const double value[N_VARIABLES], int as_known, EndBody *end_body)
 {
     double payload = value[PAYLOAD];
@@ -33,7 +33,7 @@ static void body(const double value[N_VARIABLES], int as_known, EndBody *end_bod
     load_end_body(payload, &value[PAYLOAD_COM], end_body);
 }
 
-/* True if the effort that acts is the output tau, held until a sampled controller commands another. */
+/* True if a sampled controller holds the effort, which is then the output tau. */
 static int is_held(const double value[N_VARIABLES])
 {
     return value[CONTROL_PERIOD] != 0.0;
@@ -50,7 +50,7 @@ static int knows_all(const double value[N_VARIABLES])
 #endif
 }
 
-/* τ of what the law gave, without limits. */
+/* τ for the result of the law, without limits. */
 static void wanted_effort(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                           const double v[N_JOINTS], const double given[N_JOINTS],
                           double tau[N_JOINTS])
@@ -71,7 +71,7 @@ static void limit_effort(const double value[N_VARIABLES], double tau[N_JOINTS])
         tau[i] = saturated(tau[i], EFFORT[i]);
 }
 
-/* True if a torque that has been commanded may be beyond its limit, without computing it. */
+/* True if a commanded torque may exceed its limit; decided without computing the torque. */
 static int may_saturate(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                         const double v[N_JOINTS], const double a[N_JOINTS])
 {
@@ -86,7 +86,7 @@ static int may_saturate(const double value[N_VARIABLES], const JointPosition joi
     return 0;
 }
 
-/* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 where a was commanded and is what comes. */
+/* sum += sat(τ) − (M(q) a + h(q, v)), which is 0 if a is the commanded and the actual acceleration. */
 static void add_excess(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
                        const double v[N_JOINTS], const double given[N_JOINTS],
                        const double a[N_JOINTS], double sum[N_JOINTS])

@@ -6,39 +6,39 @@
 #include "model.h"
 
 /* All variables of the FMU by value reference: inputs, outputs (q and v are the state; x and tau
-   are computed on demand) and parameters. Truth values are 0 or 1. */
+   are computed on demand) and parameters. Booleans are 0 or 1. */
 typedef struct {
     double value[N_VARIABLES];
 } Plant;
 
-enum { N_STATES = 2 * N_JOINTS }; /* q and v follow each other in the table, their derivatives too */
+enum { N_STATES = 2 * N_JOINTS }; /* q and v are adjacent in the table, and so are their derivatives */
 
-/* q̈ of the equations of motion at a state, with a J⁺ of this rank, of joints that slip in these directions
-   (−1, 1; 0, or NULL: without friction), all joints at rest being free. Returns the rank; the margin, which
-   may be NULL, is negative where the singular values give another. */
+/* q̈ by the equations of motion at a state, with the given rank of J⁺. Joints slip in the given directions (−1, 1; 0 or
+   NULL: no friction), and joints at rest are free. Returns the rank. The margin, which may be NULL, is negative if the
+   singular values give another rank. */
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                           const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin);
 
-/* The outputs x and xd, and quat and omega where there are such, at the plant's state. */
+/* Compute the outputs x and xd, and with an orientation quat and omega, at the plant's state. */
 INTERNAL void compute_position(Plant *plant);
 
 #ifdef IS_COMPLEX
-/* Columns of M(q)⁻¹, of so many joints: what an effort of 1 there does to all. */
+/* The columns of M(q)⁻¹ for count joints. */
 INTERNAL void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,
                            const int joints[N_JOINTS], double columns[N_JOINTS][N_JOINTS]);
 #else
-/* a and λ of M(q) a = τ + λ, as hybrid_dynamics has them. */
+/* a and λ of M(q) a = τ + λ, as in hybrid_dynamics. */
 INTERNAL void hybrid_motion(const Plant *plant, const double q[N_JOINTS], const double armature[N_JOINTS],
                             const double free[N_JOINTS], const double given[N_JOINTS], double a[N_JOINTS],
                             double reaction[N_JOINTS]);
 #endif
 
-/* τ of the control law for a measured state, within limits where there are, J⁺ being of this rank. */
+/* τ of the control law for a measured state, within effort limits, with the given rank of J⁺. */
 INTERNAL void control_effort(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                              int rank, double tau[N_JOINTS]);
 
-/* The output tau, the control effort applied, at the plant's state and inputs, J⁺ being of this rank. That of a
-   sampled controller is held: it is what acts. */
+/* Compute the output tau, the applied control effort, at the plant's state and inputs, with the given rank of J⁺. The
+   effort of a sampled controller is held and stays as it is. */
 INTERNAL void compute_effort(Plant *plant, int rank);
 
 #endif

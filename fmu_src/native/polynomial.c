@@ -1,8 +1,8 @@
-/* Polynomials, and where they change their sign. */
+/* Values and sign changes of polynomials. */
 
 static const double ROOT_RESOLUTION = 1.0 / 4503599627370496.0; /* 2⁻⁵² */
 
-/* The value of a polynomial of a degree, its constant first. */
+/* The value of a polynomial; its coefficients begin with the constant. */
 static double polynomial(const double c[], int degree, double x)
 {
     double sum = c[degree];
@@ -12,8 +12,7 @@ static double polynomial(const double c[], int degree, double x)
 }
 
 /* Find the points in (0, 1) at which a polynomial of degree 4 or less changes its sign, in ascending order; return
-   their number. Between the
-   turning points, at which its derivative does so, it is monotonic. */
+   their number. The polynomial is monotonic between the sign changes of its derivative. */
 static int sign_changes(const double c[], int degree, double root[])
 {
     double slope[4], turn[5], left = 0.0;

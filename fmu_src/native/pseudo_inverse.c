@@ -5,8 +5,8 @@
 
 /* Bound on (σ_min/σ_max)² above which the normal equations lose less than 1e-12. */
 static const double WELL_CONDITIONED = 1e-3;
-/* Rows count as orthogonal where the cosine of their angle is below this, 2⁻⁵⁰, or the ratio of their
-   lengths: the shorter is what rounding has left of a row that depends on others. */
+/* Two rows count as orthogonal if the cosine of their angle, or the ratio of their lengths, is below 2⁻⁵⁰. If the ratio
+   is, the shorter row is the rounding error of a linearly dependent row. */
 static const double ORTHOGONAL = 1.0 / 1125899906842624.0;
 enum { MAX_SWEEPS = 12 };
 
@@ -18,8 +18,8 @@ static double dot(const double a[N_JOINTS], const double b[N_JOINTS])
     return total;
 }
 
-/* y = (J Jᵀ)⁻¹ b by cofactors; false where a singular value may have to be dropped. Bound is a lower
-   bound of (σ_min/σ_max)², where asked for. */
+/* y = (J Jᵀ)⁻¹ b by cofactors; false if a singular value may have to be dropped. bound, unless it is NULL, receives a
+   lower bound of (σ_min/σ_max)². */
 static int solve_normal_equations(double J[N_ROWS][N_JOINTS], const double b[N_ROWS],
                                   double smallest, double y[N_ROWS], double *bound)
 {
@@ -90,8 +90,8 @@ static void orthogonalise(double J[N_ROWS][N_JOINTS], double b[N_ROWS])
 }
 
 #ifdef IS_COMPLEX
-/* The rows are orthogonal, their variations are not yet: what is dropped is turned out of what is kept,
-   and b makes up for the rest, to first order. */
+/* The rows are orthogonal, but their variations are not. To first order, rotate the dropped rows out of the kept ones,
+   and correct b for the rest. */
 static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double square[N_ROWS],
                  const int kept[N_ROWS])
 {
@@ -118,8 +118,7 @@ static void vary(double J[N_ROWS][N_JOINTS], double b[N_ROWS], const double squa
 }
 #endif
 
-/* The singular values of orthogonal rows over the largest, in descending order; index says where each row
-   is among them. */
+/* σ/σ_max of orthogonal rows in descending order; index has the rank order of the rows. */
 static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double ratio[N_ROWS],
                       int index[N_ROWS])
 {
@@ -135,8 +134,8 @@ static void sort_rows(double J[N_ROWS][N_JOINTS], double square[N_ROWS], double 
         ratio[index[k]] = RE(largest) > 0.0 ? sqrt(square[k] / largest) : 0.0;
 }
 
-/* Distance of the singular values next to a rank from rcond, as ratios to the largest; negative where
-   the rule σ > rcond·σ_max gives another rank. */
+/* Distance of the singular values next to a rank from rcond, as ratios to the largest; negative if the rule σ >
+   rcond·σ_max gives another rank. */
 INTERNAL double rank_margin(const double ratio[N_ROWS], double rcond, int rank)
 {
     double margin = 1.0;
@@ -147,7 +146,7 @@ INTERNAL double rank_margin(const double ratio[N_ROWS], double rcond, int rank)
     return margin;
 }
 
-/* y of J⁺ b = Jᵀ y, J and b being made orthogonal; the other arguments are those of apply_pseudo_inverse. */
+/* y of J⁺ b = Jᵀ y; makes the rows of J orthogonal and rotates b. Other arguments as in apply_pseudo_inverse. */
 static int solve_by_singular_values(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond,
                                     int rank, double y[N_ROWS], double *margin)
 {
@@ -170,10 +169,9 @@ static int solve_by_singular_values(double J[N_ROWS][N_JOINTS], double b[N_ROWS]
     return rank;
 }
 
-/* result = J⁺ b, the least-squares solution of smallest norm, where J⁺ keeps as many of the largest
-   singular values as the rank says; ANY_RANK keeps σ > rcond·σ_max. Returns the rank. The margin, where
-   asked for, is that of rank_margin or, where positive, a lower bound of it. J and b are used as
-   working memory. */
+/* result = J⁺ b, the least-squares solution of smallest norm. J⁺ keeps as many of the largest singular values as the
+   rank says; ANY_RANK keeps σ > rcond·σ_max. Returns the rank. The margin, unless it is NULL, is that of rank_margin
+   or, if positive, a lower bound of it. J and b are working memory. */
 INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], double rcond, int rank,
                                   double result[N_JOINTS], double *margin)
 {
@@ -195,8 +193,7 @@ INTERNAL int apply_pseudo_inverse(double J[N_ROWS][N_JOINTS], double b[N_ROWS], 
     return rank;
 }
 
-/* The singular values of J over the largest, in descending order; 0 where all are 0. J is used as
-   working memory. */
+/* σ/σ_max of J in descending order; all are 0 for a zero matrix. J is working memory. */
 INTERNAL void singular_ratios(double J[N_ROWS][N_JOINTS], double ratio[N_ROWS])
 {
     double nothing[N_ROWS] = {0}, square[N_ROWS];

@@ -1,12 +1,12 @@
-/* The rules are those of plant/rosenbrock.py. The method is of its order with any approximation T of the Jacobian,
-   and L-stable for the part that is in T. Here that is the damping D of the joints and q̇ = v,
+/* The rules are those of plant/rosenbrock.py. The method has its order with any approximation T of the Jacobian, and is
+   L-stable for the terms in T. Here T contains the joint damping D and q̇ = v:
 
        T = [ 0      1   ]        (1 − h γ T) uᵢ = h γ f(y + Σ aᵢⱼ uⱼ) + γ Σ cᵢⱼ uⱼ,    j < i
            [ 0   −M⁻¹D  ]        y_new = y + Σ mᵢ uᵢ
 
-   where (1 + h γ M⁻¹D) x = r is x = r − (M + h γ D)⁻¹ h γ D r, with h γ D in the place of an armature. The velocity of
-   the dense output begins with the acceleration, so that a joint which begins to slip does so in the right direction;
-   where that is stiff it is the rate of the position's, for small errors of v are large ones of q̈ there.
+   (1 + h γ M⁻¹D) x = r has the solution x = r − (M + h γ D)⁻¹ h γ D r, in which h γ D acts like an armature. The dense
+   output of v begins and ends with the accelerations, so that a joint begins to slip in the right direction. For a
+   stiff joint, small errors of v become large errors of q̈; the acceleration of q's cubic then replaces q̈.
 
    Source: Rang & Angermann, "New Rosenbrock W-methods of order 3 for partial differential algebraic equations of
    index 1", BIT 45(4), 2005, in the form without products by T of Hairer & Wanner, "Solving ODEs II", IV.7. */
@@ -18,7 +18,7 @@
 
 enum { N_INCREMENTS = 4 };
 static const double GAMMA = 0.435866521508459;
-/* Row i weighs the increments u of the stages before i; the last row and the last increment are the solution. */
+/* Row i has the weights of the increments u of the stages before i; the last row and increment are the solution. */
 static const double WEIGHT[N_INCREMENTS][N_INCREMENTS] = {
     {0, 0, 0, 0},
     {2, 0, 0, 0},
@@ -35,11 +35,11 @@ static const double ESTIMATE[N_INCREMENTS] = {0.2777499476479681, -1.40323989517
 /* Weights of the derivatives in the dense output, a cubic by the values and derivatives at both ends. */
 static const double CUBIC[N_INCREMENTS + 1][4] = {
     {0, 0, 0, 0}, {1, -2, 1, 0}, {0, 3, -2, 0}, {0, -1, 1, 0}, {0, 0, 0, 0}};
-/* Rates of damping times a step: up to which Dormand–Prince is stable, and times the largest step from which on the
-   other method is the cheaper one. */
+/* Damping rate times step: up to STABLE, Dormand–Prince is stable; if the product with the largest step exceeds WORTH,
+   this method is cheaper. */
 static const double STABLE = 3.3, WORTH = 12.0;
 
-/* x of (M + s D) x = τ at y, joints at rest being held. */
+/* x of (M + s D) x = τ at y, with joints at rest held. */
 static void damped_motion(const Step *step, double s, const double tau[N_JOINTS], double x[N_JOINTS])
 {
     const double *value = step->plant->value;
@@ -69,7 +69,7 @@ static void solve(const Step *step, double u[N_STATES])
     }
 }
 
-/* Sum of the first increments, with weights. */
+/* Weighted sum of the first increments. */
 static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_INCREMENTS], int count, int i)
 {
     double sum = 0.0;
@@ -78,7 +78,7 @@ static double weighted(double u[N_INCREMENTS][N_STATES], const double weight[N_I
     return sum;
 }
 
-/* Fill y_new, K and P from y and K[0]; the norm of the error, which passes where below 1. */
+/* Fill y_new, K and P from y and K[0]; return the norm of the error. A step passes if it is below 1. */
 static double rosenbrock(Step *step)
 {
     const double h = step->size, rtol = step->plant->value[RTOL], atol = step->plant->value[ATOL];
@@ -121,8 +121,8 @@ static double rosenbrock(Step *step)
     return error_norm(step, error);
 }
 
-/* Whether damping makes a step of Dormand–Prince that failed unstable, and steps of the largest size, s, are worth this
-   method. */
+/* True if a step of Dormand–Prince failed because of stiff damping, and this method is cheaper at the largest step, s.
+   */
 static int damping_limits(const Step *step, double largest)
 {
     double effort[N_JOINTS], answer[N_JOINTS], power = 0.0, rate = 0.0;
@@ -135,6 +135,6 @@ static int damping_limits(const Step *step, double largest)
         return 0;
     damped_motion(step, 0.0, effort, answer);
     for (int i = 0; i < N_JOINTS; i++)
-        rate += effort[i] * answer[i] / power; /* a Rayleigh quotient of M⁻¹D: the fastest mode prevails */
+        rate += effort[i] * answer[i] / power; /* a Rayleigh quotient of M⁻¹D: the fastest mode dominates */
     return rate * step->size > STABLE && rate * largest > WORTH;
 }

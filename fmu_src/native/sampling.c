@@ -14,19 +14,19 @@
 
 enum { MOST_PERIODS = 10 }; /* of a delay */
 
-/* Discrete state of the controller and its sensors. What acts is the output tau of the plant. */
+/* Discrete state of the controller and its sensors. The acting effort is the plant's output tau. */
 typedef struct {
     double start;            /* t_0, s */
-    double time;             /* of the latest sample, s */
-    double k;                /* samples so far, a whole number */
-    double q_meas[N_JOINTS]; /* the latest, of which the next may be a difference */
-    double pending[MOST_PERIODS + 1][N_JOINTS]; /* efforts that do not act yet, the oldest first, */
-    int count;                                  /* so many */
+    double time;             /* time of the latest sample, s */
+    double k;                /* number of samples so far, an integer */
+    double q_meas[N_JOINTS]; /* the latest positions, for velocities by differences */
+    double pending[MOST_PERIODS + 1][N_JOINTS]; /* efforts that do not act yet, the oldest first */
+    int count;                                  /* number of pending efforts */
 } Sampling;
 
-/* Times are equal within this part of max(1 s, |t|), and of the period. */
+/* Tolerances for equal times, relative to max(1 s, |t|) and to the period. */
 static const double EQUAL_TIMES = 1e-9, PART_OF_PERIOD = 1e-3;
-static const double ALL_WHOLE = 9007199254740992.0; /* 2⁵³, from which on all numbers are whole */
+static const double ALL_WHOLE = 9007199254740992.0; /* 2⁵³: doubles of this size or larger are integers */
 
 static double slack(const Plant *plant, double time)
 {
@@ -38,14 +38,14 @@ static double instant(const Sampling *sampling, const Plant *plant, double k)
     return sampling->start + k * plant->value[CONTROL_PERIOD];
 }
 
-/* When the oldest pending effort acts. */
+/* Time from which the oldest pending effort acts. */
 static double due(const Sampling *sampling, const Plant *plant)
 {
     return sampling->count ? instant(sampling, plant, sampling->k - sampling->count) + plant->value[CONTROL_DELAY]
                            : HUGE_VAL;
 }
 
-/* When the next sample is taken or the next effort acts, s; HUGE_VAL where there are no samples. */
+/* Time of the next sample or of the next change of effort, s; HUGE_VAL without samples. */
 static double next_sampling_event(const Sampling *sampling, const Plant *plant)
 {
     return plant->value[CONTROL_PERIOD] == 0.0
@@ -81,8 +81,9 @@ static void measure(Sampling *sampling, Plant *plant, double time)
     sampling->k += 1.0;
 }
 
-/* Do all that is due at a time, s: the outputs tau, q_meas and v_meas follow, of a continuous controller the last
-   two alone. False, and all unchanged, where an effort is not finite. */
+/* Take the sample and apply the efforts that are due at a time, s, and update the outputs tau, q_meas and v_meas; for a
+   continuous controller, update q_meas and v_meas only. If an effort is not finite, return false and leave the sampling
+   unchanged. */
 static int settle(Sampling *sampling, Plant *plant, double time)
 {
     const double period = plant->value[CONTROL_PERIOD], by = time + slack(plant, time);
@@ -92,7 +93,7 @@ static int settle(Sampling *sampling, Plant *plant, double time)
     }
     if (instant(sampling, plant, sampling->k) <= by) {
         const Sampling before = *sampling;
-        /* those that an importer's solver passed are gone */
+        /* samples that an importer's solver skipped are lost */
         sampling->k = fmax(sampling->k, fmin(ALL_WHOLE, floor((by - sampling->start) / period)));
         measure(sampling, plant, time);
         double *effort = sampling->pending[sampling->count++];
@@ -111,7 +112,7 @@ static int settle(Sampling *sampling, Plant *plant, double time)
     return 1;
 }
 
-/* True if there are samples: of a controller, or of sensors without one at communication points. */
+/* True if there are samples: of a controller, or of sensors at communication points. */
 static int are_samples(const double value[N_VARIABLES])
 {
     int any = value[CONTROL_PERIOD] != 0.0;
@@ -123,7 +124,7 @@ static int are_samples(const double value[N_VARIABLES])
     return any;
 }
 
-/* Advance plant and samples from a time by h, s. False, and both unchanged, where that cannot be done. */
+/* Advance plant and samples from a time by h, s. On failure return false and leave both unchanged. */
 static int advance_sampled(Sampling *sampling, Plant *plant, double time, double h, Failure *failure)
 {
     const double period = plant->value[CONTROL_PERIOD], max_step = plant->value[MAX_STEP], end = time + h;
@@ -154,7 +155,7 @@ static int advance_sampled(Sampling *sampling, Plant *plant, double time, double
     return 1;
 }
 
-/* True if the state, its numbers whatever they are, is one that a plant can be in at a time. */
+/* True if a state of any numbers is valid at a time. */
 static int is_sampling(const Sampling *sampling, const Plant *plant, double time)
 {
     const double k = sampling->k, period = plant->value[CONTROL_PERIOD];

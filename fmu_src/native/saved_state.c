@@ -7,17 +7,17 @@
 #include "instance.h"
 
 static const char FOREIGN[] = "the state is not one of this FMU";
-static const char UNSOUND[] = "the state is none that an instance can be in";
+static const char UNSOUND[] = "invalid FMU state";
 static const char OTHER_KIND[] = "the state is one of the FMU's other kind of instance";
 
-/* True if a state, or its bytes, begin as those of this FMU do. */
+/* True if a state, or its bytes, begin with this FMU's GUID. */
 static int is_own(const void *state)
 {
     return memcmp(state, MODEL_GUID, sizeof MODEL_GUID) == 0;
 }
 
-/* Serialised, a checksum follows the state: bytes that were changed are refused. FNV-1a, 64 bits;
-   source: Fowler, Noll & Vo, RFC 9923. */
+/* Checksum after a serialised state, with which changed bytes are refused: FNV-1a, 64 bits. Source: Fowler, Noll & Vo,
+   RFC 9923. */
 static uint64_t checksum(const void *bytes)
 {
     const unsigned char *byte = bytes;
@@ -29,7 +29,7 @@ static uint64_t checksum(const void *bytes)
 
 enum { SERIALIZED_SIZE = sizeof(State) + sizeof(uint64_t) };
 
-/* True if integers are whole, and truth values 0 or 1; the table has the range of integers. */
+/* True if integers have no fraction and Booleans are 0 or 1; RANGE has the ranges of integers. */
 static int are_whole(const double value[])
 {
     for (int i = FIRST_INTEGER; i < N_VARIABLES; i++)
@@ -38,7 +38,7 @@ static int are_whole(const double value[])
     return 1;
 }
 
-/* Check that joints rest and slip in a way that there is; recompute any_*. */
+/* Check that the values of held, watched and slip are valid; recompute any_*. */
 static int are_stops(Stops *stops)
 {
     int sound = stops->rank >= 0 && stops->rank <= N_ROWS;
@@ -65,8 +65,8 @@ static int is_passage(const Passage *passage)
     return sound;
 }
 
-/* Take over a state from bytes that may be anybody's, with whatever checksum: each field is checked,
-   dependent values are recomputed. A refusal is logged. */
+/* Restore a state from untrusted bytes, whose checksum may be forged: check each field and recompute dependent values.
+   A refusal is logged. */
 static Status take_over(Instance *instance, const void *bytes)
 {
     State *state = &instance->state;
@@ -75,9 +75,9 @@ static Status take_over(Instance *instance, const void *bytes)
     int sound = can_be_in(instance->kind, state->phase) && isfinite(state->time)
                 && state->stop_time > -HUGE_VAL && are_whole(value)
                 && are_stops(&state->stops) && is_passage(&state->passage);
-    const int runs = state->phase >= STEP; /* before, initialisation reports errors */
+    const int runs = state->phase >= STEP; /* before the run, initialisation reports errors */
     sound = sound && (!runs || is_sampling(&state->sampling, &state->plant, state->time));
-    const int steps = runs && instance->kind == CO_SIMULATION; /* solvers try what they like */
+    const int steps = runs && instance->kind == CO_SIMULATION; /* a solver may try any state in Model Exchange */
     for (int i = 0; i < N_VARIABLES; i++)
         sound = sound && (isfinite(value[i]) || (i >= X && i < FIRST_PARAMETER));
     for (int i = 0; i < N_JOINTS && steps; i++)
@@ -93,7 +93,7 @@ static Status take_over(Instance *instance, const void *bytes)
     return runs ? check_parameters(instance) : OK;
 }
 
-/* Save a state over what was saved before, or in memory of its own. */
+/* Save the state, into the memory of an earlier saved state or into new memory. */
 static Status save(Instance *instance, Call call, const State *state, void **saved)
 {
     if (!*saved)

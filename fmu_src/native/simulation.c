@@ -13,7 +13,7 @@ static int is_far(double point, double time)
     return !(fabs(point - time) <= TIME_TOLERANCE * fmax(1.0, fabs(time)));
 }
 
-/* Say why a step cannot be done, and what would help. */
+/* Log why a step cannot be done, and the remedy. */
 static Status discard(Instance *instance, double point, double h, const Failure *failure)
 {
     const char *call = call_name(DO_STEP);

@@ -1,6 +1,6 @@
-/* Joint-limit stops and friction; the rules are those of plant/stops.py. Without a reaction a stop is a
-   clamp: a joint is pressed while its own acceleration points into the limit. Rigid stops act on all joints,
-   and friction F does. With E the unit vectors of joints at a limit, into the range, and of joints at rest,
+/* Joint-limit stops and friction; the rules are those of plant/stops.py. A stop without reaction is a clamp: a joint
+   rests while its own acceleration points into the limit. A rigid stop acts on all joints, as friction F does. With the
+   unit vectors E of joints at a limit, which point into the range, and the efforts λ on joints at rest,
 
        v⁺ = v + M⁻¹E Λ,          0 ≤ Λ ⟂ Eᵀv⁺ ≥ 0                       at an impact
        q̈ = q̈_free + M⁻¹λ,        −F ≤ λ ≤ F, at a limit into the range without an upper bound;
@@ -15,20 +15,20 @@
 #include <string.h>
 
 enum { MOST_PIVOTS = 10000, BLOCK_TRIES = 5 };
-/* 2⁻⁴⁰: of the terms that a sign is the sum of, what rounding may leave of them. */
+/* 2⁻⁴⁰: rounding error of a sum whose sign decides, relative to its terms. */
 static const double ROUNDING_OF_SUM = 1.0 / 1099511627776.0;
 
 #ifndef IS_COMPLEX
 /* A joint at a limit or at rest. */
 typedef struct {
-    int there;        /* whether there are bounds of what acts on it */
-    int fixed;        /* whether that has none, and the joint rests */
-    double side;      /* at a limit: the sign of the way back into the range; else 0 */
-    double low, high; /* the bounds of what acts, an effort or an impulse */
-    int at;           /* once that is known: −1 and 1 where it is at a bound, 0 where the joint rests */
+    int there;        /* whether an effort or impulse acts on it */
+    int fixed;        /* whether the joint rests in any case, without bounds */
+    double side;      /* at a limit, the sign of the direction into the range; else 0 */
+    double low, high; /* bounds of the effort or impulse */
+    int at;           /* active bound: −1 or 1; 0 if the joint rests */
 } Contact;
 
-/* The joints at limits; a joint without a range, and those in kept, have stops that act both ways. */
+/* Find the joints at limits; stops of joints without a range, and of those in kept, act in both directions. */
 static void find_contacts(const Plant *plant, const double q[N_JOINTS], const int kept[N_JOINTS],
                           Contact contact[N_JOINTS])
 {
@@ -41,7 +41,7 @@ static void find_contacts(const Plant *plant, const double q[N_JOINTS], const in
     }
 }
 
-/* True if the stop of a joint acts on a rate: a velocity or an acceleration. */
+/* True if the stop of a joint acts against a velocity or an acceleration. */
 static int is_pressed(const Contact *contact, double rate)
 {
     return contact->there && (contact->fixed ? rate != 0.0 : contact->side * rate < 0.0);
@@ -52,7 +52,8 @@ static double bound(const Contact *contact)
     return contact->at < 0 ? contact->low : contact->at > 0 ? contact->high : 0.0;
 }
 
-/* The other state of a contact where what acts, or at a bound the rate, has the wrong sign; else its own. */
+/* The active bound that corrects a contact: a new one if the effort exceeds a bound, or if the rate has the wrong sign
+   at a bound; otherwise the present one. */
 static int mended(const Contact *contact, double acts, double rate, double slack)
 {
     if (!contact->there || contact->fixed)
@@ -62,9 +63,10 @@ static int mended(const Contact *contact, double acts, double rate, double slack
     return acts < contact->low - slack ? -1 : acts > contact->high + slack ? 1 : 0;
 }
 
-/* rate + M⁻¹z, where z is within the bounds of the contacts: above 0 only where z is at the lower one, below
-   only at the upper one. All contacts that are wrong change their state at a time; where that does not lessen
-   their number for a while only the last one does, which ends for every positive definite M. Whether it did.
+/* Solve a linear complementarity problem for rate + M⁻¹z, with z within the contacts' bounds: the result is above 0
+   only if z is at its lower bound, and below 0 only if z is at its upper bound. Each iteration changes all violated
+   contacts (block pivoting). If their number does not decrease for some iterations, only the last one changes, which
+   terminates for every positive definite M. Returns whether a solution was found.
    Sources: Júdice & Pires, Computers & Operations Research 21(5), 1994; Murty, Opsearch 11, 1974. */
 static int complementary(const Plant *plant, const double q[N_JOINTS], Contact contact[N_JOINTS],
                          double rate[N_JOINTS])
@@ -123,8 +125,8 @@ void impact(const Plant *plant, double y[N_STATES], const int anti_chatter[N_JOI
                 v[i] = 0.0;
 }
 
-/* Bound what acts on joints at rest by their friction too. Whether any may rest. That of a clamp which holds in any case, or of a
-   joint without a range, is no matter. */
+/* Add friction to the bounds of joints at rest; return whether any joint may rest. The friction of a clamp that holds
+   in any case, or of a joint without a range, has no effect. */
 static int add_friction(const Plant *plant, const double v[N_JOINTS], Contact contact[N_JOINTS])
 {
     const int rigid = plant->value[RIGID_STOPS] != 0.0;
@@ -133,7 +135,7 @@ static int add_friction(const Plant *plant, const double v[N_JOINTS], Contact co
         Contact *own = &contact[i];
         const int clamps = own->side != 0.0 && !rigid;
         const double friction = clamps && own->fixed ? 0.0 : plant->value[FRICTION + i];
-        any |= v[i] == 0.0 && (friction > 0.0 || own->there); /* others move away */
+        any |= v[i] == 0.0 && (friction > 0.0 || own->there); /* other joints move away */
         own->there = v[i] == 0.0 && (friction > 0.0 || (own->there && rigid));
         own->low = (clamps ? 0.0 : own->low) - friction;
         own->high = (clamps ? 0.0 : own->high) + friction;
@@ -141,7 +143,7 @@ static int add_friction(const Plant *plant, const double v[N_JOINTS], Contact co
     return any;
 }
 
-/* Add what the friction of joints that begin to slip does to a, the accelerations without. */
+/* Add to a the accelerations that the friction of joints that begin to slip causes. */
 static void add_slip(const Plant *plant, const double y[N_STATES], const Stops *stops, double a[N_JOINTS])
 {
     double free[N_JOINTS], given[N_JOINTS], change[N_JOINTS], none[N_JOINTS];
@@ -225,14 +227,14 @@ int is_above(const Plant *plant, double q, int i)
     return RE(plant->value[Q_MAX + i] - q) <= RE(q - plant->value[Q_MIN + i]);
 }
 
-/* Make the accelerations of joints 0 that a reaction holds. */
+/* Hold joints by reactions, so that their accelerations are 0. */
 static int reacts(const Stops *stops, int i)
 {
     return stops->held[i] == STUCK || stops->held[i] == STOPPED;
 }
 
 #ifdef IS_COMPLEX
-/* By the columns of M⁻¹, which have derivatives. */
+/* Use the columns of M⁻¹, which have derivatives. */
 static void add_reactions(const Plant *plant, const Stops *stops, const double q[N_JOINTS],
                           double a[N_JOINTS], double reaction[N_JOINTS])
 {

@@ -32,7 +32,7 @@ static void law(const double value[N_VARIABLES], TaskFrame *task, Row row[N_ROWS
 #endif
 }
 
-/* m and rad, 2⁻⁴⁸: a smaller error is rounding's, which would set stiff joints at rest in motion. */
+/* 2⁻⁴⁸ m or rad: smaller errors are rounding errors, which would move stiff joints at rest. */
 static const double ROUNDING = 1.0 / 281474976710656.0;
 
 int command(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],

@@ -1,5 +1,5 @@
-/* Getting and setting variables. A refused call changes no variable. Each reference is of so many values as PLACE
-   says, in all n_values. */
+/* Getting and setting variables. A refused call changes no variable. Each reference stands for as many values as PLACE
+   says, in total n_values. */
 #include <math.h>
 #include <stddef.h>
 #include <string.h>
@@ -7,7 +7,7 @@
 #include "directional.h"
 #include "instance.h"
 
-/* In the order of the calls that get and set them. */
+/* Types in the order of the calls that get and set them. */
 typedef enum { REAL, BOOLEAN, INTEGER, OTHER } Type;
 static const char *const TYPE_NAME[] = {REAL_NAME, "Boolean", INTEGER_NAME};
 
@@ -16,7 +16,7 @@ static size_t size_of(Reference vr)
     return (size_t)(PLACE[vr + 1] - PLACE[vr]);
 }
 
-/* True if the references are of variables of a type, of so many values in all. */
+/* True if all references are variables of a type, and have the given total number of values. */
 static int known(Instance *instance, Call call, Type type, const Reference vr[], size_t count,
                  const void *values, size_t n_values)
 {
@@ -75,8 +75,8 @@ static int settable(Instance *instance, Call call, int variable)
                    VARIABLE_NAME[variable]);
 }
 
-/* Take over a value; dependent outputs are recomputed when they are read. That of q or v
-   before the run is their start. */
+/* Set a value; dependent outputs are recomputed when they are read. A value of q or v before the run is its start
+   value. */
 static void set(Instance *instance, int variable, double value)
 {
     State *state = &instance->state;
@@ -86,13 +86,14 @@ static void set(Instance *instance, int variable, double value)
     state->has_tau = state->has_rates = 0;
     if (is_state(variable))
         state->has_x = 0;
-    if (is_state(variable) || instance->kind == CO_SIMULATION) /* there each point decides */
+    if (is_state(variable) || instance->kind == CO_SIMULATION) /* in co-simulation, each communication point finds the
+    joints at rest */
         state->has_stops = 0;
     if (variable >= FIRST_PARAMETER)
         state->initialised = 0;
 }
 
-/* Variables after the derivatives of the states, that FMI 3.0 has: the event indicators and the time. */
+/* The variables that only FMI 3.0 has, after the derivatives of the states: event indicators and time. */
 #if FMI == 3
 enum { END_OF_RATES = EVENT_INDICATORS };
 static void update_others(State *state)
@@ -109,7 +110,7 @@ static void update_others(State *state)
 }
 #endif
 
-/* Make an output right for the present state, inputs and parameters. */
+/* Compute an output for the present state, inputs and parameters. */
 static Status update(Instance *instance, int variable)
 {
     State *state = &instance->state;
@@ -136,7 +137,7 @@ static Status update(Instance *instance, int variable)
     return OK;
 }
 
-/* The number that a value of a type is in an importer's array. */
+/* Read a value of a type from an importer's array as a number. */
 static double number_in(Type type, const void *values, size_t i)
 {
     if (type == REAL)
@@ -202,8 +203,8 @@ static Status set_values(void *component, Call call, const Reference vr[], size_
     return OK;
 }
 
-/* The computed variables that the derivatives of the unknowns by the knowns need; -1, which is logged,
-   where there are none. */
+/* The computed variables that the derivatives of the unknowns need; -1, with a logged reason, if there are no such
+   derivatives. */
 static int wanted(Instance *instance, Call call, const Reference unknown[], size_t n_unknown,
                   const Reference given[], size_t n_given)
 {
@@ -233,7 +234,7 @@ static int wanted(Instance *instance, Call call, const Reference unknown[], size
     return wants;
 }
 
-/* Name of the first variable whose value is not finite, NULL where all are. */
+/* Name of the first variable whose value is not finite, or NULL. */
 static const char *culprit(const Reference vr[], size_t count, const double value[])
 {
     for (size_t i = 0; i < count; i++)
@@ -243,7 +244,7 @@ static const char *culprit(const Reference vr[], size_t count, const double valu
     return NULL;
 }
 
-/* The change of the unknowns where the knowns, states and inputs, change by the seed. */
+/* The change of the unknowns if the knowns (states and inputs) change by the seed. */
 static Status directional_derivative(void *component, const Reference unknown[], size_t n_unknown,
                                      const Reference given[], size_t n_given, const double seed[],
                                      size_t n_seed, double result[], size_t n_result)

@@ -1,5 +1,5 @@
-/* The FMU for a page, of either version of FMI: an instance that keeps what it logs, and whose
-   variables are set and read one by one, whether they are scalars or elements of vectors. */
+/* The FMU for a page, of either version of FMI: an instance that stores its last log message, and whose scalars and
+   elements of vectors are set and read one by one. */
 #include "fmu.c"
 
 #define EXPORT(name) __attribute__((export_name(#name))) name
@@ -33,7 +33,7 @@ int EXPORT(engine_instantiate)(void)
     return instance ? OK : ERROR;
 }
 
-/* Back to the beginning, before initialisation. */
+/* Reset to the state before initialisation. */
 int EXPORT(engine_reset)(void)
 {
     return STANDARD(Reset)(instance);
@@ -62,7 +62,7 @@ void *EXPORT(engine_allocate)(size_t size)
     return malloc(size);
 }
 
-/* Set variables of any type, all or, where a value is refused, none. */
+/* Set variables of any type: all, or none if a value is refused. */
 int EXPORT(engine_set)(const int place[], size_t count, const double value[])
 {
     if (!enter(instance, SET_REAL, 1))

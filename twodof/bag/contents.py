@@ -15,7 +15,7 @@ from .sqlite import sqlite3_messages
 def storage_files(folder: Path) -> list[Path]:
     """Return the files that hold a bag's messages, in the order of writing.
 
-    An MCAP file alone, as pages and other tools write them, is a bag too.
+    A single MCAP file, as pages and other tools write it, is a bag too.
 
     Raises:
         BagError: a file is a link: an untrusted bag could name any file of this machine.
@@ -30,7 +30,7 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def stated_count(folder: Path) -> int | None:
-    """Return the number of messages in metadata.yaml; None where it states none.
+    """Return the number of messages that metadata.yaml states; None if it states none.
 
     Raises:
         OSError: it cannot be read.
@@ -41,7 +41,7 @@ def stated_count(folder: Path) -> int | None:
 
 
 def read_messages(file: Path, budget: ReadBudget) -> Iterator[Batch]:
-    """Read all messages of a file; those of a channel are in order.
+    """Read all messages of a file; the messages of a channel are in order.
 
     Args:
         file: one of a bag's.

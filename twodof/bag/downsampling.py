@@ -1,9 +1,8 @@
 """Downsample a recording for plotting without visible change (M4).
 
-Of each of many spans of time the first and the last sample, and those where a line is lowest and
-highest, as in Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB
-7(10), 2014. Spans grow by doubling, so that the extremes of a longer one are among those of its
-halves: what was left out before is not missed.
+Time is divided into spans. The first and the last sample of each span are kept, and the samples at which a line has its
+minimum or maximum. Source: Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB 7(10), 2014.
+Spans grow by doubling, so that the extremes of a longer span are among those of its halves, which were kept.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,10 +17,10 @@ Indices = NDArray[np.intp]
 
 
 class Downsampler:
-    """Downsampler that chooses among its earlier samples and those that came since.
+    """Incremental downsampler, which chooses among the samples kept so far and the new ones.
 
-    At most ``most`` samples wait to be chosen from, of which a quarter is left at most; ``lines``
-    gives those of a recording beside its positions and velocities, N values each.
+    It reduces at most ``most`` samples to at most a quarter of these. ``lines`` returns the curves of a recording, N
+    values each, in addition to its positions and velocities.
     """
 
     def __init__(self, most: int, lines: Callable[[Recording], Sequence[Array]]) -> None:
@@ -42,9 +41,9 @@ class Downsampler:
 
 
 def extremes(parts: NDArray[Any], lines: Sequence[Array]) -> Indices:
-    """Return the first and last sample of each part, and those where a line has its extremes.
+    """Return the first and the last sample of each part, and the samples at which a line has an extreme.
 
-    Parts are numbered, N numbers that ascend from 0 or more; values that are not finite are no extremes.
+    ``parts`` has the ascending part numbers of N samples, all ≥ 0. Values that are not finite are ignored.
     """
     starts = np.flatnonzero(np.diff(parts, prepend=-1))
     sizes = np.diff(starts, append=len(parts))

@@ -1,4 +1,4 @@
-"""Bags as tables, or as one MCAP file, for tools that open no rosbag2 folder."""
+"""Export bags as tables, or as one MCAP file, for tools that cannot open a rosbag2 folder."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ ENDINGS = (".csv", ".parquet", ".mcap")
 
 
 def export_bag(bag: str | Path, output: str | Path) -> Path:
-    """Write a bag as a table, or as one MCAP file, as the output's ending says; return its path.
+    """Write a bag as a table or as one MCAP file, by the output's suffix; return its path.
 
-    A table has a row a sample, and named columns: "time", then of each joint "elbow.position", "elbow.velocity" and
-    "elbow.effort", then "x.y" and "x_des.y" of each task axis; what the bag does not know has no column. Units are
-    in the header of a CSV file, "elbow.position [rad]", and in the pandas attributes of a Parquet file. Values in
-    SI units are written in full precision. An MCAP file has all messages, with the provenance as metadata.
+    A table has one row for each sample. Its columns are "time"; for a joint "elbow", "elbow.position",
+    "elbow.velocity" and "elbow.effort"; and for a task axis "y", "x.y" and "x_des.y". Unknown quantities have no
+    column. Units are in the header of a CSV file, "elbow.position [rad]", and in the pandas attributes of a Parquet
+    file. Values are in SI units, in full precision. An MCAP file has all messages, with the provenance as metadata.
 
     Raises:
-        BagError: it is no whole bag, the ending is unknown, pandas or pyarrow is missing, or it cannot be written.
+        BagError: the bag is incomplete, the suffix is unknown, pandas or pyarrow is missing, or the file cannot be
+            written.
     """
     bag, path = Path(bag), Path(output)
     if path.suffix not in ENDINGS:
@@ -46,7 +47,7 @@ def export_bag(bag: str | Path, output: str | Path) -> Path:
 
 
 def _columns(run: Recording) -> dict[str, tuple[str, Array]]:
-    """Return columns by name: unit, "" where no robot tells it, and N values."""
+    """Return the unit ("" if unknown) and the N values of each column, by name."""
     try:
         known = read_urdf(run.provenance.get("urdf") or "").joints
     except RobotError:

@@ -22,11 +22,11 @@ def verdict(run: Recording | str | Path | Iterable[Sample], experiment: Experime
 
     Args:
         run: a bag, its folder, or all samples of a run.
-        experiment: of the samples.
+        experiment: the experiment of the samples.
 
     Raises:
         BagError, FmuError: the bag, or the robot in the experiment's FMU, cannot be read.
-        InputError: samples have no experiment, or there are none.
+        InputError: samples are given without an experiment, or there are no samples.
     """
     if isinstance(run, Recording | str | Path):
         return (run if isinstance(run, Recording) else read_bag(run)).verdict

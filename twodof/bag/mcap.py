@@ -26,9 +26,9 @@ MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, FOOTER = 3, 4, 5, 6, 12, 2  # opcodes
 READ = (SCHEMA, CHANNEL, MESSAGE, CHUNK)
 HEAD = struct.Struct("<BQ")
-MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # with the record's head: channel, sequence, two times
-STAMP = slice(15, 23)  # the first of them
-MANY = 1000  # records outside of chunks
+MESSAGE_HEAD = struct.Struct("<BQHIqQ")  # record header, channel, sequence, two times
+STAMP = slice(15, 23)  # the first of the two times
+MANY = 1000  # records outside chunks that are read at a time
 
 
 def mcap_messages(path: Path, budget: ReadBudget) -> Iterator[Batch]:
@@ -39,7 +39,7 @@ def mcap_messages(path: Path, budget: ReadBudget) -> Iterator[Batch]:
 
 
 def _chunks(path: Path, budget: ReadBudget) -> Iterator[bytes]:
-    """Yield the records of each chunk, and those outside of chunks, many at a time."""
+    """Yield the records of each chunk, and groups of records outside chunks."""
     loose: list[bytes] = []
     try:
         for opcode, content in _records(path, budget):
@@ -51,7 +51,7 @@ def _chunks(path: Path, budget: ReadBudget) -> Iterator[bytes]:
                 yield before
             if opcode == CHUNK:
                 yield unpack_chunk(path, content, budget)
-    except DamageError:  # what came before is sound
+    except DamageError:  # earlier records are sound
         yield b"".join(loose)
         raise
     yield b"".join(loose)
@@ -72,11 +72,11 @@ def read_metadata(path: Path, name: str, key: str) -> str:
 def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) -> Iterator[Batch]:
     """Return the messages of a chunk.
 
-    Where messages of equal lengths come in turns, as a writer's of ROS 2 mostly do, all are taken
-    at once: record by record, Python would take a microsecond for each.
+    If messages of equal lengths repeat periodically, as they mostly do in bags of ROS 2, all of them are read at once:
+    one by one, each would take a microsecond.
     """
     position = 0
-    seen: dict[bytes, int] = {}  # heads of the last records, which are messages, and their offsets
+    seen: dict[bytes, int] = {}  # headers of the latest message records, and their offsets
 
     def alone(offsets: Iterable[int]) -> Iterator[Batch]:
         for offset in offsets:
@@ -112,9 +112,9 @@ def messages_in(path: Path, chunk: bytes, tables: Tables, budget: ReadBudget) ->
 
 
 def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
-    """Return periodic records from given offsets up to an end: one row per repetition.
+    """Return periodic records as rows, one for each repetition of the records between the first offset and the end.
 
-    One row a time; once where a channel has its turn twice, whose messages are to stay in order.
+    If a channel occurs twice in a period, return the first row only, so that the channel's messages stay in order.
     """
     every = np.frombuffer(chunk, np.uint8, offset=turn[0])
     length = end - turn[0]
@@ -133,7 +133,7 @@ def _turns(chunk: bytes, turn: Sequence[int], end: int) -> Rows:
 
 
 class Tables:
-    """The channels of an MCAP file that are known so far."""
+    """The schemas and channels of an MCAP file that were read so far."""
 
     def __init__(self, channels: Mapping[int, Channel] = MappingProxyType({})) -> None:
         self._schemas: dict[int, tuple[str, str]] = {0: ("", "")}
@@ -154,7 +154,7 @@ class Tables:
             raise DamageError(f"'{path.name}' has more than {MAX_TOPICS} topics")
 
     def batch(self, path: Path, rows: Rows) -> Batch:
-        """Return the messages of records that have one channel and one length."""
+        """Return the messages of records with the same channel and length."""
         _, length, channel, *_ = MESSAGE_HEAD.unpack_from(rows[0])
         end = HEAD.size + length
         if end < MESSAGE_HEAD.size:
@@ -166,9 +166,7 @@ class Tables:
 
 
 def _records(path: Path, budget: ReadBudget, wanted: Sequence[int] = READ) -> Iterator[tuple[int, bytes]]:
-    """Yield the opcode of each record up to the requested footer, and the record with its header.
-
-    Of a chunk, the content alone.
+    """Yield opcode and bytes of each record up to the footer; for a chunk, only its content.
     """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -227,7 +225,7 @@ def _entries(metadata: bytes) -> dict[str, str]:
 
 
 def fields(form: str, content: bytes, position: int) -> list[Any]:
-    """Return the fields of a record and their end, by struct's letters, with s for a prefixed text."""
+    """Return the fields of a record and their end, by the format letters of ``struct``; s is a length-prefixed text."""
     values: list[Any] = []
     for letter in form:
         if letter == "s":

@@ -1,6 +1,6 @@
 """Provenance of a run: run.json, flushed before the messages that it describes.
 
-Of several robots in one bag each has its own, run.NAME.json, with its namespace in the name.
+In a bag of several robots, each robot has a file run.NAME.json, where NAME is its namespace.
 """
 
 import json
@@ -22,10 +22,10 @@ FILE = "run.json"
 FORMAT = 1
 KEY = "twodof"
 """Key of the provenance in a bag's own metadata."""
-MAX_YAML = 256 * 1024  # bytes of changes: a writer of YAML takes 2 s for a MiB
+MAX_YAML = 256 * 1024  # bytes of changes in metadata.yaml: a YAML writer takes 2 s per MiB
 KNOWN_UNTIL: Final = "inputs_known_until"
-"""Key of the time, s, from which on more inputs changed than the file has room for."""
-MAX_TAIL = 64 * 1024  # bytes of who commanded: more than 20 of them have
+"""Key of the time, s, after which changes of inputs are missing because the file is full."""
+MAX_TAIL = 64 * 1024  # bytes of commanders and verdict; 20 commanders have fewer
 PACKAGES = ("numpy", "fmpy", "rosbags", "pin")
 
 SHAPE = {
@@ -49,8 +49,8 @@ SHAPE = {
 class Provenance(TypedDict, total=False):
     """Content of run.json; empty for a third-party bag.
 
-    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` a time and facts of a third
-    party; ``verdict`` is there if the writer lived to its end.
+    ``input_changes`` has pairs of a time, s, and values by name; ``commanders`` has pairs of a time and facts of a
+    third party. ``verdict`` is missing if the writer died.
     """
 
     format: int
@@ -73,18 +73,18 @@ class Provenance(TypedDict, total=False):
 
 
 class ProvenanceFile:
-    """run.json of a bag in progress, complete at any moment with the changes so far.
+    """run.json of a bag in progress, a valid file with all changes so far at any moment.
 
     The changes of inputs stand at its end, before the commanders only, so that adding one rewrites few bytes.
 
     Args:
-        folder: of the bag.
-        namespace: of the robot in it, or "".
+        folder: folder of the bag.
+        namespace: namespace of the robot in it, or "".
         run: the experiment.
-        command_line: that made the bag; "" where none did.
+        command_line: command line that made the bag, or "".
 
     Raises:
-        OSError: it cannot be written; ``add`` raises it too, and can be called again.
+        OSError: the file cannot be written. ``add`` raises it too, and can be called again.
     """
 
     def __init__(self, folder: Path, namespace: str, run: Experiment, command_line: str) -> None:
@@ -98,7 +98,7 @@ class ProvenanceFile:
         self._separator, self._full = b"", False
 
     def add(self, changes: Changes, verdict: dict[str, object] | None = None) -> None:
-        """Append times and the inputs that changed there, up to a reader's limit, and set the verdict."""
+        """Append times and the inputs that changed at them, up to the size that readers accept, and set the verdict."""
         commanders = len(self._run.commanders)
         same = commanders == self._commanders and verdict is self._verdict
         self._verdict = verdict
@@ -117,7 +117,7 @@ class ProvenanceFile:
         self._separator, self._commanders = b"," if changes else self._separator, commanders
 
     def text(self) -> str:
-        """Return the metadata entry of the bag: all of it, or without the changes where that is long."""
+        """Return the provenance for the bag's metadata, without the changes of inputs if these are long."""
         content = self.path.read_bytes()
         if len(content) > len(self._head) + MAX_YAML:
             content = self._head + self._tail(self._start)
@@ -126,7 +126,7 @@ class ProvenanceFile:
     def _tail(self, until: float | None = None) -> bytes:
         """Return the commanders, the verdict, and the time until which the changes of inputs are complete."""
         rest: Provenance = {}
-        if self._verdict is not None and len(_as_json(self._verdict)) < MAX_TAIL // 2:  # of names without end
+        if self._verdict is not None and len(_as_json(self._verdict)) < MAX_TAIL // 2:  # names have no length limit
             rest["verdict"] = self._verdict
         if self._run.commanders:
             rest["commanders"] = [*self._run.commanders]
@@ -179,7 +179,7 @@ def robot_in(path: Path) -> tuple[Path, str]:
     """Split an address such as "pair:left" into the bag's folder and the robot's namespace.
 
     Raises:
-        BagError: the bag has no such robot, or several and none is chosen.
+        BagError: the bag does not have this robot, or has several robots and the address names none.
     """
     text, _, name = str(path).rpartition(":")
     if path.exists() or not text or not Path(text).is_dir():
@@ -202,17 +202,17 @@ def each_robot(path: Path) -> list[Path]:
 
 
 def _as_json(content: object) -> bytes:
-    """Return JSON without spaces, because some writers of YAML fold wrongly at a space."""
+    """Return JSON without spaces, because some YAML writers fold lines incorrectly at spaces."""
     return json.dumps(content, separators=(",", ":")).replace(" ", "\\u0020").encode()
 
 
 def read_provenance(path: Path, namespace: str = "") -> Provenance:
-    """Return the provenance of a bag's robot; {} where there is none of this package.
+    """Return the provenance of a bag's robot; {} for a third-party bag.
 
     It is in the bag's folder, or in the metadata of a bag that is a single file.
 
     Raises:
-        BagError: it cannot be read, or is not what was written.
+        BagError: the provenance cannot be read, or is invalid.
     """
     single = path.suffix == ".mcap" and path.is_file()
     file = path if single else path / file_of(namespace)
@@ -233,7 +233,7 @@ def read_provenance(path: Path, namespace: str = "") -> Provenance:
 
 
 def _limited(provenance: Provenance) -> Provenance:
-    """Return a provenance with no more changes of inputs than a reader can hold; later ones count as not known."""
+    """Return a provenance with a limited number of changes of inputs; later changes count as unknown."""
     names, room = set[str](), MAX_HELD
     for i, (time, values) in enumerate(provenance["input_changes"]):
         names.update(values)

@@ -34,10 +34,10 @@ def read_bag(path: str | Path) -> Recording:
     """Read the joint states and targets of a bag of any writer.
 
     Args:
-        path: the bag's folder; of one robot of several, with a colon and its namespace.
+        path: the bag's folder; for one of several robots, followed by a colon and its namespace.
 
     Raises:
-        BagError: it is no bag, is unfinished or damaged, or has no joint states.
+        BagError: the path is no bag, or the bag is unfinished, damaged or without joint states.
     """
     return _read(Path(path), _JointStates, _Targets())
 
@@ -45,8 +45,8 @@ def read_bag(path: str | Path) -> Recording:
 def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], Sequence[Array]]) -> Recording:
     """Read a bag as ``read_bag`` does, downsampled to at most ``most`` samples for drawing.
 
-    Besides those of a chunk of the bag no more are in memory. ``lines`` gives what is drawn over
-    time beside positions and velocities, of a part of the bag; what it raises is raised here too.
+    Memory holds at most ``most`` samples and a chunk of the bag. ``lines`` returns the curves of a part of the bag that
+    are drawn in addition to positions and velocities; its exceptions are passed on.
     """
     return _read(Path(path), _JointStates, _Targets(), Downsampler(most, lines))
 
@@ -54,7 +54,7 @@ def read_downsampled(path: str | Path, most: int, lines: Callable[[Recording], S
 def read_ends(path: str | Path) -> Recording:
     """Return the first and the last joint state of a bag.
 
-    By the summaries of its files, where all have one that can be believed.
+    Use the summaries of the files if all have a valid one; otherwise read the whole bag.
 
     Raises:
         BagError: as ``read_bag``.
@@ -75,7 +75,7 @@ def read_ends(path: str | Path) -> Recording:
                 total += count
         stating = [topic for topic, kind in counts if kind == JOINT_STATE]
         usual = prefix + JOINT_STATES
-        if len(stating) > 1 and usual not in stating:  # that which begins first in the file
+        if len(stating) > 1 and usual not in stating:  # the topic that comes first in the file decides
             return _read(path, _Ends, None)
         chosen = usual if usual in stating else "".join(stating)
         ends, budget = _Ends(path), ReadBudget()
@@ -87,7 +87,7 @@ def read_ends(path: str | Path) -> Recording:
 
 
 def _place(path: Path) -> tuple[Path, str, tuple[str, ...]]:
-    """Return a bag's folder, the topic prefix of the chosen robot, and the prefixes of others."""
+    """Return a bag's folder, the chosen robot's topic prefix, and the prefixes of robots nested in its namespace."""
     folder, namespace = robot_in(path)
     inside = (name for name in robots_of(folder) if name.startswith(f"{namespace}/"))
     return folder, f"/{namespace}" if namespace else "", tuple(f"/{name}/" for name in inside)
@@ -115,7 +115,7 @@ def _refusing(path: Path) -> Iterator[None]:
 def _read(
     path: Path, kind: type[_JointStates], targets: _Targets | None, downsampler: Downsampler | None = None
 ) -> Recording:
-    """Read a bag's joint states by a kind of reader, and downsample them."""
+    """Read a bag's joint states with the given accumulator, and downsample them."""
     counts: Counter[tuple[str, str]] = Counter()
     chosen, states, total = "", kind(path), 0
     budget, thinned = ReadBudget(), False
@@ -150,12 +150,12 @@ def _read(
             f" what is read is {shown(chosen)}"
         )
     if downsampler is not None and thinned:
-        thin(downsampler)  # the end alike
+        thin(downsampler)  # downsample the end like the rest
     return _recording(path, counts, chosen, states, targets)
 
 
 def _check_count(path: Path, count: int) -> None:
-    """Warn where the files and metadata.yaml disagree on the number of messages."""
+    """Warn if the files and metadata.yaml disagree on the number of messages."""
     stated = stated_count(path) if path.is_dir() else count
     if stated not in (None, count):
         LOG.warning(
@@ -187,7 +187,7 @@ def _recording(
 
 
 def whole_bag(path: Path) -> list[Path]:
-    """Return the files of a closed bag; raise BagError for an unfinished one or none."""
+    """Return the files of a closed bag; raise BagError for an unfinished bag, or for a path that is no bag."""
     files = storage_files(path)
     if not files:
         packed = f"cannot read the bag '{path}': it is compressed as a whole"
@@ -221,7 +221,7 @@ class _JointStates:
         return len(self._stamps)
 
     def keep(self, chosen: Indices) -> None:
-        """Keep only some of the states that ``arrays`` returns."""
+        """Keep only the states at these indices of the arrays that ``arrays`` returns."""
         stamps, *numbers = self.arrays()
         self._stamps = array("q", stamps[chosen].tobytes())
         self._numbers = [array("d", part[chosen].tobytes()) for part in numbers]
@@ -250,13 +250,13 @@ class _JointStates:
             return numbers
         except MixtureError as error:
             raise BagError(f"'{self._path}' has joint states of different {error}") from error
-        except Exception as error:  # rosbags raises anything where a message is no JointState
+        except Exception as error:  # rosbags raises any exception for bytes that are no JointState
             packed = message.startswith(ZSTD_MAGIC)
             reason = "its messages are compressed" if packed else "a joint state is damaged"
             raise BagError(f"cannot read the bag '{self._path}': {reason}") from error
 
     def _decode_one(self, message: Rows) -> list[Array]:
-        """Decode a message with another frame, byte order or padding."""
+        """Decode a message whose frame, byte order or padding differs from the first one's."""
         _, names, *parts = _deserialised(message.tobytes())
         if names != self.names:
             raise MixtureError("joints")
@@ -286,14 +286,14 @@ class _Ends(_JointStates):
         self._ends = [earliest, max(reversed(some), key=lambda end: end[0])]
 
     def arrays(self) -> tuple[Stamps, Array, Array, Array]:
-        """Return stamps, positions, velocities and efforts of the two."""
+        """Return stamps, positions, velocities and efforts of both states."""
         for stamp, message in self._ends:
             super().add(np.array([stamp]), message)
         return super().arrays()
 
 
 class _Targets:
-    """Points on /target in one frame."""
+    """Points on /target, all in one frame."""
 
     def __init__(self) -> None:
         self._frame: bytes | None = None
@@ -309,13 +309,13 @@ class _Targets:
             return
         self._sound &= self._frame in (None, frame)
         self._frame = frame
-        new = np.ones(len(stamps), bool)  # a point that is repeated says nothing new
+        new = np.ones(len(stamps), bool)  # repeated points are dropped
         new[1:-1] = (np.diff(points[:-1], axis=0) != 0).any(axis=1) | (np.diff(stamps)[1:] < 0)
         self._stamps.frombytes(stamps[new].tobytes())
         self._points.frombytes(points[new].tobytes())
 
     def received(self, stamps: Stamps) -> ReceivedTargets | None:
-        """Return the latest target at each stamp; None where there are none, or several frames."""
+        """Return the latest target at each stamp; None without targets, or if they are in several frames."""
         if self._frame is None or not self._sound:
             return None
         own = np.asarray(self._stamps)

@@ -27,11 +27,11 @@ from .reader import whole_bag
 from .records import DamageError, ReadBudget
 
 LOG = logging.getLogger(__name__)
-SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of what a robot did
-FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs with which trajectories are followed
+SAMPLES = (JOINT_STATES, END_EFFECTOR)  # topics of a robot's motion, not of commands
+FOLLOWING = ("q_des", "v_des", "a_des")  # groups of inputs that trajectories set
 Read = TypeVar("Read", Command, Trajectory)
 Stored = list[tuple[int, str, bytes]]
-"""Messages: time when they were recorded, ns since the epoch, type and content."""
+"""Messages: recording time (ns since the epoch), type and content."""
 
 
 def read_commands(
@@ -42,23 +42,23 @@ def read_commands(
     step: float | None = None,
     settings: Mapping[str, Setting] | None = None,
 ) -> Changes:
-    """Return the commands of any bag: times, s, and the inputs that change there.
+    """Return the commands in a bag: times, s, and the inputs that change at these times.
 
-    JointStates, points or poses, as the FMU's control follows them (``ros.commands``), each at the
-    time when it was recorded, after the bag's first joint state that is no command; or for control
-    'joint' JointTrajectories, as values of the inputs at whole steps (``ros.trajectories``).
+    Commands are JointStates, points or poses, as the FMU's control law requires (``ros.commands``). Their times are the
+    recording times relative to the bag's first joint state that is no command. For control 'joint' they may also be
+    JointTrajectories, which are converted to inputs at whole steps (``ros.trajectories``).
 
     Args:
-        fmu: that is commanded, or its path.
-        path: the bag's folder; of one robot of several, with a colon and its namespace.
-        topic: of the commands; None: the inputs that the bag's run.json has, those of the start at
-            −∞; or where there is none, the only topic that can be commands.
-        step: of the run, in which trajectories are followed; None: the FMU's, s.
-        settings: of the run: trajectories begin at rest at its q_des, or else at its q_start.
+        fmu: the commanded FMU, or its path.
+        path: the bag's folder; for one of several robots, followed by a colon and its namespace.
+        topic: topic of the commands; None: the inputs in the bag's run.json, with initial inputs at time −∞, or
+            without run.json the only topic that can contain commands.
+        step: communication step of the run, for trajectories, s; None: the FMU's default.
+        settings: settings of the run: trajectories begin at rest at its q_des, or else at its q_start.
 
     Raises:
-        BagError: it is no bag, or is unfinished or damaged.
-        InputError: it has no such commands, or one that is none.
+        BagError: the path is no bag, or the bag is unfinished or damaged.
+        InputError: the bag has no such commands, or an invalid one.
     """
     fmu, path = fmu if isinstance(fmu, Fmu) else load_fmu(fmu), Path(path)
     provenance = read_provenance(*robot_in(path)) if topic is None else {}
@@ -86,7 +86,7 @@ def read_commands(
 
 
 def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict[str, Stored], dict[str, int]]:
-    """Return candidate command messages by topic, and each joint-state topic's first time."""
+    """Return the messages that may be commands by topic, and the first time of each topic of joint states."""
     topics: dict[str, Stored] = {}
     begins: dict[str, int] = {}
     try:
@@ -106,7 +106,7 @@ def _messages(path: Path, types: Sequence[str], topic: str | None) -> tuple[dict
 
 
 def _inputs(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float]:
-    """Return the commanding inputs of a bag's start values, for its FMU or this one."""
+    """Return the start values of a bag's inputs that command the FMU."""
     commands = {group for law in CONTROLS.values() for group in law.inputs}
 
     def commands_it(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""A bag read back: arrays over the samples, and the run's settings from its provenance."""
+"""A recording: a bag's samples as arrays, and the run's settings from its provenance."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Schedule = list[tuple[int, Mapping[str, Value]]]
-"""Communication points, ascending from 0, and values of inputs and parameters from each on."""
+"""Ascending communication points, from 0 on, and the values of inputs and parameters that apply from each on."""
 
-MOST_LOST = 10  # times as many samples as there are
+MOST_LOST = 10  # lost samples, as a multiple of the existing ones
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class ReceivedTargets:
     """Targets received on a bag's /target: for each sample the latest one.
 
     Attributes:
-        frame: that they are expressed in.
-        points: m, N × 3; not a number before the first.
+        frame: frame of the points.
+        points: N × 3, m; NaN before the first one.
     """
 
     frame: str
@@ -64,22 +64,22 @@ class ReceivedTargets:
 class Recording:
     """A bag read back: N samples of n joints and m task axes.
 
-    All samples of the bag, or where it has many and is to be drawn, some of them.
+    A recording for drawing has only some of the samples of a large bag.
 
     Attributes:
         path: the bag's folder.
         topics: all topics of the bag.
-        count: samples of the bag.
+        count: number of samples in the bag.
         stamps: time stamps of the joint states, ns since the epoch, N, ascending.
         joints: joint names.
         q, v: positions (rad, m) and velocities, N × n.
-        tau: efforts (N·m, N), N × n, or N × 0 where the bag has none.
-        received: points received on /target; None where the bag has no such points.
-        provenance: the logger's facts of the run, {} for a third-party bag.
+        tau: efforts (N·m, N), N × n, or N × 0 without efforts.
+        received: points received on /target; None without such points.
+        provenance: content of run.json, {} for a third-party bag.
 
     Raises:
-        BagError: by what the provenance tells, where it does not fit the samples, and by ``steps``
-            where there is none.
+        BagError: attributes from the provenance raise it if the provenance does not fit the samples, and ``steps``
+            raises it without provenance.
     """
 
     path: Path
@@ -108,12 +108,12 @@ class Recording:
 
     @property
     def axes(self) -> str:
-        """Task axes, of "xyz"; "" where the provenance does not know them."""
+        """Task axes, letters of "xyz"; "" if unknown."""
         return str(self.provenance.get("axes") or "")
 
     @cached_property
     def schedule(self) -> Schedule:
-        """Inputs and parameters in effect, each from its communication point on."""
+        """Values of inputs and parameters, with the communication point from which on they apply."""
         try:
             starts = self.provenance.get("start_values", {})
             changes = self.provenance.get("input_changes", [])
@@ -125,7 +125,7 @@ class Recording:
                 steps = (time - self.provenance["start_time"]) / self.provenance["step"]
                 k = max(0, ceil(steps - TIME_TOLERANCE))
                 changed = {**changed, **values}
-                if k == schedule[-1][0] and len(schedule) > 1:  # the first sample is before any
+                if k == schedule[-1][0] and len(schedule) > 1:  # no change precedes the first sample
                     schedule.pop()
                 schedule.append((k, ChainMap(changed, starts)))
             last = self.steps[-1] if self.provenance else 0
@@ -147,8 +147,8 @@ class Recording:
     def target(self) -> Array:
         """Target position in effect up to each sample, along the task axes, m, N × m.
 
-        As the provenance has it, or else the bag's /target in the robot's root frame, which is
-        then all of x, y, z where the task axes are not known. N × 0 where neither knows it.
+        It comes from the provenance, or else from the bag's /target in the robot's root frame. Without known task
+        axes, it has all of x, y and z. It is N × 0 if unknown.
         """
         held = self.held("x_des", len(self.axes))
         if held.size:
@@ -170,12 +170,12 @@ class Recording:
             return np.empty((len(self.stamps), 0))
         begins = [k for k, _ in self.schedule]
         values = np.array([[float(held[name]) for name in names] for _, held in self.schedule])
-        # at its own communication point a change has had no effect yet
+        # a change has no effect yet at its own communication point
         return cast(Array, values[np.maximum(np.searchsorted(begins, self.steps) - 1, 0)])
 
     @property
     def setup(self) -> Setup:
-        """Robot and settings of the run, as far as the provenance knows them."""
+        """Robot and settings of the run, as far as the provenance has them."""
         run = self.provenance
         return self._setup(robot_of(run.get("urdf")), run.get("frame", ""), self.axes)
 
@@ -186,25 +186,25 @@ class Recording:
 
     @property
     def stored_verdict(self) -> Verdict | None:
-        """Verdict of the run that made the bag; None where it was broken off, or samples are missing."""
+        """Stored verdict of the run that made the bag; None if the run was aborted or samples are missing."""
         facts = self.provenance.get("verdict")
-        if facts is None or not fits(facts, SHAPE) or len(json.dumps(facts)) > MAX_TAIL:  # no writer stores more
+        if facts is None or not fits(facts, SHAPE) or len(json.dumps(facts)) > MAX_TAIL:  # writers store less
             return None
         whole = facts["samples"] == self.count and abs(facts["duration"] - float(self.t[-1])) < TIME_TOLERANCE
         return verdict_in(facts) if whole else None
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Verdict of the run: the one that it stored, or of its samples.
+        """Verdict of the run: the stored one, or else one computed from the samples.
 
-        Efforts are known if the bag has them, and targets if its provenance does.
+        It considers efforts only if the bag has them, and targets only if the provenance has them.
         """
         if (stored := self.stored_verdict) is not None:
             return stored
         return self._judged(self.setup, self.x, self.target if self.x.size else self.x)
 
     def verdict_with(self, robot: Urdf, frame: str, axes: str, x: Array, target: Array) -> Verdict:
-        """Return the verdict of a third-party bag's samples with a robot, its positions and targets, N × m."""
+        """Return the verdict of a third-party bag's samples, given its robot, and its positions and targets, N × m."""
         return self._judged(self._setup(robot, frame, axes), x, target)
 
     def _judged(self, setup: Setup, x: Array, target: Array) -> Verdict:
@@ -218,7 +218,7 @@ class Recording:
 
     @cached_property
     def x(self) -> Array:
-        """End effector position along the task axes, m, N × m; N × 0 where no robot is known."""
+        """Position of the end effector along the task axes, m, N × m; N × 0 without a known robot."""
         if self.provenance.get("urdf") is None or not self.axes:
             return np.empty((len(self.stamps), 0))
         if self.setup.robot is None or self.setup.frame not in self.setup.robot.links:

@@ -1,8 +1,8 @@
 """Record types and limits for untrusted bags.
 
-Nothing that a file claims is believed: a length, a table of contents, a size after decompression.
-Memory is bounded by the size of one chunk or message, time by the size of the files.
-rosbags reads no file that lacks its end, and believes the rest.
+Every claim of a file is checked: lengths, tables of contents, sizes after decompression. The size of one chunk or
+message bounds memory, and the size of the files bounds time. rosbags does not read files that lack their end, and
+trusts the claims of others.
 """
 
 import struct
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from ..bounds import MAX_CHUNK, MAX_RATIO
 from ..ros.cdr import Rows
 
-RECORD = 2000  # bytes that a record counts for; a message takes 3 of the file at least, packed
-TEXT = 100  # bytes that one of a topic's texts counts for, which are kept
+RECORD = 2000  # bytes of budget for a record; a packed message takes at least 3 bytes of a file
+TEXT = 100  # bytes of budget for each byte of a topic's texts, which stay in memory
 
 Stamps = NDArray[np.int64]
-"""ns since the epoch, N."""
+"""N times, ns since the epoch."""
 
 
 class Channel(NamedTuple):
@@ -52,15 +52,15 @@ class DamageError(Exception):
 class ReadBudget:
     """Read budget of a bag: the bytes to which its files may still unpack.
 
-    A few bytes can unpack to millions, and to records without end that are all alike. The messages
-    of an honest bag differ in their time stamps at least. So after a large chunk no more is
-    believed than MAX_RATIO times what was read, where each record counts for RECORD bytes more.
+    A few bytes can unpack to millions of bytes, or to an unlimited number of equal records. The messages of an honest
+    bag differ at least in their time stamps. Therefore, apart from one large chunk, a bag may unpack to at most
+    MAX_RATIO times the bytes that were read, and each record counts as RECORD bytes more.
     """
 
     left: int = MAX_CHUNK
 
     def spend(self, size: int) -> None:
-        """Subtract bytes from the budget; raise DamageError where it is exhausted."""
+        """Subtract bytes from the budget; raise DamageError if it is exhausted."""
         self.left -= size
         if self.left < 0:
             raise DamageError(f"it unpacks to more than {MAX_RATIO} times its size")

@@ -26,7 +26,7 @@ from .records import Channel, DamageError, ReadBudget
 from .storage import BATCH_SIZE, KINDS, OVERHEAD, BagWriter, McapStorage, check_path
 from .summary import read_summary
 
-NO_HASH = "RIHS01_" + "0" * 64  # of a type whose definition is not known
+NO_HASH = "RIHS01_" + "0" * 64  # hash of a type without a known definition
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Recovered:
     """A recovered bag.
 
     Attributes:
-        path: its folder.
-        original: where the folder is now that was found; None if it was whole already.
-        counts: messages by topic.
-        damage: why not all was saved; "" where the file merely lacks its end.
+        path: folder of the recovered bag.
+        original: new path of the damaged folder; None if the bag was complete.
+        counts: number of messages by topic.
+        damage: why messages were lost; "" if the file only lacked its end.
     """
 
     path: Path
@@ -49,11 +49,11 @@ class Recovered:
 def recover(path: str | Path) -> Recovered:
     """Complete the bag of a writer that died: index, metadata.yaml, statistics.
 
-    All messages that can be read are written to a new bag beside it. Only when that is whole and
-    on the disk it takes the place of the old one, which is kept as ``<name>.unfinished``.
+    All readable messages are written to a new bag in the same folder. When the new bag is complete and on the disk, it
+    replaces the old bag, which is renamed to ``<name>.unfinished``.
 
     Raises:
-        BagError: there is nothing to recover, the bag is being written, or the new one cannot be.
+        BagError: there is nothing to recover, the bag is being written, or the new bag cannot be written.
     """
     bag = Path(path)
     folder = bag.resolve()
@@ -91,7 +91,7 @@ def recover(path: str | Path) -> Recovered:
 def _held(bag: Path, folder: Path, original: Path, work: Path) -> Iterator[None]:
     """Lock a bag; undo an earlier recovery that was killed, and this one if it fails.
 
-    Between its two renames there is nothing in the bag's place: the lock goes with the old one.
+    Between the two renames of a recovery no folder has the bag's name; the lock then stays on the old folder.
     """
     between = not folder.exists() and (work / folder.name).is_dir()
     if not between and not folder.is_dir():
@@ -116,7 +116,7 @@ def _undo(folder: Path, original: Path, work: Path) -> None:
 
 
 def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | None:
-    """Return messages by topic of a complete and consistent bag, else None."""
+    """Return the number of messages by topic of a complete and consistent bag, else None."""
     counts: Counter[str] = Counter()
     try:
         stated = stated_count(folder)
@@ -133,7 +133,7 @@ def _counts_if_whole(folder: Path, files: Iterable[Path]) -> dict[str, int] | No
 
 
 def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) -> tuple[dict[str, int], str]:
-    """Write readable messages into a new bag; return messages by topic, and the reason why reading ended."""
+    """Write readable messages into a new bag; return their number by topic, and why reading ended early."""
     damage = []
     budget = ReadBudget()
     robots = provenance.robots_of(folder)
@@ -144,7 +144,7 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
         name = provenance.file_of(robot)
         with suppress(OSError):
             kept[name] = read_file(folder / name, MAX_PROVENANCE, follow=False)
-        with suppress(BagError):  # damaged: the messages are worth saving without it
+        with suppress(BagError):  # save the messages without a damaged provenance
             if provenance.read_provenance(folder, robot):
                 text = kept[name].decode("utf-8").strip()
                 writer.set_custom_data(provenance.key_of(robot), text)
@@ -168,29 +168,29 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
             except DamageError as error:
                 damage.append(str(error))
         for name, content in kept.items():
-            if isinstance(writer.storage, McapStorage):  # a file that is copied alone says where it is from
+            if isinstance(writer.storage, McapStorage):  # so that a copy of the file alone has the provenance
                 writer.flush()
                 writer.storage.describe(provenance.KEY, name, content.decode("utf-8", "replace"))
     if others:
         damage.append(f"messages in another form than CDR, on {', '.join(sorted(others))}")
-    for kept_folder in {Path(robot).parts[0] if robot else "meshes" for robot in robots}:  # of meshes
+    for kept_folder in {Path(robot).parts[0] if robot else "meshes" for robot in robots}:  # folders of meshes
         if not (folder / kept_folder).is_dir() or (folder / kept_folder).is_symlink():
             continue
         size = sum(file.lstat().st_size for file in (folder / kept_folder).rglob("*"))
-        if size > MAX_MESHES * len(robots):  # a few bytes on the disk can be a terabyte
+        if size > MAX_MESHES * len(robots):  # a sparse file of a few bytes can have a terabyte
             damage.append(f"meshes of {size} bytes in '{kept_folder}'")
         else:
             shutil.copytree(folder / kept_folder, new / kept_folder, symlinks=True)
     for name, content in kept.items():
         (new / name).write_bytes(content)
-    with Reader(new) as reader:  # whole is what another reader opens
+    with Reader(new) as reader:  # the new bag must open in another reader
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
     sync(*new.iterdir(), new)
     return counts, "; ".join(damage)
 
 
 class _Topics:
-    """Adds topics to a bag as they appear."""
+    """Adder of topics to a bag, as they appear."""
 
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
@@ -211,7 +211,7 @@ class _Topics:
         return self._connections[channel]
 
     def _qos(self, text: str) -> list[Qos]:
-        """Return the QoS profiles of a topic; none where they are invalid, so that players use defaults."""
+        """Return the QoS profiles of a topic; none if they are invalid, so that players use defaults."""
         if text not in self._profiles:
             self._profiles[text] = []
             self._yaml += len(text)
@@ -223,7 +223,7 @@ class _Topics:
 
 @cache
 def _hash(kind: str, definition: str) -> str:
-    """Return ROS 2's hash of a type, from the definition in the file."""
+    """Return ROS 2's hash of a type, computed from the definition in the file."""
     if len(definition) > MAX_DEFINITION:
         return NO_HASH
     store = get_typestore(Stores.EMPTY)

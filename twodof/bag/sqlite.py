@@ -16,14 +16,14 @@ from ..bounds import MAX_TOPICS
 from ..files import temporary_folder
 from .records import Batch, Channel, DamageError
 
-PLAIN = ("CREATE TABLE ", "CREATE INDEX ")  # as SQLite begins its records of them
-TABLES = {  # of ROS 2, and their columns; those of older versions end earlier
+PLAIN = ("CREATE TABLE ", "CREATE INDEX ")  # beginnings of SQLite's schema records of plain tables
+TABLES = {  # ROS 2's tables and their columns; older versions lack the last ones
     "topics": "id name type serialization_format offered_qos_profiles type_description_hash",
     "message_definitions": "id topic_type encoding encoded_message_definition",
     "messages": "id topic_id timestamp data",
 }
-SCHEMA_STEPS = 1000  # of SQLite's machine, for which it reads a hundred of those
-SOME = 1000  # rows that are put together
+SCHEMA_STEPS = 1000  # instructions of SQLite's virtual machine
+SOME = 1000  # rows in a group
 
 
 def sqlite3_messages(path: Path) -> Iterator[Batch]:
@@ -40,7 +40,7 @@ def sqlite3_messages(path: Path) -> Iterator[Batch]:
                             raise DamageError(f"'{path.name}' is damaged")
                         waiting.setdefault(topic, []).append((stamp, data))
                 except (sqlite3.Error, DamageError) as error:
-                    failure = error  # after what was read before it
+                    failure = error  # raised after the rows read before
                 for topic, messages in waiting.items():
                     yield from _batches(channels[topic], messages)
                 if not waiting and failure is None:
@@ -54,11 +54,11 @@ def sqlite3_messages(path: Path) -> Iterator[Batch]:
 def _database(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a database of plain tables without changing it.
 
-    Where a writer died over it, a copy is repaired. A journal can name that of several databases,
-    which SQLite would look for, anywhere, and delete; a copy that is longer names none.
+    If its writer died, SQLite repairs a copy. A journal can name a super-journal at any path, which SQLite would look
+    for and delete; appended zero bytes remove this name from the copy.
     """
     unfinished = _unfinished(path)
-    beside = path.absolute().parent.parent  # where there is room for a second one, as a rule
+    beside = path.absolute().parent.parent  # this disk usually has room for a copy
     use = beside if unfinished and os.access(beside, os.W_OK) else None
     with temporary_folder(use) as folder:
         uri = path.absolute().as_uri() + "?immutable=1"
@@ -106,8 +106,8 @@ def _sqlite3_channels(path: Path, database: sqlite3.Connection) -> dict[int, Cha
 def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a table of ROS 2, with NULL in missing and computed columns.
 
-    No more is believed to lie in them than there is room for in the files: pages can be linked in
-    a circle, or be part of many rows. Nor may there be others before them, to be passed by.
+    Rows may not have more bytes than the files, because a damaged file can link pages in a circle or use a page in many
+    rows. ROS 2's columns must come first, so that no other column has to be skipped.
     """
     columns = TABLES[table].split()
     infos = database.execute(f"PRAGMA table_xinfo({table})")
@@ -128,7 +128,7 @@ def _rows(path: Path, database: sqlite3.Connection, table: str) -> Iterator[tupl
 
 
 def _batches(channel: Channel, messages: Iterable[tuple[int, bytes]]) -> Iterator[Batch]:
-    """Yield stamps and messages, grouped while they have equal lengths."""
+    """Yield stamps and messages in groups of equal message length."""
     for size, group in groupby(messages, lambda message: len(message[1])):
         stamps, contents = zip(*group)
         rows = np.frombuffer(b"".join(contents), np.uint8).reshape(len(stamps), size)

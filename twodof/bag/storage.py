@@ -1,7 +1,7 @@
-"""rosbags' writer with storages that can be flushed to the disk during a run.
+"""rosbags' writer, with storages that can be flushed to the disk during a run.
 
-rosbags commits sqlite3 only at the end and cuts MCAP chunks at 1 MiB, so that a process that is
-killed leaves little or nothing.
+rosbags commits SQLite transactions only at the end and cuts MCAP chunks at 1 MiB, so that a killed process would leave
+few messages or none.
 """
 
 import errno
@@ -32,30 +32,30 @@ from .mcap import CHUNK, HEAD, MAGIC, MESSAGE, METADATA
 from .mcap import zstd as zstd
 from .records import Stamps as Stamps
 
-METADATA_VERSION: Final[Literal[8]] = 8  # what Humble reads; it refuses version 9
+METADATA_VERSION: Final[Literal[8]] = 8  # Humble reads version 8 and refuses version 9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SYNCHRONOUS = {False: "PRAGMA synchronous = OFF", True: "PRAGMA synchronous = FULL"}
 REMOVED = "it was removed while it was being written"
 KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
-OVERHEAD = 64  # bytes that a message takes beside its data until it is flushed
-BATCH_SIZE = 512 * 1024  # bytes; below 1 MiB, where rosbags would cut a chunk by itself
+OVERHEAD = 64  # bytes of memory for a waiting message besides its data
+BATCH_SIZE = 512 * 1024  # bytes; below the 1 MiB at which rosbags cuts a chunk
 RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("times", "<u8", 2)])
 """Header of a message record in MCAP."""
 MESSAGE_INDEX = 7  # opcode
 CHECKSUM = struct.Struct("<I8s")  # of the summary, and the magic: the end of a file
-FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # place of the summary, of its offsets; and these
+FOOTER = struct.Struct(f"<QQ{CHECKSUM.size}s")  # offsets of summary and summary offsets; checksum, magic
 
 
 class McapStorage(McapWriter):
     """MCAP storage that closes its chunk at each flush."""
 
     durable = False  # wait for the disk at the end
-    packing = b""  # of chunks: b"zstd", or none
+    packing = b""  # compression of chunks: b"zstd", or b"" for none
 
-    _end = 0  # of the last chunk that got through
+    _end = 0  # end of the last chunk that was written
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Write messages, one of each connection for each of N stamps."""
+        """Write N messages of each connection, one for each stamp."""
         if not messages:
             return
         parts, ends, chunk = [], [0], self.chunk
@@ -97,7 +97,7 @@ class McapStorage(McapWriter):
         self.bio.writelines((HEAD.pack(opcode, sum(map(len, parts))), *parts))
 
     def describe(self, title: str, key: str, value: str) -> None:
-        """Write one entry of the file's own metadata."""
+        """Write an entry into the metadata of the file itself."""
         name, *entry = (struct.pack("<I", len(text)) + text for text in map(str.encode, (title, key, value)))
         self._write(METADATA, name, struct.pack("<I", sum(map(len, entry))), *entry)
 
@@ -110,7 +110,7 @@ class McapStorage(McapWriter):
             os.fsync(self.bio.fileno())
 
     def close(self, version: int, metadata: str) -> None:
-        """Write the summary, and its checksum, which rosbags leaves out."""
+        """Write the summary with its checksum, which rosbags omits."""
         super().close(version, metadata)
         with self.path.open("r+b") as file:
             file.seek(-FOOTER.size, os.SEEK_END)
@@ -119,20 +119,20 @@ class McapStorage(McapWriter):
             checksum = crc32(file.read()[: -CHECKSUM.size])
             file.seek(-CHECKSUM.size, os.SEEK_END)
             file.write(CHECKSUM.pack(checksum, MAGIC))
-            if self.durable:  # before metadata.yaml says that it is whole
+            if self.durable:  # before metadata.yaml, which marks the bag as complete
                 file.flush()
                 os.fsync(file.fileno())
 
     def salvage(self) -> None:
         """Restore a valid file after a failed flush, so that the next can continue."""
         self.bio.flush()
-        if self.chunk.msgs:  # the chunk did not get through: cut off what did of it
+        if self.chunk.msgs:  # the chunk was written in part: cut it off
             self.bio.seek(self._end)
             self.bio.truncate()
 
 
 class Sqlite3Storage(Sqlite3Writer):
-    """SQLite storage that inserts and commits all messages of a flush, or none."""
+    """SQLite storage whose flush inserts and commits all waiting messages, or none."""
 
     durable = False  # wait for the disk at the end
 
@@ -152,7 +152,7 @@ class Sqlite3Storage(Sqlite3Writer):
 
     def flush(self, sync: bool) -> None:
         """Pass all messages to the operating system, and with ``sync`` to the disk."""
-        if sync and not self.conn.in_transaction:  # new topics open one, the next flush waits
+        if sync and not self.conn.in_transaction:  # new topics have opened one; the next flush waits
             self.conn.execute(SYNCHRONOUS[True])
         self.conn.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", self._rows)
         self.conn.commit()
@@ -204,20 +204,20 @@ class BagWriter(Writer):
             OSError, sqlite3.Error: the disk is full, or the file is gone.
         """
         assert self.storage is not None
-        if not self.storage.path.exists():  # what has lost its name can be written for ever
+        if not self.storage.path.exists():  # a removed file could be written without an error
             raise FileNotFoundError(errno.ENOENT, REMOVED)
         self.storage.flush(self._fsync)
 
 
 def profile(qos: Qos) -> str:
-    """Return a topic's quality of service as bags have it."""
+    """Return a topic's quality of service in the form of bags."""
     return dump_qos_v8([qos])
 
 
 def check_path(path: Path, storage: str) -> None:
-    """Raise BagError for a path under which a bag of this storage would not be found again.
+    """Raise BagError for a path that readers of this storage could not open.
 
-    Its name is written into metadata.yaml; rosbags makes a URI of a database's whole path.
+    metadata.yaml contains the bag's name, and rosbags makes a URI of a database's whole path.
     """
     part, text = ("path", str(path)) if storage == "sqlite3" else ("name", path.name)
     if storage == "sqlite3" and any(c in text for c in "?#%"):

@@ -24,7 +24,7 @@ from .storage import REMOVED, STORAGES, BagWriter, check_path
 RESERVE = "reserve"
 RESERVE_SIZE = 2 * 1024**2
 FLUSH_PERIOD = 0.5  # s of wall time
-PAUSE = 0.0005  # s between two looks at how far the thread is
+PAUSE = 0.0005  # s between two checks of the thread's progress
 
 
 class Part(Protocol):
@@ -42,13 +42,13 @@ class Part(Protocol):
         """Return the number of samples in the bag."""
 
     def metadata(self) -> tuple[str, str]:
-        """Return key and text of the robot's provenance; raise OSError where that was removed."""
+        """Return key and text of the robot's provenance; raise OSError if its file was removed."""
 
 
 class Store:
-    """A folder with the messages of one robot or several; the first opens it, the last closes it.
+    """The folder of a bag of one or several robots; the first robot opens it, the last one closes it.
 
-    Arguments and errors are those of ``Bag``. ``writer`` takes messages while it is open.
+    Arguments and errors are those of ``Bag``. ``writer`` accepts messages while the bag is open.
     """
 
     def __init__(self, path: Path, storage: str, *, overwrite: bool, fsync: bool, compress: str) -> None:
@@ -63,10 +63,10 @@ class Store:
         self.path, self.fsync = path, fsync
         self._storage, self._overwrite, self._compress = storage, overwrite, compress
         self._parts: list[Part] = []
-        self._entered = 0  # of them have not left
-        self._turn = Lock()  # of threads, as each robot may have its own
-        self._names: set[str] = set()  # of the robots in the bag that was closed
-        self._ended = True  # what has not begun takes nothing
+        self._entered = 0  # robots that have not left
+        self._turn = Lock()  # robots may have threads of their own
+        self._names: set[str] = set()  # namespaces in the closed bag
+        self._ended = True  # a bag that has not begun accepts nothing
         self._failure: Exception | None = None
         _check_free(path, overwrite)
 
@@ -74,7 +74,7 @@ class Store:
         """Add one robot's part; the first one creates the folder.
 
         Raises:
-            BagError: it cannot be written, or has samples already.
+            BagError: the bag cannot be written, or has samples already.
         """
         with self._turn:
             self._enter(part)
@@ -98,7 +98,7 @@ class Store:
                 if not self._entered:
                     self._remove()
                 raise
-        except WriterError as error:  # the folder appeared meanwhile and is not ours
+        except WriterError as error:  # another process has made the folder meanwhile
             raise BagError(f"cannot write the bag '{self.path}': {error}") from error
         except (OSError, sqlite3.Error) as error:
             raise BagError(f"cannot write the bag '{self.path}': {_reason(error)}") from error
@@ -106,7 +106,7 @@ class Store:
         self._entered += 1
 
     def add_topics(self, topics: Mapping[str, Topic]) -> list[int]:
-        """Return the numbers of new connections, in the order of the topics."""
+        """Add topics; return the numbers of their connections, in the same order."""
         add = self.writer.add_connection
         return [
             add(name, kind, typestore=store_of(kind), offered_qos_profiles=[qos]).id
@@ -114,7 +114,7 @@ class Store:
         ]
 
     def check(self) -> None:
-        """Raise the error that ended the thread, if any; BagError where the bag is not open."""
+        """Raise the error that ended the thread, if any; raise BagError if the bag is not open."""
         if self._failure is not None:
             self._wait(lambda: False)
             raise self._error(self._failure) from self._failure
@@ -124,8 +124,8 @@ class Store:
     def flush(self) -> None:
         """Make the thread store the queue; the first flush starts the thread.
 
-        It is a thread so that Ctrl-C, which Python raises in the main one, never comes between the
-        bytes of a message, and what is written reaches the disk also while the FMU takes its time.
+        A thread stores the messages for two reasons. Ctrl-C, which Python raises in the main thread, cannot interrupt
+        the writing of a message. Samples also reach the disk during a long step of the FMU.
         """
         before = self._stores
         self._due.put(None)
@@ -133,9 +133,9 @@ class Store:
         self._wait(lambda: self._stores > before)
 
     def leave(self, exception: object) -> None:
-        """End one robot's part; the last one closes the bag, and removes it where a run failed without a sample.
+        """End one robot's part; the last one closes the bag, or removes it if the run failed without a sample.
 
-        A full disk or a lost folder is a BagError, unless such an exception is on its way already.
+        A full disk or a lost folder raises BagError, unless the present exception is a BagError already.
         """
         with self._turn:
             self._entered -= 1
@@ -168,7 +168,7 @@ class Store:
                 reserve.write(b"\0" * RESERVE_SIZE)
                 reserve.flush()
                 os.fsync(reserve.fileno())
-        except (WriterError, BlockingIOError):  # the folder is another's
+        except (WriterError, BlockingIOError):  # another process has the folder
             raise
         except BaseException:
             self._remove()
@@ -190,14 +190,14 @@ class Store:
     def _wait(self, done: Callable[[], bool]) -> None:
         """Wait until a condition holds or the thread has ended.
 
-        Without a lock, an event or a join: Ctrl-C, which Python raises between any two instructions
-        of this thread, would leave a lock taken for ever if it came when that had just been.
+        It polls instead of using a lock, an event or a join: Python raises Ctrl-C between any two instructions, and a
+        lock that was just acquired would then never be released.
         """
         while not (done() or self._ended):
             time.sleep(PAUSE)
 
     def _keep_storing(self) -> None:
-        """Store the queue twice a second and on request, then close the bag: the thread's function."""
+        """Store the queue twice a second and on request, then close the bag; this is the thread's function."""
         try:
             closing = False
             while not closing:
@@ -234,7 +234,7 @@ class Store:
             storage.salvage()
             self._store()
         for part in self._parts:
-            with suppress(OSError):  # it was removed: the messages are worth closing without it
+            with suppress(OSError):  # provenance was removed: close the bag without it
                 self.writer.set_custom_data(*part.metadata())
         self.writer.close()
         if self.fsync:
@@ -245,7 +245,7 @@ class Store:
         """Return the main thread's error for a failure of the thread."""
         if not isinstance(failure, OSError | sqlite3.Error):
             return failure
-        gone = not self.path.exists()  # the storage fails with this or that then
+        gone = not self.path.exists()  # the storage's own error would be arbitrary
         reason = REMOVED if gone else _reason(failure)
         reason = f"cannot go on writing the bag '{self.path}': {reason}"
         if self._closed:
@@ -264,7 +264,7 @@ def _reason(error: Exception) -> str:
 
 
 def _check_free(path: Path, overwrite: bool, *, clear: bool = False) -> None:
-    """Refuse an existing folder; with ``clear``, remove one that may be overwritten."""
+    """Refuse an existing folder, except one that may be overwritten, which ``clear`` removes."""
     try:
         if not path.exists():
             return

@@ -1,11 +1,11 @@
-"""Read the summary of an MCAP file where its checksum is valid.
+"""Read the summary of an MCAP file if its checksum is valid.
 
-It is at the end of a file that was closed, with a checksum over all of it:
+The summary is at the end of a closed file, followed by its checksum:
 
     … | data end | schemas, channels, chunk indexes, statistics, … | footer | magic
     footer   where the summary begins, where its offsets begin, CRC-32 of the summary and of these
 
-Source: MCAP's specification. A file without one, or without its checksum, is to be read instead.
+Source: MCAP's specification. A file without a summary, or without its checksum, must be read completely.
 """
 
 import struct
@@ -22,7 +22,7 @@ CHUNK_INDEX, STATISTICS = 8, 11  # opcodes
 FOOTER_FIELDS = struct.Struct("<QQI")
 END = HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
 STATISTICS_FIELDS = struct.Struct("<QHIIIIQQI")
-CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of what follows
+CHUNK_FIELDS = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the rest
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class McapSummary:
         """Return batches that include the first and the last message of a topic.
 
         Raises:
-            DamageError: a chunk is not where it should be, or not sound.
+            DamageError: a chunk is damaged, or not at its stated offset.
             OSError: the file cannot be read.
         """
         numbers = {n for n, channel in self.channels.items() if channel.topic == topic}
         chunks = [chunk for chunk in self.chunks if chunk.channels & numbers]
-        # each chunk has a message of the topic between its times
+        # each of these chunks has a message of the topic
         soonest = min((max(c.first, c.last) for c in chunks), default=0)
         latest = max((min(c.first, c.last) for c in chunks), default=0)
         found = not chunks
@@ -75,7 +75,7 @@ class McapSummary:
 
 
 def read_summary(path: Path) -> McapSummary | None:
-    """Return the summary of an MCAP file; None where it has no valid one.
+    """Return the summary of an MCAP file; None without a valid one.
 
     Raises:
         OSError: the file cannot be read.
@@ -102,7 +102,7 @@ def read_summary(path: Path) -> McapSummary | None:
 
 
 def _summary(path: Path, content: bytes, start: int) -> McapSummary | None:
-    """Return a summary from its records at an offset; None where they are inconsistent."""
+    """Return a summary from its records at an offset; None if they are inconsistent."""
     tables, chunks, counts = Tables(), [], None
     position, stated, chunk_count = 0, 0, 0
     while position < len(content):

@@ -24,31 +24,31 @@ from .store import Store
 class Bag(Sink):
     """A sink that writes a rosbag2 folder.
 
-    Left in whatever way, the bag is closed and readable with every sample written so far; while
-    the run goes on, what is older than a second survives the death of the process.
+    However the context ends, the bag is closed and readable, with every sample written so far. During the run, samples
+    older than a second survive the death of the process.
 
-    Samples are serialised and stored, many at a time, by a thread.
+    A thread serialises and stores many samples at a time.
 
     Args:
-        path: folder of the bag; must not exist, unless ``overwrite`` and it is a bag.
+        path: folder of the bag; it must not exist, except as a bag with ``overwrite``.
         storage: "mcap" or "sqlite3".
         scene: add the robot description, transforms, target and end effector.
-        meshes: keep the robot's meshes in the folder, where the description of the scene names them by file URIs.
+        meshes: store the robot's meshes in the folder; the robot description refers to them by file URIs.
         effort: put the control effort into JointState.effort.
-        measured: joint states are what the controller saw, and /joint_states_true the true ones.
+        measured: /joint_states has the measured values, and /joint_states_true the true ones.
         overwrite: replace an existing bag.
-        fsync: wait for the disk at each flush, so that the machine may lose its power too.
+        fsync: wait for the disk at each flush, so that samples also survive a power failure.
         compress: "zstd" compresses the chunks of an MCAP file.
-        command_line: for the provenance.
+        command_line: command line for the provenance.
 
     Attributes:
         path: the folder.
-        namespace: of the robot's topics, "" where the bag is of one robot.
+        namespace: namespace of the robot's topics; "" in a bag of one robot.
         count: number of samples so far.
 
     Raises:
-        BagError: the folder exists or cannot be written; in ``write`` and at the end where the
-            disk is full or the folder is gone.
+        BagError: the folder exists or cannot be written. ``write`` and the end of the context raise it if the disk is
+            full or the folder was removed.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Bag(Sink):
         """Return a sink for one of several robots, whose topics have a namespace in the same bag.
 
         Raises:
-            InputError: it is no name of ROS 2.
+            InputError: the namespace is no name of ROS 2.
         """
         check_name("namespace", namespace)
         robot = copy(self)
@@ -85,7 +85,7 @@ class Bag(Sink):
 
     @property
     def address(self) -> str:
-        """Address for readers: the folder, with a robot's namespace where it has one."""
+        """Address for readers: the folder, followed by the robot's namespace, if any."""
         return f"{self.path}:{self.namespace}" if self.namespace else str(self.path)
 
     @property
@@ -94,7 +94,7 @@ class Bag(Sink):
         return self._named(JOINT_STATES)
 
     def begin(self, run: Experiment) -> Bag:
-        """Receive the experiment of the samples to come.
+        """Receive the experiment of the following samples.
 
         Raises:
             BagError: the FMU lacks a requested output.
@@ -111,10 +111,10 @@ class Bag(Sink):
     def __enter__(self) -> Bag:
         if self._run is None:
             raise BagError("a bag is given its experiment first: 'with bag.begin(experiment):'")
-        self._queue: deque[bytes] = deque()  # numbers of samples
+        self._queue: deque[bytes] = deque()  # packed numbers of waiting samples
         self._changes: deque[tuple[float, dict[str, Value]]] = deque()
         self._verdict: dict[str, object] | None = None
-        self._taken = 0  # samples, counted by the thread
+        self._taken = 0  # samples that the thread has taken
         self._store.enter(self)
         return self
 
@@ -150,7 +150,7 @@ class Bag(Sink):
         self._connections = dict(zip(self._messages.topics, self._store.add_topics(topics)))
 
     def hand_over(self) -> None:
-        """Pass the queue to the store: changes of inputs before the messages that show them."""
+        """Pass the queue to the store: changes of inputs first, then the messages that they affect."""
         samples, changes = list(self._queue), list(self._changes)
         self._provenance.add(changes, self._verdict)
         for _ in changes:
@@ -171,7 +171,7 @@ class Bag(Sink):
         return self._store.writer.counts[self._connections[JOINT_STATES]]
 
     def metadata(self) -> tuple[str, str]:
-        """Return key and text of the provenance; raise OSError where that was removed."""
+        """Return key and text of the provenance; raise OSError if its file was removed."""
         return self._provenance.key, self._provenance.text()
 
     @property
@@ -187,7 +187,7 @@ class Bag(Sink):
         self._store.writer.write_all(stamps, rows)
 
     def _note(self, sample: Sample) -> None:
-        """Queue the inputs that changed since the sample before."""
+        """Queue the inputs that changed since the previous sample."""
         changed = {n: v for n, v in sample.inputs.items() if v != self._inputs.get(n)}
         if changed:
             self._changes.append((sample.since, changed))

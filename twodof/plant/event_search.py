@@ -21,8 +21,9 @@ of the magnitudes of their rates.
 """
 LOOKS, DOUBT = 4, 0.25
 """Samples of an effort's margin in a step, and a fraction of their range. Between the stages, the margin falls below
-their smallest value by less than the range of their values. If it may therefore be below zero, it is sampled
-LOOKS equal intervals, and at each extremum of the polynomial through the samples that is below DOUBT times their range.
+their smallest value by less than the range of their values. If it may therefore be below zero, it is sampled at the
+ends of LOOKS equal intervals, and at each extremum of the polynomial through these samples that is below DOUBT times
+their range.
 """
 HALVINGS = 7
 """Halvings of a step in the search; shorter excursions are ignored."""
