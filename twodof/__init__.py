@@ -20,12 +20,12 @@ Check an FMU of any maker:      check, Check
 Linear models:                  linearise, LinearModel
 ROS 2 and Foxglove:             publish, publish_together, Publisher, Foxglove, layouts
 
-Errors that a user can mend are a TwoDofError. Functions and classes that need an extra raise one that names it.
+Errors that a user can correct are a TwoDofError. Without its extra, a function or class raises one that names it.
 """
 
 from typing import NoReturn
 
-# a name is imported on first use: FMPy, rosbags and Pinocchio take a second together
+# a name is imported on first use, because FMPy, rosbags and Pinocchio take a second to import
 with open(f"{__file__}i", encoding="utf-8") as _stub:
     _HOMES = {line.split()[3]: line.split()[1] for line in _stub if line.startswith("from .")}
 __all__ = [*_HOMES]
@@ -44,7 +44,7 @@ def __getattr__(name: str) -> object:
 
     try:
         return getattr(importlib.import_module(_HOMES[name], __name__), name)
-    except TwoDofError as error:  # an extra is missing: the name can be imported, and using it raises this
+    except TwoDofError as error:  # without its extra, a name can be imported, and its use raises this
         missing = error
 
     def unusable(*_arguments: object, **_named: object) -> NoReturn:

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status.
 
-    Ctrl-C ends the process at once while the command line is loaded, and not any more when the command has ended.
+    Ctrl-C ends the process at once while the command line is loaded, and is ignored after the command has ended.
     """
-    interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # or to be ignored
+    interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # otherwise it is ignored
     if interruptible:
         signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
     _open_streams()
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return command(arguments)
         finally:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except KeyboardInterrupt:  # of the very end, in place of which the next is ignored
+    except KeyboardInterrupt:  # Ctrl-C at the very end; the next one is ignored
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return INTERRUPTED
 
@@ -37,7 +37,7 @@ def _open_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
             stream = open(number, "w" if number else "r", closefd=False)  # noqa: SIM115
             setattr(sys, name, stream)
 

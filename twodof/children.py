@@ -1,8 +1,8 @@
 """Child processes that each run one function over an anonymous pipe, and their confinement.
 
-A child that parses untrusted bytes confines itself: limits of memory and time hold on every POSIX system. On Linux,
-Landlock leaves the folders that are given, readable, and on x86-64 seccomp leaves the system calls that a parser
-needs; a kernel that has neither keeps the limits. Sources: landlock(7), seccomp(2).
+A child that parses untrusted bytes confines itself. Limits of memory and time apply on every POSIX system. On Linux,
+Landlock restricts it to reading the given folders, and on x86-64 seccomp restricts it to the system calls that a parser
+needs. On a kernel without these, only the limits apply. Sources: landlock(7), seccomp(2).
 """
 
 import ctypes
@@ -39,7 +39,7 @@ with Connection(int(sys.argv[1])) as pipe, suppress(OSError):  # the parent has 
 """
 
 DESCRIPTORS = 64  # open at a time
-NO_NEW_PRIVILEGES = 38  # of prctl
+NO_NEW_PRIVILEGES = 38  # option of prctl
 LANDLOCK_CREATE, LANDLOCK_ADD, LANDLOCK_RESTRICT = 444, 445, 446  # on all architectures
 FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 """Number of rights to files that a version of Landlock handles."""
@@ -60,15 +60,15 @@ OPEN, LIMIT = 257, 302  # openat for reading, prlimit64 of the process itself
 class Child(Connection):
     """A process that runs one function, and the connection to it; closing it ends the process.
 
-    Nobody else can talk to it, as it inherits one end of a socket pair. It imports nothing from the
-    working directory, nor the program's main module. The terminal's signals are not for it, and it
-    ends with this process, whatever it is at.
+    No other process can communicate with it, because it inherits one end of a socket pair. It imports nothing from the
+    working directory, and not the program's main module. It does not receive the terminal's signals, and it ends when
+    this process ends.
 
     Args:
-        function: of a module; called with the other end of the connection and the arguments.
-        arguments: what can be pickled.
-        environment: variables beside those of this process.
-        output: for stdout and stderr, as of ``subprocess.Popen``.
+        function: function at module level; called with the other end of the connection and the arguments.
+        arguments: arguments that can be pickled.
+        environment: environment variables in addition to those of this process.
+        output: destination of stdout and stderr, as in ``subprocess.Popen``.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Child(Connection):
         with ours, theirs:
             handle = theirs.fileno()
             self._process = Popen(
-                [sys.executable, "-I", "-c", BOOT, str(handle)],  # -I: from Python's own path alone
+                [sys.executable, "-I", "-c", BOOT, str(handle)],  # -I: import from Python's own path only
                 pass_fds=[handle],
                 env={**os.environ, **(environment or {})},
                 stdin=DEVNULL,
@@ -95,7 +95,7 @@ class Child(Connection):
         self.send(partial(_call, function, arguments))
 
     def send(self, value: object) -> None:
-        """Send a value; where the process has ended, ``recv`` raises."""
+        """Send a value; if the process has ended, the next ``recv`` raises."""
         with suppress(OSError):
             super().send(value)
 
@@ -103,9 +103,9 @@ class Child(Connection):
         """Return the next value from the process.
 
         Raises:
-            TwoDofError: what its function raised.
-            ChildError: it failed otherwise.
-            EOFError: it has ended, with the exit status that the text says.
+            TwoDofError: the function raised it.
+            ChildError: the function failed with another exception.
+            EOFError: the process has ended; the text has its exit status.
         """
         try:
             value = super().recv()
@@ -118,14 +118,14 @@ class Child(Connection):
         return value
 
     def receive(self, most: int, seconds: float) -> bytes:
-        """Return the next bytes from a process that is not trusted.
+        """Return the next bytes from an untrusted process.
 
         Args:
-            most: more bytes end it.
-            seconds: it is ended where it takes longer to send them.
+            most: largest number of bytes; more bytes end the process.
+            seconds: longest wall time; the process is killed afterwards.
 
         Raises:
-            EOFError: it has ended, as the text says.
+            EOFError: the process has ended; the text says how.
         """
         timer = Timer(seconds, self._process.kill)
         timer.daemon = True
@@ -139,7 +139,7 @@ class Child(Connection):
             timer.cancel()
 
     def _end(self) -> str:
-        """Return the error that describes how the process ended."""
+        """Return a text that says how the process ended."""
         status = self._process.wait()
         return f"exit status {status}" if status >= 0 else str(strsignal(-status))
 
@@ -155,7 +155,7 @@ def _path() -> list[str]:
     home = str(Path(__file__).parents[1])
 
     def is_same(entry: str, folder: str) -> bool:
-        with suppress(OSError):  # where there is none
+        with suppress(OSError):  # a missing folder
             return os.path.samefile(entry or ".", folder)
         return False
 
@@ -165,7 +165,7 @@ def _path() -> list[str]:
 
 def _call(function: Callable[..., None], arguments: tuple[object, ...], pipe: Connection) -> None:
     """Run the function in the child, until the other end of its pipe closes."""
-    os.set_inheritable(pipe.fileno(), False)  # what an FMU starts must not keep ours open
+    os.set_inheritable(pipe.fileno(), False)  # programs that an FMU starts must not keep the pipe open
     closed = poll()
     closed.register(pipe, 0)
     Thread(target=lambda: closed.poll() and os._exit(1), daemon=True).start()
@@ -176,9 +176,9 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
     """Confine this process irrevocably; import everything that it needs beforehand.
 
     Args:
-        memory: most of its address space, bytes.
-        seconds: processor time from its start.
-        folders: the only ones whose files it may read, where the kernel has Landlock.
+        memory: largest address space, bytes.
+        seconds: processor time since its start.
+        folders: the only folders whose files it may read, on kernels with Landlock.
     """
     limits = {
         resource.RLIMIT_AS: memory,
@@ -200,7 +200,7 @@ def confine(memory: int, seconds: int, folders: Sequence[Path] = ()) -> None:
 
 
 def limit_time(seconds: float) -> None:
-    """Limit this process to more processor time from now on; call it again for the next task."""
+    """Limit the processor time of this process from now on; call it again for the next task."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     most = resource.getrlimit(resource.RLIMIT_CPU)[1]
     soft = int(used.ru_utime + used.ru_stime + seconds) + 1
@@ -227,7 +227,7 @@ def _allow_calls(libc: ctypes.CDLL) -> None:
     """Restrict all threads to a table of system calls with seccomp; others fail with EPERM."""
     load, equal, mask, end = 0x20, 0x15, 0x54, 0x06
     allow, refuse = (end, 0, 0, 0x7FFF0000), (end, 0, 0, 0x00050001)
-    number, architecture, first, third = 0, 4, 16, 32  # places in struct seccomp_data
+    number, architecture, first, third = 0, 4, 16, 32  # offsets in struct seccomp_data
     program = [(load, 0, 0, architecture), (equal, 1, 0, X86_64), refuse, (load, 0, 0, number)]
     for call in ALLOWED:
         program += [(equal, 0, 1, call), allow]

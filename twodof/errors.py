@@ -1,6 +1,6 @@
-"""Exceptions of the package, one root and named leaves, and the remedies that their messages name.
+"""Exceptions of the package with a common root, and remedies for their messages.
 
-Each message is one clear line.
+Each message is one line with the culprit and the remedy.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from itertools import islice
 from os import scandir
 from pathlib import Path
 
-MOST_NEIGHBOURS = 1000  # of a file, among which the nearest name is looked for
+MOST_NEIGHBOURS = 1000  # files of a folder among which the nearest name is searched
 KINDS = {
     "bag": ("a bag", "twodof view"),
     "sweep": ("a sweep", "twodof plot"),
@@ -25,7 +25,7 @@ KINDS = {
     "CSV": ("a CSV file, for `changes` of a run", ""),
     "folder": ("a folder without a bag or a sweep", ""),
 }
-"""Kinds of paths: their words, and the command that takes one."""
+"""Kinds of paths: the kind in words, and the command that accepts it."""
 SUFFIXES = {".fmu": "FMU", ".urdf": "URDF", ".xacro": "URDF", ".mcap": "bag", ".html": "page", ".csv": "CSV"}
 MAKERS = {"FMU": "twodof build", "bag": "twodof run", "sweep": "twodof sweep"}
 ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
@@ -33,7 +33,7 @@ ZIP_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, V
 
 
 class TwoDofError(Exception):
-    """Root of all errors caused by a user's input or machine."""
+    """Root of all errors that a user's input or machine causes."""
 
 
 class BuildError(TwoDofError):
@@ -52,8 +52,8 @@ class SimulationError(TwoDofError):
     """The FMU refused or failed a call, or returned a value that is not finite.
 
     Attributes:
-        k: number of communication steps that were done.
-        outcome: "discarded" (fmi2Discard), "diverged" (not finite) or "failed" (all else).
+        k: number of communication steps before the failure.
+        outcome: "discarded" (fmi2Discard), "diverged" (not finite) or "failed" (any other).
     """
 
     def __init__(self, message: str, k: int = 0, outcome: str = "failed") -> None:
@@ -86,17 +86,17 @@ class PublishError(TwoDofError):
 
 
 def diverged(k: int, t: float) -> SimulationError:
-    """Return the error of a sample that is not finite, after k steps, at a time."""
+    """Return the error for a sample at time t, after k steps, that is not finite."""
     return SimulationError(f"the FMU gave a value that is not finite at t = {t:g} s", k, "diverged")
 
 
 def step_failure(k: int, t: float, error: SimulationError, remark: str = "") -> SimulationError:
-    """Return the error of a failed step, after k steps, at a time."""
+    """Return the error for a step that failed at time t, after k steps."""
     return SimulationError(f"step {k + 1} at t = {t:g} s: {error}{remark}", k, error.outcome)
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return the most similar of known names, whatever its case; None where there is none."""
+    """Return the most similar known name, ignoring case; None without a similar one."""
     by_lower = {candidate.lower(): candidate for candidate in reversed([*known])}
     near = get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
     return by_lower[near[0]] if near else None
@@ -110,7 +110,7 @@ def choice(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def kind_of(path: Path) -> str:
-    """Return what a path is, a key of ``KINDS``; "" for another file, or none."""
+    """Return the kind of a path, a key of ``KINDS``; "" for any other file, or no file."""
     if not path.is_dir():
         return SUFFIXES.get(path.suffix, "") if path.is_file() else ""
     suffixes = {Path(name).suffix for name in _names(path)}
@@ -120,7 +120,7 @@ def kind_of(path: Path) -> str:
 
 
 def no_such(wanted: str, path: Path) -> str:
-    """Return the message about a path that is no FMU, bag, sweep or URDF: what it is, or what is near it."""
+    """Return the message for a path of the wrong kind or without a file: its kind, or a similar path."""
     words, command = KINDS.get(kind_of(path), ("", ""))
     if words:
         use = f"; '{command} {shlex.quote(str(path))}' takes it" if command else ""
@@ -133,7 +133,7 @@ def no_such(wanted: str, path: Path) -> str:
 
 
 def neighbour(path: Path, *kinds: str) -> Path | None:
-    """Return the path in the same folder whose name is nearest, of some kinds; None where there is none."""
+    """Return the path of one of these kinds with the nearest name in the same folder, or None."""
     others = (path.parent / name for name in _names(path.parent))
     stems = {other.stem: other for other in others if kind_of(other) in kinds}
     near = nearest(path.stem, stems)

@@ -21,11 +21,11 @@ from typing import Any
 from .bounds import MAX_ARCHIVE, MAX_DIRECTORY, MAX_FOLDERS_DEEP, MAX_MEMBERS, MAX_UNZIPPED
 from .errors import TwoDofError
 
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that FMI allows
-MAX_LINKS_FOLLOWED = 40  # as the kernel
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # compression methods that FMI allows
+MAX_LINKS_FOLLOWED = 40  # the kernel's limit
 TEMPORARY = ".twodof."
-"""Prefix of folders whose process has died, or holds their lock."""
-LOCK_TIMEOUT = 5.0  # s that a lock is waited for
+"""Prefix of temporary folders, whose process holds their lock or has died."""
+LOCK_TIMEOUT = 5.0  # s of waiting for a lock
 NUMBER = int | float
 VALUES = {str: NUMBER}
 
@@ -36,7 +36,7 @@ class UnsafeArchiveError(zipfile.BadZipFile):
 
 @contextmanager
 def refusing(kind: type[TwoDofError], what: str) -> Iterator[None]:
-    """Raise ``kind`` where the operating system refuses ``what``."""
+    """Raise ``kind`` if the operating system refuses ``what``."""
     try:
         yield
     except OSError as error:
@@ -46,7 +46,7 @@ def refusing(kind: type[TwoDofError], what: str) -> Iterator[None]:
 def check_file(path: str | Path, most: int) -> None:
     """Refuse anything but a regular file of at most ``most`` bytes, before it is opened.
 
-    A pipe would be waited for, and a device has no end.
+    Reading a pipe would wait, and a device has no end.
 
     Raises:
         OSError: with the reason in ``strerror``.
@@ -65,7 +65,7 @@ def read_file(path: str | Path, most: int, *, follow: bool = True) -> bytes:
     """Return the content of a regular file of at most ``most`` bytes.
 
     Raises:
-        OSError: it cannot be read, ``check_file`` refuses it, or it is a link and not to follow.
+        OSError: the file cannot be read, ``check_file`` refuses it, or it is a link and ``follow`` is false.
     """
     if not follow and os.path.islink(path):
         raise OSError(errno.ELOOP, "It is a link, and links in a bag are not followed", str(path))
@@ -75,26 +75,26 @@ def read_file(path: str | Path, most: int, *, follow: bool = True) -> bytes:
 
 
 def head_of(path: Path, size: int) -> bytes:
-    """Return the first bytes of a file; none where it cannot be read."""
+    """Return the first bytes of a file; b"" if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return file.read(size)
     return b""
 
 
 def shown(path: str | Path) -> str:
-    """Return a path as text that can be written anywhere, with bytes outside UTF-8 as escapes."""
+    """Return a path as text for any stream, with bytes outside UTF-8 as escapes."""
     return os.fsencode(path).decode("utf-8", "backslashreplace")
 
 
 def check_archive(path: str | Path) -> None:
     """Refuse a zip archive that is unsafe to unzip, or has too many members to list.
 
-    zipfile reads the whole list of members before it can tell the length.
+    zipfile reads the whole list of members before it knows their number.
 
     Raises:
         OSError: with the reason in ``strerror``.
-        UnsafeArchiveError: saying why.
-        zipfile.BadZipFile: it is damaged.
+        UnsafeArchiveError: the archive is unsafe; the message says why.
+        zipfile.BadZipFile: the archive is damaged.
     """
     check_file(path, MAX_ARCHIVE)
     with _Archive(path) as file, zipfile.ZipFile(file) as archive:
@@ -102,7 +102,7 @@ def check_archive(path: str | Path) -> None:
     files = set[str]()
     for member in members:
         _check_member(member)
-        if member.filename in files:  # readers differ in which one they take
+        if member.filename in files:  # readers differ in the member that they read
             raise UnsafeArchiveError(f"it is unsafe: it has two members '{member.filename}'")
         files.add(member.filename)
     names = [PurePosixPath(member.filename) for member in members]
@@ -130,19 +130,19 @@ def read_member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
     """Return a member of an archive, of at most ``most`` bytes.
 
     Raises:
-        KeyError: there is none.
-        UnsafeArchiveError: it is larger.
-        OSError, zipfile.BadZipFile, …: it is damaged.
+        KeyError: there is no such member.
+        UnsafeArchiveError: the member is larger.
+        OSError, zipfile.BadZipFile, …: the archive is damaged.
     """
     member = archive.getinfo(name)
     if member.file_size > most:
         raise UnsafeArchiveError(f"its member '{name}' is larger than {most} bytes")
-    with archive.open(member) as file:  # gives no more than the list of members says
+    with archive.open(member) as file:  # returns at most the size in the list of members
         return file.read(member.file_size)
 
 
 class _Archive(io.FileIO):
-    """A zip archive whose list of members limits what is read at once."""
+    """A zip archive that limits reads by the sizes in its list of members."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > MAX_DIRECTORY:
@@ -153,7 +153,7 @@ class _Archive(io.FileIO):
 def write_file(path: Path, content: bytes) -> None:
     """Write a file atomically, following links; or write into a device, pipe or /dev/stdout.
 
-    A new file has the mode that the umask leaves; one that is replaced keeps its mode.
+    The umask sets the mode of a new file; a replaced file keeps its mode.
 
     Raises:
         OSError: it cannot be written.
@@ -183,14 +183,14 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def descriptor_of(path: str | Path) -> int | None:
-    """Return the descriptor that a name such as /dev/stdout or /dev/fd/3 stands for, else None."""
+    """Return the descriptor of a name such as /dev/stdout or /dev/fd/3; None for other paths."""
     for _ in range(MAX_LINKS_FOLLOWED):
         folder, name = os.path.split(os.path.abspath(path))
         if name.isdecimal() and os.path.realpath(folder) == f"/proc/{os.getpid()}/fd":
             return int(name)
         try:
             path = Path(folder, os.readlink(path))
-        except OSError:  # no link
+        except OSError:  # it is no link
             break
     return None
 
@@ -200,7 +200,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Make a folder that is removed at the end, or by the next process if this one is killed.
 
     Args:
-        parent: where it is made; None: the system's folder for temporary files.
+        parent: folder in which it is made; None: the system's folder for temporary files.
 
     Raises:
         OSError: it cannot be made.
@@ -213,7 +213,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
         _remove_abandoned(left)
     folder = Path(tempfile.mkdtemp(dir=parent))
     held = lock(folder)
-    if is_being_written(folder):  # only now, as others find it locked, the name that they look for
+    if is_being_written(folder):  # only now that it is locked: others remove unlocked ones
         folder = folder.rename(folder.with_name(TEMPORARY + folder.name))
     try:
         yield folder
@@ -223,8 +223,8 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove a temporary folder of this user that no process holds."""
-    with suppress(OSError):  # gone, a link, another user's, held, or on a disk without locks
+    """Remove a temporary folder of this user that no process has locked."""
+    with suppress(OSError):  # removed, a link, another user's, locked, or on a disk without locks
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
             if os.fstat(descriptor).st_uid == os.geteuid():
@@ -235,17 +235,17 @@ def _remove_abandoned(folder: Path) -> None:
 
 
 def lock(path: Path, *, wait: bool = False) -> int:
-    """Keep other writers from a folder until the descriptor is closed or the process ends.
+    """Lock a folder against other writers until the returned descriptor is closed or the process ends.
 
     Args:
         path: the folder.
-        wait: up to LOCK_TIMEOUT s, for those that look whether it is being written.
+        wait: wait up to LOCK_TIMEOUT s for processes that only check the lock.
 
     Raises:
         BlockingIOError: another process writes it.
         OSError: it cannot be opened.
     """
-    folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place would be waited for
+    folder = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # opening a pipe of this name would wait
     try:
         end = time.monotonic() + (LOCK_TIMEOUT if wait else 0.0)
         while not (own := _locked(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)) and time.monotonic() < end:
@@ -272,13 +272,13 @@ def _locked(folder: int, how: int) -> bool:
         fcntl.flock(folder, how)
     except BlockingIOError:
         return False
-    except OSError:  # a file system without locks
+    except OSError:  # the file system has no locks
         pass
     return True
 
 
 def free_name(name: str, ending: str = "", replaceable: Callable[[Path], bool] = lambda path: False) -> Path:
-    """Return the name, or the name with the first number from 2 on, that no file has."""
+    """Return the name, or if a file has it, the name with the first free number from 2 on."""
     names = chain([f"{name}{ending}"], (f"{name}-{i}{ending}" for i in count(2)))
     return next(p for p in map(Path, names) if not os.path.lexists(p) or replaceable(p))
 
@@ -304,17 +304,17 @@ def parsed(text: bytes) -> Any:
     """Parse untrusted JSON.
 
     Raises:
-        ValueError, RecursionError: it is none, or would take much more memory than its text.
+        ValueError, RecursionError: the text is no JSON, or would take much more memory than its length.
     """
     if text.count(b"{") + text.count(b"[") > len(text) // 8 + 1000:
-        raise ValueError("it is damaged")  # an empty one takes 24 times as much memory
+        raise ValueError("it is damaged")  # empty lists and objects take 24 times the memory of their text
     return json.loads(text.decode("utf-8"))
 
 
 def fits(content: Any, shape: Any) -> bool:
-    """Return whether a JSON value has a shape, with finite numbers.
+    """Return whether a JSON value has a given shape and only finite numbers.
 
-    [x]: any number of x; (x, y): these two; {str: x}: x by any name; else the type.
+    A shape is [x] for a list of any number of x, (x, y) for these two, {str: x} for x by any name, or a type.
     """
     if isinstance(shape, list):
         return isinstance(content, list) and all(fits(element, shape[0]) for element in content)

@@ -2,9 +2,9 @@
 
     ẏ = A y + B u,    z = C y + D u,    y = (q, v)
 
-A, B, C and D are the FMU's own directional derivatives, exact to rounding; deviations of states y, inputs u and
-outputs z from the operating point. An eigenvalue λ ≠ 0 of A has the frequency |λ| and the damping ratio −Re λ/|λ|.
-A sampled controller holds the effort that its law gives at the point, and has no part in the model.
+A, B, C and D are the FMU's directional derivatives, exact to rounding. y, u and z are the deviations of states, inputs
+and outputs from the operating point. An eigenvalue λ ≠ 0 of A has the frequency |λ| and the damping ratio −Re λ/|λ|. In
+the model of a sampled controller, the effort is held at the law's value at the operating point.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ Array = NDArray[np.float64]
 
 MOST_ITERATIONS = 50
 SETTLED, AT_REST = 1e-11, 1e-6
-"""Rates, beside the largest that a change of a state by one makes: where a search ends, and below
-which a point is called an equilibrium."""
+"""Rates at which the search for an equilibrium ends, and below which a point is called an equilibrium. They are
+relative to the largest derivative of a rate with respect to a state, if that is above 1.
+"""
 NEAR_JUMP = 1e-6
 PERFECT = {"control_delay": 0.0, "q_resolution": 0.0, "q_noise": 0.0, "v_noise": 0.0, "v_from_q": False}
-"""Settings with which a sampled controller gives the effort of its law at once."""
+"""Settings with which a sampled controller applies the effort of its law immediately."""
 
 
 class Mode(NamedTuple):
-    """An eigenvalue, 1/s, with its damping ratio, NaN for 0, and frequency, rad/s."""
+    """An eigenvalue, 1/s, with its damping ratio (NaN for the eigenvalue 0) and its frequency, rad/s."""
 
     eigenvalue: complex
     damping: float
@@ -42,15 +43,15 @@ class Mode(NamedTuple):
 
 
 class LinearModel(NamedTuple):
-    """A linear system; ``control.ss(*model[:4])`` converts it for python-control.
+    """Linear model; ``control.ss(*model[:4])`` converts it for python-control.
 
     Attributes:
         A, B, C, D: the matrices, SI units.
-        states, inputs, outputs: names of their rows and columns, as the FMU has them.
-        units: of all of these, by name.
+        states, inputs, outputs: the FMU's names of rows and columns.
+        units: units of states, inputs and outputs, by name.
         point: values of states and inputs at the operating point, by name.
         rates: derivatives of the states there; 0 at an equilibrium.
-        remarks: what is to be known of the point, a line each.
+        remarks: notes on the operating point, one line each.
     """
 
     A: Array
@@ -86,7 +87,7 @@ class LinearModel(NamedTuple):
 
 
 def _eigenvalues(A: Array) -> list[complex]:
-    """Return eigenvalues, their parts rounded to 0 within n ε ‖A‖ κ (κ: eigenvalue condition numbers)."""
+    """Return eigenvalues, with parts below n ε ‖A‖ κ set to 0 (κ: condition number of the eigenvalue)."""
     values, vectors = np.linalg.eig(A)
     condition = np.linalg.norm(np.linalg.pinv(vectors), axis=1)
     error = len(A) * np.finfo(float).eps * np.linalg.norm(A) * condition
@@ -104,14 +105,14 @@ def linearise(
     """Return the linear model of an FMU at an operating point.
 
     Args:
-        fmu: an FMU that gives directional derivatives, as the native flavour does.
+        fmu: an FMU with directional derivatives, such as a native one.
         at: values of inputs and parameters, and of the states ``q`` and ``v``. Without ``q`` and
-            ``v`` the point is an equilibrium that is looked for from ``q_start``.
+            ``v`` the point is the equilibrium near ``q_start``.
         inputs, outputs: groups of variables, e.g. ``["tau_cmd"]``; None: all.
 
     Raises:
-        InputError: a name or value is wrong, or the FMU gives no derivatives.
-        SimulationError: there is no equilibrium near, or the model is not linear at the point.
+        InputError: a name or value is wrong, or the FMU has no derivatives.
+        SimulationError: there is no equilibrium near ``q_start``, or the plant has no linear model at the point.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
     if not fmu.description.coSimulation.providesDirectionalDerivative or "der(q[1])" not in (fmu.variables):
@@ -136,7 +137,7 @@ def linearise(
 
 
 def _values(fmu: Fmu, given: Mapping[str, Setting]) -> dict[str, Value]:
-    """Return the values of inputs and parameters; a state, or its element, is set by its parameter."""
+    """Return the values of inputs and parameters, with a state or its element as the parameter that sets it."""
     values: dict[str, Value] = {}
     for name, value in given.items():
         group, bracket, index = name.partition("[")
@@ -200,7 +201,7 @@ class _Point:
         )
 
     def hold_effort(self, period: float) -> None:
-        """Sample the controller from here on."""
+        """Hold the effort: sample the controller at the present state, with a period."""
         self._values["control_period"] = period
         self._instance.reset()
         self._instance.initialise(0.0, np.inf, self._values)
@@ -234,7 +235,7 @@ class _Point:
         )
 
     def _remarks(self) -> list[str]:
-        """Return notes on a singular pose, joints that stick or saturate; raise where no linear model exists."""
+        """Return notes on a singular pose and on joints that stick or saturate; raise if there is no linear model."""
         limits = [self._read(self._fmu.vector(name)) for name in ("q", "q_min", "q_max")]
         for joint, q, low, high in zip(self._fmu.joints, *limits):
             if q in (low, high):
@@ -251,7 +252,7 @@ class _Point:
                 raise SimulationError(
                     "the frame is half a turn from quat_des, where the way back jumps: choose another q or quat_des"
                 )
-        rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # all that J⁺ is of
+        rows = [*self._fmu.vector("xd"), *self._fmu.vector("omega")]  # the rows of the task Jacobian
         if "rcond" not in self._fmu.variables or not rows:
             return remarks
         jacobian = self._instance.derivatives(rows, self._v)
@@ -267,7 +268,7 @@ class _Point:
         return remarks
 
     def _stuck(self) -> list[str]:
-        """Return notes on joints that their friction holds; raise where one begins to slip."""
+        """Return notes on joints that stick; raise if one begins to slip."""
         if "friction[1]" not in self._fmu.variables:
             return []
         remarks = []
@@ -283,7 +284,7 @@ class _Point:
         return remarks
 
     def _saturated(self) -> list[str]:
-        """Return notes on joints at their effort limit; raise where one is exactly at it."""
+        """Return notes on saturated joints; raise if an effort is exactly at its limit."""
         if not {**self._fmu.start_values, **self._values}.get("limit_effort"):
             return []
         self._instance.reset()

@@ -1,4 +1,4 @@
-"""HTML of results for notebooks: a table of facts beside a small SVG picture, without scripts."""
+"""HTML of results for notebooks: a table of facts and a small SVG picture, without scripts."""
 
 from collections.abc import Iterable, Mapping
 from html import escape
@@ -11,11 +11,11 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 
 WIDTH, HEIGHT, EDGE = 320.0, 160.0, 18.0  # px; the edge holds the labels
 SMALLEST_RANGE = 1e-9  # smaller ranges are drawn as one value
-MOST_PARTS = 300  # about one a pixel
+MOST_PARTS = 300  # about one part for each pixel
 
 
 def card(title: str, facts: Mapping[str, object], picture: str = "") -> str:
-    """Return a table with a title and a row for each fact, and a picture beside it."""
+    """Return a table with a title, a row for each fact, and a picture next to it."""
     rows = (f"<tr><th>{escape(name)}</th><td>{escape(str(fact))}</td></tr>" for name, fact in facts.items())
     table = f"<table><caption>{escape(title)}</caption>{''.join(rows)}</table>"
     return f'<div style="display:flex;gap:1em;flex-wrap:wrap;align-items:center">{table}{picture}</div>'
@@ -24,13 +24,13 @@ def card(title: str, facts: Mapping[str, object], picture: str = "") -> str:
 def picture(
     curves: Iterable[tuple[ArrayLike, ArrayLike]], x: str, y: str, *, dots: bool = False, equal: bool = False
 ) -> str:
-    """Return an SVG picture of curves in one pair of axes, without points that are not finite.
+    """Return an SVG picture of curves in one pair of axes; points that are not finite are left out.
 
     Args:
         curves: x and y values of each curve, drawn in the order of ``COLOURS``.
-        x, y: axis labels; the picture adds the range that each axis has.
-        dots: draw points and no lines.
-        equal: give both axes one scale.
+        x, y: axis labels; the picture adds the range of each axis.
+        dots: draw points instead of lines.
+        equal: use the same scale for both axes.
     """
     kept = [_thinned(np.column_stack(curve)) for curve in curves]
     points = np.concatenate([*kept, np.empty((0, 2))])
@@ -60,7 +60,7 @@ def picture(
 
 
 def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the finite points of a curve, or of each part of a long one the lowest and the highest."""
+    """Return the finite points of a curve; of a long curve, the lowest and the highest point of each part."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) <= 2 * MOST_PARTS:
         return points

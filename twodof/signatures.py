@@ -1,4 +1,4 @@
-"""Keywords that functions share, and the defaults of callbacks."""
+"""Shared keywords of functions, and default callbacks."""
 
 from collections.abc import Callable, Iterable
 from inspect import Parameter, signature
@@ -17,9 +17,9 @@ def ignore(*_: object) -> None:
 
 
 def with_keywords_of(*delegates: Callable[..., object]) -> Callable[[Function], Function]:
-    """Return a decorator that shows the delegates' keywords in the signature of a function with ``**options``.
+    """Return a decorator that adds the delegates' keywords to the signature of a function with ``**options``.
 
-    Type checkers know them by PEP 692; ``help``, editors and ``check_keywords`` know them by this.
+    Type checkers know these keywords from PEP 692; ``help``, editors and ``check_keywords`` read the signature.
     """
 
     def shown(function: Function) -> Function:
@@ -39,7 +39,7 @@ def check_keywords(given: Iterable[str], called: Callable[..., object]) -> None:
     """Refuse keywords that a function with ``**options`` does not accept.
 
     Raises:
-        TypeError: naming the function that was called, and the nearest keyword that it takes.
+        TypeError: a keyword is unknown; the message names the function and its nearest keyword.
     """
     import difflib
 

@@ -14,9 +14,9 @@ def versions(*packages: str) -> dict[str, str]:
 
 
 def install(extra: str) -> str:
-    """Return the remedy for a missing extra: pip with the source of this package, or with the extra's requirements.
+    """Return the remedy for a missing extra: a pip command with this package's source or the extra's requirements.
 
-    The package may be on no index: where its source is gone, the requirements are named one by one.
+    The package may be on no index. If its source was removed, the command names the requirements one by one.
     """
     import importlib.metadata as metadata
     import json
@@ -41,7 +41,7 @@ def install(extra: str) -> str:
 
 @contextmanager
 def needing(kind: type[Exception], task: str, extra: str) -> Iterator[None]:
-    """Raise ``kind``, with the remedy, where a package of an extra is missing that a task needs."""
+    """Raise ``kind`` with the remedy if an extra's package is missing that a task needs."""
     try:
         yield
     except ImportError as missing:
@@ -50,7 +50,7 @@ def needing(kind: type[Exception], task: str, extra: str) -> Iterator[None]:
 
 @cache
 def _version(package: str) -> str | None:
-    import importlib.metadata  # takes longer than all else that a short command needs
+    import importlib.metadata  # takes longer to import than everything else in a short command
 
     try:
         return importlib.metadata.version(package)

@@ -166,8 +166,7 @@ class Tables:
 
 
 def _records(path: Path, budget: ReadBudget, wanted: Sequence[int] = READ) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and bytes of each record up to the footer; for a chunk, only its content.
-    """
+    """Yield opcode and bytes of each record up to the footer; for a chunk, only its content."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise DamageError(f"'{path.name}' is no MCAP file")

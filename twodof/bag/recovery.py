@@ -190,7 +190,7 @@ def copy_messages(folder: Path, files: Sequence[Path], new: Path, storage: str) 
 
 
 class _Topics:
-    """Adder of topics to a bag, as they appear."""
+    """Topics of a new bag, added as they appear."""
 
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer

@@ -55,7 +55,7 @@ class McapStorage(McapWriter):
     _end = 0  # end of the last chunk that was written
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Write N messages of each connection, one for each stamp."""
+        """Write messages, one of each connection for each of the N stamps."""
         if not messages:
             return
         parts, ends, chunk = [], [0], self.chunk
@@ -145,7 +145,7 @@ class Sqlite3Storage(Sqlite3Writer):
         self._rows: list[tuple[int, int, bytes]] = []
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Keep messages until the next flush, one of each connection for each of N stamps."""
+        """Keep messages until the next flush, one of each connection for each of the N stamps."""
         parts = [(number, rows.tobytes(), rows.shape[1]) for number, rows in messages.items()]
         for k, stamp in enumerate(stamps.tolist()):
             self._rows += [(n, stamp, data[k * size : (k + 1) * size]) for n, data, size in parts]
@@ -189,7 +189,7 @@ class BagWriter(Writer):
             self.storage.packing = self._packing
 
     def write_all(self, stamps: Stamps, messages: Mapping[int, Rows]) -> None:
-        """Write messages, one of each connection for each of N stamps, at the next flush."""
+        """Write messages, one of each connection for each of the N stamps, at the next flush."""
         assert self.storage is not None
         self.storage.write_all(stamps, messages)
         for connection in messages:

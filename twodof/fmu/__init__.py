@@ -2,7 +2,7 @@
 
 from contextlib import redirect_stdout
 
-with redirect_stdout(None):  # where FMPy says that for aarch64-linux it has no logger of FMI 2.0
+with redirect_stdout(None):  # FMPy prints on aarch64-linux that it has no logger for FMI 2.0
     import fmpy  # noqa: F401
 
 from ..export.start_values import Setting, no_variable, resolve

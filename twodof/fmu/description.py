@@ -27,7 +27,7 @@ from ..plant.urdf import RobotError, read_urdf
 from .validation import is_plain_xml, read_description
 
 NUMBERS: dict[str, Callable[[str], float]] = {"Real": float, "Integer": int, "Boolean": ("true", "1").__contains__}
-"""Types of variables that have values here, and how their texts are read."""
+"""Supported types of variables, and functions that parse their start values."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class Scalar:
     """A scalar variable, or an element of an array of FMI 3.0.
 
     Attributes:
-        name: of an element with its 1-based indices, e.g. "q[1]", "der(q[1])".
-        causality, unit: as the description has them.
-        type: "Real" for Float64 too, "Integer" for Int32, "Boolean", or another as the description has it.
-        start: text of the start value; None where there is none.
-        description: of the scalar, or of the array as a whole.
+        name: name; an element's name has 1-based indices, e.g. "q[1]", "der(q[1])".
+        causality, unit: as in the description.
+        type: "Real" also for Float64, "Integer" also for Int32, "Boolean", or another type of the description.
+        start: text of the start value; None without one.
+        description: description of the scalar, or of the whole array.
         reference: value reference.
-        element: 0-based place in the array, row by row.
+        element: 0-based index in the array, row by row.
     """
 
     name: str
@@ -68,13 +68,13 @@ class Fmu:
         path: the file.
         description: FMPy's model description.
         variables: by name, in the order of the description.
-        members: checksums of all that is in the file, by name.
-        platforms: FMI names of the platforms that it has binaries for, e.g. "linux64".
-        robot: name of the robot; "" where the FMU does not say.
-        joints: joint names, one for each q[i]; "joint1", … where the FMU does not say.
-        frame, root, axes: the task frame, the frame its position is expressed in and the task
-            axes; "" where the FMU does not say.
-        control: name of its control law, e.g. "task"; likewise.
+        members: checksums of the file's members, by name.
+        platforms: FMI names of the platforms of its binaries, e.g. "linux64".
+        robot: name of the robot; "" if unknown.
+        joints: joint names, one for each q[i]; "joint1", … if unknown.
+        frame, root, axes: the task frame, the frame in which its position is expressed, and the task
+            axes; "" if unknown.
+        control: name of the control law, e.g. "task"; "" if unknown.
     """
 
     path: Path
@@ -110,7 +110,7 @@ class Fmu:
 
     @property
     def platform(self) -> str:
-        """Name of this machine in the FMU's version of FMI; "" where it has none."""
+        """Platform of this machine in the FMU's version of FMI; "" if FMI has no name for it."""
         return host_platform() if self.version == 2 else str(fmpy.platform_tuple)
 
     @property
@@ -126,7 +126,7 @@ class Fmu:
 
     @property
     def urdf(self) -> str | None:
-        """Text of resources/robot.urdf, None where there is none."""
+        """Text of resources/robot.urdf; None without it."""
         content = read_resource(self, "robot.urdf")
         try:
             return None if content is None else content.decode("utf-8")
@@ -135,7 +135,7 @@ class Fmu:
 
     @property
     def start_values(self) -> dict[str, float | bool]:
-        """Return start values of inputs and parameters, as described."""
+        """Return start values of inputs and parameters, by the model description."""
         settable = (v for v in self.variables.values() if v.causality in ("input", "parameter"))
         return {v.name: v.start_value for v in settable if v.start_value is not None}
 
@@ -149,7 +149,7 @@ class Fmu:
 
 
 def _pose(fmu: Fmu) -> str:
-    """Return a picture of the robot at its start, seen along the axis in which it extends least; "" without a URDF."""
+    """Return a picture of the robot at its start, seen along the axis of its smallest extent; "" without a URDF."""
     from ..geometry.kinematics import Kinematics  # SciPy takes half a second to import
 
     try:
@@ -168,8 +168,8 @@ def load_fmu(path: str | Path) -> Fmu:
     """Read and check an FMU's description, without unzipping or running it.
 
     Raises:
-        FmuError: the file is missing, no zip, not FMI 2.0 or 3.0 co-simulation, unsafe to unzip, or
-            has no outputs q[i] and v[i].
+        FmuError: the file is missing, is no zip archive, is unsafe to unzip, is no co-simulation FMU of FMI 2.0 or 3.0,
+            or has no outputs q[i] and v[i].
     """
     fmu = load_any_fmu(path)
     n = len(fmu.vector("q"))
@@ -186,10 +186,10 @@ def load_fmu(path: str | Path) -> Fmu:
 
 
 def load_any_fmu(path: str | Path) -> Fmu:
-    """Read the description of a co-simulation FMU, which need not be a robot's; its joints may be none.
+    """Read the description of any co-simulation FMU, of a robot or not; ``joints`` may be empty.
 
     Raises:
-        FmuError: as of ``load_fmu``.
+        FmuError: as ``load_fmu``, but q[i] and v[i] are not required.
     """
     path = Path(path)
     xml, members = _read(path)
@@ -202,7 +202,7 @@ def load_any_fmu(path: str | Path) -> Fmu:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
         raise FmuError(f"'{path}' is FMI {description.fmiVersion} {kind}; FMI 2.0 or 3.0 co-simulation is needed")
     simulation = root.find("CoSimulation[@providesDirectionalDerivatives]")
-    if simulation is not None:  # FMPy knows 2.0's word for it
+    if simulation is not None:  # FMPy expects the name of FMI 2.0
         derivatives = simulation.get("providesDirectionalDerivatives") in ("true", "1")
         description.coSimulation.providesDirectionalDerivative = derivatives
     fmu = Fmu(
@@ -254,7 +254,7 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
     """Open the FMU's file, if it is still the file whose description was read.
 
     Raises:
-        FmuError: it is another one by now, or what is done with it fails.
+        FmuError: the file was replaced meanwhile, or cannot be read.
     """
     try:
         with zipfile.ZipFile(fmu.path) as archive:
@@ -266,14 +266,14 @@ def opened(fmu: Fmu) -> Iterator[zipfile.ZipFile]:
 
 
 def read_resource(fmu: Fmu, name: str) -> bytes | None:
-    """Return a file of the FMU's resources/ folder, None where there is none."""
+    """Return a file of the FMU's resources/ folder; None without it."""
     with opened(fmu) as archive, suppress(KeyError):
         return read_member(archive, f"resources/{name}", MAX_RESOURCE)
     return None
 
 
 def _read(path: Path) -> tuple[bytes, dict[str, int]]:
-    """Return modelDescription.xml and the members' checksums of an archive that is safe to unzip."""
+    """Check that an archive is safe to unzip; return its modelDescription.xml and its members' checksums."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -310,7 +310,7 @@ def _platforms(members: Iterable[str], identifier: str) -> tuple[str, ...]:
 
 
 def _vendor_annotation(root: ET.Element) -> dict[str, Any]:
-    """Return the robot's facts from the vendor annotation; none in third-party FMUs."""
+    """Return the robot's facts from the vendor annotation; empty for third-party FMUs."""
     places = "VendorAnnotations/Tool[@name='twodof']", "Annotations/Annotation[@type='twodof']"
     robots = (root.find(f"{place}/Robot") for place in places)
     robot = next((robot for robot in robots if robot is not None), ET.Element("Robot"))

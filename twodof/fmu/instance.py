@@ -27,10 +27,10 @@ from .description import Fmu, opened
 
 logger = logging.getLogger("twodof.fmu")
 LEVELS = {0: logging.INFO, 1: logging.WARNING, 2: logging.ERROR, 3: logging.ERROR}
-"""Levels of FMI status ok, warning, discard and error; fatal is CRITICAL."""
+"""Log levels of the FMI statuses ok, warning, discard and error; fatal is CRITICAL."""
 WARNING = fmi2.fmi2Warning
 READ = ("documentation/", "sources/")
-"""Folders of an FMU that no library looks into."""
+"""Folders of an FMU that its library does not need."""
 LOADING = Lock()
 Values = Array[c_double]
 
@@ -42,7 +42,7 @@ class _Staying:
         return getattr(os, name)
 
     def chdir(self, folder: str) -> None:
-        """Stay in the working directory."""
+        """Do nothing."""
 
 
 @contextmanager
@@ -60,10 +60,10 @@ def _loading() -> Iterator[None]:
 
 
 class Instance:
-    """An instance of an FMU, from instantiation on, in the order of calls that FMI allows.
+    """An instance of an FMU; its methods must be called in the order that FMI allows.
 
-    FMU log messages go to the logger "twodof.fmu". A call that the FMU does not accept raises
-    SimulationError with the FMU's own words.
+    FMU log messages go to the logger "twodof.fmu". A call that the FMU refuses raises SimulationError with the FMU's
+    message.
 
     What is called at each step goes past FMPy, by functions of the library that know no types, with
     arguments that have theirs already: to convert those takes half of a call. Vectors of FMI 3.0 are
@@ -77,14 +77,14 @@ class Instance:
         self.fmu = fmu
         self._said = ""
         self._fatal = False
-        self._ends = c_bool()  # what doStep of FMI 3.0 says
+        self._ends = c_bool()  # doStep's argument terminateSimulation in FMI 3.0
         self._t, self._h = c_double(), c_double()
         starts: dict[tuple[str, int], list[float | bool]] = {}
         for v in fmu.variables.values():
             vector = starts.setdefault((v.type, v.reference), [])
-            if v.element == len(vector):  # no alias, which has the reference of another
+            if v.element == len(vector):  # an alias has the reference of another vector
                 vector.append(v.start_value or 0.0)
-        self._starts, self._vectors = starts, dict(starts)  # by type and value reference
+        self._starts, self._vectors = starts, dict(starts)  # start and latest values by type and value reference
         identifier = fmu.description.coSimulation.modelIdentifier
         try:
             self.slave = self._instantiate(
@@ -96,7 +96,7 @@ class Instance:
             raise FmuError(f"'{fmu.path}' cannot be loaded: {self._said or error}") from error
 
     def _instantiate(self, **what: str) -> Any:
-        from fmpy.logging import addLoggerProxy  # none for aarch64-linux, which 2.0 has no name for
+        from fmpy.logging import addLoggerProxy  # missing on aarch64-linux, for which FMI 2.0 has no name
 
         with _loading():
             slave = fmi2.FMU2Slave(**what)
@@ -113,7 +113,7 @@ class Instance:
         return slave
 
     def initialise(self, start_time: float, stop_time: float, values: Mapping[str, float | bool]) -> None:
-        """Set start values and pass initialisation mode; the stop time may be infinite."""
+        """Set start values, and enter and exit initialisation mode; the stop time may be infinite."""
         self.set(values)
         self._set_up(startTime=start_time, stopTime=stop_time if stop_time < inf else None)
         self._accept(self.slave.exitInitializationMode)
@@ -158,7 +158,7 @@ class Instance:
         return [reference for _, reference in vectors], columns, size
 
     def _of_size(self, size: int) -> tuple[int, ...]:
-        """Return the number of values where the version of FMI has it as an argument."""
+        """Return the number of values as an argument, if this version of FMI has this argument."""
         return ()
 
     def reader(self, names: Sequence[str]) -> Callable[[], Values]:
@@ -208,7 +208,7 @@ class Instance:
         self.slave.freeInstance()
 
     def _refuse(self, status: int) -> NoReturn:
-        """Raise the error of a call's status, with the FMU's own message where there is one."""
+        """Raise the error of a call's status, with the FMU's own message, if any."""
         self._fatal = status == fmi2.fmi2Fatal
         outcome = "discarded" if status == fmi2.fmi2Discard else "failed"
         reason = f"a call failed, status {status}" if status > WARNING else "the FMU ends the run"
@@ -231,7 +231,7 @@ class Instance:
         return bool(self._said)
 
     def _accept(self, function: Callable[..., object], *arguments: object, **named: object) -> None:
-        """Make a call that must log no error: pythonfmu's wrapper cannot return a status."""
+        """Make a call and raise if it logs an error, because pythonfmu's wrapper cannot return an error status."""
         self._said = ""
         try:
             function(*arguments, **named)
@@ -271,9 +271,10 @@ class Instance3(Instance):
 def instantiate(fmu: Fmu) -> Iterator[Instance]:
     """Instantiate an FMU from a temporary folder, and free the instance at the end.
 
-    It is unzipped into a temporary folder, but for what is there to be read by people.
+    Its documentation is not unzipped.
 
-    An FmuError says that it has no binary for this platform, or cannot be unzipped or loaded.
+    Raises:
+        FmuError: it has no binary for this platform, or cannot be unzipped or loaded.
     """
     if fmu.platform not in fmu.platforms:
         here = fmu.platform or f"{fmpy.platform_tuple}, which FMI 2.0 has no name for"

@@ -1,4 +1,4 @@
-"""Check a modelDescription.xml from elsewhere before FMPy reads it."""
+"""Check an untrusted modelDescription.xml before FMPy reads it."""
 
 import codecs
 import io
@@ -15,7 +15,7 @@ from fmpy.model_description import ModelDescription
 from ..bounds import MAX_DIMENSIONS, MAX_ELEMENTS, MAX_NAME
 
 SCHEMAS = {"1": "fmi1/fmiModelDescription", "2": "fmi2/fmi2ModelDescription", "3": "fmi3/fmi3ModelDescription"}
-"""Files of FMPy's folder of schemas, by the major version of FMI."""
+"""Schema files in FMPy, by the major version of FMI."""
 
 
 def is_plain_xml(xml: bytes) -> bool:
@@ -46,7 +46,7 @@ def read_description(root: ET.Element, xml: bytes, **more: bool) -> ModelDescrip
 def check_description(root: ET.Element, xml: bytes) -> None:
     """Check the sizes of names and arrays, and the schema.
 
-    FMPy checks the schema too, but of a parsed tree, where libxml2 takes time with the square of the number of errors.
+    FMPy also checks the schema, but on a parsed tree, for which libxml2 takes quadratic time in the number of errors.
 
     Raises:
         ValueError: a name or an array is too large.
@@ -59,7 +59,7 @@ def check_description(root: ET.Element, xml: bytes) -> None:
 
 
 def _check_arrays(root: ET.Element) -> None:
-    """Raise ValueError for long names, which elements repeat, invalid sizes, and too many elements, aliases counted."""
+    """Raise ValueError for names that are too long, invalid sizes, and too many elements, including aliases."""
     sizes = {v.get("valueReference"): v.get("start") for v in root.iterfind("ModelVariables/*")}
     room = MAX_ELEMENTS
     for variable in root.iterfind("ModelVariables/*"):

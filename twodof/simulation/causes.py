@@ -30,27 +30,27 @@ KINDS = {
     "effort": "an effort beyond the URDF's limit",
     "velocity": "a speed beyond the URDF's limit",
 }
-"""Kinds of causes in their order: one may bring about those after it."""
-MOST = 20  # causes of a verdict
-FLOOR = 1e-4  # m, rad: an error below is that of the integrator
-MANY_CHANGES = 12  # of a target from which on it moves, and is followed
-OFTEN = 0.05  # of the samples from which on a state is a cause, and not a passing one
+"""Kinds of causes in their order; a cause may lead to those after it."""
+MOST = 20  # causes in a verdict
+FLOOR = 1e-4  # m, rad: a smaller error is the integrator's
+MANY_CHANGES = 12  # changes of a target beyond which it counts as moving
+OFTEN = 0.05  # share of samples from which on a state is a cause
 NEAR_SINGULAR = 0.02  # ratio of the smallest to the largest singular value
-LEAST_TURN = 2.0 * pi  # rad: a larger target of a joint may be in degrees
-MILLIMETRES = 10.0  # m: a target farther away is not meant in metres
-CREEPING = 1e-3  # of a joint's largest speed: friction stops one that is overdamped without end
+LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
+MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
+CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
-FAST = 0.25  # changes of a velocity's sign a sample, from which on the step shows
+FAST = 0.25  # sign changes of a velocity per sample that indicate too large a step
 
 
 class Cause(NamedTuple):
-    """A cause in words, with its kind of KINDS.
+    """A cause in words, and its kind, a key of KINDS.
 
     Attributes:
-        share: of the samples, or of a limit; the larger the worse. 0 where there is none.
-        joint: whose it is, or "".
-        time: when it began to be seen, s since the first sample; None where it is of all the run.
-        point: nearest reachable position in the root frame, m; () of other kinds.
+        share: share of the samples or of a limit, by which causes are ranked; 0 without one.
+        joint: joint concerned, or "".
+        time: time at which it was first seen, s since the first sample; None if it holds for the whole run.
+        point: nearest reachable position in the root frame, m; () for other kinds.
     """
 
     kind: str
@@ -65,9 +65,9 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
     """Return the causes, the root first.
 
     Args:
-        judge: what has all samples.
+        judge: the judge of all samples.
         missed: outputs that are not at their targets: "x", "quat" or "q".
-        motion: at the end.
+        motion: motion at the end of the run.
     """
     found = [*_degrees(judge), *_beyond_limits(judge)]
     ill = bool(missed) or motion == "diverging"
@@ -142,7 +142,7 @@ def _reach(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def point_text(values: Array) -> str:
-    """Return a vector in words, without what is rounding."""
+    """Return a vector as text, without rounding errors."""
     return f"({', '.join(f'{value:.4g}' for value in np.round(values, 9) + 0.0)})"
 
 
@@ -154,7 +154,7 @@ def _gains(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def _late(judge: Judge, inside: NDArray[np.bool_]) -> float:
-    """Return the share of the last quarter of samples, or of all for a moving target, at which a condition holds."""
+    """Return the share of samples at which a condition holds: of the last quarter, or of all for a moving target."""
     return float(inside[0 if judge.changes > MANY_CHANGES else -(len(inside) // 4 + 1) :].mean())
 
 
@@ -175,7 +175,7 @@ def _at_limits(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
 
 
 def _chain(judge: Judge) -> list[Joint]:
-    """Return the joints that move the end effector to its target; none where that is not known."""
+    """Return the joints that move the end effector; empty if they are unknown."""
     robot, frame = judge.setup.robot, judge.setup.frame
     return [] if robot is None or frame not in robot.links or "x" not in judge.aims else robot.chain(frame)
 
@@ -260,7 +260,7 @@ def _singular(judge: Judge) -> Iterator[Cause]:
 
 
 def _slow(judge: Judge, missed: Sequence[str]) -> Iterator[Cause]:
-    """Yield the time that shrinking errors will still take, by their rate at the end."""
+    """Yield a cause for each output whose error still shrinks, with the remaining time by its rate."""
     t = judge.history()
     for name in missed:
         aim = judge.aims[name]

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..fmu import Fmu, load_fmu
 from .input_values import Changes, Setting, Value, read_changes, resolve
 
-TIME_TOLERANCE = 1e-9  # of a communication step
+TIME_TOLERANCE = 1e-9  # fraction of a communication step
 NANOSECONDS = 1_000_000_000
 LOG = logging.getLogger(__name__)
 LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 seconds
@@ -27,17 +27,17 @@ LATEST_STAMP = (2**31 - 1) * NANOSECONDS  # builtin_interfaces/Time has int32 se
 
 @dataclass(frozen=True, repr=False)
 class Experiment:
-    """A run of an FMU, checked before anything is instantiated; made by ``experiment``.
+    """Checked settings of a run, made by ``experiment``.
 
     Attributes:
         fmu: the FMU.
         start_time, step: s.
         steps: N, the number of communication steps; infinite for a run without end.
-        start_values: all inputs and parameters with the values they start with.
-        given: those of them that differ from the model description on purpose.
-        changes: inputs over time, after the start.
-        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
-        commanders: times in s, and facts of each third party whose commands are followed from then.
+        start_values: start values of all inputs and parameters.
+        given: start values that the settings give.
+        changes: times, s, and the inputs that change at them, after the start.
+        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
+        commanders: times in s, and facts of each node whose commands are followed from that time on.
     """
 
     fmu: Fmu
@@ -62,10 +62,10 @@ class Experiment:
         """Return the stamp of the first sample if the run began now, ns since the epoch.
 
         Raises:
-            InputError: ROS 2 has no such time.
+            InputError: ROS 2's messages cannot express this time.
         """
         start = self.stamp_start
-        # a fraction: a double of today's nanoseconds is good to 256 only
+        # a fraction, because doubles of today's time in ns are multiples of 256
         first = time.time_ns() if start is None else round(Fraction(start) * NANOSECONDS)
         last = first + (self.steps * self.step * NANOSECONDS if self.steps < inf else 0)
         if not 0 <= first <= last <= LATEST_STAMP:
@@ -101,14 +101,16 @@ def experiment(
 
     Args:
         fmu: the FMU or its path.
-        start_time, stop_time, step: s; whole steps, the stop may be infinite. None: the FMU's default, or 5 s, 10 ms.
-        settings: start values by name; a vector's name takes one value for all elements or a sequence.
+        start_time, stop_time, step: s; the run has whole steps, and the stop time may be infinite. None: the FMU's
+            default, or else 5 s and 10 ms.
+        settings: start values by name; a vector has one value for all elements, or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
-        changes: instead of a file, times, s, and the inputs that change then; earlier ones hold at the start.
-        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's.
+        changes: times, s, and the inputs that change at them, instead of a file; changes before the start time
+            apply at the start.
+        stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
 
     Raises:
-        InputError, FmuError: naming what is wrong.
+        InputError, FmuError: an argument or the FMU is invalid; the message names it.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
     step = default(fmu, "stepSize", 0.01) if step is None else step
@@ -139,7 +141,7 @@ def experiment(
         changes=[*due],
         stamp_start=stamp_start,
     )
-    run.first_stamp()  # which refuses what has none
+    run.first_stamp()  # raises for a time that ROS 2 cannot express
     end, source = run.time(run.steps), "`changes`" if input_file is None else f"'{input_file}'"
     if late := sum(t > end + TIME_TOLERANCE * step for t, _ in run.changes):
         LOG.warning(
@@ -149,7 +151,7 @@ def experiment(
 
 
 def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str, Value]:
-    """Remove the changes that are due by t, and return the values that they set."""
+    """Remove the changes that are due at t; return the values that they set."""
     values: dict[str, Value] = {}
     while due and due[0][0] <= t:
         values |= due.popleft()[1]

@@ -30,12 +30,12 @@ OPERATORS: dict[object, Callable[..., Any]] = {
     ("min", 2): np.minimum,
     ("max", 2): np.maximum,
 }
-"""Operators, and functions by their names and numbers of arguments."""
+"""Operators, and functions by name and number of arguments."""
 Values = Mapping[str, Any]
 
 
 class Expression(NamedTuple):
-    """A checked expression, the names that it has, and its value for numbers, or arrays of equal lengths, by name."""
+    """A checked expression: its names, and a function that evaluates it for numbers or equal-sized arrays by name."""
 
     text: str
     names: tuple[str, ...]
@@ -43,7 +43,7 @@ class Expression(NamedTuple):
 
 
 def full_name(name: str, known: Iterable[str]) -> str:
-    """Return the known name that equals a name, begins with it, or equals "final_" + name; "" if none or several."""
+    """Return the known name that equals, begins with, or is "final_" + a name; "" for none or several."""
     names = [*known]
     for candidate in (name, f"final_{name}"):
         if candidate in names:
@@ -53,10 +53,10 @@ def full_name(name: str, known: Iterable[str]) -> str:
 
 
 def expression(text: str, known: Iterable[str], *, condition: bool) -> Expression:
-    """Read an expression of known names: a condition, as "error > 1e-3", or a value, as "settling + overshoot".
+    """Read an expression of known names: a condition such as "error > 1e-3", or a value such as "settling + overshoot".
 
     Raises:
-        InputError: it is none, or has a name that is not known.
+        InputError: the text is no such expression, or has an unknown name.
     """
     known = tuple(known)
     try:
@@ -83,7 +83,7 @@ def expression(text: str, known: Iterable[str], *, condition: bool) -> Expressio
 
 
 def _compiled(node: ast.expr, names: list[str], condition: bool = False) -> Callable[[Values], Any]:
-    """Return an expression as a function, and add its names; raise ValueError for any other content."""
+    """Return an expression as a function and collect its names; raise ValueError for any other syntax."""
     if isinstance(node, ast.Compare) != condition:
         raise ValueError
     parts: list[ast.expr] = []

@@ -16,14 +16,14 @@ from ..plant.variables import GAINS
 from ..plant.variables import Value as Value
 
 Changes = list[tuple[float, dict[str, Value]]]
-"""Times in s, ascending, and the inputs that take new values there."""
+"""Ascending times, s, and the new values of inputs at these times."""
 
 
 def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Value]) -> None:
-    """Refuse inputs that would end a run and may arrive at any time.
+    """Refuse inputs that would end the run, for sources that may send them at any time.
 
     Raises:
-        InputError: a gain below 0, or with the others that are held a quaternion of zeros.
+        InputError: a gain is negative, or the target quaternion would be zero.
     """
     for name, value in asked.items():
         if name.partition("[")[0] in GAINS and value < 0.0:
@@ -36,10 +36,10 @@ def check_going_on(fmu: Fmu, asked: Mapping[str, Value], held: Mapping[str, Valu
 def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     """Read inputs over time from a CSV in FMPy's form: a column ``time``, and one for each input.
 
-    Columns are named as in settings. A row holds until the next row; before the first, start values hold.
+    Columns have the names of settings. A row applies until the next row. Start values apply before the first row.
 
     Raises:
-        InputError: naming the file, and the row or column at fault.
+        InputError: the file is invalid; the message names the file and the row or column.
     """
     rows = _rows(path)
     _, names = next(rows, (0, None))
@@ -76,7 +76,7 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
 
 
 def _header_remedy(cells: list[str]) -> str:
-    """Return what to change in a CSV's first line."""
+    """Return a remedy for the first line of a CSV file."""
     line = ",".join(cells)
     if mark := next((mark for mark in (";", "\t") if mark in line), None):
         kind = "semicolons" if mark == ";" else "tabs"
@@ -100,7 +100,7 @@ def _inputs(fmu: Fmu, path: str | Path, name: str) -> list[str]:
 
 
 def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield non-empty rows with their line numbers; quotes do not span lines."""
+    """Yield non-empty rows with their line numbers; a quoted cell must not span lines."""
     cells = 0
     try:
         check_file(path, MAX_TABLE)

@@ -1,9 +1,9 @@
-"""The samples of a run as the numbers by which it is judged, in constant memory.
+"""Reduce the samples of a run to the numbers of its verdict, in constant memory.
 
-With e_k = x_des − x_k, the end effector's error at t_k, or under joint control e_k = q_des − q_k, and d = e_0 / |e_0|,
-its first direction; |·| is the Euclidean norm over the task axes or joints, h the communication step, θ_k the angle
-between the end effector's orientation and its target. Nothing is interpolated: times are those of samples, and
-extremes those of samples. e_0 is the error at the last change of the target.
+Definitions: e_k = x_des − x_k is the error of the end effector at t_k; under joint control e_k = q_des − q_k. e_0 is
+the error at the last change of the target, and d = e_0 / |e_0| its direction. |·| is the Euclidean norm over the task
+axes or joints, h the communication step, and θ_k the angle between the end effector's orientation and its target.
+Nothing is interpolated: times and extremes are those of samples.
 """
 
 import io
@@ -16,11 +16,11 @@ from ..plant.variables import EXACT as EXACT
 from .setup import Array, Setup
 
 BAND = 0.02
-"""Band of the settling time, as a share of the initial error."""
-SMALLEST_MOVE = 1e-9  # m: below, a run that starts at its target has no band to settle in
-AT_LIMIT = 1e-9  # rad or m: a joint that the plant has stopped is at its limit to the last bit
-BLOCK = 8192  # samples that are judged at a time; a smaller block finds its code and data out of the cache
-KEPT = 2048  # least samples of the whole run, and of its end, that are kept
+"""Band of the settling time, as a fraction of the initial error."""
+SMALLEST_MOVE = 1e-9  # m: a smaller move counts as a start at the target, without a settling time
+AT_LIMIT = 1e-9  # rad or m; the plant sets a stopped joint to its limit exactly
+BLOCK = 8192  # samples that are judged at a time; smaller blocks suffer from cold caches
+KEPT = 2048  # minimum number of kept samples, of the whole run and of its end
 OUTPUTS = ("q", "v", "x", "tau", "quat")
 TARGETS = {"x": "x_des", "quat": "quat_des", "q": "q_des"}
 
@@ -49,23 +49,24 @@ class Aim:
 class Judge:
     """Accumulator of a run's samples.
 
-    A master writes each row of outputs to ``rows``, says when inputs ``change``, and calls ``flush`` every BLOCK rows.
+    The master writes each row of outputs to ``rows``, reports changed inputs by ``change``, and calls ``flush`` after
+    each BLOCK rows.
 
     Args:
         setup: the run's robot and settings.
-        sizes: values of each of OUTPUTS in a row, 0 where the run has none.
+        sizes: number of values of each of OUTPUTS in a row, 0 if the run lacks it.
 
     Attributes:
         count: samples so far.
-        inputs: those that differ from the start values, as they are now.
-        aims: by output that has a target.
-        targets: with which the run starts, or that hold now, by output, 1 × values.
-        effort, speed: largest magnitude of each joint's, n values; likewise what follows.
-        chatter: sum of the squares of the effort's changes from sample to sample.
-        saturated, low, high: samples at the effort limit, and after the first at a position limit.
-        moved: time of the last sample at which the velocity is not exactly 0, s.
-        changes, changed, travel: of targets: how many, the time of the last, s, and their largest distance from the
-            first.
+        inputs: present values of changed inputs.
+        aims: errors by output, for outputs with a target.
+        targets: present targets by output, 1 × values.
+        effort, speed: largest magnitude for each joint, n values; the following attributes also have n values.
+        chatter: sum of the squares of the effort's changes between samples.
+        saturated, low, high: number of samples at the effort limit, and after the first one at a position limit.
+        moved: time of the last sample with a velocity that is not exactly 0, s.
+        changes, changed, travel: number of changes of targets, time of the last one (s), and largest distance
+            of a target from the first one (scalars).
     """
 
     def __init__(self, setup: Setup, sizes: Sequence[int]) -> None:
@@ -91,10 +92,10 @@ class Judge:
         self.rows, self._changed = io.BytesIO(), [(0, held)]
         self._at_limits = 0
 
-    # --- from a master ---
+    # --- input from the master ---
 
     def change(self, inputs: Mapping[str, float]) -> None:
-        """Receive inputs that hold from the last sample on."""
+        """Receive inputs that apply from the last sample on."""
         self.inputs |= inputs
         held = self._changed[-1][1]
         for variable in inputs.keys() & self._where.keys():
@@ -104,7 +105,7 @@ class Judge:
         self._changed.append((self.count + self.rows.tell() // (8 * int(self._ends[-1])), held))
 
     def flush(self) -> None:
-        """Judge the rows that wait."""
+        """Judge the waiting rows."""
         rows = np.frombuffer(self.rows.getvalue()).reshape(-1, self._ends[-1])
         if not len(rows):
             return
@@ -114,7 +115,7 @@ class Judge:
         self.judge(t, rows, self._in_effect(len(rows)))
 
     def _in_effect(self, count: int) -> Mapping[str, Array]:
-        """Return the targets of the rows that wait: the object of the block before where none has changed."""
+        """Return the targets of the waiting rows; without changes, the same object as for the previous block."""
         if len(self._changed) == 1:
             return self.targets
         changed = [(max(0, k - self.count), held) for k, held in self._changed]
@@ -131,7 +132,7 @@ class Judge:
         fit = {name: value for name, value in known.items() if len(value) == sizes[name]}
         return {name: value for name, value in fit.items() if name != "quat" or value.any()}
 
-    # --- from anyone ---
+    # --- input from a master or a recording ---
 
     def judge(self, t: Array, rows: Array, targets: Mapping[str, Array]) -> None:
         """Judge N samples.
@@ -139,7 +140,7 @@ class Judge:
         Args:
             t: times since the first sample, s, N.
             rows: all OUTPUTS side by side, N × values.
-            targets: by output, N rows, or one for all, in effect up to each sample.
+            targets: targets in effect up to each sample, by output: N rows, or one row for all.
         """
         rows = np.asfortranarray(rows)
         own = {name: rows[:, a:b] for name, a, b in zip(OUTPUTS, self._ends, self._ends[1:])}
@@ -152,7 +153,7 @@ class Judge:
         self.count, self.last, self._time = self.count + len(rows), rows[-1], float(t[-1])
 
     def _change(self, t: Array, targets: Mapping[str, Array]) -> int:
-        """Return the first row of the move to the last target: 0 where that began in an earlier block."""
+        """Return the first row of the move to the last target; 0 if the move began in an earlier block."""
         if self.count and targets is self._same:
             return 0
         start, self._same = 0, targets
@@ -171,11 +172,11 @@ class Judge:
         return start
 
     def wanted(self, name: str) -> Array:
-        """Return the last target of an output; empty where there is none."""
+        """Return the last target of an output; empty without a target."""
         return self._targets.get(name, np.empty(0))
 
     def _aim(self, name: str, now: Array, target: Array, t: Array, start: int) -> Array:
-        """Judge an output by its target; return the sizes of its errors."""
+        """Judge an output by its target; return the magnitudes of its errors."""
         e, size = errors(name, now, target)
         aim, fresh = self.aims.get(name), start > 0 or not self.count or self.changed == self._time
         if aim is None:
@@ -190,7 +191,7 @@ class Judge:
         return size
 
     def _watch(self, own: Mapping[str, Array], t: Array) -> None:
-        """Count what joints and motors do."""
+        """Update efforts, speeds, chatter, and counts of limits and saturation."""
         setup, n = self.setup, len(self.setup.joints)
         self.speed = np.maximum(self.speed, _largest(own["v"]))
         if own["tau"].shape[1] == n:
@@ -229,23 +230,23 @@ class Judge:
             self._kept[self._filled : end] = np.column_stack([*columns, chosen])
             self._filled = end
 
-    # --- what is known in the end ---
+    # --- results ---
 
     def _of(self, rows: Array, name: str) -> Array:
         i = OUTPUTS.index(name)
         return np.asarray(rows[..., self._ends[i] : self._ends[i + 1]])
 
     def history(self, name: str = "") -> Array:
-        """Return an output at evenly spaced samples of the whole run, N × values; without a name the times, N."""
+        """Return an output at evenly spaced samples of the whole run, N × values; without a name, the N times."""
         kept = self._kept[: self._filled]
         return self._of(kept[:, 1 + len(TARGETS) :], name) if name else kept[:, 0]
 
     def error_history(self, name: str) -> Array:
-        """Return the size of an output's error from its target at evenly spaced samples, N."""
+        """Return the magnitude of an output's error at evenly spaced samples, N values."""
         return self._kept[: self._filled, 1 + [*TARGETS].index(name)]
 
     def tail(self, name: str) -> Array:
-        """Return an output at the last samples, all of them, N × values."""
+        """Return an output at the kept last samples, without gaps, N × values."""
         return self._of(np.concatenate(self._recent), name)
 
     def end(self, name: str) -> Array:
@@ -264,15 +265,15 @@ class Judge:
 
     @property
     def held(self) -> Mapping[str, float]:
-        """Inputs and parameters as they are now."""
+        """Present values of inputs and parameters."""
         return {**self.setup.starts, **self.inputs}
 
     def given(self, group: str) -> Array:
-        """Return the elements of a vector of inputs or parameters as they are now."""
+        """Return the present elements of a vector of inputs or parameters."""
         return self.setup.given(group, self.held)
 
     def use(self) -> tuple[Array, Array]:
-        """Return peak efforts and speeds as shares of the URDF's limits, 0 where there is none."""
+        """Return peak efforts and speeds as fractions of the URDF's limits; 0 without a limit."""
         return self.effort / np.array(self.setup.limits.effort), self.speed / np.array(self.setup.limits.velocity)
 
     def metrics(self) -> dict[str, float]:
@@ -309,7 +310,7 @@ class Judge:
             found["overshoot"] = ways[0]
         if moved:
             late = [aim.last > BAND * aim.first for aim in moved]
-            ends = [aim.outside + taken - aim.began for aim in moved]  # at the sample after the last one outside
+            ends = [aim.outside + taken - aim.began for aim in moved]  # the sample after the last one outside the band
             found["settling_time"] = inf if any(late) else max(ends)
         return found
 
@@ -320,7 +321,7 @@ def _largest(values: Array) -> Array:
 
 
 def errors(name: str, now: Array, target: Array) -> tuple[Array, Array]:
-    """Return the error vectors of N samples, none of an angle, and their sizes."""
+    """Return the error vectors of N samples (empty for an angle) and their magnitudes."""
     if name == "quat":
         return np.empty((len(now), 0)), angles(now, target)
     e = target - now
@@ -328,7 +329,7 @@ def errors(name: str, now: Array, target: Array) -> tuple[Array, Array]:
 
 
 def angles(quat: Array, target: Array) -> Array:
-    """Return the angle of each unit quaternion from a target of any length but 0, rad."""
+    """Return the angle of each unit quaternion from a target quaternion of any length but 0, rad."""
     target = target / np.linalg.norm(target, axis=-1, keepdims=True)
     apart = [np.linalg.norm(quat - side, axis=1) for side in (target, -target)]
     return np.asarray(4.0 * np.arcsin(np.minimum(1.0, 0.5 * np.minimum(*apart))))

@@ -34,7 +34,7 @@ from .setup import robot_of, setup_of
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-LARGE = 1e5  # in a setting's unit: a robot's run hardly means more
+LARGE = 1e5  # in a setting's unit: larger settings are probably mistakes
 
 
 Stop = Callable[[], bool]
@@ -58,17 +58,18 @@ def samples(
 ) -> Samples:
     """Run an FMU; yield the initial state, then one sample per communication step.
 
-    A loop of one's own may answer a sample with new inputs, ``run.send({"x_des": (0.2, 0.1)})``,
-    which hold from that sample's time on.
+    Your loop may answer a sample with new inputs, ``run.send({"x_des": (0.2, 0.1)})``, which apply from that sample's
+    time on.
 
     Args:
-        run: the experiment, or an FMU with the options of ``experiment`` beside it.
-        pace: waits before each sample until its time has come.
-        stop: asked between two steps, and while it is waited for the next one's time; True ends the run.
+        run: the experiment, or an FMU together with options of ``experiment``.
+        pace: waits until the time of each sample.
+        stop: called between two steps, and while the pace waits; True ends the run.
         ready: called after the initialisation, before time and stamps begin.
-        resume: asked where a step was discarded; start values with which the FMU is initialised
-            again to continue from the sample before, or None to fail.
-        instance: one of that FMU which is as instantiated, and stays when the run has ended; None: an own one.
+        resume: called after a discarded step; returns start values with which the FMU is initialised
+            again to continue from the previous sample, or None to fail.
+        instance: a new or reset instance of the FMU, which is not freed at the end of the run; None: the run
+            instantiates the FMU itself.
 
     Raises:
         FmuError, InputError: before the first sample.
@@ -133,11 +134,11 @@ def as_experiment(
     options: ExperimentOptions,
     usual: ExperimentOptions | None = None,
 ) -> Experiment:
-    """Return the experiment itself, or that of an FMU with the options of ``experiment``.
+    """Return the experiment itself, or make one from an FMU and the options of ``experiment``.
 
     Raises:
-        FmuError, InputError: as ``experiment``; or an experiment has options beside it.
-        TypeError: ``called``, which was given the options, has none of such a name.
+        FmuError, InputError: as ``experiment``; or options are given together with an experiment.
+        TypeError: the function ``called`` has no keyword of an option's name.
     """
     check_keywords(options, called)
     if not isinstance(run, Experiment):
@@ -157,7 +158,7 @@ def _sampler(
     ends = list(accumulate(map(len, groups)))
     read, unpack = instance.reader([*chain(*groups)]), Struct(f"{ends[-1]}d").unpack
     of_q, of_v, of_x, of_tau, *rest = (slice(a, b) for a, b in zip([0, *ends], ends))
-    judged = memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # of the one buffer of all reads
+    judged = memoryview(read()).cast("B")[: 8 * ends[len(OUTPUTS) - 1]]  # a view of the buffer that all reads use
     start, step, first_stamp = run.start_time, run.step, run.first_stamp()
 
     def take(k: int, inputs: Mapping[str, Value], since: float) -> Sample:
@@ -174,7 +175,7 @@ def _sampler(
 
 
 def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Resume) -> dict[str, Value]:
-    """Return start values with which a run continues after a failed step; raise where there are none."""
+    """Return start values with which a run continues after a failed step; raise without them."""
     failure = step_failure(sample.k, sample.t, error, _too_large(run, sample))
     settings = resume(sample, failure) if error.outcome == "discarded" else None
     if settings is None:
@@ -183,7 +184,7 @@ def _resumed(run: Experiment, sample: Sample, error: SimulationError, resume: Re
 
 
 def _too_large(run: Experiment, sample: Sample) -> str:
-    """Return the settings so large that they may have caused a failure, as the end of its message."""
+    """Return the end of a failure's message, which names settings that are so large that they may be the cause."""
     given = {**run.given, **sample.inputs}
     usual, kinds = run.fmu.start_values, run.fmu.variables
     large = [name for name, value in given.items() if abs(value) > LARGE and value != usual.get(name)]
@@ -192,10 +193,10 @@ def _too_large(run: Experiment, sample: Sample) -> str:
 
 
 def at_rest(fmu: Fmu, sample: Sample) -> dict[str, tuple[float, ...]] | None:
-    """Return start values of a robot that rests at a sample's position and is meant to stay there.
+    """Return start values with which the robot rests at a sample's position, with its target there.
 
-    With them a run can go on after a discarded step: across a singularity, speeds can escape to
-    infinity in finite time. None where the FMU has no such variables.
+    With them a run can continue after a discarded step; across a singularity, speeds can become infinite in finite
+    time. Return None if the FMU has no such variables.
     """
     still = (0.0,) * len(sample.v)
     start = {"q_start": sample.q, "v_start": still}
@@ -227,8 +228,8 @@ def simulate(
     Other arguments and errors as in ``samples``.
 
     Args:
-        steer: asked after each sample for new inputs, which hold from that sample's time on. Those
-            that a sink commands precede them.
+        steer: called after each sample; returns new inputs, which apply from that sample's time on. Inputs
+            that a sink commands take precedence.
     """
     run = as_experiment(simulate, run, options)
     member = Member(run, sinks, steer, resume, instance)
@@ -245,7 +246,7 @@ def judge_of(run: Experiment, robot: Urdf | None) -> Judge:
 
 
 class Member(NamedTuple):
-    """One of several runs that advance together; its fields are the arguments of ``simulate``."""
+    """One of several runs that advance together; the fields are arguments of ``simulate``."""
 
     run: Experiment
     sinks: Sequence[Sink]
@@ -254,7 +255,7 @@ class Member(NamedTuple):
     instance: Instance | None = None
 
     def steered(self, pace: RealTime | None, stop: Stop) -> Steer:
-        """Return a function that returns the new inputs after a sample, those of sinks before others."""
+        """Return a function that returns the new inputs after a sample; inputs from sinks take precedence."""
         commands = [sink.command for sink in self.sinks if type(sink).command is not Sink.command]
 
         def steer() -> Mapping[str, Setting] | None:
@@ -266,7 +267,7 @@ class Member(NamedTuple):
         return steer if commands else self.steer
 
     def resumed(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
-        """Return the first start values that ``resume`` or a sink has to continue after a discarded step."""
+        """Return the first start values from ``resume`` or a sink with which to continue after a discarded step."""
         every = (resume(sample, error) for resume in (self.resume, *(sink.resume for sink in self.sinks)))
         return next((values for values in every if values is not None), None)
 
@@ -275,12 +276,12 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
     """Run FMUs in one loop: all reach a communication point before any continues.
 
     Args:
-        members: of one start time, step, stop time and, where there are several, first stamp.
-        pace, stop: as of ``simulate``, for all of them.
+        members: the runs; start time, step and stop time must be equal, and for several runs also the first stamp.
+        pace, stop: as in ``simulate``, for all runs.
 
     Raises:
         InputError: their times differ.
-        FmuError, SimulationError: as of ``simulate``.
+        FmuError, SimulationError: as ``simulate``.
     """
     times = {(run.start_time, run.step, run.steps, run.stamp_start) for run, *_ in members}
     start, stamp, ended = members[0].run.start_time, members[0].run.stamp_start, False
@@ -289,7 +290,7 @@ def simulate_together(members: Sequence[Member], *, pace: RealTime | None = None
     with ExitStack() as stack:
 
         def begin() -> None:
-            """Open the sinks; the last run calls it, so that none is open if another fails before."""
+            """Open the sinks; the last run calls it, so that no sink is open if an earlier run fails."""
             for sink in [sink.begin(run) for run, sinks, *_ in members for sink in sinks]:
                 stack.enter_context(sink)
 

@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-LINEAR = 0.05  # of the second differences: a larger residual is of another motion
-VISIBLE = 1e-3  # of a signal's range: swings below are not counted
-LASTING = 0.01  # of the scale: a smaller amplitude at the end is at rest
-UNEVEN = 1e-6  # of a duration: times that differ more from evenly spaced ones
-GROWTH = 1.5  # of the amplitude from the third quarter to the last one
+LINEAR = 0.05  # residual, relative to the second differences, above which the motion is not linear
+VISIBLE = 1e-3  # fraction of a signal's range below which swings are not counted
+LASTING = 0.01  # fraction of the scale: a smaller amplitude at the end counts as rest
+UNEVEN = 1e-6  # fraction of the duration by which uneven times differ from evenly spaced ones
+GROWTH = 1.5  # of the amplitude from the third to the last quarter of the run
 
 
 class Ringing(NamedTuple):
-    """Frequency of a damped oscillation, Hz, and its damping ratio; negative where it grows."""
+    """Frequency of a damped oscillation, Hz, and its damping ratio, which is negative if the oscillation grows."""
 
     frequency: float
     damping: float
 
 
 def ringing(t: Array, y: Array) -> Ringing | None:
-    """Return the oscillation of a signal at evenly spaced times, s; None where it has none.
+    """Return the oscillation of a signal at evenly spaced times, s; None without an oscillation.
 
-    Of a motion that is not linear, by its crossings of the middle and the decrement of its swings.
+    If the motion is not linear, use crossings of the mean and the decrement of the swings.
     """
     if len(y) < 8 or not np.ptp(y) > 0.0:
         return None
@@ -48,14 +48,14 @@ def ringing(t: Array, y: Array) -> Ringing | None:
 
 
 def swings(y: Array) -> int:
-    """Count the changes of sign of a signal, without those below the visible."""
+    """Count the sign changes of a signal, without swings smaller than VISIBLE."""
     size = VISIBLE * float(np.abs(y).max(initial=0.0))
     signs = np.sign(y[np.abs(y) > size])
     return int(np.count_nonzero(np.diff(signs)))
 
 
 def _by_crossings(t: Array, y: Array) -> Ringing | None:
-    """Return frequency and damping by the crossings of the last half's mean, and its swings."""
+    """Return frequency and damping by the crossings of the mean in the last half, and by its swings."""
     half = len(y) // 2
     t, y = t[half:], y[half:] - np.mean(y[half:])
     k = np.flatnonzero(np.sign(y[1:]) * np.sign(y[:-1]) < 0)
@@ -69,17 +69,17 @@ def _by_crossings(t: Array, y: Array) -> Ringing | None:
 
 
 def motion_of(t: Array, signals: Array, scale: float) -> tuple[str, Ringing | None, int]:
-    """Return the kind of motion at the end, its oscillation, and the signal that shows it most.
+    """Return the kind of motion at the end, the oscillation, and the index of the signal with the largest swing.
 
     Args:
         t: N times, s.
         signals: N × s errors or positions.
-        scale: size of the way, in the signals' unit.
+        scale: length of the motion, in the signals' unit.
     """
     if len(t) < 8:
         return "steady", None, 0
     even = np.linspace(t[0], t[-1], len(t))
-    if np.abs(t - even).max() > UNEVEN * (t[-1] - t[0]):  # of a bag with gaps, or downsampled
+    if np.abs(t - even).max() > UNEVEN * (t[-1] - t[0]):  # a bag with gaps, or a downsampled one
         signals = np.column_stack([np.interp(even, t, signal) for signal in signals.T])
         t = even
     quarter = len(t) // 4

@@ -1,4 +1,4 @@
-"""Pace of a run by the wall clock."""
+"""Pacing of a run to the wall clock."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class RealTime:
     """Pace a run to the wall clock.
 
     Args:
-        speed: s of the run in a second.
+        speed: simulated seconds per second.
 
     Attributes:
-        missed: samples that were ready only after their time.
+        missed: number of samples that were ready after their time.
         worst: the largest delay, s.
     """
 
@@ -31,11 +31,11 @@ class RealTime:
         self._start: float | None = None
 
     def restart(self) -> None:
-        """Make the next sample due at once, and count from it."""
+        """Make the next sample due now, and count time from it."""
         self._start = None
 
     def wait(self, elapsed: float, stop: Callable[[], bool] = never) -> None:
-        """Wait until ``elapsed`` s of the run have passed since the first call, or ``stop`` is true."""
+        """Wait until ``elapsed`` s of simulated time have passed since the first call, or ``stop`` returns true."""
         now = time.perf_counter()
         elapsed /= self._speed
         if self._start is None:

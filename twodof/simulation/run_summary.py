@@ -17,8 +17,8 @@ class Summary:
 
     Attributes:
         last: the last sample.
-        wall_time: s, without loading and initialisation.
-        stopped: whether a request ended it before its stop time.
+        wall_time: wall time without loading and initialisation, s.
+        stopped: whether a request ended the run before its stop time.
     """
 
     last: Sample

@@ -20,16 +20,16 @@ class Sample(NamedTuple):
     """State, outputs and inputs at one communication point.
 
     Attributes:
-        k: communication steps done so far.
+        k: number of communication steps so far.
         t: time, s.
         q, v: joint positions (rad, m) and velocities, n values each.
         x: position of the end effector along the task axes, m; empty if the FMU has none.
         tau: control effort applied, N·m or N; empty if the FMU has none.
-        inputs: values of all inputs by name, as they are at t.
-        since: the communication point from which on the inputs have had these values, s.
-        stamp: of the messages that tell of it, ns since the epoch.
+        inputs: values of all inputs at t, by name.
+        since: the communication point from which on the inputs have these values, s.
+        stamp: time stamp of the sample's messages, ns since the epoch.
         quat: orientation of the end effector, a unit quaternion x, y, z, w; empty if the FMU has none.
-        q_meas, v_meas: what the controller saw at its latest sample, as q and v; empty if the FMU has none.
+        q_meas, v_meas: measured values at the controller's latest sample, like q and v; empty if the FMU has none.
     """
 
     k: int
@@ -51,12 +51,12 @@ class Sample(NamedTuple):
 
     @property
     def target(self) -> tuple[float, ...] | None:
-        """Target x_des, m, one value for each of x; None where the FMU has no such inputs."""
+        """Target x_des, m, one value for each of x; None if the FMU has no such inputs."""
         return self._given("x_des", len(self.x))
 
     @property
     def target_quat(self) -> tuple[float, ...] | None:
-        """Unit quaternion of quat_des; None where the FMU has no such inputs, or they are 0."""
+        """Unit quaternion of quat_des; None if the FMU has no such inputs, or if they are 0."""
         given = self._given("quat_des", len(self.quat)) or ()
         length = hypot(*given)
         return tuple(value / length for value in given) if length else None
@@ -67,7 +67,7 @@ class Sample(NamedTuple):
 
 
 def _brief(values: tuple[float, ...]) -> str:
-    """Return three significant digits of up to three values."""
+    """Return up to three values with three significant digits as text."""
     shown = [f"{value:.3g}" for value in values]
     return f"({', '.join(shown if len(shown) <= 3 else [*shown[:2], f'… {len(shown)}'])})"
 
@@ -75,8 +75,8 @@ def _brief(values: tuple[float, ...]) -> str:
 class Sink:
     """Consumer of samples: a context that receives the experiment and then each sample.
 
-    One of one's own needs ``write`` alone; the rest does nothing here. Those that hear commands
-    steer the run with them.
+    A derived class must define ``write``; the other methods do nothing here. Sinks that receive commands override
+    ``command`` and so change the inputs of the run.
 
     ::
 
@@ -86,7 +86,7 @@ class Sink:
     """
 
     def begin(self, run: Experiment) -> Self:
-        """Receive the experiment of the samples to come; return self, to be entered."""
+        """Receive the experiment of the following samples; return self, a context manager."""
         return self
 
     def __enter__(self) -> Self:
@@ -99,11 +99,11 @@ class Sink:
         """Receive one sample."""
 
     def command(self, stop: Callable[[], bool], pace: RealTime | None) -> Mapping[str, Setting] | None:
-        """Return new inputs from the latest sample's time on; ``stop`` and ``pace`` are the run's."""
+        """Return new inputs from the latest sample's time on; ``stop`` and ``pace`` are those of the run."""
         return None
 
     def resume(self, sample: Sample, error: SimulationError) -> Mapping[str, Setting] | None:
-        """Return start values to continue after a discarded step, from the sample before it; None to fail."""
+        """Return start values to continue from the sample before a discarded step, or None to fail."""
         return None
 
     def conclude(self, verdict: Callable[[], Verdict]) -> None:

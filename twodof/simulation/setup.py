@@ -1,4 +1,4 @@
-"""Constant facts of a run by which its samples are judged: robot, limits, step and settings."""
+"""Constants for judging a run's samples: robot, limits, step and settings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Limits(NamedTuple):
-    """Effort (N·m, N) and velocity limits of joints, infinite where there is none."""
+    """Effort (N·m, N) and velocity limits of joints, infinite without a limit."""
 
     effort: tuple[float, ...]
     velocity: tuple[float, ...]
@@ -30,11 +30,11 @@ class Setup(NamedTuple):
 
     Attributes:
         joints: names of the n joints.
-        units: "rad" or "m" of each; "" where unknown.
-        low, high: position limits of the run, or else of the URDF, n values; infinite where there is none.
-        limits: of the URDF.
-        robot: None where none is known.
-        frame, axes: the end effector's link and the task axes, of "xyz"; "" where unknown.
+        units: "rad" or "m" for each joint; "" if unknown.
+        low, high: position limits of the run, or else of the URDF, n values; infinite without a limit.
+        limits: effort and velocity limits of the URDF.
+        robot: the robot; None if unknown.
+        frame, axes: the end effector's link, and the task axes, letters of "xyz"; "" if unknown.
         step: communication step, s.
         starts: start values of all inputs and parameters.
     """
@@ -51,7 +51,7 @@ class Setup(NamedTuple):
     starts: Mapping[str, float]
 
     def given(self, group: str, values: Mapping[str, float] | None = None) -> Array:
-        """Return the elements of a vector of inputs or parameters, by its start values or others; empty if none."""
+        """Return the elements of a vector of inputs or parameters, from start values or ``values``; empty if none."""
         values = self.starts if values is None else values
         found: list[float] = []
         while (name := f"{group}[{len(found) + 1}]") in values:
@@ -84,7 +84,7 @@ class Setup(NamedTuple):
 
 
 def limits_of(robot: Urdf | None, names: Sequence[str]) -> Limits:
-    """Return the limits of joints; a follower's velocity limit counts for its leader."""
+    """Return the limits of joints; the velocity limit of a joint that mimics another also limits its leader."""
     joints = robot.joints if robot is not None else {}
     if not {*names} <= joints.keys():
         return Limits((inf,) * len(names), (inf,) * len(names))
@@ -96,7 +96,7 @@ def limits_of(robot: Urdf | None, names: Sequence[str]) -> Limits:
 
 
 def robot_of(text: str | None) -> Urdf | None:
-    """Return the robot of a URDF's text; None where it has none that is sound."""
+    """Return the robot of a URDF's text; None if there is no valid one."""
     try:
         return None if text is None else read_urdf(text)
     except RobotError:
@@ -106,7 +106,7 @@ def robot_of(text: str | None) -> Urdf | None:
 def setup(
     *, joints: Sequence[str], robot: Urdf | None, frame: str, axes: str, step: float, starts: Mapping[str, float]
 ) -> Setup:
-    """Return the setup of a run by what its FMU, or its bag's provenance, says."""
+    """Return the setup of a run from the facts in its FMU or in its bag's provenance."""
     known = robot.joints if robot is not None else {}
     own = [known.get(name) for name in joints]
     ends = []

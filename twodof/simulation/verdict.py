@@ -16,15 +16,15 @@ from .judge import BAND, BLOCK, OUTPUTS, Judge
 from .motion import motion_of
 from .setup import Array, Setup
 
-OF_THE_END = 0.1  # part of a run in which a target that moves still does, and in which an error stays in its band
-FOLLOWED = 0.1  # of the target's way: a larger RMS error in the second half does not follow
+OF_THE_END = 0.1  # last fraction of a run, in which a moving target still changes and an error must stay in its band
+FOLLOWED = 0.1  # fraction of the target's travel: with a larger RMS error in the second half, a target is not followed
 
 
 class Metric(NamedTuple):
     """One number of a run, and column of a sweep's table.
 
     Attributes:
-        title: for people.
+        title: title in tables and figures.
         unit: FMI unit, "" for a number without one.
         text: definition.
     """
@@ -70,10 +70,11 @@ METRICS: Mapping[str, Metric] = {
         "saturation", "", "share of the samples at which |τ_i| is at the URDF's effort limit, of the joint with most"
     ),
 }
-"""By name of the column. A metric is NaN where it is not defined: what a run that was not finished would have done,
-the settling and overshoot of one that starts within 1e-9 m or rad of its target, and what needs an output, target or
-limit that the FMU has not. The settling time of a run that did not settle is infinite in a verdict, and NaN in a table.
-For all of them less is better."""
+"""Metrics by column name; smaller is better for all of them. A metric is NaN if it is not defined: in a run that was
+not finished; settling and overshoot of a run that starts within 1e-9 m or rad of its target; and metrics of an output,
+target or limit that the FMU does not have. The settling time of a run that did not settle is infinite in a verdict, and
+NaN in a table.
+"""
 RESULTS = (*METRICS, "frequency", "damping")
 """Names of all numbers of a verdict: the metrics, the frequency of an oscillation, Hz, and its damping ratio."""
 
@@ -94,13 +95,13 @@ class Verdict:
     """Verdict of a run.
 
     Attributes:
-        outcome: "reached", "not reached", "followed" or "not followed", of a target that moves, or "no target".
-        motion: at the end: "steady", "moving", "oscillating" or "diverging".
-        samples, duration: judged, and s from the first to the last.
-        numbers: by name (``METRICS``, "frequency" in Hz and "damping"); a name is missing where its number is not
-            defined, and the settling time is infinite where the run did not settle.
-        causes: of what went wrong, the root first.
-        lines: the verdict in words; the first has the outcome and the first cause.
+        outcome: "reached" or "not reached"; for a moving target "followed" or "not followed"; or "no target".
+        motion: motion at the end: "steady", "moving", "oscillating" or "diverging".
+        samples, duration: number of judged samples, and time from the first to the last one, s.
+        numbers: values by name (``METRICS``, "frequency" in Hz, and "damping"). Undefined numbers are missing; the
+            settling time is infinite if the run did not settle.
+        causes: causes of a failure, the root cause first.
+        lines: the verdict in words; the first line has the outcome and the first cause.
     """
 
     outcome: str
@@ -115,12 +116,12 @@ class Verdict:
         return "\n".join(self.lines)
 
     def failed_by(self, *conditions: str) -> str:
-        """Return a line on the first of some conditions that holds, as "error > 1e-3"; "" where none does.
+        """Return a line for the first condition, such as "error > 1e-3", that holds; "" if none holds.
 
-        A condition on a number that is not defined, as of a run without a target, counts as one that holds.
+        A condition on an undefined number, for example without a target, counts as one that holds.
 
         Raises:
-            InputError: a condition is no comparison of numbers of a verdict.
+            InputError: a condition is no comparison of a verdict's numbers.
         """
         for condition in [expression(text, RESULTS, condition=True) for text in conditions]:
             unknown = [name for name in condition.names if name not in self.numbers]
@@ -132,20 +133,20 @@ class Verdict:
         return ""
 
     def facts(self) -> dict[str, object]:
-        """Return the verdict as JSON has it: of an infinite number None."""
+        """Return the verdict for JSON, with None for an infinite number."""
         numbers = {name: value if isfinite(value) else None for name, value in self.numbers.items()}
         return {**asdict(self), "numbers": numbers, "causes": [cause._asdict() for cause in self.causes]}
 
 
 def verdict_in(facts: Mapping[str, Any]) -> Verdict:
-    """Return the verdict of ``facts`` that were stored, of SHAPE but for infinite numbers."""
+    """Return the verdict from stored ``facts``, which must have the shape SHAPE, with None for infinite numbers."""
     numbers = {name: inf if value is None else float(value) for name, value in facts["numbers"].items()}
     found = [Cause(**{**cause, "point": tuple(cause["point"])}) for cause in facts["causes"]]
     return Verdict(**{**facts, "numbers": numbers, "causes": tuple(found), "lines": tuple(facts["lines"])})
 
 
 def conclude(judge: Judge, known: tuple[Cause, ...] = ()) -> Verdict:
-    """Return the verdict of what has been judged, with causes that are known beforehand."""
+    """Return the verdict of a judge's samples, with causes that are known beforehand."""
     numbers = {name: value for name, value in judge.metrics().items() if not np.isnan(value)}
     t, signals, scale = _signals(judge)
     motion, found, _ = motion_of(t, signals, scale)
@@ -166,8 +167,8 @@ def judged(setup: Setup, t: Array, values: Mapping[str, Array], targets: Mapping
     Args:
         setup: the run's robot and settings.
         t: times since the first sample, s, N.
-        values: q, v, x, tau and quat, N rows each, or no columns where they are not known.
-        targets: of x, quat and q, N rows each, in effect up to each sample; not a number before the first.
+        values: q, v, x, tau and quat, N rows each; unknown ones have no columns.
+        targets: targets of x, quat and q in effect up to each sample, N rows each; NaN before the first target.
     """
     rows = np.hstack([values[name] for name in OUTPUTS])
     known = np.isfinite(np.hstack([*targets.values(), np.zeros((len(t), 1))])).all(axis=1)
@@ -184,7 +185,7 @@ def judged(setup: Setup, t: Array, values: Mapping[str, Array], targets: Mapping
 
 
 def _signals(judge: Judge) -> tuple[Array, Array, float]:
-    """Return times, errors in the way's largest kind, or positions, and their scale."""
+    """Return times, the errors of position or joints (without a target: joint positions), and their scale."""
     t = judge.history()
     way = t >= judge.changed
     aims = {name: aim for name, aim in judge.aims.items() if name != "quat"}
@@ -207,7 +208,7 @@ def _missed(judge: Judge) -> list[str]:
 
 
 def _lagging(judge: Judge) -> list[str]:
-    """Return the outputs that do not follow their moving targets, by the second half of the run."""
+    """Return the outputs that do not follow their moving targets in the second half of the run."""
     late = {name: judge.error_history(name)[len(judge.history()) // 2 :] for name in judge.aims}
     return [name for name, e in late.items() if np.sqrt(np.mean(e * e)) > max(FOLLOWED * judge.travel, FLOOR)]
 
@@ -230,7 +231,7 @@ def _lines(
 
 
 def _also(why: tuple[Cause, ...]) -> list[str]:
-    """Return lines of the causes after the first: of each kind the worst, and the joints of the others."""
+    """Return lines for the causes after the first: the worst cause of each kind, and the joints of the others."""
     kinds = {cause.kind: [other for other in why if other.kind == cause.kind] for cause in why}
     lines = []
     for worst, *others in kinds.values():
@@ -274,7 +275,7 @@ def _response(outcome: str, motion: str, numbers: Mapping[str, float]) -> str:
 
 
 def _peaks(judge: Judge) -> str:
-    """Return the largest uses of the URDF's limits in words."""
+    """Return the peaks in words, as fractions of the URDF's limits."""
     texts = []
     for what, use in zip(("effort", "speed"), judge.use()):
         if use.max(initial=0.0) > 0.0:
