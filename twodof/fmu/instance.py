@@ -65,12 +65,12 @@ class Instance:
     FMU log messages go to the logger "twodof.fmu". A call that the FMU refuses raises SimulationError with the FMU's
     message.
 
-    What is called at each step goes past FMPy, by functions of the library that know no types, with
-    arguments that have theirs already: to convert those takes half of a call. Vectors of FMI 3.0 are
-    set and read whole, and a variable of FMI 2.0 is a vector of one.
+    Calls of each step bypass FMPy: they call the library's functions without declared types, with arguments that were
+    converted once, because the conversion would take half of a call. Vectors of FMI 3.0 are set and read as a whole. A
+    variable of FMI 2.0 is a vector of one element.
 
     Attributes:
-        slave: FMPy's object, for calls that a run does not make.
+        slave: FMPy's object, for calls that a run does not use.
     """
 
     def __init__(self, fmu: Fmu, folder: Path) -> None:
@@ -149,7 +149,7 @@ class Instance:
             self._refuse(status)
 
     def _columns(self, names: Sequence[str]) -> tuple[list[int], list[int], int]:
-        """Return references of Real variables, their places among all values of these, and how many these are."""
+        """Return the value references for Real variables, the variables' indices among all values, and their number."""
         wanted = [self.fmu.variables[name] for name in names]
         vectors = list(dict.fromkeys((variable.type, variable.reference) for variable in wanted))
         *firsts, size = accumulate((len(self._starts[vector]) for vector in vectors), initial=0)
@@ -203,7 +203,7 @@ class Instance:
         """End the instance; after a fatal failure the standard allows no further call."""
         if self._fatal:
             return
-        with suppress(FMICallException):  # it may have failed already, and is freed all the same
+        with suppress(FMICallException):  # after a failure, terminate may be refused
             self.slave.terminate()
         self.slave.freeInstance()
 
