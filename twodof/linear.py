@@ -201,7 +201,7 @@ class _Point:
         )
 
     def hold_effort(self, period: float) -> None:
-        """Hold the effort: sample the controller at the present state, with a period."""
+        """Sample the controller at the present state, so that its effort is held."""
         self._values["control_period"] = period
         self._instance.reset()
         self._instance.initialise(0.0, np.inf, self._values)

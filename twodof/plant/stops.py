@@ -184,7 +184,7 @@ class Stops:
 def _complementary(
     W: Array, b: Sequence[float], bounds: Bounds, fixed: Collection[int]
 ) -> tuple[Array, dict[int, int]]:
-    """Solve a linear complementarity problem; return z (n values) and its active bounds.
+    """Return the solution z (n values) of a linear complementarity problem, and its active bounds.
 
     The active bound of a joint with bounds is −1 for the lower, 1 for the upper, and 0 for none. b + W z is above 0
     only if z is at its lower bound, below 0 only if z is at its upper bound, and 0 for ``fixed`` joints, whose z has

@@ -101,8 +101,7 @@ def experiment(
 
     Args:
         fmu: the FMU or its path.
-        start_time, stop_time, step: s; the run has whole steps, and the stop time may be infinite. None: the FMU's
-            default, or else 5 s and 10 ms.
+        start_time, stop_time, step: s; the stop time may be infinite. None: the FMU's default, or 5 s and 10 ms.
         settings: start values by name; a vector has one value for all elements, or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
         changes: times, s, and the inputs that change at them, instead of a file; changes before the start time

@@ -191,7 +191,7 @@ class Judge:
         return size
 
     def _watch(self, own: Mapping[str, Array], t: Array) -> None:
-        """Update efforts, speeds, chatter, and counts of limits and saturation."""
+        """Note efforts, speeds, chatter, and samples at limits or in saturation."""
         setup, n = self.setup, len(self.setup.joints)
         self.speed = np.maximum(self.speed, _largest(own["v"]))
         if own["tau"].shape[1] == n:
