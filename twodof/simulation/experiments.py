@@ -104,8 +104,7 @@ def experiment(
         start_time, stop_time, step: s; the stop time may be infinite. None: the FMU's default, or 5 s and 10 ms.
         settings: start values by name; a vector has one value for all elements, or a sequence.
         input_file: CSV of inputs over time (``read_changes``).
-        changes: times, s, and the inputs that change at them, instead of a file; changes before the start time
-            apply at the start.
+        changes: instead of a file, times, s, and the inputs that change; earlier changes apply at the start.
         stamp_start: stamp of the first sample, s since the epoch; None: the wall clock's time.
 
     Raises:
