@@ -1,7 +1,7 @@
-"""The HTML page of an arm, driven by its engine, by samples of a run, or by a server.
+"""HTML page of an arm, whose motion comes from an engine, from samples of a run, or from a server.
 
-All is in the page itself: it asks no network for anything, and its Content-Security-Policy allows
-its own script alone. Text from the URDF is in it as JSON, and shown as text.
+The page is self-contained and uses no network. Its Content-Security-Policy allows only its own script. Text from the
+URDF is stored as JSON and shown as text.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
 
 RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
-"""Groups of variables that a sample holds, in its order."""
-GRAIN = 65535  # of a mesh's size: how exactly its vertices are known
+"""Groups of variables in a sample, in their order."""
+GRAIN = 65535  # resolution of vertices, as parts of a mesh's size
 POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
 CONTAINER = b'<div class="arm" id="arm"'
 """Mark that identifies a page with an arm."""
@@ -45,11 +45,11 @@ class Arm(NamedTuple):
     """Contents of a robot's page.
 
     Attributes:
-        facts: of its FMU, by name: name, robot, joints, frame, axes and control as in ``Fmu``; step,
-            s; variables, elements of vectors by themselves: name, place among all, causality, type,
-            unit, start and description; remarks, what is not as it should be.
+        facts: facts of the FMU by name: name, robot, joints, frame, axes and control as in ``Fmu``; step, s; variables,
+            with each element of a vector: name, index, causality, type, unit, start and description; and remarks,
+            which are warnings.
         urdf: text of resources/robot.urdf.
-        shapes: of its links.
+        shapes: shapes of the links.
     """
 
     facts: dict[str, Any]
@@ -71,16 +71,16 @@ def page(
 ) -> Path:
     """Write an FMU as a page with the robot in 3D and its running plant; return its path.
 
-    The FMU's own C sources are compiled to WebAssembly: its numbers are the FMU's.
+    The FMU's C sources are compiled to WebAssembly, so that the page computes the same numbers.
 
     Args:
         fmu: a native FMU of this package.
-        output: the HTML file, written whole or not at all.
+        output: the HTML file, which is written completely or not at all.
         step: communication step, s; None: the FMU's own.
         settings: start values of inputs and parameters, as for ``experiment``.
 
     Raises:
-        FmuError, InputError: the file is no FMU, or a setting is at fault.
+        FmuError, InputError: the file is no FMU, or a setting is invalid.
         PageError: the FMU is not a native one of this package, or the page cannot be written.
         BuildError: there is no compiler.
     """
@@ -98,9 +98,9 @@ def page_of(run: Experiment) -> bytes:
         raise PageError(f"'{fmu.path}' has no plant in C, as native FMUs of this package have; build one with `native`")
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
-    module = compile_web_module(files, ["page.c"])  # a page asks for no derivatives
+    module = compile_web_module(files, ["page.c"])  # a page needs no derivatives
     provenance = provenance_of(run, "")
-    provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses no other package
+    provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses only this package
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
     recorded = {kind: definition(kind) for kind in (JOINT_STATE, POINT, POSE)}
     topics = {"definitions": recorded, "qos": profile(STREAM)}
@@ -108,7 +108,7 @@ def page_of(run: Experiment) -> bytes:
 
 
 def is_page(path: Path) -> bool:
-    """Return whether a file is such a page."""
+    """Return whether a file is a page with an arm."""
     return CONTAINER in head_of(path, MAX_HEAD)
 
 
@@ -116,7 +116,7 @@ def arm_of(run: Experiment) -> Arm:
     """Return the page contents of a run's FMU.
 
     Raises:
-        PageError: its robot cannot be shown.
+        PageError: the robot cannot be shown.
     """
     fmu = run.fmu
     urdf = fmu.urdf or ""
@@ -158,12 +158,12 @@ def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "",
     """Return the HTML of an arm.
 
     Args:
-        title: of the page.
+        title: title of the page.
         arm: the robot.
-        source: what moves it, packed: its "engine", or "samples", N × (time in s, groups in
-            ``RECORDED``); nothing: the server of the page, at /socket.
-        allowed: what the page may do beside running its script, in the words of its policy.
-        facts: further ones for the script.
+        source: packed source of motion: "engine", or "samples", N × (time in s, groups in ``RECORDED``); empty: the
+            server of the page, at /socket.
+        allowed: further permissions of the page, in the syntax of a Content-Security-Policy.
+        facts: further facts for the script.
     """
     known, meshes = _facts(arm)
     data = json.dumps({**known, **facts}, sort_keys=True).replace("<", "\\u003c")
@@ -180,7 +180,7 @@ def arm_page(title: str, arm: Arm, source: Mapping[str, str], allowed: str = "",
         f'<link rel="icon" href="data:,">\n<style>\n{_asset("arm.css")}</style>\n</head>\n'
         f"<body>\n{_asset('arm.html')}{blocks}\n<script>{code}</script>\n</body>\n</html>\n"
     )
-    return page.encode("utf-8", "replace")  # names of files need not be text
+    return page.encode("utf-8", "replace")  # file names need not be UTF-8
 
 
 def _asset(name: str) -> str:
@@ -237,7 +237,7 @@ def _links(urdf: Urdf, joints: Sequence[str]) -> tuple[list[dict[str, object]], 
 
 
 def _matrix(transform: Placement) -> list[float]:
-    """Return a 4 × 4 matrix by columns, as WebGL requires."""
+    """Return a 4 × 4 matrix in column order, as WebGL requires."""
     matrix = np.eye(4)
     matrix[:3, :3] = transform.rotation
     matrix[:3, 3] = transform.translation

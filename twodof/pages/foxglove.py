@@ -1,7 +1,7 @@
 """Serve a run to Foxglove without ROS: the bag's messages over a WebSocket, and gains as parameters.
 
-Foxglove's SDK answers any website. So it listens where no website finds it, on an address of the
-loopback network that is drawn at random, and browsers are answered by the door of the pages.
+Foxglove's SDK answers any website. Therefore it listens on a random address of the loopback network, and a relay of
+``serving``, which checks the origin of requests, answers browsers.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ PORT = 8765
 PROTOCOL = "foxglove.sdk.v1"
 APPS = ("https://app.foxglove.dev", "https://embed.foxglove.dev", "file://")
 """Origins of Foxglove's web app, its embedded viewer and its desktop app."""
-logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL + 1)  # a line a bad message
+logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL + 1)  # it would log a line for each bad message
 
 
 class Foxglove(Sink):
-    """A sink that serves each sample to Foxglove, on the loopback interface alone.
+    """A sink that serves each sample to Foxglove, on the loopback interface only.
 
-    The gains are its parameters, which a panel there shows and, with ``set_gains``, sets.
+    The gains are parameters, which Foxglove's Parameters panel shows and, with ``set_gains``, sets.
 
     Args:
-        port: where it listens; 0: any that is free.
-        scene: also the robot description, transforms, target and end effector.
+        port: port; 0: any free port.
+        scene: also robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        set_gains: allow programs of this user to set the gains; those of other users are refused on Linux.
-        opened: called when it listens.
+        set_gains: allow programs of this user to set the gains; programs of other users are refused on Linux.
+        opened: called when the server listens.
 
     Attributes:
-        url: of the WebSocket, known when it listens.
+        url: URL of the WebSocket, known when the server listens.
 
     Raises:
-        PublishError: the port cannot be listened on.
+        PublishError: the server cannot listen on the port.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Foxglove(Sink):
         self._scene, self._effort, self._set_gains = scene, effort, set_gains
 
     def begin(self, run: Experiment) -> Foxglove:
-        """Receive the experiment of the samples to come.
+        """Receive the experiment of the following samples.
 
         Raises:
             BagError: the FMU lacks a requested output.
@@ -80,7 +80,7 @@ class Foxglove(Sink):
         return self
 
     def __enter__(self) -> Foxglove:
-        context = self._context = Context()  # which its channels do not keep
+        context = self._context = Context()  # a reference, which its channels do not hold
         self._channels = {}
         for name, topic in self._messages.topics.items():
             schema = Schema(name=topic.type, encoding="ros2msg", data=definition(topic.type).encode())
@@ -119,7 +119,7 @@ class Foxglove(Sink):
             self._channels[name].log(rows.tobytes(), log_time=stamp)
 
     def command(self, stop: Callable[[], bool] = never, pace: RealTime | None = None) -> dict[str, Value]:
-        """Return gains that were set since the last call, as inputs of the FMU."""
+        """Return the gains that were set since the last call, as inputs of the FMU."""
         return self._gains.take()
 
     def __exit__(self, *exception: object) -> None:
@@ -153,7 +153,7 @@ class _Gains(ServerListener):
         return asked
 
     def on_get_parameters(self, client: object, param_names: list[str], request_id: str | None = None) -> Parameters:
-        """Return gains by name, all where no name is given."""
+        """Return gains by name; without names, return all."""
         with self._lock:
             values = {**self.held, **self._asked}
         return [
@@ -163,7 +163,7 @@ class _Gains(ServerListener):
         ]
 
     def on_set_parameters(self, client: object, parameters: Parameters, request_id: str | None = None) -> Parameters:
-        """Set gains, one number for all elements or one each; return the values in effect."""
+        """Set gains, by one number for all elements or one for each; return the values in effect."""
         for parameter in parameters:
             try:
                 if not self._control:
@@ -181,7 +181,7 @@ class _Gains(ServerListener):
 
 
 def _numbers(value: object) -> object:
-    """Return a parameter's numbers; an integer counts, and one number is for all elements."""
+    """Return a parameter's numbers; integers are accepted, and a single number applies to all elements."""
     if isinstance(value, list):
         return value[0] if len(value) == 1 else value
     return value

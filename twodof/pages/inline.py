@@ -1,4 +1,4 @@
-"""Pages inline in a notebook: an arm that runs, a replay or a map of a sweep; offline, and without a server."""
+"""Pages inline in a notebook: a running arm, a replay or a map of a sweep, all without a server or network."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEIGHT = 560  # pixels
 
 
 class Inline:
-    """A page that a notebook shows in a frame of its own."""
+    """A page that a notebook shows in an iframe."""
 
     def __init__(self, page: str, height: int) -> None:
         self._page, self._height = page, height
@@ -40,7 +40,7 @@ def show(shown: Fmu | Recording | pandas.DataFrame | str | Path, *, height: int 
     Args:
         shown: a native FMU, whose plant runs in the page; a recording, which is replayed; the table of a sweep, which
             becomes an interactive map; or the path of one of them.
-        height: of the frame, pixels.
+        height: height of the iframe, pixels.
 
     Raises:
         FmuError, BagError, SweepError, PageError, PlotError, BuildError: as ``page``, ``view`` and ``plot`` raise.

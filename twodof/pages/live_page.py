@@ -18,7 +18,7 @@ from .arm import arm_of, arm_page
 from .loop import Loop
 from .serving import HOST, PORT, Connection, Server, user_token
 
-RATE = 30.0  # Hz, of the news to pages
+RATE = 30.0  # Hz, updates to pages
 
 
 def live(
@@ -33,17 +33,17 @@ def live(
     bag: str | None = None,
     command_line: str = "",
 ) -> list[Path]:
-    """Step an FMU in real time behind a page until ``stop`` is true; return the recorded bags.
+    """Step an FMU in real time behind a page until ``stop`` returns true; return the recorded bags.
 
     Args:
         fmu: the FMU or its path.
-        stop: asked between two steps.
-        opened: called with the URL, when it can be opened.
-        host, port: where to listen.
-        step: communication step, s; None: the FMU's own.
-        settings: start values, as of ``experiment``.
+        stop: called between two steps.
+        opened: called with the URL when the page can be opened.
+        host, port: address to listen on.
+        step: communication step, s; None: the FMU's default.
+        settings: start values, as in ``experiment``.
         bag: name of the first recording; None: rosbag2_<date and time>.
-        command_line: for the provenance of recordings.
+        command_line: command line for the provenance of recordings.
 
     Raises:
         FmuError, InputError, PageError, SimulationError: before the page is served.
@@ -58,7 +58,7 @@ def live(
 
 
 async def _talk(loop: Loop, connection: Connection) -> None:
-    """Send one page the news at its own pace, and pass its requests to the loop."""
+    """Send updates to one page at its own pace, and pass its requests to the loop."""
     received, seen, before = 0, {"run": 0, "seen": 0}, None
 
     async def listen() -> None:
@@ -70,9 +70,9 @@ async def _talk(loop: Loop, connection: Connection) -> None:
             except InputError as error:
                 loop.note(str(error))
             except (ValueError, TypeError, AttributeError):
-                return  # none of our pages
+                return  # not one of our pages
             received += 1
-            await asyncio.sleep(1 / RATE if loop.behind else 0.0)  # the news have their turn
+            await asyncio.sleep(1 / RATE if loop.behind else 0.0)  # so that updates are sent too
 
     loop.viewers += 1
     listening = asyncio.ensure_future(listen())

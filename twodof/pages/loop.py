@@ -1,7 +1,7 @@
 """The loop that steps an FMU in real time at the request of pages.
 
-They are served by a thread of its own, which tells what their controls ask for, to be done between
-two steps, and asks for the news. Neither waits for the other.
+A separate thread serves the pages. It queues the requests of their controls, which the loop executes between two steps,
+and reads the updates for the pages. Neither thread waits for the other.
 """
 
 import time
@@ -22,12 +22,12 @@ from ..simulation.master import at_rest, samples
 from ..simulation.pace import RealTime
 from ..simulation.sample import Sample
 
-MOST_ROWS = 1000  # that are kept for pages that have not asked yet,
+MOST_ROWS = 1000  # rows kept for pages that have not read them
 MOST_AT_ONCE = 200  # rows in one message
 MOST_NOTES = 4
-MOST_ORDERS = 16  # that wait, after which a page is not listened to for a while
-MOST_STEPS = 10  # in one order
-IDLE = 0.05  # s between two looks at whether to go on
+MOST_ORDERS = 16  # waiting requests above which a page's messages are read later
+MOST_STEPS = 10  # steps in one request
+IDLE = 0.05  # s between two checks of ``stop``
 TOLD = ("x_des", "quat_des", "q_des")
 """Inputs sent with a sample."""
 
@@ -35,8 +35,8 @@ TOLD = ("x_des", "quat_des", "q_des")
 class PartialBag(Bag):
     """A partial bag that begins during a run, at the current sample.
 
-    Its provenance is that of a run which starts there: from the joint positions and velocities and
-    with the inputs of its first sample. Its stamps start at the wall clock's time.
+    Its provenance describes a run that starts with the joint positions, velocities and inputs of its first sample. Its
+    stamps start at the present wall time.
     """
 
     def __init__(self, path: Path, run: Experiment, first: Sample, command_line: str) -> None:
@@ -61,19 +61,19 @@ class Loop:
     """Steps an FMU at the request of pages.
 
     Args:
-        run: what to run; a long one.
+        run: the experiment, with a long stop time.
         bag: name of the first recording; None: rosbag2_<date and time>.
-        command_line: for the provenance of recordings.
+        command_line: command line for the provenance of recordings.
 
     Attributes:
-        recorded: the bags that were written.
-        pace: keeps the time.
+        recorded: the written bags.
+        pace: pace of the run.
         steps: number of steps in real time.
-        viewers: number of pages that are open; without one, nothing moves.
+        viewers: number of open pages; without one, the FMU is not stepped.
 
     Raises:
-        PageError: the FMU carries no robot, or no target.
-        FmuError, SimulationError: it cannot be instantiated.
+        PageError: the FMU contains no robot, or has no target.
+        FmuError, SimulationError: the FMU cannot be instantiated.
     """
 
     def __init__(self, run: Experiment, *, bag: str | None = None, command_line: str = "") -> None:
@@ -92,7 +92,7 @@ class Loop:
         self._playing = True
         self._orders: deque[tuple[str, Any]] = deque()
         self._groups = [name for group in TOLD for name in fmu.vector(group)]
-        self._lock = Condition()  # of orders, and of what news are made of
+        self._lock = Condition()  # protects the requests and the data for updates
         self._rows: deque[list[float]] = deque(maxlen=MOST_ROWS)
         self._notes: deque[str] = deque(maxlen=MOST_NOTES)
         self._number = self._count = self._noted = 0
@@ -109,10 +109,10 @@ class Loop:
             self._rows.clear()
             self._count, self._number = 0, self._number + 1
             self._values = dict(self._run.start_values)
-            self._take(sample)  # in one go: there are no news of a run without a sample
+            self._take(sample)  # atomically, so that no update describes a run without a sample
 
     def play(self, stop: Callable[[], bool]) -> None:
-        """Step the FMU as pages request, until ``stop`` is true."""
+        """Step the FMU as pages request, until ``stop`` returns true."""
         try:
             while not stop():
                 if self._playing and self.viewers and not self._broken:
@@ -120,7 +120,7 @@ class Loop:
                 else:
                     self.pace.restart()
                     self._obey(IDLE)
-                for _ in range(len(self._orders)):  # whoever adds more meanwhile
+                for _ in range(len(self._orders)):  # requests added meanwhile wait
                     if not stop():
                         self._obey()
         finally:
@@ -130,17 +130,17 @@ class Loop:
     def tell(self, order: str, value: Any = None) -> None:
         """Queue a request for execution between two steps; callable from any thread.
 
-        Orders of one kind that follow each other become one, in which the newest values win.
+        Successive requests of one kind are merged, and the newest values win.
 
         Args:
-            order: "change" of inputs and parameters, a parameter restarts the simulation; "play";
-                "step"; "reset"; "record".
-            value: settings by name; whether to go on; -; whether inputs and parameters are reset
-                too; whether to record.
+            order: "change" inputs and parameters (a parameter restarts the simulation), "play", "step", "reset" or
+                "record".
+            value: for "change", settings by name; for "play", whether to run; for "reset", whether inputs and
+                parameters are reset too; for "record", whether to record.
 
         Raises:
-            InputError: a setting is at fault.
-            ValueError: there is no such order.
+            InputError: a setting is invalid.
+            ValueError: there is no such request.
         """
         if order not in ("change", "play", "step", "reset", "record"):
             raise ValueError(order)
@@ -169,21 +169,21 @@ class Loop:
             self._noted += 1
 
     def news(self, run: int = 0, seen: int = 0) -> dict[str, Any]:
-        """Return the events since a page's last news; callable from any thread.
+        """Return an update for a page since its last one; callable from any thread.
 
         Args:
-            run, seen: as of the news before.
+            run, seen: values of the last update.
 
         Returns:
-            run: number of the run; it has begun again where that is another.
+            run: number of the run; another number means that the simulation was restarted.
             t: time of the latest sample, s.
-            seen: number of the last of the rows.
-            rows: time, s, and the groups of ``TOLD`` of each sample since.
+            seen: number of the last row.
+            rows: time, s, and the groups in ``TOLD`` of each new sample.
             values: inputs and parameters after all requests so far.
-            playing: whether it is to go on.
-            missed, steps, worst: deadlines missed, of how many steps, and the largest delay, s.
-            recorded: number of samples in the bag that is being recorded, 0 where there is none.
-            notes, noted: the latest of what to tell the user, and how many there were.
+            playing: whether the simulation runs.
+            missed, steps, worst: missed deadlines, number of steps, and largest delay, s.
+            recorded: number of samples in the present recording, 0 without one.
+            notes, noted: the latest notes for the user, and their total number.
         """
         recording = self._recording
         with self._lock:
@@ -228,7 +228,7 @@ class Loop:
         inputs = self._sample.inputs
         self._changes |= {name: values[name] for name in values if name in inputs}
         with self._lock:
-            self._values |= values  # again: an earlier request to reset came between
+            self._values |= values  # again, because an earlier request may have reset them
         parameters = {name: values[name] for name in values if name not in inputs}
         if parameters:
             self._restart(parameters)
@@ -266,7 +266,7 @@ class Loop:
                 self._recording = None
 
     def _restart(self, values: Mapping[str, Value], first: Experiment | None = None) -> None:
-        """Restart the simulation; inputs and parameters keep their values unless given or reset."""
+        """Restart the simulation; inputs and parameters keep their values unless they are given or reset."""
         self._end_recording()
         self._source.close()
         now, self._changes = {**self._sample.inputs, **self._changes}, {}
@@ -278,7 +278,7 @@ class Loop:
                 self.note(str(error))
 
     def _starting(self, values: Mapping[str, Value]) -> Experiment:
-        """Return the run with these start values."""
+        """Return the experiment with these start values."""
         run = self._run
         return replace(run, start_values={**run.start_values, **values}, given={**run.given, **values})
 
@@ -288,7 +288,7 @@ class Loop:
             self._recording = PartialBag(path, self._run, self._sample, self._command_line)
         except BagError as error:
             self.note(f"There is no recording: {error}")
-        self.pace.restart()  # opening a bag may wait for the disk: time has stood still
+        self.pace.restart()  # opening a bag may have waited for the disk
 
     def _end_recording(self) -> None:
         recording, self._recording = self._recording, None
@@ -304,7 +304,7 @@ class Loop:
 
 
 def _joined(order: str, before: Any, value: Any) -> Any:
-    """Merge the values of two successive requests of one kind."""
+    """Merge two successive requests of one kind."""
     if order == "change":
         return {**before, **value}
     if order == "step":

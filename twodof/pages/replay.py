@@ -31,9 +31,9 @@ from .serving import HOST, PORT, Server
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-MOST_SAMPLES = 100_000  # of which a quarter is shown at most where there are more
+MOST_SAMPLES = 100_000  # of a bag with more samples, at most a quarter of this number is shown
 NO_ROBOT = '<robot name="none"><link name="base"/></robot>'
-IDLE = 0.05  # s between two looks at whether to go on
+IDLE = 0.05  # s between two checks of ``stop``
 
 
 class RobotOptions(TypedDict, total=False):
@@ -57,14 +57,14 @@ def replay(
 
     Args:
         bag: the bag, or its folder.
-        urdf: the robot; None: the one that the bag carries, if any.
+        urdf: the robot; None: the robot in the bag, if any.
         mesh_dir: folder of that URDF's packages or meshes.
         frame: the end effector's link; None: as in the run.
-        fmu: the FMU that the meshes are in; None: the one that made the bag, where it lies in the
-            working directory or beside the bag.
+        fmu: the FMU with the meshes; None: the FMU that made the bag, if it is in the working directory or in the
+            bag's parent folder.
 
     Raises:
-        BagError, PlotError, PageError, FmuError, BuildError: naming what is wrong.
+        BagError, PlotError, PageError, FmuError, BuildError: a file or an argument is invalid; the message names it.
     """
     if mesh_dir is not None and urdf is None:
         raise PageError("`mesh_dir` has the meshes of a URDF; give that with `urdf`")
@@ -82,7 +82,7 @@ def replay(
             shapes, absent = link_shapes(read_urdf(text), read)
         except RobotError as error:
             raise PageError(str(error)) from error
-        if absent and urdf is None:  # of a URDF given, `collect_meshes` says it
+        if absent and urdf is None:  # for a given URDF, `collect_meshes` warns
             missing = ", ".join(absent[:3])
             remarks.append(f"without the meshes {missing}; give them with `fmu` or `urdf`")
     groups, shown = _groups(track), len(track.t)
@@ -105,7 +105,7 @@ def replay(
 
 
 def _groups(track: Track) -> dict[str, Array]:
-    """Return the known values of each sample by group: N × elements."""
+    """Return the known values of all samples by group, N × elements."""
     bag, task, joints = track.recording, track.task, track.joints
     groups = {"q": bag.q, "q_des": bag.held("q_des", len(joints))}
     groups["v"] = np.column_stack([joint.v for joint in joints])
@@ -171,13 +171,13 @@ def view(
     port: int = PORT,
     **robot: Unpack[RobotOptions],
 ) -> None:
-    """Replay a bag in the browser until ``stop`` is true.
+    """Replay a bag in the browser until ``stop`` returns true.
 
     Args:
         bag: the bag, or its folder.
-        stop: asked 20 times a second.
-        opened: called with the URL when it can be opened, and with remarks.
-        host, port: where to listen.
+        stop: called 20 times a second.
+        opened: called with the URL and remarks when the page can be opened.
+        host, port: address to listen on.
         robot: options of ``replay``.
     """
     check_keywords(robot, view)
@@ -192,7 +192,7 @@ def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotO
     """Write a replay as one HTML file, or as a film; return its remarks. Options are those of ``replay``.
 
     Raises:
-        PageError: its name has an unknown suffix, an option does nothing, or it cannot be written.
+        PageError: the suffix is unknown, an option has no effect, or the file cannot be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix in PICTURES:

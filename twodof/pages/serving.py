@@ -1,6 +1,6 @@
-"""A server thread for one page and its websocket, or for a websocket alone.
+"""A server thread for one page and its websocket, or for a websocket only.
 
-It answers requests of its own page, and of origins that are named: whatever else a browser has open cannot read it.
+It answers only requests from its own page and from named origins, so that other websites in the browser cannot read it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ with needing(PageError, "show a page", "view"):
     from websockets.typing import Subprotocol
 
 HOST, PORT = "127.0.0.1", 8080
-SLOW = 60.0  # s that a page may take to a browser
+SLOW = 60.0  # s for the transfer of a page to a browser
 CLOSING = 1.0  # s
 LARGEST = 64 * 1024  # bytes of a message from a browser
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -52,31 +52,31 @@ HEADERS = {
 }
 NOT_GET = b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n"
 ANYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
-"""Address of this machine where a server listens on all of its addresses."""
+"""Address of this machine in the URL of a server that listens on all addresses."""
 Connection = ServerConnection
 Talk = Callable[[Connection], Awaitable[None]]
 
-_silent = logging.getLogger(__name__)  # who asks for what else is none of the user's business
+_silent = logging.getLogger(__name__)  # log entries for foreign requests would confuse the user
 _silent.setLevel(logging.CRITICAL + 1)
 
 
 class Server:
-    """A page that is served while the context lasts.
+    """A page that is served during the context.
 
     Args:
-        page: its HTML; None: there is none, and a websocket on any path.
-        host, port: where to listen; port 0: any that is free.
-        talk: to each websocket that the page opens; None: it opens none.
-        origins: other pages that are answered too.
-        token: that requests must have in their query; "": none.
+        page: HTML of the page; None: no page, and a websocket on any path.
+        host, port: address to listen on; port 0: any free port.
+        talk: handler of each websocket that the page opens; None: the page opens none.
+        origins: other origins whose requests are answered.
+        token: token that requests must have in their query; "": none.
         private: refuse other users of this machine, also without a token.
-        protocol: of the websocket.
+        protocol: subprotocol of the websocket.
 
     Attributes:
-        url: where the page is.
+        url: URL of the page.
 
     Raises:
-        PageError: the port is in use, or the host is not this machine's.
+        PageError: the port is in use, or the host is no address of this machine.
     """
 
     def __init__(
@@ -171,7 +171,7 @@ class _Answering(ServerConnection):
 
 
 def user_token() -> str:
-    """Return the user's secret, stored for the pages of later servers; a new one where storing fails."""
+    """Return the user's stored token, which later servers use too; if it cannot be stored, return a new one."""
     with suppress(OSError, RuntimeError):
         home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
         path, private = Path(home, "twodof", "token"), partial(os.open, mode=0o600)
@@ -205,15 +205,15 @@ async def relay(url: str, connection: Connection) -> None:
 
 
 def _is_own(request: Request, host: str, address: str, others: Collection[str] = ()) -> bool:
-    """Return whether a request is for this page, by the address that the server was asked to use.
+    """Return whether a request is for this page, by its Host and Origin.
 
-    Any website may have its own name resolve to this machine, and then its Origin is the Host that
-    it asks for. An address is not resolved, so where all are listened on, any is good.
+    A website can let its own name resolve to this machine (DNS rebinding); its Origin then equals the Host. Therefore
+    only known names are accepted. A numeric address is not resolved, so a server on all addresses accepts any address.
 
     Args:
         request: the request.
-        host, address: the host to listen on as given, and its resolved address.
-        others: origins that may ask too.
+        host, address: the given host to listen on, and its resolved address.
+        others: other permitted origins.
     """
     hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
     foreign = any(it not in others and it.partition("://")[2] not in hosts for it in origins)
@@ -227,11 +227,11 @@ def _is_own(request: Request, host: str, address: str, others: Collection[str] =
 
 
 def _is_of_another_user(connection: Connection) -> bool:
-    """Return whether another user of this machine sends a request, also with the right token.
+    """Return whether a request comes from another user of this machine, who may know the token.
 
     A browser is started with the page's URL on its command line, which every user of the machine can read. Linux lists
-    the owner of each socket, and inode 0 after its program has closed it. Root is not told apart: a container's root
-    serves the desktop's user. Source: proc_net_tcp(5).
+    the owner of each socket, and inode 0 after its program has closed it. Root counts as the same user, and if this
+    process runs as root, every user does: in a container, root serves the desktop's user. Source: proc_net_tcp(5).
     """
     user, rows = os.geteuid(), list[list[str]]()
     for table in ("tcp", "tcp6"):
@@ -246,7 +246,7 @@ def _is_of_another_user(connection: Connection) -> bool:
 
 
 def _listed(host: str, port: int) -> tuple[IPv4Address | IPv6Address, Collection[str]]:
-    """Return an address without its zone, IPv4 where IPv6 stands for it, and its forms in Linux's lists of sockets."""
+    """Return an address without its zone, as IPv4 if it is mapped, and its forms in Linux's lists of sockets."""
     address = ip_address(host.partition("%")[0])
     address = getattr(address, "ipv4_mapped", None) or address
     forms = (address.packed, bytes(10) + b"\xff\xff" + address.packed)
@@ -267,7 +267,7 @@ def _listen(host: str, port: int) -> tuple[socket.socket, str]:
     """Return a bound socket, and its address."""
     if not 0 <= port <= 65535:
         raise PageError(f"port {port} is not in 0…65535")
-    if not host:  # which to the operating system is all of them
+    if not host:  # an empty host would mean all addresses
         raise PageError("`host` is empty; 0.0.0.0 is all addresses of this machine")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(

@@ -1,11 +1,11 @@
 """Pack and unpack many serialised messages (CDR) of a topic at a time.
 
-    message     4 bytes, the second of which is 1 where numbers are little endian; header; the rest
+    message     4 bytes, the second of which is 1 for little-endian numbers; header; fields
     header      stamp, int32 s and uint32 ns; frame_id
     text        uint32 length; bytes; a NUL, which counts
     sequence    uint32 length; elements
 
-Numbers are aligned to their size, counted from behind the first 4 bytes. Source: OMG, "DDS-XTypes"
+Numbers are aligned to their size, relative to the end of the first 4 bytes. Source: OMG, "DDS-XTypes"
 1.3, section 7.4.1, "plain CDR".
 """
 
@@ -23,7 +23,7 @@ Rows = NDArray[np.uint8]
 """Serialised messages of equal length, N × bytes."""
 
 LITTLE_ENDIAN = b"\0\1\0\0"
-FRAME = 16  # where a frame_id begins, behind its length
+FRAME = 16  # offset of a frame_id, after its length
 
 
 class Numbers(NamedTuple):
@@ -41,10 +41,10 @@ class MixtureError(Exception):
 
 
 class Layout:
-    """Layout of serialised messages that differ only in stamps and numbers, as those of a run do.
+    """Layout of serialised messages that differ only in stamps and numbers, like the messages of a run.
 
     Args:
-        parts: a stamp, a text, the length of a sequence, or numbers, as they follow each other.
+        parts: the parts in their order: a stamp, a text, the length of a sequence, or numbers.
     """
 
     def __init__(self, *parts: Stamp | str | int | Numbers) -> None:
@@ -88,24 +88,24 @@ class Layout:
         return rows
 
     def unpack(self, rows: Rows) -> list[Array] | None:
-        """Return the numbers of N messages, N × count each; None where other bytes differ."""
+        """Return the numbers of N messages, N × count each; None if other bytes differ."""
         if rows.shape[1] != self.size or (rows[:, self._fixed] != self._plain[self._fixed]).any():
             return None
         return [np.ascontiguousarray(rows[:, where]).view("<f8").astype(np.float64) for where in self._numbers]
 
 
 def joint_state_layout(names: Sequence[str], frame: str, sizes: Sequence[int]) -> Layout:
-    """Return the layout of serialised JointStates with so many positions, velocities and efforts."""
+    """Return the layout of serialised JointStates with given numbers of positions, velocities and efforts."""
     parts = [part for size in sizes for part in (size, Numbers(size))]
     return Layout(Stamp(), frame, len(names), *names, *parts)
 
 
 def unpack_points(rows: Rows) -> tuple[bytes, Array]:
-    """Return frame and coordinates, N × 3, of PointStampeds, or of PoseStampeds, which begin alike.
+    """Return frame and coordinates, N × 3, of PointStampeds, or of PoseStampeds, which begin with the same fields.
 
     Raises:
-        MixtureError: they are in different frames.
-        IndexError, struct.error: one is damaged.
+        MixtureError: the points are in different frames.
+        IndexError, struct.error: a message is damaged.
     """
     order, end = _header(rows[0].tobytes())
     start = end + _gap(8, end)
@@ -122,7 +122,7 @@ def unpack_points(rows: Rows) -> tuple[bytes, Array]:
 
 
 def _header(message: bytes) -> tuple[str, int]:
-    """Return the byte order, in struct's letters, and the end of the frame_id."""
+    """Return the byte order as a format letter of ``struct``, and the end of the frame_id."""
     order = "<" if message[1] else ">"
     return order, FRAME + int(struct.unpack_from(f"{order}I", message, FRAME - 4)[0])
 

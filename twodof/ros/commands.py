@@ -1,7 +1,7 @@
 """Map ROS 2 commands to FMU inputs; command time-out.
 
-A control law (``plant.variables.CONTROLS``) follows messages of one type: points or poses of the
-frame, or JointStates, whose joints are matched by name.
+A control law (``plant.variables.CONTROLS``) accepts messages of one type: points or poses of the frame, or JointStates,
+whose joints are matched by name.
 """
 
 import logging
@@ -16,9 +16,9 @@ from ..simulation.experiments import NANOSECONDS
 from .messages import JOINT_STATE, POINT, POSE, store_of
 
 LOG = logging.getLogger(__name__)
-LONGEST_NAME = 80  # of a frame or joint in a message
+LONGEST_NAME = 80  # characters of a frame or joint name in a message
 TIMEOUT = 0.5  # s without a command until the robot is held
-RAMP = 0.5  # s in which efforts come down to 0
+RAMP = 0.5  # s in which efforts decrease to 0
 Inputs = dict[str, float]
 
 
@@ -38,7 +38,7 @@ class CommandError(Exception):
     """A message is not a valid command.
 
     Attributes:
-        kind: of the fault, one word.
+        kind: kind of the fault, one word.
     """
 
     def __init__(self, kind: str, text: str) -> None:
@@ -50,9 +50,9 @@ class Command(NamedTuple):
     """The inputs that a message commands.
 
     Attributes:
-        stamp: ns since the epoch; 0 where it has none.
+        stamp: time stamp, ns since the epoch; 0 without one.
         inputs: values of the FMU's inputs.
-        unknown_joints: names of joints that the robot has not.
+        unknown_joints: names of joints that the robot does not have.
     """
 
     stamp: int
@@ -64,13 +64,13 @@ def deserialise(kind: str, cdr: bytes, most: int = MAX_COMMAND) -> Any:
     """Deserialise a message of a type, of limited size.
 
     Raises:
-        CommandError: the bytes, which are anybody's, are none.
+        CommandError: the untrusted bytes are no message of the type.
     """
     try:
         if len(cdr) > most:
             raise ValueError(f"it has {len(cdr)} bytes")
         return store_of(kind).deserialize_cdr(cdr, kind)
-    except Exception as error:  # rosbags raises anything
+    except Exception as error:  # rosbags raises exceptions of any type
         raise CommandError("bytes", f"cannot be read ({error})") from error
 
 
@@ -78,7 +78,7 @@ def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[
     """Match joints by name: (robot index, message index) pairs.
 
     Raises:
-        CommandError: there are none, or it names one twice.
+        CommandError: the message has no joint of this robot, or names one twice.
     """
     known = [(joints[name], k) for k, name in enumerate(names) if name in joints]
     listed = f"{', '.join(names)[:LONGEST_NAME]!r}"
@@ -90,10 +90,10 @@ def known_joints(names: Sequence[str], joints: Mapping[str, int]) -> list[tuple[
 
 
 def sized(part: Sequence[float], what: str, names: Sequence[str]) -> Sequence[float]:
-    """Return numbers of a message, one for each joint that it names.
+    """Check that a message has one number for each joint that it names; return the numbers.
 
     Raises:
-        CommandError: there are not as many.
+        CommandError: the numbers of names and values differ.
     """
     if len(part) != len(names):
         raise CommandError("sizes", f"has {len(part)} {what} for {len(names)} joints")
@@ -104,11 +104,11 @@ class Commands:
     """The message types that an FMU can follow.
 
     Args:
-        fmu: that is commanded.
+        fmu: the commanded FMU.
 
     Attributes:
-        type: of the message that commands all that there is; "" where the FMU follows none.
-        types: all that it follows.
+        type: message type that commands all inputs of the control law; "" if the FMU accepts no commands.
+        types: all accepted message types.
     """
 
     def __init__(self, fmu: Fmu) -> None:
@@ -125,11 +125,11 @@ class Commands:
     def read(self, kind: str, cdr: bytes) -> Command:
         """Return the command in a message of one of ``types``.
 
-        Points and poses are in the frame of the robot's root, which an empty frame_id means too.
+        Points and poses must be in the robot's root frame; an empty frame_id means this frame.
 
         Raises:
-            CommandError: it cannot be read, is in another frame, not finite, no orientation, of
-                no joint of this robot, or without the numbers that its control takes.
+            CommandError: the message cannot be decoded, is in another frame, is not finite, has an invalid
+                orientation, names no joint of this robot, or lacks the numbers that the control law needs.
         """
         message = deserialise(kind, cdr)
         given = self._of_joints(message) if kind == JOINT_STATE else self._of_frame(kind, message)
@@ -156,7 +156,7 @@ class Commands:
         return given
 
     def _of_joints(self, message: Any) -> Inputs:
-        """Return efforts, or positions and velocities; missing velocities are 0."""
+        """Return the inputs for efforts, or for positions and velocities; missing velocities are 0."""
         names = message.name
         known = known_joints(names, self._joints)
         if effort := self._groups["tau_cmd"]:
@@ -170,17 +170,17 @@ class Commands:
 
 
 class Watchdog:
-    """Command time-out: the safe inputs after the last command.
+    """Command time-out, which sets safe inputs if no command arrives.
 
-    Targets are held, without the velocity that went with them; efforts are ramped to 0.
+    Targets are held with velocity 0; efforts are ramped to 0.
 
     Args:
-        fmu: that is commanded.
-        timeout: s without a command.
-        ramp: bring efforts down to 0; None: where there are any.
+        fmu: the commanded FMU.
+        timeout: time without a command, s.
+        ramp: whether to ramp efforts to 0; None: ramp if the FMU has commanded efforts.
 
     Raises:
-        InputError: efforts are to be ramped where there are none.
+        InputError: ``ramp`` is given for an FMU without commanded efforts.
     """
 
     def __init__(self, fmu: Fmu, timeout: float, ramp: bool | None = None) -> None:
@@ -193,12 +193,12 @@ class Watchdog:
         self._warn = warner(LOG)
 
     def received(self, t: float, inputs: Inputs) -> None:
-        """Register a command that arrived at a time, s."""
+        """Register a command that arrived at time t, s."""
         self._since = t
         self._last |= inputs
 
     def asked(self, t: float) -> Inputs:
-        """Return the inputs at a time, s, at which no command has arrived."""
+        """Return the inputs at a time, s, at which no command arrived."""
         late = t - self._since - self.timeout
         if not self._last or late < 0.0:
             return {}

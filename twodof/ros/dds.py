@@ -1,7 +1,7 @@
 """DDS types and topics for serialised messages, under ROS 2's type names.
 
-Names, types and qualities of service are those of ROS 2 (REP 2011's type hashes, rmw_cyclonedds of
-Jazzy), so that its tools see the run as they see any node's.
+Names, types and qualities of service are those of ROS 2 (type hashes of REP 2011, rmw_cyclonedds of Jazzy). Therefore
+ROS 2's tools treat the run like any node.
 """
 
 import functools
@@ -25,9 +25,9 @@ SERIALISED = {
     "__init__": _keep,
     "serialize": lambda self, **_options: self.cdr,
     "deserialize": classmethod(lambda cls, cdr: cls(cdr)),
-    "deserialize_key": classmethod(lambda cls, _key: None),  # a notice without a message: a writer has left
+    "deserialize_key": classmethod(lambda cls, _key: None),  # a sample without data: a writer has left
 }
-"""Methods of every DDS type, whose messages rosbags has already serialised."""
+"""Methods of every DDS type; they pass messages that rosbags has serialised."""
 
 
 @functools.cache
@@ -36,7 +36,7 @@ def dds_type(name: str) -> Any:
     package, _, kind = name.split("/")
     fields = {f"{field}_": _field_type(*of) for field, of in store_of(name).fielddefs[name][1]}
     struct = idl.make_idl_struct(f"{kind}_", f"{package}.msg.dds_.{kind}_", fields, dataclassify=False)
-    for name, method in SERIALISED.items():  # a base class would be part of the type
+    for name, method in SERIALISED.items():  # not a base class, which would be part of the type
         setattr(struct, name, method)
     return struct
 
@@ -52,7 +52,7 @@ def _field_type(node: Nodetype, of: Any) -> Any:
 def dds_qos(offered: Qos, type_name: str) -> qos.Qos:
     """Return the quality of service of a writer or reader.
 
-    A write never waits for a reader: one that does not keep up misses messages.
+    A write never waits for a reader; a slow reader misses messages.
     """
     latched = offered.durability is QosDurability.TRANSIENT_LOCAL
     return qos.Qos(

@@ -1,4 +1,4 @@
-"""Readers of a ROS 2 network: commands, their senders, and requests to pause."""
+"""Receive commands, their senders, and requests to pause from a ROS 2 network."""
 
 import logging
 import time
@@ -22,21 +22,21 @@ LOOK = 100_000_000  # ns between two checks of `stop`
 UNREAD = core.SampleState.NotRead | core.ViewState.Any | core.InstanceState.Any
 WHAT = {JOINT_STATE: "a command", POINT: "a point", POSE: "a pose"}
 Read = TypeVar("Read")
-MOST_COMMANDERS = 20  # that are recorded
-AT_ONCE = 1.0  # s within which commands of two nodes are conflicting ones
+MOST_COMMANDERS = 20  # recorded nodes
+AT_ONCE = 1.0  # s within which commands of two nodes conflict
 PROPERTIES = {
     "host": ("__Hostname", "fastdds.physical_data.host"),
     "process": ("__ProcessName", "fastdds.physical_data.process"),
 }
-"""Facts of a participant, and what Cyclone DDS and Fast DDS call them."""
+"""Facts of a participant, and their names in Cyclone DDS and Fast DDS."""
 
 
 class Commanders:
-    """The nodes whose commands are followed, recorded in the experiment, with a warning of conflicts.
+    """Recorder of the nodes that command the robot, with a warning of conflicts.
 
     Args:
-        participant: of the DDS domain.
-        run: that is commanded.
+        participant: participant of the DDS domain.
+        run: the commanded experiment, in which nodes are recorded.
     """
 
     def __init__(self, participant: domain.DomainParticipant, run: Experiment) -> None:
@@ -59,7 +59,7 @@ class Commanders:
     def _record(self, reader: sub.DataReader, writer: int, t: float) -> str:
         """Return the GUID of a writer's participant, and record its host and process."""
         endpoint = reader.get_matched_publication_data(writer)
-        if endpoint is None:  # it has left
+        if endpoint is None:  # the writer has left
             return f"writer {writer:x}"
         facts = {"guid": str(endpoint.participant_key)}
         for one in self._participants.read(1000):
@@ -77,12 +77,12 @@ class Listener:
     """Readers of commands, and of requests to pause and to step.
 
     Args:
-        participant: of the DDS domain.
-        follows: what messages ask of the FMU.
+        participant: participant of the DDS domain.
+        follows: mapping from messages to the FMU's inputs.
         received: topics and types of commands.
         orders: receive /pause and /step.
-        oldest: s before a sample that joint commands for it may be stamped; None: any time.
-        run: in which the nodes that command are recorded.
+        oldest: largest age of a joint command's stamp relative to the sample, s; None: any age.
+        run: the commanded experiment.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class Listener:
         return bool(self._readers[name].get_matched_publications())
 
     def commands(self, sample: Sample) -> Iterator[Command]:
-        """Return received commands; log one warning per kind of invalid message."""
+        """Yield received commands; log one warning for each kind of invalid message."""
         for name, kind in self._topics.items():
 
             def read(cdr: bytes, kind: str = kind) -> Command:
@@ -139,8 +139,8 @@ class Listener:
         """Wait while the run is paused, except for requested steps.
 
         Args:
-            stop: asked while it waits; True ends that.
-            pace: restarts after it.
+            stop: called while it waits; True ends the wait.
+            pace: restarted after a pause.
         """
         if not self._orders:
             return
@@ -161,7 +161,7 @@ class Listener:
                     self._steps += order.data
 
     def _come(self, name: str, read: Callable[[bytes], Read], what: str) -> Iterator[tuple[Read, int]]:
-        """Return the last few messages of a topic, as read, with their writers."""
+        """Yield the latest messages of a topic, decoded by ``read``, and their writers."""
         for message in self._readers[name].take(STREAM.depth):
             if message.sample_info.valid_data:
                 try:

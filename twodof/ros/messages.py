@@ -61,13 +61,13 @@ DEFINITIONS = {
     "geometry_msgs/Transform transform",
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
 }
-"""Definitions of Humble; rosbags' store of all of Humble's takes longer to import than NumPy."""
+"""Definitions of Humble; the import of rosbags' store of all types of Humble takes longer than that of NumPy."""
 _STORE = get_typestore(Stores.EMPTY)
 
 
 @cache
 def store_of(kind: str) -> Typestore:
-    """Return rosbags' store of types for one type and its parts; loading all types is slow."""
+    """Return rosbags' type store with one type and its parts; loading all types is slow."""
     for line in DEFINITIONS[kind].splitlines():
         package, slash, name = line.partition(" ")[0].removesuffix("[]").partition("/")
         if slash:
@@ -77,7 +77,7 @@ def store_of(kind: str) -> Typestore:
 
 
 def definition(kind: str) -> str:
-    """Return the definition of a type and of its parts, as bags have it."""
+    """Return the definition of a type and of its parts in the form of bags."""
     return store_of(kind).generate_msgdef(kind, ros_version=2)[0]
 
 
@@ -85,7 +85,7 @@ def check_name(argument: str, name: str) -> None:
     """Refuse an invalid ROS 2 name.
 
     Raises:
-        InputError: naming the argument.
+        InputError: the name is invalid; the message names the argument.
     """
     if name and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
         raise InputError(f"`{argument}` '{name}' is no name of ROS 2")
@@ -123,11 +123,11 @@ class Messages:
     """The messages of a run, serialised.
 
     Args:
-        run: the experiment whose samples come.
-        scene: also the robot description, transforms, target and end effector.
+        run: the experiment of the samples.
+        scene: also robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        clock: also the samples' stamps as the time.
-        measured: joint states are what the controller saw; the true ones have a topic of their own.
+        clock: also the samples' stamps on /clock.
+        measured: /joint_states has the measured values; the true ones have their own topic.
 
     Attributes:
         topics: all topics by name.
@@ -195,10 +195,10 @@ class Messages:
         return sum(layout.size for layout in self._layouts.values())
 
     def numbers(self, sample: Sample) -> bytes:
-        """Return the numbers of one sample's messages; several, joined, give all their messages.
+        """Return the packed numbers of one sample's messages, which may be joined with those of other samples.
 
         Raises:
-            struct.error: the sample is not of this run.
+            struct.error: the sample does not belong to this run.
         """
         given: tuple[float, ...] = (*sample.q_meas, *sample.v_meas) if self._measured else ()
         given = (*given, *sample.tau) if self._efforts else given
@@ -221,7 +221,7 @@ class Messages:
         parts[TRUE_STATES] = [table["q"], table["v"], table["tau"][:, :0]]
         if self._scene is not None:
             end_effector = self._scene.end_effector(table["q"])
-            target = end_effector.copy()  # an axis that is not controlled is left as it is
+            target = end_effector.copy()  # axes that are not controlled keep the end effector's position
             if TARGET in self._layouts:
                 target[:, self._axes] = table["x_des"]
             parts |= {
@@ -233,9 +233,9 @@ class Messages:
         return stamps, {t: layout.pack(stamps, *parts[t]) for t, layout in self._layouts.items()}
 
     def latched(self, stamp: int | np.int64) -> dict[str, Rows]:
-        """Return messages that hold for the whole run: robot description, fixed transforms.
+        """Return the messages that hold for the whole run: robot description and fixed transforms.
 
-        Their stamp is given in ns since the epoch.
+        ``stamp`` is their time stamp, ns since the epoch.
         """
         if self._scene is None:
             return {}

@@ -1,6 +1,6 @@
-"""ROS 2 network settings: the reach of a run by environment variables, and the DDS domain.
+"""ROS 2 network settings from environment variables, and the DDS domain.
 
-Variables are those of rcl and rmw_cyclonedds of Jazzy.
+The variables are those of rcl and rmw_cyclonedds of Jazzy.
 """
 
 import ctypes
@@ -26,13 +26,13 @@ from cyclonedds import core, domain
 
 LOG = logging.getLogger(__name__)
 RANGES = ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT")
-LAST_DOMAIN = 232  # the ports of later ones are beyond 65535
+LAST_DOMAIN = 232  # ports of larger domains would exceed 65535
 LOOPBACK = {"lo": "127.0.0.1"}
-MOST_PARTICIPANTS = 32  # of one host, that are looked for; as rmw_cyclonedds
+MOST_PARTICIPANTS = 32  # participants of one host that are searched, as in rmw_cyclonedds
 NO_NETWORK = "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
 ANNOUNCED = 1  # s between two announcements to participants of this host
-SO_ATTACH_FILTER = 26  # of Linux, on the architectures that there are packages for
-INTERFACE, SOURCE = 0xFFFFF008, 0xFFF0000C  # a packet's interface and IPv4 source, for its filter
+SO_ATTACH_FILTER = 26  # on Linux, for all supported architectures
+INTERFACE, SOURCE = 0xFFFFF008, 0xFFF0000C  # packet filter: offsets of interface and IPv4 source
 LOAD, EQUAL, ACCEPT = 0x20, 0x15, 0x06  # instructions of a packet filter
 
 
@@ -41,10 +41,10 @@ class Network(NamedTuple):
 
     Attributes:
         domain: ROS_DOMAIN_ID.
-        range: how far participants look for each other, ROS_AUTOMATIC_DISCOVERY_RANGE.
-        peers: other hosts to announce the run to, ROS_STATIC_PEERS.
-        loopback: on the loopback interface alone, ROS_LOCALHOST_ONLY.
-        custom: configuration that has the last word, CYCLONEDDS_URI.
+        range: discovery range, ROS_AUTOMATIC_DISCOVERY_RANGE.
+        peers: other hosts to which the run is announced, ROS_STATIC_PEERS.
+        loopback: use the loopback interface only, ROS_LOCALHOST_ONLY.
+        custom: Cyclone DDS configuration that overrides ours, CYCLONEDDS_URI.
     """
 
     domain: int = 0
@@ -66,12 +66,12 @@ class Network(NamedTuple):
     def guarded(self) -> Iterator[None]:
         """Limit the sockets that Cyclone DDS opens in this context to the hosts of ``reach``.
 
-        Cyclone DDS listens on all addresses, whatever its interfaces, and answers whoever finds
-        its ports. So the kernel drops packets that come neither by the loopback interface, as all
-        of this host do, nor from a peer: Cyclone DDS sends only to hosts from which it received.
+        Cyclone DDS listens on all addresses, whatever its interfaces, and answers any host that finds its ports.
+        Therefore a kernel filter drops packets unless they come over the loopback interface, as all packets of this
+        host do, or from a peer. Cyclone DDS sends only to hosts from which it has received packets.
 
         Raises:
-            PublishError: the kernel refuses.
+            PublishError: the kernel refuses the filter.
         """
         before = _sockets()
         yield
@@ -99,24 +99,24 @@ class Network(NamedTuple):
     def configuration(self, trace: str, own: Mapping[str, str] | None = None) -> str:
         """Return the configuration of Cyclone DDS, equivalent to that of rmw_cyclonedds of Jazzy.
 
-        LOCALHOST looks for others by messages to this host's own addresses, which no other host receives. Unlike
-        there it keeps doing so each second: a participant that starts later, and announces itself by multicast alone,
-        else would find us after half a minute or never. And it uses the loopback interface too: Fast DDS speaks to
-        its own host there, and Cyclone DDS drops what comes by an interface that it does not use.
+        With LOCALHOST, discovery messages go to this host's own addresses only. There are two differences from
+        rmw_cyclonedds. The messages are repeated each second, because a participant that starts later and announces
+        itself by multicast only would find this one after half a minute or never. The loopback interface is used too,
+        because Fast DDS uses it on its own host, and Cyclone DDS drops packets from an interface that it does not use.
 
         Args:
-            trace: file for the account of what was configured.
-            own: addresses by interface, those to use; None: what Cyclone DDS chooses.
+            trace: file for Cyclone DDS's log of its configuration.
+            own: addresses of the interfaces to use, by interface; None: Cyclone DDS chooses.
         """
         off, localhost = self.range == "OFF", self.range == "LOCALHOST"
         general, discovery = "", ""
-        if (off or localhost) and not self.loopback:  # which nothing leaves; older nodes need it
+        if (off or localhost) and not self.loopback:  # no packet leaves loopback, and older nodes need multicast there
             general += "<AllowMulticast>false</AllowMulticast>"
         if own:
             named = "".join(f"<NetworkInterface name={quoteattr(name)}/>" for name in own)
             general += f"<Interfaces>{named}</Interfaces>"
         if off:
-            discovery = "<ParticipantIndex>none</ParticipantIndex>"  # ports that nobody guesses
+            discovery = "<ParticipantIndex>none</ParticipantIndex>"  # random ports
         elif self.range != "SYSTEM_DEFAULT":
             discovery = (
                 "<ParticipantIndex>auto</ParticipantIndex>"
@@ -138,14 +138,14 @@ class Network(NamedTuple):
 def network_of_environment(variables: Mapping[str, str] = os.environ, *, subnet: bool = False) -> Network:
     """Return the network that ROS 2's environment variables select.
 
-    Unlike ROS 2, whose default range is SUBNET, nothing leaves the host unless asked for.
+    The default range is LOCALHOST, not SUBNET as in ROS 2: nothing leaves the host without permission.
 
     Args:
         variables: the environment.
-        subnet: range SUBNET, whatever they say.
+        subnet: use the range SUBNET, and ignore the variables of the range.
 
     Raises:
-        PublishError: naming the variable that is at fault.
+        PublishError: a variable is invalid; the message names it.
     """
     number = variables.get("ROS_DOMAIN_ID") or "0"
     if not re.fullmatch("[0-9]{1,9}", number) or int(number) > LAST_DOMAIN:
@@ -168,7 +168,7 @@ def _sockets() -> set[int]:
     """Return file descriptors of this process that are internet sockets."""
     found = set()
     for name in os.listdir("/proc/self/fd"):
-        with suppress(OSError):  # it is closed by now
+        with suppress(OSError):  # closed meanwhile
             if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
                 with socket.socket(fileno=os.dup(int(name))) as one:
                     if one.family in (socket.AF_INET, socket.AF_INET6):
@@ -180,7 +180,7 @@ def _peers(variables: Mapping[str, str]) -> tuple[str, ...]:
     peers = tuple(filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")))
     for peer in peers:
         try:
-            socket.getaddrinfo(peer, None)  # Cyclone DDS would end the process
+            socket.getaddrinfo(peer, None)  # otherwise Cyclone DDS would end the process
         except (OSError, UnicodeError) as error:
             raise PublishError(f"ROS_STATIC_PEERS: '{peer}' is not found: {error}") from error
     return peers
@@ -192,7 +192,7 @@ class OpenDomain(NamedTuple):
     Attributes:
         network: the network.
         interface: names of the network interfaces in use.
-        handle: Cyclone DDS's.
+        handle: Cyclone DDS's handle of the domain.
     """
 
     network: Network
@@ -204,16 +204,16 @@ def open_domain(network: Network) -> OpenDomain:
     """Open the DDS domain of a network.
 
     Raises:
-        PublishError: saying what Cyclone DDS says.
+        PublishError: Cyclone DDS cannot open it; the message has Cyclone DDS's reason.
     """
     own = LOOPBACK if network.loopback else None
     opened, used, messages = _try_to_open(network, own)
     if opened and network.range == "LOCALHOST" and not used.keys() & LOOPBACK:
-        del opened  # which closes it
+        del opened  # closes the domain
         opened, both, messages = _try_to_open(network, {**used, **LOOPBACK})
         if opened:
             used = both
-        else:  # CYCLONEDDS_URI names interfaces, and none may be named twice
+        else:  # CYCLONEDDS_URI names interfaces, which must not be named again
             opened, used, messages = _try_to_open(network, own)
     interfaces = ", ".join(used) or "an interface of CYCLONEDDS_URI"
     if opened is None and "failed to find interfaces" in messages:
@@ -232,7 +232,7 @@ def open_domain(network: Network) -> OpenDomain:
 def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, dict[str, str], str]:
     """Return a domain or None, the addresses of the interfaces in use by name, and the error.
 
-    Cyclone DDS tells interfaces in its trace, and reasons of a failure on the standard error alone.
+    Cyclone DDS reports interfaces only in its trace, and the reason for a failure only on the standard error.
     """
     with temporary_folder() as folder:
         trace, errors = folder / "trace", folder / "errors"

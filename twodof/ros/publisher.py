@@ -33,31 +33,30 @@ class Publisher(Sink):
     """A sink that publishes each sample, and receives targets and commands.
 
     Args:
-        network: the network, or one that is open already; None: that of the environment variables.
-        scene: also the robot description, transforms, target and end effector.
+        network: the network settings, or an open domain; None: from the environment variables.
+        scene: also robot description, transforms, target and end effector.
         effort: put the control effort into JointState.effort.
-        clock: also the samples' stamps as /clock; and hear /pause and /step.
-        namespace: of all topics but /clock, /pause, /step and names given that begin with "/".
-        state_topic: of the joint states.
-        command_topic: topic of received commands; None: "joint_commands", or "target_command" for an
-            FMU whose control has a target of the frame.
-        lockstep: each communication step awaits the command that has the sample's stamp.
-        timeout: s without a command until the robot is held, or in lockstep until the run ends,
-            by the wall clock; None: 0.5, in lockstep 10.
-        on_timeout: "hold" or "ramp", as of ``Watchdog``; None: what is safe.
+        clock: also publish the samples' stamps on /clock, and subscribe to /pause and /step.
+        namespace: namespace of all topics except /clock, /pause, /step and given names that begin with "/".
+        state_topic: topic of the joint states.
+        command_topic: topic of received commands; None: "joint_commands", or "target_command" under task control.
+        lockstep: do each communication step when the command with the sample's stamp has arrived.
+        timeout: simulated time without a command until the robot is held, s; in lockstep, wall time without a
+            command until the run ends. None: 0.5 s, in lockstep 10 s.
+        on_timeout: "hold" or "ramp", as in ``Watchdog``; None: ramp efforts, hold targets.
         opened: called when the network is open.
 
     Attributes:
-        lockstep: as given.
-        network: the network.
-        interface: names of the network interfaces in use, known when it is open.
-        topics: what is published.
-        commands: the topics of received commands; none where the FMU has no inputs for
-            them, or does not say which axes of which frame targets are. Known when it has begun.
+        lockstep: the argument.
+        network: the network settings.
+        interface: names of the network interfaces in use, known when the network is open.
+        topics: published topics.
+        commands: topics of received commands, known after ``begin``; empty if the FMU has no inputs for
+            commands, or does not state the frame and axes of its targets.
 
     Raises:
-        InputError: an argument is wrong.
-        PublishError: the network cannot be used as asked for.
+        InputError: an argument is invalid.
+        PublishError: the network cannot be used as requested.
     """
 
     def __init__(
@@ -93,14 +92,14 @@ class Publisher(Sink):
         self._warn = warner(LOG)
 
     def begin(self, run: Experiment) -> Publisher:
-        """Receive the experiment of the samples to come.
+        """Receive the experiment of the following samples.
 
         Raises:
             BagError: the FMU lacks a requested output.
-            InputError: it has nothing to command, or no effort to ramp.
+            InputError: the FMU accepts no commands, or has no commanded effort to ramp.
         """
         self._run, self._follows = run, Commands(run.fmu)
-        run.commanders.clear()  # those of a run before
+        run.commanders.clear()  # from an earlier run
         self._messages = Messages(run, scene=self._scene, effort=self._effort, clock=self._clock)
         self.topics = tuple(map(self._named, self._messages.topics))
         of_joints = self._follows.type == JOINT_STATE
@@ -131,20 +130,20 @@ class Publisher(Sink):
         return self
 
     def _named(self, name: str) -> str:
-        """Return the network name of one of our topics."""
-        if name == CLOCK:  # there is one
+        """Return the name on the network of one of the messages' topics."""
+        if name == CLOCK:  # all robots share it
             return name
         return self._resolved(self._state_topic if name == JOINT_STATES else name[1:])
 
     def _resolved(self, name: str) -> str:
-        """Resolve a name as ROS 2 does: without a leading "/" it is in the namespace."""
+        """Resolve a name as ROS 2 does: a name without a leading "/" is in the namespace."""
         return name if name.startswith("/") else f"{self._prefix}/{name}"
 
     def __enter__(self) -> Publisher:
         self._domain = self._shared or open_domain(self.network)
         self.interface = self._domain.interface
         try:
-            with self.network.guarded():  # one may have sockets of its own, by CYCLONEDDS_URI
+            with self.network.guarded():  # with CYCLONEDDS_URI, a participant may open its own sockets
                 participant = self._participant = domain.DomainParticipant(self.network.domain)
             self._writers = {
                 name: pub.DataWriter(
@@ -184,14 +183,14 @@ class Publisher(Sink):
     def command(self, stop: Callable[[], bool] = never, pace: RealTime | None = None) -> Mapping[str, Setting] | None:
         """Return the inputs commanded from the latest sample on, or None.
 
-        Waits while the run is paused and, in lockstep, for the command that belongs to the sample.
+        It waits while the run is paused and, in lockstep, until the command with the sample's stamp arrives.
 
         Args:
-            stop: asked while it waits; True ends that.
-            pace: restarts after a pause.
+            stop: called while it waits; True ends the wait.
+            pace: restarted after a pause.
 
         Raises:
-            PublishError: in lockstep no command came in time; it says who is missing.
+            PublishError: in lockstep no command arrived in time; the message names the missing participant.
         """
         self._listener.await_go(stop, pace)
         if self.lockstep:
@@ -220,11 +219,11 @@ class Publisher(Sink):
                     f"no command for the sample at t = {sample.t:g} s in {waited:.3g} s: {self._missing(latest)}"
                 )
             if not self._listener.wait() and not self._answered:
-                self._publish(self._messages.of(sample))  # who comes now has missed it
+                self._publish(self._messages.of(sample))  # for late subscribers
         return None
 
     def _missing(self, latest: int | None) -> str:
-        """Name the missing participant, by the stamp of the latest command."""
+        """Return why no command arrived, given the stamp of the latest one."""
         (name,) = self.commands
         if latest is not None:
             own = self._sample.stamp / NANOSECONDS

@@ -36,19 +36,19 @@ def publish(
     steer: Steer = ignore,
     **options: Unpack[ExperimentOptions],
 ) -> Summary:
-    """Step an FMU in real time on a ROS 2 network until it is asked to stop.
+    """Step an FMU in real time on a ROS 2 network until its stop time, or until ``stop`` returns true.
 
     Args:
-        run: an experiment, or an FMU for which ``options`` are those of ``experiment``; without
-            a stop time it has no end.
+        run: an experiment, or an FMU together with options of ``experiment``; without a stop time, the run
+            has no end.
         sinks: further consumers of the samples, for example a bag.
-        publisher: the publisher; None: one of the joint states.
-        pace: as of ``simulate``; None: real time, or in lockstep as fast as the commands come.
-        stop, steer: as of ``simulate``; commands from the network have precedence.
+        publisher: the publisher; None: a publisher of joint states.
+        pace: as in ``simulate``; None: real time, or in lockstep as fast as commands arrive.
+        stop, steer: as in ``simulate``; commands from the network take precedence.
 
     Raises:
         FmuError, InputError, PublishError: before the first sample.
-        PublishError: in lockstep no command came in time.
+        PublishError: in lockstep no command arrived in time.
         SimulationError: the FMU refused or failed a call.
     """
     run = as_experiment(publish, run, options, {"stop_time": inf})
@@ -59,7 +59,7 @@ def publish(
 
 
 class PublisherOptions(TypedDict, total=False):
-    """Keywords of ``Publisher`` that ``publish_together`` passes on to each."""
+    """Keywords of ``Publisher`` that ``publish_together`` passes on to each publisher."""
 
     scene: bool
     effort: bool
@@ -86,11 +86,11 @@ def publish_together(
     """Step several FMUs in one loop on a ROS 2 network, each in its own namespace.
 
     Args:
-        robots: an experiment by namespace, all of the same times; their first stamp is one. "" is
-            the namespace of a robot that is alone.
-        sinks: further consumers of a robot's samples.
-        network, clock, namespace, options: as of ``Publisher``; the clock is one, and pauses all.
-        pace, stop: as of ``publish``.
+        robots: experiments by namespace, with equal times; they share the first stamp. A single robot may have the
+            namespace "".
+        sinks: further consumers of samples, by namespace.
+        network, clock, namespace, options: as in ``Publisher``; all robots share one clock and pause together.
+        pace, stop: as in ``publish``.
 
     Raises:
         FmuError, InputError, PublishError, SimulationError: as ``publish``.

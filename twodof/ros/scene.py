@@ -1,6 +1,6 @@
 """Robot description and transforms with which RViz, Foxglove and rerun show a robot.
 
-Transforms are those of robot_state_publisher: one for each joint, parent link to child link.
+There is one transform for each joint, from parent to child link, as in robot_state_publisher.
 """
 
 import logging
@@ -24,18 +24,18 @@ class Scene:
 
     Args:
         urdf: XML text whose meshes are named ``package://meshes/…``.
-        joints: names of the joints whose positions q has, in its order.
+        joints: names of the joints, in the order of q.
         frame: the end effector's link.
-        read: gives the bytes of a mesh by its name ``meshes/…``, None where it is missing.
-        meshes_in: URI of the folder that has the meshes by these names, with a slash at its end; "": none has.
+        read: returns the bytes of a mesh by its name ``meshes/…``, or None if it is missing.
+        meshes_in: URI of the folder with meshes of these names, with a trailing slash; "": there is none.
 
     Attributes:
-        description: the URDF with each mesh replaced by its best-fitting box or cylinder, which
-            renders where the mesh files are not at hand; or with the URIs of the meshes.
-        fixed, moving: joints whose transforms hold for the whole run, and the others.
+        description: the URDF, in which the best-fitting box or cylinder replaces each mesh, so that it renders
+            without mesh files; with ``meshes_in``, the URIs of the meshes instead.
+        fixed, moving: joints with constant transforms, and the other joints.
 
     Raises:
-        RobotError: the URDF is not sound.
+        RobotError: the URDF is invalid.
     """
 
     def __init__(self, urdf: str, joints: Sequence[str], frame: str, read: ReadMesh, meshes_in: str = "") -> None:
@@ -58,9 +58,9 @@ class Scene:
         self.description = ET.tostring(robot.tree, encoding="unicode")
 
     def transforms(self, joints: Iterable[Joint], q: Array) -> list[Array]:
-        """Return transforms of joints' children in their parents, at N positions q, rad or m.
+        """Return the transforms of the joints' child links in their parent links, at N positions q, rad or m.
 
-        One N × 7 array each, or 1 × 7 where it is fixed: m, and a unit quaternion x, y, z, w.
+        Each is an N × 7 array, or 1 × 7 if it is constant: position in m, and a unit quaternion x, y, z, w.
         """
         return [self._kinematics.pose(joint, q) for joint in joints]
 
@@ -91,7 +91,7 @@ def _replace_meshes(tree: ET.Element, meshes: Meshes) -> None:
 
 
 def _fit(uri: str, scale: Array, meshes: Meshes) -> tuple[ET.Element, Placement] | None:
-    """Return the smallest box or cylinder along the mesh's principal or own axes, and its pose."""
+    """Return the smallest box or cylinder along the mesh's principal axes or its own axes, and its pose."""
     vertices = _vertices(uri, scale, meshes)
     if vertices is None:
         return None
@@ -129,7 +129,7 @@ def _vertices(uri: str, scale: Array, meshes: Meshes) -> Array | None:
         if not surfaces:
             raise ValueError("the FMU does not carry it")
         vertices = np.concatenate([surface.vertices for surface in surfaces]) * scale
-        if np.abs(vertices).max(initial=0.0) < LARGEST:  # false where one is not a number
+        if np.abs(vertices).max(initial=0.0) < LARGEST:  # false also for NaN
             return vertices
         raise ValueError("it has no sound size")
     except ValueError as error:
@@ -142,7 +142,7 @@ def _place(part: ET.Element, transform: Placement) -> None:
     if origin is None:
         origin = ET.SubElement(part, "origin")
     r = transform.rotation
-    # roll from what yaw leaves: exact too where the two turn about one axis, as SciPy's are not
+    # roll after removal of yaw, which is exact also in gimbal lock, unlike SciPy's
     yaw = math.atan2(r[1, 0], r[0, 0])
     sin, cos = math.sin(yaw), math.cos(yaw)
     pitch = math.atan2(-r[2, 0], cos * r[0, 0] + sin * r[1, 0])

@@ -1,13 +1,13 @@
 """Joint trajectories as inputs of an FMU.
 
-From one point to the next a joint's position is a polynomial, by what both points have:
+Between two points, the position of a joint is a polynomial. The fields that both points have determine its degree:
 
     positions                               q(s) = Σ cᵢ sⁱ, linear
     positions, velocities                   cubic
     positions, velocities, accelerations    quintic
 
-and behind the last point it rests there. Inputs are held over a communication step: what is held is
-the mean over the step, with which a robot does not lag half a step behind.
+After the last point, the joint rests there. Inputs are held over a communication step; their value is the mean over the
+step, so that the robot does not lag by half a step.
 
 Source: ros2_controllers, joint_trajectory_controller, "Trajectory Representation".
 """
@@ -38,7 +38,7 @@ HIGHER = {
     2: np.array([[3.0, -1.0], [-2.0, 1.0]]),
     3: np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]),
 }
-"""cᵢ Tⁱ of the higher half of i, from what the lower half misses of q, T q̇, T² q̈ at the end T."""
+"""Matrices for cᵢ Tⁱ, higher half of i, from the errors of the lower half in q, T q̇ and T² q̈ at the end T."""
 NODES, WEIGHTS = leggauss(3)  # exact up to degree 5
 
 
@@ -46,11 +46,11 @@ class Trajectory(NamedTuple):
     """A trajectory of joints.
 
     Attributes:
-        start: from when on, s.
+        start: start time, s.
         joints: indices of the n joints.
-        times: of the points, s, ascending; some may be before the start.
-        points: position and, where they have any, velocity and acceleration, k × n each.
-        unknown_joints: names of joints that the robot has not.
+        times: times of the points, s, ascending; some may be before the start.
+        points: position, and if given velocity and acceleration, k × n each.
+        unknown_joints: names of joints that the robot does not have.
     """
 
     start: float
@@ -63,18 +63,18 @@ class Trajectory(NamedTuple):
 def read_trajectory(cdr: bytes, joints: Mapping[str, int], came: int, begin: int) -> Trajectory:
     """Read a JointTrajectory.
 
-    It starts when it came, and its points are as long after its stamp, or where that is 0 after
-    its start, as they say.
+    It starts at its recording time. ``time_from_start`` of its points counts from its stamp, or from its start if the
+    stamp is 0.
 
     Args:
         cdr: the message.
         joints: indices of the robot's joints by name.
-        came: when, ns since the epoch.
-        begin: the time 0 of the run, ns since the epoch.
+        came: recording time, ns since the epoch.
+        begin: time 0 of the run, ns since the epoch.
 
     Raises:
-        CommandError: it cannot be read, is not finite, of no joint of this robot, has no points or
-            such as do not ascend in time or lack what goes before, or ends before it starts.
+        CommandError: the message cannot be decoded, is not finite, names no joint of this robot, has no points,
+            has points whose times do not ascend or whose fields are incomplete, or ends before it starts.
     """
     message = deserialise(JOINT_TRAJECTORY, cdr, MAX_TRAJECTORY)
     known = known_joints(message.joint_names, joints)
@@ -106,35 +106,35 @@ class _Path:
     """Desired motion of a joint over time: polynomials, each until the next begins.
 
     Args:
-        begin: from when on there is anything, s.
-        q: its rest position before the first polynomial.
+        begin: start time, s.
+        q: rest position before the first polynomial, rad or m.
     """
 
     def __init__(self, begin: float, q: float) -> None:
         self._begins, self._pieces = [begin], [np.array([q, *[0.0] * DEGREE])]
 
     def before(self, t: float) -> Array:
-        """Return position, velocity and acceleration just before a time after the begin."""
+        """Return position, velocity and acceleration just before a time t > ``begin``."""
         i = bisect_left(self._begins, t) - 1
         values: Array = _moved(self._pieces[i], t - self._begins[i])[:3] * FACTORIALS[:3]
         return values
 
     def replace(self, begins: Sequence[float], pieces: Sequence[Array]) -> None:
-        """Replace the polynomials from the first of the new begins on."""
+        """Replace the polynomials from the first new start time on."""
         keep = bisect_left(self._begins, begins[0])
         self._begins[keep:], self._pieces[keep:] = begins, pieces
 
     def means(self, grid: Array) -> Array:
-        """Return position, velocity and acceleration, means between N successive times, N − 1 × 3.
+        """Return the means of position, velocity and acceleration between N successive times, N − 1 × 3.
 
-        All that begins does so within them.
+        All polynomials begin within these times.
         """
         edges = np.union1d(grid, self._begins)
         spans, steps = np.diff(edges), np.searchsorted(grid, edges[:-1], "right") - 1
         times = edges[:-1, None] + spans[:, None] * (NODES + 1.0) / 2.0
         means = []
         for order in range(3):
-            start = self._values(order, grid[:-1])  # so that a joint at rest stays exactly at rest
+            start = self._values(order, grid[:-1])  # the reference value, so that a joint at rest stays exactly at rest
             off = (self._values(order, times) - start[steps, None]) @ (WEIGHTS / 2.0) * spans
             total = np.add.reduceat(off, np.searchsorted(edges, grid[:-1]))
             means.append(start + total / np.diff(grid))
@@ -148,22 +148,20 @@ class _Path:
 
 
 def follow(trajectories: Iterable[Trajectory], rest: Sequence[float], grid: Array) -> dict[int, Array]:
-    """Return the motion of joints along trajectories, each along the latest that names it.
+    """Return the motion of joints along trajectories; each joint follows the latest trajectory that names it.
 
-    Where a trajectory has points after its start alone, it goes to the first of them from what was
-    wanted just before the start.
+    If all points of a trajectory are after its start, it begins at the desired state just before its start.
 
     Args:
-        trajectories: in the order in which they came.
-        rest: where each joint is before.
+        trajectories: trajectories in the order of their recording times.
+        rest: position of each joint before the first trajectory, rad or m.
         grid: N communication points, s; the first before and the last after all trajectories.
 
     Returns:
-        By index of the joint, means from each of these times to the next of position, velocity and
-        acceleration, N − 1 × 3.
+        Means of position, velocity and acceleration between successive times, N − 1 × 3, by joint index.
     """
     paths: dict[int, _Path] = {}
-    with np.errstate(all="ignore"):  # who takes the values refuses such
+    with np.errstate(all="ignore"):  # the inputs are checked later
         for start, joints, times, points, _ in trajectories:
             own = [paths.setdefault(i, _Path(grid[0], rest[i])) for i in joints]
             if times[0] > start:

@@ -1,6 +1,6 @@
 """Write layout files with which RViz, PlotJuggler and Foxglove show a robot.
 
-Topics and their types are those that ``Messages`` has, in a namespace.
+Topics and their types are those of ``Messages``, in a namespace.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def layouts(
     """Write the files with which RViz, PlotJuggler and Foxglove show an FMU's robot.
 
     Args:
-        fmu: whose robot is published or recorded, with ``scene`` and ``effort``.
-        folder: where the files are written, made if need be; they are called as the FMU is.
-        namespace: of its topics, as of ``Publisher``.
+        fmu: the FMU whose robot is published or recorded with ``scene`` and ``effort``.
+        folder: output folder, made if it does not exist; the files have the name of the FMU.
+        namespace: namespace of the topics, as in ``Publisher``.
         overwrite: replace files that differ.
 
     Returns:
@@ -41,7 +41,7 @@ def layouts(
     Raises:
         BagError: the FMU carries no robot.
         FmuError: it cannot be read.
-        InputError: the namespace is none, or a file exists and holds something else.
+        InputError: the namespace is invalid, or a file exists with another content.
         OSError: a file cannot be written.
     """
     check_name("namespace", namespace)
@@ -79,7 +79,7 @@ def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
     layout = json.loads(template.substitute(prefix=prefix, frame=json.dumps(fmu.root), pitch=pitch, yaw=yaw))
 
     def shows(display: Mapping[str, Any]) -> bool:
-        """Return whether a display has no topic, or one of the robot's and its type."""
+        """Return whether a display has no topic, or a topic of the robot with the right type."""
         kind = types.get(display.get("Topic", {}).get("Value"), "").rpartition("/")[2]
         return "Topic" not in display or kind.startswith(display["Class"].rpartition("/")[2])
 
@@ -89,7 +89,7 @@ def _rviz(fmu: Fmu, prefix: str, types: Mapping[str, str]) -> str:
 
 
 def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
-    """Return a plot of each part of the joint states, under PlotJuggler's names."""
+    """Return a layout with a plot for each field of the joint states, by PlotJuggler's names."""
     root = ET.Element("root")
     window = ET.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
     tab = ET.SubElement(window, "Tab", tab_name=fmu.name, containers="1")
@@ -116,7 +116,7 @@ def _plotjuggler(fmu: Fmu, prefix: str, units: Mapping[str, str]) -> str:
 
 
 def _foxglove(fmu: Fmu, prefix: str, units: Mapping[str, str], types: Mapping[str, str]) -> str:
-    """Return a layout of the robot in 3D with its gains, beside plots of the joint states."""
+    """Return a layout with the robot in 3D, its gains, and plots of the joint states."""
     shown = [prefix + DESCRIPTION, *(name for name, kind in types.items() if kind == POSE)]
     panels: dict[str, object] = {
         "3D!robot": {

@@ -9,19 +9,19 @@ from .runner import Point, Row, lost
 
 BATCH_TIME = 0.25  # s, of one batch
 MAX_BATCH = 256
-MOST_DEATHS = 3  # of a run's worker, two of them while it ran alone
+MOST_DEATHS = 3  # deaths of a run's worker, two of them during batches of this run only
 GIVEN_UP = "the process that ran it died, repeatedly"
-LOOK = 0.2  # s between two looks at whether to go on
+LOOK = 0.2  # s between two checks of ``stop``
 
 
 class Batches:
     """Divides points into batches of about a quarter of a second.
 
-    A run whose worker dies is done again, with nothing beside it that could be at fault. Where that
-    kills its worker twice more, it has the outcome "crashed".
+    If a worker dies, each unfinished run of its batch is repeated in a batch of its own. A run that kills two more
+    workers has the outcome "crashed".
 
     Args:
-        points: of all runs.
+        points: points of all runs.
         left: number of runs that have no row yet.
     """
 
@@ -32,7 +32,7 @@ class Batches:
         self._deaths: Counter[int] = Counter()
 
     def next(self, *, alone: bool) -> list[Point]:
-        """Return the next batch; empty if all are taken, or the rest must run alone and cannot now."""
+        """Return the next batch; empty if all runs are taken, or if the rest must run alone and cannot yet."""
         batch = list(islice(self._points, self._size))
         return [self._suspects.popleft()] if not batch and alone and self._suspects else batch
 
@@ -45,7 +45,7 @@ class Batches:
         return rows
 
     def died(self, batch: list[Point]) -> list[Row]:
-        """Return rows of the runs of a dead worker's batch that are given up."""
+        """Return the rows of runs that are given up after the death of a worker."""
         self._deaths.update(number for number, _ in batch)
         self._suspects.extend(p for p in batch if self._deaths[p[0]] < MOST_DEATHS)
         given_up = [p for p in batch if self._deaths[p[0]] >= MOST_DEATHS]

@@ -1,7 +1,7 @@
 """Run a sweep on the workers of an existing Dask cluster; all uses of Dask are here.
 
-Who reaches its scheduler runs code on its workers, and in this process. What keeps others away is
-Dask's own configuration, ``distributed.comm.tls``.
+Anybody who can reach the scheduler can run code on its workers and in this process. Dask's configuration
+``distributed.comm.tls`` restricts access.
 """
 
 import os
@@ -21,8 +21,8 @@ with needing(SweepError, "use a cluster", "cluster"):
     from distributed import Client, Future, KilledWorker, Worker, WorkerPlugin, get_worker, wait
 
 SCHEDULER_TIMEOUT = 5.0  # s for a scheduler to answer
-NO_WORKER = 60.0  # s after which nobody hopes for another
-IN_HAND = 2  # tasks a worker, so that it never waits for the next
+NO_WORKER = 60.0  # s of waiting for a worker
+IN_HAND = 2  # tasks for each worker, so that it never waits for the next one
 
 
 class JobPlugin(WorkerPlugin):  # type: ignore[misc]
@@ -33,10 +33,10 @@ class JobPlugin(WorkerPlugin):  # type: ignore[misc]
         self._runner: Runner | None = None
 
     def setup(self, worker: Worker) -> None:
-        """Refuse mixed versions, whose results might differ."""
+        """Refuse different versions, whose results might differ."""
         if __version__ != self._version:
             raise SweepError(f"worker {worker.address} has twodof {__version__}, not {self._version}")
-        self._lock = Lock()  # for workers of several threads: the FMU has one instance
+        self._lock = Lock()  # a worker may have several threads, but the FMU has one instance
 
     def teardown(self, worker: Worker) -> None:
         """Free the FMU."""
@@ -64,14 +64,14 @@ class Cluster:
     A thread talks to Dask, because Dask can wait for ever for a peer that does not answer.
 
     Args:
-        job: what all runs share.
+        job: common settings of all runs.
         batches: the runs.
-        address: of the scheduler.
-        stop: asked all the time; True ends it.
+        address: address of the scheduler.
+        stop: called repeatedly; True ends the sweep.
 
     Raises:
-        SweepError: there are no workers, they cannot run the job, or the scheduler is gone.
-        FmuError, InputError, BagError: from a run, for a reason that others will meet too.
+        SweepError: there are no workers, they cannot run the job, or the scheduler does not answer.
+        FmuError, InputError, BagError: a run failed for a reason that affects all runs.
     """
 
     def __init__(self, job: Job, batches: Batches, address: str, stop: Callable[[], bool]) -> None:
@@ -88,7 +88,7 @@ class Cluster:
     def __exit__(self, *exception: object) -> None:
         self._ended.set()
         if self._answers:
-            self._thread.join(SCHEDULER_TIMEOUT)  # it takes back the job
+            self._thread.join(SCHEDULER_TIMEOUT)  # the thread unregisters the job
 
     def _next(self) -> list[Row] | None:
         """Return the thread's next message; None at its end, or if the sweep is to stop."""
@@ -120,7 +120,7 @@ class Cluster:
             if now - seen > NO_WORKER:
                 raise SweepError("no worker is left; go on with `resume=True`")
             width = IN_HAND * max(1, workers)
-            # a worker's death is blamed on all that it had in hand
+            # all batches of a dead worker may have caused its death
             while len(tasks) < width and (batch := batches.next(alone=not tasks)):
                 tasks[client.submit(run_batch, name, batch, pure=False)] = batch
             with suppress(TimeoutError):
@@ -164,11 +164,11 @@ def _registered(client: Client, job: Job) -> Iterator[str]:
         client.register_plugin(JobPlugin(job, __version__), name=name)
     except TwoDofError:
         raise
-    except Exception as error:  # Dask hands on what a worker said, as one of these
+    except Exception as error:  # Dask re-raises a worker's exception as one of these
         remedy = f"install twodof {__version__} and its extra 'cluster' there"
         raise SweepError(f"a worker cannot take the job: {error!s:.300}; {remedy}") from error
     try:
         yield name
     finally:
-        with suppress(OSError):  # from a worker that dies at this moment
+        with suppress(OSError):  # a worker may die at this moment
             client.unregister_worker_plugin(name)

@@ -57,23 +57,23 @@ def sweep(
 
     Args:
         fmu: the FMU or its path.
-        grid: values by variable; a name without an index sets all elements. All combinations.
-        ranges: low and high by variable, drawn uniformly, ``random`` times, beside each combination of the grid.
-        random, seed: number of draws, and what makes them reproducible.
-        stop_time, step, settings: of each run, as of ``experiment``.
-        output: folder for the table; None: it is not kept.
-        resume: go on with the sweep in ``output``; what is done is not repeated.
-        bags: write a bag of each run, ``output``/bags/<run>; workers must see that folder.
-        workers: processes of this machine; None: as many as there are cores.
-        scheduler: address of a Dask scheduler whose workers are to be used instead. Who can reach
-            it runs code as you, unless Dask is configured to use TLS.
+        grid: values by variable; a name without an index sets all elements. All combinations are run.
+        ranges: low and high by variable; values are drawn uniformly, ``random`` times for each grid combination.
+        random, seed: number of draws, and their seed.
+        stop_time, step, settings: settings of each run, as in ``experiment``.
+        output: folder for the table; None: it is not stored.
+        resume: continue the sweep in ``output`` without repeating finished runs.
+        bags: write a bag of each run, ``output``/bags/<run>; workers need access to that folder.
+        workers: number of local processes; None: one for each core.
+        scheduler: address of a Dask scheduler whose workers are used instead. Anybody who can reach it can
+            run code as you, unless Dask is configured to use TLS.
         progress: called with the number of finished runs and of all runs.
-        stop: asked at least twice a second; True ends the sweep with what it has.
-        command_line: for the provenance.
+        stop: called at least twice a second; True ends the sweep with the finished runs.
+        command_line: command line for the provenance.
 
     Raises:
-        InputError, FmuError: the design or the FMU is wrong.
-        SweepError: naming the folder, the scheduler or the workers at fault.
+        InputError, FmuError: the design or the FMU is invalid.
+        SweepError: the folder, the scheduler or the workers failed; the message names them.
         ChildError: a worker failed for another reason.
         BagError: a bag cannot be written.
     """

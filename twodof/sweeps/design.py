@@ -20,9 +20,9 @@ class Design:
 
     Attributes:
         grids: values by variable; the last one changes fastest.
-        ranges: low and high by variable; drawn uniformly.
-        draws: number of draws of all ranges, 1 where there are none.
-        seed: of the draws.
+        ranges: low and high by variable, drawn uniformly.
+        draws: number of draws of all ranges; 1 without ranges.
+        seed: seed of the draws.
     """
 
     grids: Mapping[str, tuple[float, ...]]
@@ -58,7 +58,7 @@ def make_design(
     """Return the design, checked against the FMU and the other settings.
 
     Raises:
-        InputError: naming the variable or the number that is wrong.
+        InputError: a variable or number is invalid; the message names it.
     """
     grids = {name: tuple(map(float, values)) for name, values in grid.items()}
     limits = {}

@@ -14,21 +14,21 @@ from .batches import LOOK, Batches
 from .runner import Job, Point, Row, Runner
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-MOST_FAILURES = 5  # of workers that start, one after the other
+MOST_FAILURES = 5  # successive failures of starting workers
 
 
 class Pool:
-    """Worker processes, replaced where they die, as a context that needs at least one of them.
+    """Worker processes, which are replaced when they die, as a context that needs at least one of them.
 
     Args:
-        job: what all runs share.
+        job: common settings of all runs.
         batches: the runs.
         count: number of processes.
-        stop: asked all the time; True ends it.
+        stop: called repeatedly; True ends the sweep.
 
     Raises:
-        SweepError: they die as they start.
-        FmuError, InputError, BagError, ChildError: from a run, for a reason that others will meet.
+        SweepError: the processes die while they start.
+        FmuError, InputError, BagError, ChildError: a run failed for a reason that affects all runs.
     """
 
     def __init__(self, job: Job, batches: Batches, count: int, stop: Callable[[], bool]) -> None:
@@ -53,7 +53,7 @@ class Pool:
 
     def __exit__(self, *exception: object) -> None:
         for worker in self._workers:
-            worker.close()  # it has sent all its rows; its files are removed with the folder
+            worker.close()  # it has sent all rows; the folder is removed with its files
         self._exit.close()
 
     def _rows(self) -> Iterator[list[Row]]:
@@ -61,7 +61,7 @@ class Pool:
             yield from self._look()
 
     def _look(self) -> Iterator[list[Row]]:
-        """Return rows that arrive within a moment, while all workers are busy."""
+        """Return the rows that arrive within a short time, while all workers are busy."""
         while len(self._workers) < self._count and self._failures < MOST_FAILURES:
             environment = {**ONE_THREAD, "TMPDIR": str(self._folder)}
             child = Child(work, self._folder, environment=environment, output=DEVNULL)
@@ -89,7 +89,7 @@ class Pool:
 
 
 def work(pipe: Connection, folder: Path) -> None:
-    """Report the start, then rows and durations of batches: the function of a worker."""
+    """Report the start, then run batches and send their rows and durations; this is a worker's function."""
     with Runner(pickle.loads((folder / "job").read_bytes())) as runner:
         pipe.send(([], 0.0))
         while True:

@@ -1,4 +1,4 @@
-"""Rank the runs of a sweep within the URDF's limits, up to rounding."""
+"""Rank the runs of a sweep that are within the URDF's limits."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ RANKED = {
     "final_turn_error": "with least orientation error at the end",
     "final_joint_error": "with least joint error at the end",
 }
-"""Criteria of the best run in words; each one breaks the ties of those before."""
+"""Criteria of the ranking in words; each one breaks ties of the previous ones."""
 USE = ["effort_use", "velocity_use"]
-ROUNDING = 1e-12  # relative, and absolute below 1: values that are nearer count as equal
+ROUNDING = 1e-12  # relative, and absolute below 1: values with a smaller difference are equal
 
 
 def ranks(values: Array) -> NDArray[np.int64]:
-    """Return the rank of each value, 0 for the least; values equal up to rounding share it.
+    """Return the rank of each value, 0 for the smallest; values that are equal up to rounding share a rank.
 
-    NaN have the last place.
+    NaN has the last rank.
     """
     order = np.argsort(values, kind="stable")
     begins, most = [], -inf
     for value in values[order].tolist():
-        begins.append(value > most)  # NaN begins none
+        begins.append(value > most)  # NaN never begins a rank
         if begins[-1]:
             most = value + ROUNDING * max(1.0, abs(value))
     ranks = np.empty(len(values), np.int64)
@@ -51,17 +51,17 @@ def beyond_limits(table: pandas.DataFrame) -> pandas.Series:
 
 
 def candidates(table: pandas.DataFrame) -> pandas.DataFrame:
-    """Return finished runs within the URDF's limits; all finished runs where none is within them."""
+    """Return finished runs within the URDF's limits, or all finished runs if none is within them."""
     finished = table[table["outcome"] == "finished"]
     possible = finished[~beyond_limits(finished)]
     return finished if possible.empty else possible
 
 
 def cost_of(text: str | None) -> Expression | None:
-    """Return the expression of a cost of metrics, as "settling + 0.1*peak_effort"; None for None.
+    """Return the expression of a cost of metrics, such as "settling + 0.1*peak_effort"; None for None.
 
     Raises:
-        InputError: it is none.
+        InputError: the text is no such expression.
     """
     return None if text is None else expression(text, METRICS, condition=False)
 
@@ -74,7 +74,7 @@ def _keys(runs: pandas.DataFrame, cost: Expression | None) -> list[NDArray[np.in
 
 
 def ranked(table: pandas.DataFrame, cost: Expression | None = None) -> pandas.DataFrame:
-    """Return the candidates, the best first: by a cost, or by settling time, effort and errors at the end."""
+    """Return the candidates, the best first, by a cost or by settling time, peak effort and final errors."""
     runs = candidates(table)
     if cost is not None and len(runs):
         value = np.broadcast_to(cost.value(runs), len(runs))
@@ -89,7 +89,7 @@ def equals(runs: pandas.DataFrame, cost: Expression | None = None) -> int:
 
 
 def remark(table: pandas.DataFrame) -> str:
-    """Return how many finished runs exceed the URDF's limits; "" where none does."""
+    """Return a note on the number of finished runs that exceed the URDF's limits; "" if none does."""
     finished = table[table["outcome"] == "finished"]
     count = int(beyond_limits(finished).sum())
     beyond = "the URDF's effort or velocity limits"

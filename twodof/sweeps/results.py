@@ -1,7 +1,7 @@
 """The table of a sweep: a folder of Parquet files that any reader opens as one table.
 
-While the sweep runs, its rows come in parts; when all are there, they become one file, in the order
-of the runs. An untrusted table is read in bounded memory, or refused. All of pyarrow is here.
+During the sweep, rows are stored in parts. At its end, the parts become one file, in the order of the runs. An
+untrusted table is read in bounded memory, or refused. All uses of pyarrow are here.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ class Results:
     """The table of a sweep in progress.
 
     Args:
-        path: the folder; it must not exist, unless ``resume``.
-        names, units: variables that are varied.
-        runs: how many there will be.
-        provenance: where the numbers come from.
-        resume: go on with what is there.
+        path: the folder; without ``resume``, it must not exist.
+        names, units: varied variables and their units.
+        runs: number of runs.
+        provenance: provenance of the numbers.
+        resume: continue the sweep in the folder.
 
     Attributes:
-        done: for each run, whether its row is there.
+        done: for each run, whether its row is stored.
 
     Raises:
-        SweepError: the folder exists; or, to be resumed, it does not, or is another sweep's.
+        SweepError: the folder exists; or with ``resume``, it does not exist or belongs to another sweep.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Results:
             os.close(self._lock)
 
     def _begin(self) -> None:
-        """Write a part without rows, which identifies the sweep from the first moment."""
+        """Write a part without rows, which identifies the sweep from the start."""
         with refusing(SweepError, f"make '{self.path}'"):
             try:
                 self.path.mkdir(parents=True)
@@ -149,13 +149,13 @@ class Results:
         self._stored = time.monotonic()
 
     def _write_part(self, rows: Sequence[Row]) -> None:
-        frame = pandas.DataFrame(rows, columns=self._schema.names)  # whose NaN become null
+        frame = pandas.DataFrame(rows, columns=self._schema.names)  # NaN becomes null
         table = pa.Table.from_pandas(frame, self._schema, preserve_index=False)
         _write(self.path / f"part-{self._part:06d}.parquet", table.cast(self._schema))
         self._part += 1
 
     def _unite(self) -> None:
-        """Write one file in place of the parts, and remove them when it is complete."""
+        """Write one file with all rows, then remove the parts."""
         parts = [file for file in _files(self.path) if file.name != WHOLE]
         if parts:
             tables = pa.concat_tables(table for _, table in _read(parts))
@@ -165,7 +165,7 @@ class Results:
 
 
 class SweepTable(pandas.DataFrame):  # type: ignore[misc]
-    """The table of a sweep, which a notebook shows with a picture of its runs."""
+    """The table of a sweep; a notebook shows it with a picture of the runs."""
 
     def _repr_html_(self) -> str:
         varied, runs = self.columns[1], candidates(self)
@@ -177,13 +177,13 @@ class SweepTable(pandas.DataFrame):  # type: ignore[misc]
 
 
 def read_sweep(path: str | Path) -> pandas.DataFrame:
-    """Return a sweep's table in the order of the runs, also if unfinished.
+    """Return the table of a finished or unfinished sweep, in the order of the runs.
 
-    The table's ``attrs["units"]`` holds its columns' units, "" for a number without one, and
-    ``attrs["provenance"]`` the FMU, the design and the settings.
+    ``attrs["units"]`` of the table has the units of the columns, "" for a number without a unit.
+    ``attrs["provenance"]`` has the FMU, the design and the settings.
 
     Raises:
-        SweepError: it cannot be read.
+        SweepError: the table cannot be read.
     """
     path = Path(path)
     with refusing(SweepError, f"read '{path}'"):
@@ -216,7 +216,7 @@ def _schema(names: Sequence[str], units: Sequence[str], provenance: dict[str, ob
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the file of the whole table; the parts where there is none."""
+    """Return the file of the whole table, or the parts if there is none."""
     if (path / WHOLE).exists():
         return [path / WHOLE]
     return sorted(filter(_is_part, path.iterdir()))
@@ -267,7 +267,7 @@ def _check_schema(file: Path, schema: pa.Schema) -> int:
 
 
 def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> None:
-    """Refuse a table whose stated size exceeds the limit, before it is read."""
+    """Refuse a table whose stated size exceeds the limit, before reading it."""
     groups = [content.row_group(i) for i in range(content.num_row_groups)]
     size = sum(g.column(j).total_uncompressed_size for g in groups for j in range(g.num_columns))
     if size > room or sum(group.num_rows for group in groups) > runs:
@@ -275,7 +275,7 @@ def _check_size(file: Path, content: pq.FileMetaData, runs: int, room: int) -> N
 
 
 def _expanded(texts: pa.ChunkedArray) -> int:
-    """Return the bytes of dictionary-encoded texts if each row stored its own."""
+    """Return the bytes that dictionary-encoded texts would have if each row stored its own copy."""
     lengths = (pc.binary_length(chunk.dictionary).take(chunk.indices) for chunk in texts.chunks)
     return sum(pc.sum(of, min_count=0).as_py() for of in lengths)
 
@@ -323,7 +323,7 @@ def _check_same(path: Path, there: dict[str, Any], wanted: dict[str, Any]) -> No
 
 
 def _differing(there: dict[str, object], wanted: dict[str, object]) -> str:
-    """Return the settings of a design or of options that differ from the stored ones."""
+    """Return the stored settings that differ from the wanted ones, as text."""
     return ", ".join(
         f"{key.replace('_', ' ')} {json.dumps(value):.200}" for key, value in there.items() if value != wanted.get(key)
     )

@@ -1,4 +1,4 @@
-"""Run the points of a sweep one after another on one instance of the FMU: a worker's task."""
+"""Run the points of a sweep one after another on one instance of the FMU, as a worker's task."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ..simulation.setup import Array, robot_of
 from ..simulation.verdict import METRICS
 
 Point = tuple[int, tuple[float, ...]]
-"""Number of a run, and the values of the variables that are varied."""
+"""Number of a run, and the values of the varied variables."""
 Row = tuple[Any, ...]
-"""Number, values, metrics, end time in s, outcome, message or None; the columns of the table."""
+"""The columns of the table: number, values, metrics, end time in s, outcome, and message or None."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Job:
     """Common settings of all runs of a sweep.
 
     Attributes:
-        content: the FMU file's bytes.
-        file: its name.
-        names: variables that are varied.
-        options: of ``experiment``: stop_time, step, settings.
+        content: bytes of the FMU's file.
+        file: name of the FMU's file.
+        names: varied variables.
+        options: options of ``experiment``: stop_time, step, settings.
         bags: folder for a bag of each run; None: no bags.
     """
 
@@ -58,7 +58,7 @@ class Runner:
     def __init__(self, job: Job) -> None:
         self._job = job
         self._instance: Instance | None = None
-        self._used = ExitStack()  # what the instance needs
+        self._used = ExitStack()  # contexts that the instance needs
         with ExitStack() as stack:
             folder = stack.enter_context(temporary_folder())
             path = folder / job.file
@@ -88,7 +88,7 @@ class Runner:
         try:
             judge = self._judged(run, number)
         except SimulationError as error:
-            self._drop()  # whatever state it is in
+            self._drop()  # the instance may be in any state
             return lost(point, run.time(error.k), error.outcome, str(error))
         found = judge.metrics()
         metrics = (found.get(name, nan) for name in METRICS)
@@ -132,7 +132,7 @@ class Runner:
 
 
 def lost(point: Point, end: float, outcome: str, message: str) -> Row:
-    """Return the row of an unfinished run."""
+    """Return the row of a run that was not finished."""
     number, values = point
     return (number, *values, *[nan] * len(METRICS), end, outcome, message)
 
@@ -140,7 +140,7 @@ def lost(point: Point, end: float, outcome: str, message: str) -> Row:
 def trace(run: Experiment, instance: Instance) -> Array:
     """Return the outputs q, v, x, tau and quat side by side at all samples of a run without changes, N + 1 × values.
 
-    Without a ``Sample`` for each; errors as of ``samples``.
+    It makes no ``Sample`` objects, to save time. Errors are those of ``samples``.
     """
     instance.initialise(run.start_time, run.time(run.steps), run.given)
     names = [*chain(*map(run.fmu.vector, OUTPUTS))]
