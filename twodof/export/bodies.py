@@ -1,7 +1,7 @@
 """Constants of a robot: its bodies, the transforms of its joints, and their coupling.
 
-Vectors and matrices of a body are in the frame of its joint, whose axis is z: frames are rotated
-here, once, so that all else knows one kind of axis. Pinocchio has read the URDF.
+Vectors and matrices of a body are in the frame of its joint, whose axis is z. Frames are rotated here once, so that the
+other modules need only one kind of axis. Pinocchio has read the URDF.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ Scalar = Any
 Array = NDArray[Any]
 """Array of numbers, or of numbers and expressions."""
 Frame = tuple[Array, Array]
-"""R and p: a = R b + p."""
+"""R and p of the transform a = R b + p."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body by its parameters that enter the dynamics linearly.
+    """A rigid body, by the parameters that enter the dynamics linearly.
 
     Attributes:
         mass: kg.
-        moment: mass times the offset of its centre, kg·m, 3 values.
+        moment: mass times position of its centre of mass, kg·m, 3 values.
         inertia: about the frame's origin, kg·m², 3 × 3.
     """
 
@@ -44,11 +44,11 @@ class Body:
         return self + Body(mass, points, tensor)
 
     def __add__(self, other: Body) -> Body:
-        """Return two bodies as one, in the same frame."""
+        """Return the sum of two bodies in the same frame."""
         return Body(self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia)
 
     def moved(self, R: Array, p: Array) -> Body:
-        """Return the body in the frame in which its own frame has the pose (R, p)."""
+        """Return the body in another frame, in which its own frame has the pose (R, p)."""
         d = R.dot(self.moment)
         # I' = R I Rᵀ + (2 d·p + m p·p) 1 − (d pᵀ + p dᵀ + m p pᵀ)
         half = d + p * (0.5 * self.mass)
@@ -58,7 +58,7 @@ class Body:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a × b, also of expressions, which np.cross refuses in NumPy 2.2."""
+    """Return a × b, also for expressions, which np.cross refuses in NumPy 2.2."""
     product: Array = a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
     return product
 
@@ -73,12 +73,12 @@ class JointTree:
     """Constants of a robot whose N joints have axes along z; n of them are independent.
 
     Attributes:
-        parent: of each joint, −1 for the root.
-        prismatic: whether it slides.
-        R, p: placement of its frame in its parent's at q = 0.
-        body: what it moves.
+        parent: parent of each joint, −1 for the root.
+        prismatic: whether each joint is prismatic.
+        R, p: pose of each joint's frame in its parent's frame at q = 0.
+        body: body that each joint moves.
         path: joints from the root to the task frame.
-        frame_R, frame_p: placement of the task frame in that of the last of these.
+        frame_R, frame_p: pose of the task frame in the frame of the last joint of ``path``.
         G, c: positions of all joints are G q + c.
     """
 
@@ -95,7 +95,7 @@ class JointTree:
 
 
 def joint_tree(robot: Robot) -> JointTree:
-    """Return the constants of a robot, from Pinocchio, in frames that leave few of them."""
+    """Return the constants of a robot from Pinocchio's model, in frames in which many of them are 0."""
     model = robot.model
     subspaces = [_subspace(joint) for joint in list(model.joints)[1:]]
     slides = tuple(bool(axis[:3].any()) for axis in subspaces)
@@ -131,15 +131,15 @@ def joint_tree(robot: Robot) -> JointTree:
 
 
 SKEW = 0.1
-"""Sine of the angle of two axes above which the offset where they come nearest is worth knowing."""
+"""Sine of the angle between two axes above which their common normal is well conditioned."""
 
 
 def _frames(axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Frame], path: Sequence[int]) -> list[Frame]:
-    """Return a frame for each joint, in that of Pinocchio, and the root's as the last.
+    """Return a frame for each joint, in Pinocchio's frame of the joint, and last a frame for the root.
 
-    z is the joint's axis, x its common normal with the next one's, from which the origin is taken;
-    so rotations to the next frame are about x, and the offset of that has a component less. Source:
-    Khalil & Kleinfinger, "A new geometric notation for open and closed-loop robots", ICRA 1986.
+    z is the joint's axis. x and the origin are on the common normal with the next joint's axis, so that the rotation to
+    the next frame is about x, and its offset has one component less. Source: Khalil & Kleinfinger, "A new geometric
+    notation for open and closed-loop robots", ICRA 1986.
     """
     frames = []
     for i, axis in enumerate(axes):
@@ -160,10 +160,10 @@ def _frames(axes: Sequence[Array], parents: Sequence[int], placed: Sequence[Fram
 
 
 def _rotation_to(z: Array, x: Array) -> Array:
-    """Return a rotation to axes z and, where its length is not 0, x."""
+    """Return a rotation matrix with the axis z and, unless x is 0, the axis x."""
     length = np.linalg.norm(x)
     if length < 1e-9:
-        x = np.roll(np.eye(3)[0], int(np.argmax(np.abs(z))) + 1)  # after the largest component
+        x = np.roll(np.eye(3)[0], int(np.argmax(np.abs(z))) + 1)  # an axis that is not parallel to z
         x -= z * z.dot(x)
         length = np.linalg.norm(x)
     x = x / length
@@ -171,7 +171,7 @@ def _rotation_to(z: Array, x: Array) -> Array:
 
 
 def _without_turn(R: Array) -> tuple[Array, float]:
-    """Return A and φ with R = A R_z(φ), in which A has a zero."""
+    """Return A and φ with R = A R_z(φ), so that an element of A is 0."""
     tilted = np.hypot(R[2, 0], R[2, 1]) > 1e-6
     angle = np.arctan2(R[2, 0], R[2, 1]) if tilted else np.arctan2(R[1, 0], R[0, 0])
     c, s = np.cos(angle), np.sin(angle)
@@ -179,17 +179,17 @@ def _without_turn(R: Array) -> tuple[Array, float]:
 
 
 def _without_rounding(values: Array) -> Array:
-    """Round values that are within 1e-15 of a whole number."""
+    """Round values that are within 1e-15 of an integer."""
     whole = values.round()
     return np.where(np.abs(values - whole) < 1e-15, whole, values)
 
 
 def _regrouped(robot: JointTree) -> tuple[Body, ...]:
-    """Return the bodies without the parameters that a joint cannot tell from its parent's.
+    """Return the bodies, with mass that a joint cannot distinguish moved to its parent.
 
-    That is a rod along the axis of a joint that turns: m, z and I_yy of its body, which become 0.
-    The task frame's body, whose payload varies, is left whole. Source: Gautier & Khalil, "Direct
-    calculation of minimum set of inertial parameters of serial robots", IEEE T-RA 6(3), 1990.
+    This mass is a rod along the axis of a revolute joint: m, z and I_yy of its body, which become 0. The task frame's
+    body keeps its mass, because its payload varies. Source: Gautier & Khalil, "Direct calculation of minimum set of
+    inertial parameters of serial robots", IEEE T-RA 6(3), 1990.
     """
     bodies = list(robot.body)
     for i in reversed(range(len(bodies))):
@@ -204,7 +204,7 @@ def _regrouped(robot: JointTree) -> tuple[Body, ...]:
 
 
 def _subspace(joint: object) -> Array:
-    """Return the velocity of a joint with one coordinate in its own frame: linear, angular; one is zero."""
+    """Return the unit velocity of a joint in its own frame, linear and angular; one of them is zero."""
     data = joint.createData()  # type: ignore[attr-defined]
     joint.calc(data, np.zeros(1))  # type: ignore[attr-defined]
     return np.asarray(data.S).reshape(6)

@@ -30,7 +30,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "x86_64-darwin": ("x86_64-macos.11.0",),
     "aarch64-darwin": ("aarch64-macos.11.0",),
 }
-"""zig's targets by FMI platform; several are joined into one universal library."""
+"""zig's targets by FMI platform; several targets are joined into one universal library."""
 PLATFORMS = {2: tuple(name for name in TARGETS if "-" not in name), 3: tuple(name for name in TARGETS if "-" in name)}
 """Platforms by version of FMI."""
 ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
@@ -51,18 +51,19 @@ FLAGS = (
     "-Wextra",
     "-pedantic",
 )
-"""Multiplications are never fused with additions, so that platforms agree; complex ones are so
-without a thought for infinities. Pairing scalars into vectors takes long and gains nothing; short
-loops over joints are written out and vectorised at -O3 only by gcc, at -O2 already by zig."""
+"""Compiler flags. Multiplications are not fused with additions, so that platforms agree. Complex multiplications do not
+check for infinities. Vectorisation of scalars takes long and gains nothing. gcc unrolls and vectorises short loops over
+joints only at -O3, zig already at -O2.
+"""
 
 WINDOWS = "windows.c"
-"""The C file that a library for Windows has beside the units."""
+"""The additional C file of a library for Windows."""
 WINDOWS_RUNTIME = ("math", "heap", "stdio", "string", "private")
-"""Parts of the "Universal C Runtime", which every Windows has had since 10."""
+"""Parts of the Universal C Runtime, which Windows includes since version 10."""
 KEPT_FOR = 30 * 86400.0
-"""s for which a library is kept that is not used."""
+"""s after which an unused library is removed from the cache."""
 DIGEST = hashlib.sha256().digest_size
-"""Bytes before the library that is kept."""
+"""Number of bytes before the library in a cache file."""
 
 
 def standard_headers() -> dict[str, bytes]:
@@ -79,11 +80,11 @@ def compile_library(
     """Compile the shared library of an FMU.
 
     Args:
-        sources: contents of the C files and headers by file name, ``model.h`` and the headers of
-            the FMI standard among them.
+        sources: contents of the C files and headers by file name, including ``model.h`` and the headers of the
+            FMI standard.
         platform: FMI platform, a key of ``TARGETS``.
         name: model identifier, the library's name without extension.
-        units: the files that are compiled; they include others.
+        units: files to compile; they include the others.
         flags: further flags for the compiler.
 
     Raises:
@@ -103,12 +104,12 @@ def compile_library(
 
 
 def compile_web_module(sources: Mapping[str, bytes], units: Sequence[str]) -> bytes:
-    """Compile C files to a WebAssembly module without imports; they name what it exports.
+    """Compile C files to a WebAssembly module without imports; attributes in the files name its exports.
 
-    Its ``_initialize`` is to be called first.
+    Its function ``_initialize`` must be called first.
 
     Raises:
-        BuildError: there is no compiler for it, or the compiler failed.
+        BuildError: there is no compiler for WebAssembly, or the compiler failed.
     """
     if not compiles_for_the_web():
         raise BuildError("cannot compile for the browser: install the package 'ziglang' (the extra 'native')")
@@ -123,7 +124,7 @@ def compiles_for_the_web() -> bool:
 
 
 def host_platform(fmi: int = 2) -> str:
-    """Return the FMI platform of this machine in a version's terms; "" where it has no name."""
+    """Return this machine's platform in a version of FMI; "" if FMI has no name for it."""
     machine = host.machine().lower()
     architecture = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
     if fmi == 3:
@@ -154,7 +155,7 @@ def universal(libraries: Sequence[bytes]) -> bytes:
 
 def _compilers(platform: str) -> list[list[str]]:
     """Return the commands that compile for a platform, one for each architecture."""
-    if compiles_for_the_web():  # zig, which compiles for everything
+    if compiles_for_the_web():  # zig compiles for all platforms
         return [[*ZIG, target] for target in TARGETS[platform]]
     own = next((cc for cc in ("cc", "gcc", "clang") if shutil.which(cc)), None)
     here = [name for name in (host_platform(2), host_platform(3)) if name]
@@ -172,13 +173,13 @@ def _compilers(platform: str) -> list[list[str]]:
 
 
 def _link_flags(output: str) -> list[str]:
-    """Return flags that keep this machine and the time out of the library."""
+    """Return linker flags for a library that does not depend on this machine or the time."""
     flags = ["-shared", "-s"]
     if output.endswith(".so"):
         return ["-fPIC", *flags, f"-Wl,-soname,{output}", "-lm"]
     if output.endswith(".dylib"):
         return [*flags, f"-Wl,-install_name,@rpath/{output}"]
-    # the system's own C runtime alone: mingw's, which a library needs none of, takes zig a minute
+    # only the system's C runtime: zig takes a minute for mingw's, which a library does not need
     ziglang = importlib.util.find_spec("ziglang")
     assert ziglang is not None and ziglang.origin is not None
     headers = Path(ziglang.origin).parent / "lib" / "libc" / "include" / "any-windows-any"
@@ -194,7 +195,7 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
         if command[: len(ZIG)] == [*ZIG]:
             cache = zig_cache()
             environment["ZIG_GLOBAL_CACHE_DIR"] = str(cache or folder / "zig-cache")
-            environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # of these sources
+            environment["ZIG_LOCAL_CACHE_DIR"] = str(folder / "zig-cache")  # for these sources only
             if cache:
                 made_of = repr((version("ziglang"), *command, output, sorted(sources.items())))
                 kept = cache / "twodof" / hashlib.sha256(made_of.encode()).hexdigest()
@@ -211,7 +212,7 @@ def _compile(sources: Mapping[str, bytes], command: Sequence[str], output: str) 
 
 
 def _kept(file: Path) -> bytes | None:
-    """Return the content of a cache file; None where it is missing or damaged."""
+    """Return the content of a cache file; None if it is missing or damaged."""
     try:
         if not _is_ours(file):
             return None
@@ -224,11 +225,11 @@ def _kept(file: Path) -> bytes | None:
 
 
 def _keep(file: Path, content: bytes) -> None:
-    """Store content in the cache where there is room, and remove entries that are long unused."""
+    """Store content in the cache if there is room, and remove entries that were not used for long."""
     with suppress(OSError):
         file.parent.mkdir(mode=0o700, exist_ok=True)
         write_file(file, hashlib.sha256(content).digest() + content)
-        file.chmod(0o600)  # whatever the umask: one that others may write is not taken
+        file.chmod(0o600)  # independent of the umask, because a file that others may write is not reused
         for other in file.parent.iterdir():
             if other.is_file() and other.stat().st_mtime < time.time() - KEPT_FOR:
                 other.unlink()
@@ -249,10 +250,10 @@ def _run(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -
 
 
 def zig_cache() -> Path | None:
-    """Return the folder in which zig caches its C library; None where the home folder has no room.
+    """Return the folder in which zig caches its C library; None if the home folder has no room.
 
     Raises:
-        BuildError: ``ZIG_GLOBAL_CACHE_DIR`` names a folder that cannot be.
+        BuildError: the folder in ``ZIG_GLOBAL_CACHE_DIR`` cannot be made.
     """
     named, fault = os.environ.get("ZIG_GLOBAL_CACHE_DIR"), ""
     try:
@@ -263,7 +264,7 @@ def zig_cache() -> Path | None:
         tempfile.TemporaryFile(dir=cache).close()
         if not _is_ours(cache):
             fault = f"its cache '{cache}' is another user's, or others write to it"
-    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
         if named:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BuildError(
@@ -277,6 +278,6 @@ def zig_cache() -> Path | None:
 
 
 def _is_ours(path: Path) -> bool:
-    """Return whether only this user and root can have changed a file or folder."""
+    """Return whether only this user and root can write a file or folder."""
     state = path.stat()
     return state.st_uid == os.geteuid() and not state.st_mode & 0o022

@@ -26,11 +26,11 @@ from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 logger = logging.getLogger(__name__)
 
 DEFAULT_ARM = {"q_start": (0.5, 0.35), "x_des": (0.2, 0.05), "gravity": (0.0, -9.81, 0.0)}
-"""Start values of the shipped arm; nothing else knows that it has two joints."""
+"""Start values of the shipped arm; no other code depends on its two joints."""
 PLACEHOLDERS: Starts = {"x_des": (0.0,) * 3, "quat_des": (0.0, 0.0, 0.0, 1.0)}
-"""Start values of targets while the table is made to compute the real ones."""
+"""Provisional start values of targets, for the table with which the real ones are computed."""
 POSE = ("q_start", "v_start", "q_min", "q_max", "gravity")
-"""Start values on which the pose at the start depends, or that have an option of their own."""
+"""Start values that have their own option, or on which the pose at the start depends."""
 ICONS = {2: "model.png", 3: "terminalsAndIcons/icon.png"}
 """Icon files by version of FMI."""
 
@@ -39,7 +39,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     """Return the flavour, the files that the GUID covers, and a function that compiles the others.
 
     Raises:
-        BuildError, RobotError: naming the culprit; the compiling function raises them too.
+        BuildError, RobotError: the message names the culprit; the compiling function raises them too.
     """
     if not options.name.isidentifier() or not options.name.isascii():
         raise BuildError(f"name '{options.name}' must be an identifier: letters, digits and _")
@@ -149,14 +149,14 @@ def _model(options: FmuOptions, urdf: str) -> tuple[Robot, list[Variable], dict[
 
 
 class _Variables(NamedTuple):
-    """The variables of an FMU that is yet to be built."""
+    """The variables of an FMU that has not been built."""
 
     variables: Mapping[str, Variable]
     control: str
 
 
 def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:
-    """Return the given start values; ``rest`` has the start positions of all other joints."""
+    """Return the given start values, completed by the start positions ``rest`` of the other joints."""
     settings = dict(options.settings)
     for key, given in (("gravity", options.gravity), ("q_start", options.q_start)):
         if given is None:
@@ -176,7 +176,7 @@ def _settings(options: FmuOptions, rest: Mapping[str, float]) -> dict[str, Any]:
 def _set(
     robot: Robot, starts: dict[str, Any], control: str, values: Mapping[str, Value], groups: Collection[str]
 ) -> None:
-    """Put values by name into the start values of their groups."""
+    """Set elements by name in the start values of their groups."""
     table = variable_table(robot, {**PLACEHOLDERS, **starts}, control)
     for group in {variable.group for variable in table if variable.name in values} & {*groups}:
         elements = [values.get(v.name, v.start) for v in table if v.group == group]

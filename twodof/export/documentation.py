@@ -15,7 +15,7 @@ from .flavours import Files, Flavour
 from .fmu_options import FmuOptions
 
 NO_DEPENDENCIES = b"None: the binaries need the C library and its mathematics only.\n"
-"""Text about dependencies of a native FMU."""
+"""Text about the dependencies of a native FMU."""
 
 
 def documentation(

@@ -38,12 +38,12 @@ class Flavour:
     """Files that one flavour adds.
 
     Attributes:
-        native: whether it is in C: with sources, Model Exchange and derivatives.
+        native: whether the flavour is C, with sources, Model Exchange and derivatives.
         files: resources and sources; the GUID is a digest of them.
         platforms: FMI platforms of the binaries.
-        signed: given the GUID, the files that contain it, compiled libraries among them.
+        signed: function that returns the files that contain the GUID, for example compiled libraries.
         fmi: version of FMI, 2 or 3.
-        arrays: whether its vectors are arrays of FMI 3.
+        arrays: whether vectors are arrays of FMI 3.
     """
 
     native: bool
@@ -71,7 +71,7 @@ def python_flavour(options: FmuOptions, robot: Robot, urdf: str, starts: Starts)
     if (wrapper := repaired_wrapper(path.read_bytes())) is None:
         remedy = "run 'pip install --force-reinstall pythonfmu==0.7.0'"
         raise BuildError(f"'{path}' is not the library of pythonfmu 0.7.0; {remedy}")
-    config["wrapper"] = hashlib.sha256(wrapper).hexdigest()  # the GUID is of it, too
+    config["wrapper"] = hashlib.sha256(wrapper).hexdigest()  # the GUID covers it too
     resources = {
         **_slave_sources(),
         "plant.json": (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
@@ -105,7 +105,7 @@ def native_flavour(
     headers = standard_headers()
     sources = engine_sources(control, fmi)
     sources["mechanism.c"] = mechanism_source(robot, table).encode()
-    if fmi == 2:  # in 3.0 they are the importer's, so that arguments are checked
+    if fmi == 2:  # in 3.0 the importer provides them, so that compilers check arguments
         sources |= {file: text for file, text in headers.items() if file.startswith("fmi2")}
 
     def header(guid: str) -> bytes:
@@ -134,7 +134,7 @@ def native_flavour(
 
 
 def _slave_sources() -> Files:
-    """Return the Python code of the FMU under names that are unique to it."""
+    """Return the Python code of the FMU, under module names that are unique to the FMU."""
     plant = Path(__file__).parents[1] / "plant"
     package = {f"plant/{path.name}": path.read_bytes() for path in plant.glob("*.py")}
     for name in PYTHONFMU_FILES:

@@ -18,27 +18,27 @@ class FmuOptions:
     """Options of an FMU's build.
 
     Attributes:
-        urdf: the URDF or xacro file; None for the shipped planar arm.
-        mesh_dir: folder of the URDF's packages or meshes; None: its own folder and package.
-        frame: link whose origin is controlled; None: "EndEffector", or the only link without a link behind it.
+        urdf: the URDF or xacro file; None: the shipped planar arm.
+        mesh_dir: folder of the URDF's packages or meshes; None: the URDF's own folder and package.
+        frame: link whose origin is controlled; None: "EndEffector", or the only last link.
         lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
-        meshes: whether to carry them.
+        meshes: whether the FMU contains the meshes.
         axes: task axes, letters of "xyz"; None: "xy" for the shipped arm, else "xyz".
         gravity: m/s² in the root frame; None: (0, −9.81, 0) for the shipped arm, else (0, 0, −9.81).
-        q_start: start positions, rad or m, in the order of the joints or by their names; the others, or
-            None: the shipped arm's, else 0 where the limits allow and their middle where not.
+        q_start: start positions, rad or m, in the order of the joints or by name; default: the shipped arm's
+            positions, or 0 if it is within the limits, or the middle of the limits.
         settings: start values of variables by name, as in ``experiment``.
-        control: what drives the robot, a key of ``CONTROLS``: "task", "pose" (a task with the
-            frame's orientation), "joint" or "effort".
-        name: model name and identifier; "": that of the URDF's file, "TwoDof" for the shipped arm.
-        link_environment: remember the folders of this Python's packages in the FMU; not for the
-            native flavour, which needs none.
-        native: the plant as compiled C instead of Python code.
-        fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines that 2 has no name for.
-        arrays: whether vectors are arrays in FMI 3; without, each element is a variable of its own,
-            as it is in FMI 2, for tools that know no arrays.
-        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or of FMI 3.0
-            "x86_64-linux", "aarch64-linux"; empty: this machine's.
+        control: control law, a key of ``CONTROLS``: "task", "pose" (task with the orientation of the
+            frame), "joint" or "effort".
+        name: model name and identifier; "": name of the URDF's file, "TwoDof" for the shipped arm.
+        link_environment: store the folders of this Python's packages in the FMU; not for the native
+            flavour, which needs no Python.
+        native: build the plant as compiled C instead of Python code.
+        fmi: version of a native FMU, 2 or 3; None: 2, or 3 on machines for which FMI 2.0 has no name.
+        arrays: whether vectors are arrays in FMI 3; if not, each element is a scalar variable as in
+            FMI 2, for tools that do not support arrays.
+        platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or in FMI 3.0
+            "x86_64-linux", "aarch64-linux"; empty: this machine's platform.
     """
 
     urdf: str | Path | None = None
@@ -73,7 +73,7 @@ class FmuOptions:
 
 
 def identifier(robot: str | Path) -> str:
-    """Return a robot's name as an identifier, from the name of its file."""
+    """Return the name of a robot's file as an identifier."""
     stem = Path(robot).name.removesuffix(".xacro").removesuffix(".urdf").removesuffix(".fmu")
     name = re.sub(r"\W", "_", stem, flags=re.ASCII)
     return name if name.isidentifier() else f"robot_{name}"

@@ -66,9 +66,9 @@ def mechanism_source(robot: Robot, table: Sequence[Variable]) -> str:
 def _forward_dynamics(
     robot: JointTree, bodies: Sequence[Body], joint: Array, armature: Array, in_all: str
 ) -> list[str]:
-    """Return forward dynamics, and those with held joints, by factors of M or by recursion.
+    """Return forward dynamics with free and with held joints.
 
-    Whichever takes fewer operations.
+    They use factors of M or articulated bodies, whichever takes fewer operations.
     """
     n = robot.G.shape[1]
     a, tau, free, given = (_variables(name, n) for name in ("a", "tau", "free", "given"))
@@ -105,12 +105,12 @@ MECHANISM = """\
 """
 INERTIAS = "const EndBody *end_body, const double armature[N_JOINTS]"
 HELD = ("end_body->", "armature[", "gravity[", "payload", "offset[")
-"""Parameters, along which there are no derivatives."""
+"""Parameters, with respect to which there are no derivatives."""
 LOWER = np.tril_indices(3)
 
 
 def _solution(solution: Array, inertial: Array) -> list[Varied]:
-    """Return a = M⁻¹τ and its derivative, M δa = δτ − δM a; ``inertial`` is M a of the variables a."""
+    """Return a = M⁻¹τ and its derivative δa, with M δa = δτ − δM a; ``inertial`` is M a for variables a."""
     n = len(solution)
     names = [(f"a[{i}]", f"tau[{i}]") for i in range(n)]
     value = [a for a, _ in varied(solution, held=HELD)]
@@ -134,7 +134,7 @@ def _places(robot: JointTree) -> dict[str, Value]:
 
 
 def _loaded(robot: JointTree) -> tuple[list[Body], dict[str, Value]]:
-    """Return the bodies, the last with the payload as variables, and the names of these."""
+    """Return the bodies, with variables for the last one, which carries the payload, and the variables' names."""
     end_body, offset = robot.path[-1], _variables("offset", 3)
     loaded = robot.body[end_body].with_point(Expression("payload"), robot.frame_p + robot.frame_R.dot(offset))
     load = {"end_body->mass": loaded.mass}

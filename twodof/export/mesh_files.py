@@ -12,19 +12,19 @@ from ..bounds import MAX_MESHES
 from ..errors import BuildError
 from ..files import read_file
 
-MAX_LISTED = 50  # names in a message
+MAX_LISTED = 50  # names listed in a message
 LOG = logging.getLogger(__name__)
 
 
 def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str, dict[str, bytes]]:
     """Return the URDF with its meshes renamed to ``package://meshes/…``, and the files by that name.
 
-    The URDF may be anybody's, and the FMU is mailed: a mesh comes from ``mesh_dir``, the URDF's folder or its
-    package, however it is named or linked, or it is refused. Those that are not there are left out with a warning.
+    The URDF may be untrusted, and the FMU may be sent to others. Therefore meshes outside ``mesh_dir``, the URDF's
+    folder and its package are refused, also if a link leads there. Missing meshes are left out with a warning.
 
     Args:
         urdf: XML text.
-        folder: the URDF's own folder, where relative names and packages are looked for.
+        folder: the URDF's own folder, in which relative names and packages are searched.
         mesh_dir: folder of the packages, of one package, or of the meshes themselves.
     """
     tree = ET.fromstring(urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
@@ -46,7 +46,7 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
             except FileNotFoundError:
                 missing.append(uri)
                 continue
-            except (OSError, ValueError, RuntimeError) as error:  # the last: links in a circle
+            except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: a circle of links
                 reason = (isinstance(error, OSError) and error.strerror) or error
                 raise BuildError(f"mesh '{uri}' cannot be read: {reason}") from error
         mesh.set("filename", f"package://{names[uri]}")
@@ -61,10 +61,10 @@ def collect_meshes(urdf: str, folder: Path, mesh_dir: Path | None) -> tuple[str,
 
 
 def places_of(folder: Path, mesh_dir: Path | None) -> list[Path]:
-    """Return the folders from which a URDF may read files: ``mesh_dir``, its own and its package.
+    """Return the folders from which a URDF may read files: ``mesh_dir``, its own folder and its package.
 
-    The URDF's package is the nearest folder upwards with a package.xml. A folder that carries the
-    package's name is not enough: ``package://home/alice/.netrc`` names one too.
+    The URDF's package is the nearest parent folder with a package.xml. A parent folder of the package's name is not
+    enough, because ``package://home/alice/.netrc`` has one too.
     """
     own = folder.resolve()
     package = next((f for f in (own, *own.parents) if (f / "package.xml").is_file()), own)
@@ -79,8 +79,8 @@ def _find(uri: str, folder: Path, mesh_dir: Path | None) -> Path:
         name = unquote(rest) if separator else uri
         candidates = [root / name for root in (own, mesh_dir) if root is not None]
     else:
-        # package://NAME/PATH: the mesh folder may hold the package, be it, or be its meshes;
-        # the URDF's package may lie in a folder of another name
+        # package://NAME/PATH: the mesh folder may contain the package, be the package, or have its meshes;
+        # the URDF's package may be in a folder of another name
         parts = PurePosixPath(unquote(rest)).parts
         roots = [own, *own.parents] if mesh_dir is None else [mesh_dir]
         most = min(2, len(parts)) if mesh_dir is None else len(parts)
@@ -111,7 +111,7 @@ def _colours(path: Path, content: bytes, mesh_dir: Path | None) -> bytes:
 
 
 def _inside(path: Path, files: dict[str, bytes]) -> str:
-    """Return a name under meshes/ that keeps enough of the original path to be unique."""
+    """Return a unique name in meshes/ with the last parts of the original path."""
     parts = [re.sub(r"[^A-Za-z0-9._-]", "_", part) for part in path.parts[1:]]
     for depth in range(1, len(parts) + 1):
         name = "/".join(("meshes", *parts[-depth:]))

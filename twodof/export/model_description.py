@@ -1,7 +1,7 @@
 """Write modelDescription.xml of either flavour and version from the variable table.
 
-Source: FMI 2.0.4, section 2.2; FMI 3.0.2, section 2.4, where elements of vectors become arrays, or
-stay scalars for tools that know no arrays.
+In FMI 3.0, vectors are arrays, or scalars for tools without arrays. Sources: FMI 2.0.4, section 2.2; FMI 3.0.2, section
+2.4.
 """
 
 import math
@@ -41,22 +41,22 @@ VENDOR = "twodof"
 AUTHOR = "the twodof developers"
 
 UNKNOWNS_3 = {"Outputs": "Output", "Derivatives": "ContinuousStateDerivative", "InitialUnknowns": "InitialUnknown"}
-"""Elements of 3.0 by the parts of 2.0's ModelStructure."""
+"""Element names of ModelStructure in FMI 3.0, by those of FMI 2.0."""
 FMI3_TYPES = {"Real": "Float64", "Integer": "Int32"}
-"""Types of 3.0 whose names differ from those of 2.0."""
+"""Types of FMI 3.0 whose names differ from those of FMI 2.0."""
 SCALAR = ("name", "valueReference", "description", "causality", "variability", "initial")
-"""Attributes of 2.0's ScalarVariable; others are its type's."""
+"""Attributes of ScalarVariable in FMI 2.0; all others belong to its type."""
 STATES = ("q", "v")
 SMALL = ("rtol", "atol", "max_step")
 """Variables whose start value is their nominal value."""
 EFFORTS = ("tau", "tau_cmd", "tau_ext")
 START = ("q_start", "q_min", "q_max")
-"""Variables on which q depends at the start."""
+"""Variables on which the start value of q depends."""
 IMPACT = (*START, "v_start", "payload", "payload_com", "armature", "rigid_stops")
-"""Variables on which v depends at the start, where it may point into a stop."""
+"""Variables on which the start value of v depends, because a velocity into a stop is removed."""
 OWN, FRAME, EVERY = "that joint's", "those of joints that move the frame", "all"
 Dependencies = tuple[Sequence[str], str] | tuple[Sequence[str], str, Sequence[str]]
-"""Groups, which of their elements, and further groups of which it is the own element."""
+"""A group, its elements on which a variable depends, and groups of which it depends on the same element only."""
 SENSORS = ("q_resolution", "q_noise", "v_noise", "seed", "v_from_q")
 """Variables on which the first sample depends."""
 
@@ -119,7 +119,7 @@ def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
         if not two:
             every["providesAdjointDerivatives"] = True
             if interface == "ModelExchange":
-                every["needsCompletedIntegratorStep"] = True  # so it is in 2.0 by default
+                every["needsCompletedIntegratorStep"] = True  # the default in FMI 2.0
         attributes = {name: str(flag).lower() for name, flag in every.items()}
         element = ET.SubElement(root, interface, {"modelIdentifier": identifier, **attributes})
         if two and native:
@@ -129,7 +129,7 @@ def _interfaces(root: ET.Element, identifier: str, flavour: Flavour) -> None:
 
 
 def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
-    """Add the vendor annotation: facts that a logger needs besides variable names."""
+    """Add the vendor annotation, with facts for the logger that variable names do not give."""
     task = ET.SubElement(
         tool, "Robot", name=robot.name, root=robot.root, frame=robot.frame, axes=robot.axes, control=control
     )
@@ -138,7 +138,7 @@ def _describe(tool: ET.Element, robot: Robot, control: str) -> None:
 
 
 def _range(robot: Robot, variable: Variable) -> Range:
-    """Return the range of values: the URDF's position limits, else the range that the FMU accepts."""
+    """Return the range of values: for q the URDF's position limits, for others the range that the FMU accepts."""
     if variable.group == "q" and variable.index is not None:
         limits = robot.q_min[variable.index], robot.q_max[variable.index]
         low, high = (side if abs(side) < UNBOUNDED else math.inf * side for side in limits)
@@ -147,7 +147,7 @@ def _range(robot: Robot, variable: Variable) -> Range:
 
 
 def _nominal(robot: Robot, variable: Variable) -> float:
-    """Return the nominal value, 1 where no better one is known."""
+    """Return the nominal value; 1 if no better one is known."""
     if variable.group in SMALL:
         return float(variable.start or 1.0)
     if variable.group in EFFORTS and variable.index is not None:
@@ -166,7 +166,7 @@ def _variables(
 ) -> None:
     variables = ET.SubElement(root, "ModelVariables")
     row_of = {(variable.group, variable.index): i for i, variable in enumerate(table)}
-    vectors: dict[str, list[int]] = {}  # indices of the elements; of a scalar there is one
+    vectors: dict[str, list[int]] = {}  # indices of the elements; a scalar has one
     for i, name in enumerate(names):
         vectors.setdefault(name, []).append(i)
     for name, indices in vectors.items():
@@ -227,7 +227,7 @@ def _attributes(robot: Robot, variable: Variable, start: Value | None, exchanges
 
 
 def _description(elements: Sequence[dict[str, str]]) -> str:
-    """Return a description of the vector and of each element, with its unit where units differ."""
+    """Return a description of the vector and its elements, with each element's unit if units differ."""
     texts = [element["description"] for element in elements]
     if len({*texts}) == 1:
         return texts[0]
@@ -241,7 +241,7 @@ def _description(elements: Sequence[dict[str, str]]) -> str:
 
 
 def _dependencies(control: Control) -> tuple[dict[str, Dependencies], dict[str, Dependencies]]:
-    """Return on which groups each computed group depends, during a run and at its start, and on whose elements."""
+    """Return the groups and elements on which each computed group depends, during a run and at its start."""
     inputs = (*control.inputs, *DISTURBANCES)
     law = ("gravity", *control.parameters, "limit_effort", *SENSORS, "control_delay")
     during: dict[str, Dependencies] = {
@@ -280,7 +280,7 @@ def _structure(
     during, at_the_start = _dependencies(control)
 
     def known(unknown: Variable, groups: Sequence[str], whose: str, own: Sequence[str] = ()) -> dict[str, None]:
-        """Return references of the variables on which an unknown depends, in order."""
+        """Return the sorted references of the variables on which an unknown depends."""
         return {
             reference: None
             for variable, reference in zip(table, references)

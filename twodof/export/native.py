@@ -13,7 +13,7 @@ from ..plant.robot import Robot
 from ..plant.variables import CONTROLS, RANGES, Variable, count_event_indicators
 
 FIRST = {"FIRST_OUTPUT": "q", "FIRST_PARAMETER": "q_start", "FIRST_INTEGER": "seed", "FIRST_BOOLEAN": "v_from_q"}
-"""First group of each part of the table: outputs, parameters, and among these integers and truth values."""
+"""First group of each part of the table: outputs, parameters, and among these integers and Booleans."""
 INDICATORS = "event_indicators"
 SIGNS = "change their sign where a joint meets or leaves a stop, or J⁺ its rank"
 
@@ -23,8 +23,8 @@ def model_header(
 ) -> str:
     """Return the text of ``model.h``: constants of a robot and its variables, bit-exact.
 
-    Names from the URDF, which may be anybody's, are string literals and nothing else. At as many
-    joints as a URDF may have the engine's working memory, which is on the stack, is 0.2 MB.
+    Names from an untrusted URDF appear only in string literals. With the largest number of joints, the engine's working
+    memory takes 0.2 MB of the stack.
     """
     m = len(robot.axes)
     table = engine_variables(robot, table, control, fmi)
@@ -88,7 +88,7 @@ def _ranges(groups: Sequence[str]) -> str:
 
 
 def _references(table: Sequence[Variable], arrays: bool) -> str:
-    """Return value references, from 1 on as some importers require, of variables or whole vectors."""
+    """Return value references of variables or whole vectors; they begin with 1, as some importers require."""
     places = [i for i, variable in enumerate(table) if not (arrays and variable.index)]
     return (
         "/* The values of a reference, from 1 on: from PLACE[vr] to before PLACE[vr + 1]. */\n"
@@ -115,7 +115,7 @@ def _literal(value: object) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a C string literal; all but printable ASCII as octal escapes of its UTF-8."""
+    """Return a C string literal; bytes other than printable ASCII become octal escapes."""
     escaped = "".join(
         chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}" for byte in text.encode()
     )

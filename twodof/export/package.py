@@ -1,4 +1,4 @@
-"""Build an FMU file: find out whether it exists already, else write the archive."""
+"""Build an FMU file, unless the file already exists with the same content."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from .compiler import compiles_for_the_web, host_platform
 from .fmu_options import FmuOptions
 
 MADE_OF = ("fmu_src", "urdf", "meshes", "export", "plant")
-"""Folders of what is shipped."""
+"""Folders of shipped files."""
 TOOLS = ("pin", "numpy", "scipy", "ziglang")
-"""Packages whose other versions may make another FMU of the same."""
+"""Packages whose versions influence the content of an FMU."""
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 DEFAULT_ARM = b"twodof: the default arm"
-"""Beginning of the zip comment of its FMUs, whichever flavour and version."""
+"""Beginning of the zip comment of the default arm's FMUs, in any flavour and version."""
 
 
 def build_fmu(output: str | Path | None = None, options: FmuOptions | None = None, *, overwrite: bool = False) -> Path:
     """Build an FMU.
 
     Args:
-        output: the file; None: ``<name>.fmu``, or ``<name>-native.fmu``, in the working
-            directory. Written whole or not at all.
-        options: what to build; None: the shipped planar arm in the Python flavour.
-        overwrite: replace an existing file. Without it only an FMU of the shipped arm with its
-            default settings is replaced, because ``build_fmu()`` makes it again.
+        output: the file, written completely or not at all; None: ``<name>.fmu`` or ``<name>-native.fmu`` in the
+            working directory.
+        options: options of the build; None: the shipped planar arm in the Python flavour.
+        overwrite: replace an existing file. Without it, only an FMU of the shipped arm with default settings is
+            replaced, because ``build_fmu()`` makes it again.
 
     Returns:
-        The path of the FMU. A file that already holds exactly this FMU is left alone.
+        The path of the FMU. A file with exactly this FMU is not written again.
 
     Raises:
-        BuildError: naming what is wrong with the URDF, a mesh, an option, the compiler or the
-            output: another file is there, or it cannot be written.
+        BuildError: the URDF, a mesh, an option, the compiler or the output is at fault, or another file exists at
+            the output; the message names it.
     """
     options = options or FmuOptions()
     default = f"{options.name}-native.fmu" if options.native else f"{options.name}.fmu"
@@ -50,7 +50,7 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
         comment += _shipped(options)
     if made_of and _fits(path, lambda zipped: zipped.comment == comment):
         return path
-    from .composition import compose  # Pinocchio and SciPy take most of a run's time
+    from .composition import compose  # the import of Pinocchio and SciPy takes most of a run's time
 
     try:
         flavour, files, finish = compose(options)
@@ -93,7 +93,7 @@ def _shipped(options: FmuOptions) -> bytes:
 
 
 def _fits(path: Path, fits: Callable[[zipfile.ZipFile], bool]) -> bool:
-    """Return whether a file is a sound zip archive for which a condition holds."""
+    """Return whether a file is a valid zip archive for which a condition holds."""
     try:
         check_archive(path)
         with zipfile.ZipFile(path) as archive:
@@ -111,7 +111,7 @@ def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str
 
 
 def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:
-    """Write sorted entries with fixed dates, so that equal inputs give equal bytes; atomically."""
+    """Write sorted entries with fixed dates atomically; equal inputs give equal bytes."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.comment = comment

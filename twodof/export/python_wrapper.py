@@ -8,16 +8,16 @@ from pathlib import Path
 from ..bounds import MAX_WRAPPER
 from ..errors import FmuError
 
-DT_FINI_ARRAYSZ = 28  # of an ELF library's dynamic section: size of its array of exit functions
+DT_FINI_ARRAYSZ = 28  # tag in an ELF library's dynamic section: size of its array of exit functions
 WRAPPER = "4be156a552c16f30eb4395805c59855d8d4086056d0f165442565f6c5fbac0c9"
 """SHA-256 of pythonfmu 0.7.0's libpythonfmu-export.so, for linux64."""
 
 
 def repaired_wrapper(library: bytes) -> bytes | None:
-    """Return the wrapper without its exit function; None unless it is pythonfmu 0.7.0's.
+    """Return the wrapper without its faulty exit function; None if it is not that of pythonfmu 0.7.0.
 
-    The function resets a static shared_ptr that C++ has destroyed before, in memory that is free.
-    It is the second of two; the first one has C++ destroy static objects, and stays.
+    The function resets a static shared_ptr in freed memory, because C++ has already destroyed it. The library has two
+    exit functions; the first one, which destroys static objects, stays.
     """
     if hashlib.sha256(library).hexdigest() != WRAPPER:
         return None
@@ -26,14 +26,14 @@ def repaired_wrapper(library: bytes) -> bytes | None:
 
 
 def check_python_wrapper(fmu: Path, library: Path, folder: Path) -> None:
-    """Refuse an unzipped FMU whose wrapper would crash; repair a wrapper of another packager.
+    """Refuse an unzipped FMU whose wrapper would crash; repair the wrapper of an FMU that pythonfmu built.
 
-    The wrapper decodes no escape but %20, and needs its module.
+    The wrapper decodes only the escape %20 in its path, and needs the module of the slave.
     """
     with library.open("rb") as file:
         content = file.read(MAX_WRAPPER)
     if b"slavemodule.txt" not in content:
-        return  # it is no such wrapper
+        return  # not pythonfmu's wrapper
     if (repaired := repaired_wrapper(content)) is not None:
         library.write_bytes(repaired)
     if "%" in folder.as_uri().replace("%20", ""):

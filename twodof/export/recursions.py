@@ -1,7 +1,7 @@
 """Kinematics and dynamics of a robot as recursions over its joints.
 
-They are written for arrays of numbers or of expressions (``straight_line``): from the one comes a value, from the
-other the C code that computes it. Vectors and matrices of a body are in the frame of its joint, whose axis is z.
+They work with arrays of numbers or of expressions (``straight_line``). Numbers give a value, expressions give the C
+code that computes it. Vectors and matrices of a body are in the frame of its joint, whose axis is z.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from .bodies import Array, Body, JointTree, Scalar, cross, symmetric
 def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]]:
     """Return R(q), p(q) of each joint's frame in its parent's: a = R b + p.
 
-    ``joint`` is N × 2: cosine and sine of a joint's angle, or the displacement of one that slides.
+    ``joint`` is N × 2: cosine and sine of a revolute joint's angle, or the displacement of a prismatic joint.
     """
     rotations, origins = [], []
     for R, p, slides, (c, s) in zip(robot.R, robot.p, robot.prismatic, joint):
@@ -31,11 +31,11 @@ def placements(robot: JointTree, joint: Array) -> tuple[list[Array], list[Array]
 def task_frame(robot: JointTree, joint: Array, v: Array) -> tuple[Array, Array, Array, Array]:
     """Return position, rotation, Jacobian and drift of the task frame in the root's axes.
 
-        J_i = z_i × (x − o_i), or z_i of a sliding joint;   ω_i = ω_p + z_i v_i of one that turns
-        J̇ v = Σ (ω_p + ω_i) × J_i v_i,   and of the turning Σ ω_p × z_i v_i
+        J_i = z_i × (x − o_i), or z_i for a prismatic joint;   ω_i = ω_p + z_i v_i for a revolute joint
+        J̇ v = Σ (ω_p + ω_i) × J_i v_i,   and of the angular rows Σ ω_p × z_i v_i
 
     Source: Siciliano, Sciavicco, Villani & Oriolo, "Robotics", 2009, sections 3.1 and 7.3; the
-    sum is that of the accelerations there, for q̈ = 0, by joints.
+    sum over the joints is the acceleration there for q̈ = 0.
 
     Returns:
         x (3), R (3 × 3), J (6 × n: linear, angular), J̇ v (6).
@@ -70,7 +70,7 @@ def inverse_dynamics(
 
         f = m a + α × d + ω × (ω × d),   n = I α + ω × I ω + d × a     with d = m c
 
-    Gravity enters as an acceleration of the root upwards. Source: Luh, Walker & Paul, "On-line
+    Gravity enters as an upward acceleration of the root. Source: Luh, Walker & Paul, "On-line
     computational scheme for mechanical manipulators", ASME J. Dyn. Sys. 102(2), 1980.
     """
     rotations, origins = placements(robot, joint)
@@ -111,7 +111,7 @@ def inverse_dynamics(
 def effort_bounds(
     robot: JointTree, body: Sequence[Body], joint: Array, armature: Array, v: Array, a: Array, gravity: Array
 ) -> Array:
-    """Return bounds of |τ| of ``inverse_dynamics``, by its recursion with norms in place of vectors.
+    """Return upper bounds of |τ| by the recursion of ``inverse_dynamics``, with norms instead of vectors.
 
     |x × y| ≤ |x| |y|, |I x| ≤ ‖I‖ |x| with Frobenius' norm, |x + y| ≤ |x| + |y|.
     """
@@ -174,7 +174,7 @@ def mass_matrix(robot: JointTree, body: Sequence[Body], joint: Array, armature: 
 
 
 def operations_of_factors(parent: Sequence[int]) -> int:
-    """Count the operations that factorise M of a tree, zeros left out: n³/3 of a chain."""
+    """Count the operations that factorise the sparse M of a tree; n³/3 for a chain."""
     ancestors: list[int] = []
     for above in parent:
         ancestors.append(ancestors[above] + 1 if above >= 0 else 0)
@@ -193,16 +193,16 @@ def solve_by_recursion(robot: JointTree, body: Sequence[Body], joint: Array, arm
 
 
 def hybrid_by_factors(M: Array, tau: Array, free: Array, held: Array) -> tuple[Array, Array]:
-    """Return a and λ of M a = τ + λ: free joints have λ = 0, the others the prescribed a.
+    """Return a and λ of M a = τ + λ: free joints have λ = 0, the others have a prescribed a.
 
-    By M = Lᵀ D L of the free joints, from the last joint inwards: between branches of a tree all
-    stays 0. Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 6.5 and 9.2.
+    It factorises M = Lᵀ D L of the free joints from the last joint inwards, so that elements between branches of a tree
+    stay 0. Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 6.5 and 9.2.
 
-    ``tau`` is τ of the free joints, ``held`` a of the others, ``free`` 1 of the free joints; where
-    they do not apply they are 0.
+    ``tau`` has τ of the free joints and else 0, ``held`` has a of the others and else 0, and ``free`` is 1 for free
+    joints and else 0.
     """
     n = len(tau)
-    L, u = M.copy(), np.array(tau, dtype=object)  # M, row by row replaced by D L
+    L, u = M.copy(), np.array(tau, dtype=object)  # rows of D L replace those of M
     a, reaction, inverse = np.zeros(n, dtype=object), np.zeros(n, dtype=object), [0.0] * n
     for k in reversed(range(n)):
         inverse[k] = free[k] / L[k, k]
@@ -228,7 +228,7 @@ def hybrid_by_recursion(
         U = I s,  D = sᵀ U + armature,  u = τ − sᵀ b,  I − U Uᵀ/D,  b + U u/D      to the parent
         q̈ = (u − Uᵀ a)/D                                                 outwards
 
-    Without velocities and gravity. Through a joint that is not free all of I passes, and U q̈.
+    There are no velocities and no gravity. A joint that is not free transmits all of I, and U q̈.
     Source: Featherstone, "Rigid Body Dynamics Algorithms", 2008, sections 7.3 and 9.2.
     """
     rotations, origins = placements(robot, joint)
@@ -275,7 +275,7 @@ def hybrid_by_recursion(
 def _passed_on(
     blocks: tuple[Array, Array, Array], slides: bool, inverse: Scalar, passed: Scalar
 ) -> tuple[Array, Array, Array]:
-    """Return I − U Uᵀ/D of a body; along its axis a free joint transmits its armature's part, another everything."""
+    """Return I − U Uᵀ/D of a body; along its axis, a free joint transmits the armature's part, a held joint all."""
     A, B, C = blocks
     angular, linear = (B[:, 2], C[:, 2]) if slides else (A[:, 2], B[2])
     left = (
@@ -293,7 +293,7 @@ def _passed_on(
 
 
 def _moved_articulated(blocks: tuple[Array, Array, Array], R: Array, p: Array) -> list[Array]:
-    """Return A, B, C in the frame in which their own has the pose (R, p)."""
+    """Return A, B and C in another frame, in which their own frame has the pose (R, p)."""
     A, B, C = blocks
     A, B, C = (R.dot(block).dot(R.T) for block in (A, B, C))
     A, C, P = symmetric(A), symmetric(C), _skew(p)

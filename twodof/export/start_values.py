@@ -1,4 +1,4 @@
-"""Start values by name, checked against the variables of an FMU, built or yet to be."""
+"""Start values by name, checked against the variables of an FMU that exists or will be built."""
 
 import re
 from collections.abc import Mapping
@@ -10,12 +10,12 @@ from ..errors import InputError, choice
 from ..plant.variables import CONTROLS, Value
 
 Setting = object
-"""A number, a Boolean, or a sequence or array of them; a dict of several kinds is ``dict[str, object]``."""
+"""A number, a Boolean, or a sequence or array of these; a dict of mixed values has the type ``dict[str, object]``."""
 LIMIT_OF_INTEGERS = 2**31
 
 
 class Settable(Protocol):
-    """The kind of a variable."""
+    """Interface of a variable: causality and type."""
 
     @property
     def causality(self) -> str:
@@ -31,11 +31,11 @@ class Variables(Protocol):
 
     @property
     def variables(self) -> Mapping[str, Settable]:
-        """All of them, in order."""
+        """All variables, in order."""
 
     @property
     def control(self) -> str:
-        """The control law, "" where it is not known."""
+        """The control law; "" if unknown."""
 
 
 def vector(variables: Mapping[str, Settable], group: str) -> list[str]:
@@ -59,14 +59,14 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
     """Return values by variable name; a group's name sets all of its elements.
 
     Raises:
-        InputError: an unknown name (with the nearest one), an output, or a value of wrong count or kind, or not finite.
+        InputError: a name is unknown or an output, or a value has a wrong number or type, or is not finite.
     """
     values: dict[str, Value] = {}
     for name, setting in settings.items():
         elements = [name] if name in fmu.variables else vector(fmu.variables, name)
         if not elements:
             raise InputError(no_variable(fmu, name, "input", "parameter"))
-        # arrays give their own kind of numbers
+        # arrays have their own types of numbers
         plain: object = setting.tolist() if hasattr(setting, "tolist") else setting
         given = list(plain) if isinstance(plain, list | tuple) else [plain] * len(elements)
         if len(given) != len(elements):
@@ -90,7 +90,7 @@ def _checked(fmu: Variables, name: str, value: object) -> Value:
         raise InputError(f"{name} = {value!r}: expected a number")
     try:
         number = float(value)
-    except OverflowError:  # of a whole number
+    except OverflowError:  # an integer too large for a float
         number = inf if value > 0 else -inf
     if not isfinite(number):
         raise InputError(f"{name} = {number} is not finite")
@@ -102,7 +102,7 @@ def _checked(fmu: Variables, name: str, value: object) -> Value:
 
 
 def _of_another(fmu: Variables, name: str) -> str:
-    """Return a vector's length, or the controls that have a variable; "" where there is none."""
+    """Return a hint: the length of a vector, or the control laws that have a variable; "" without a hint."""
     group = name.partition("[")[0]
     having = [c for c, law in CONTROLS.items() if group in (*law.inputs, *law.parameters)]
     elements = vector(fmu.variables, group)
@@ -115,7 +115,7 @@ def _of_another(fmu: Variables, name: str) -> str:
 
 
 def no_variable(fmu: Variables, name: str, *causalities: str) -> str:
-    """Return the message for an unknown name: its control law, or the nearest names."""
+    """Return the message for an unknown name, with its control law or the nearest names."""
     groups = {g: names for causality in causalities for g, names in groups_of(fmu.variables, causality).items()}
     indexed = re.sub(r"_?(\d+)$", r"[\1]", name)  # x_des_1 and x_des1 as x_des[1]
     known = [*dict.fromkeys([*groups, *chain(*groups.values())])]

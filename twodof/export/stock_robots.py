@@ -1,4 +1,4 @@
-"""Robots by name, of installed packages: example-robot-data, and the cache of robot_descriptions."""
+"""Robots of installed packages by name: example-robot-data, and the cache of robot_descriptions."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ PACKAGE = "example-robot-data"
 CACHE = "ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"
 """Environment variable of robot_descriptions, and its default."""
 HOMES = ("home", "default", "standing", "half_sitting", "neutral")
-"""Names of a home pose in SRDF files, the most telling first."""
+"""Names of home poses in SRDF files, in the order of preference."""
 ENDS = ("tool0", "ee_link", "end_effector", "link_tcp")
 
 
 def stock_robots() -> dict[str, Path]:
-    """Return the URDFs of installed packages, by file name, or by package/name where several have one name."""
+    """Return the URDFs of installed packages by file name, or by package/name if file names are equal."""
     found: list[Path] = []
     with suppress(importlib.metadata.PackageNotFoundError):
         files = importlib.metadata.files(PACKAGE) or []
@@ -39,10 +39,10 @@ def stock_robots() -> dict[str, Path]:
 def stock_robot(name: str) -> FmuOptions:
     """Return the options with which a robot of an installed package is built.
 
-    The controlled link and the home pose are those of the package's SRDF file, where it has one.
+    The controlled link and the home pose come from the package's SRDF file, if it has one.
 
     Args:
-        name: of ``stock_robots``, e.g. "panda".
+        name: a name of ``stock_robots``, e.g. "panda".
 
     Raises:
         BuildError: there is no such robot, or it cannot be read.
@@ -71,7 +71,7 @@ def _package(path: Path) -> Path:
 
 
 def _semantics(path: Path) -> ET.Element:
-    """Return the SRDF of a URDF: of the same name, or of one that begins like it; empty where there is none."""
+    """Return the SRDF whose name equals the URDF's, or is the beginning of it; empty without one."""
     files = sorted((_package(path) / "srdf").glob("*.srdf"), key=lambda file: -len(file.stem))
     fitting = [file for file in files if path.stem.startswith(file.stem)]
     if not fitting:
@@ -85,13 +85,13 @@ def _semantics(path: Path) -> ET.Element:
 
 
 def _home(semantics: ET.Element, urdf: Urdf) -> dict[str, float]:
-    """Return the positions of the home pose, rad or m, of joints that move on their own."""
+    """Return the positions of the independent joints in the home pose, rad or m."""
     states = {str(state.get("name")): state for state in reversed(semantics.findall("group_state"))}
     state = next((states[name] for name in (*HOMES, *reversed(states)) if name in states), None)
     home = {}
     for element in [] if state is None else state.iterfind("joint"):
         joint = urdf.joints.get(str(element.get("name")))
-        with suppress(ValueError):  # a floating base has several numbers
+        with suppress(ValueError):  # a floating base has several values
             if joint is not None and joint.moves and joint.leader == joint.name:
                 home[joint.name] = float(str(element.get("value")))
     return home

@@ -1,8 +1,7 @@
 """Generate C code without loops or branches from calculations on expressions.
 
-What is 0 or 1 in a robot's constants leaves no arithmetic behind, what appears twice is computed
-once. Source: Frigerio, Buchli, Caldwell & Semini, "RobCoGen", J. Softw. Eng. Robot. 7(1), 2016,
-for what that is worth to a robot's dynamics.
+Constants 0 and 1 of a robot are folded, and common subexpressions are computed once. Frigerio, Buchli, Caldwell &
+Semini, "RobCoGen", J. Softw. Eng. Robot. 7(1), 2016, describe the benefit for a robot's dynamics.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 WIDTH = 100
-"""Characters of a line."""
+"""Longest line, in characters."""
 LONG, BLOCK = 1500, 50
-"""Statements of a function from which on it gets branches, and statements between two of them.
+"""Number of statements from which on a function has branches, and of statements between two branches.
 
 LLVM's scheduler and register allocator take time quadratic in a basic block; branches make short functions slower.
 """
 STRUCTS = {"turn": "JointPosition"}
-"""Types of functions of C that return no number."""
+"""Result types of C functions that return a struct."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ def operations(results: Iterable[Value]) -> int:
 
 
 Varied = tuple[Value, Value]
-"""A value, and how it varies."""
+"""A value and its variation."""
 
 
 def varied(
@@ -99,9 +98,9 @@ def varied(
 ) -> list[Varied]:
     """Return the real parts of values, and their derivatives by the rules of differentiation.
 
-    Complex numbers are x + i h dx with an h whose square vanishes, so that real parts are computed
-    as such. ``parts`` has those of variables by name; of others they are the real and the imaginary
-    part, but for names that begin as one of ``held``, which have no imaginary part.
+    Complex numbers are x + i h dx with h² = 0, so that real parts are computed in real numbers. ``parts`` has value and
+    variation of some variables by name. Other variables have their real and imaginary parts; those whose names begin
+    with one of ``held`` have no variation.
     """
     nodes, indices = _ordered(results)
     pairs: list[Varied] = []
@@ -131,9 +130,9 @@ def varied(
 
 
 def c_function(head: str, results: Mapping[str, Value], complexes: Iterable[Varied] | None = None) -> str:
-    """Return a void function that assigns each result to its lvalue, which is a variable of no result.
+    """Return a void function that assigns each result to its lvalue, on which no result may depend.
 
-    If numbers are complex, ``complexes`` has of each result the real part and how it varies.
+    ``complexes`` has the real part and the variation of each result, for compilation with complex numbers.
     """
     body = _statements(results, "double")
     if complexes is not None:
@@ -169,7 +168,7 @@ def _statements(results: Mapping[str, Value], kind: str) -> str:
 
 
 def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]], list[int]]:
-    """Return the operations in a computable order, equal ones once, and the indices of the results."""
+    """Return the distinct operations in an order of evaluation, and the indices of the results."""
     nodes: list[tuple[str, tuple[int, ...]]] = []
     place_of: dict[tuple[str, tuple[int, ...]], int] = {}
     seen: dict[int, int] = {}
@@ -192,7 +191,7 @@ def _ordered(results: Iterable[Value]) -> tuple[list[tuple[str, tuple[int, ...]]
 
     for result in wanted:
         pending: list[Value] = [result]
-        while pending:  # deeper than Python's recursion may go
+        while pending:  # a loop, because expressions exceed Python's recursion limit
             value = pending[-1]
             inner = value.operands if isinstance(value, Expression) else ()
             missing = [operand for operand in inner if id(operand) not in seen]

@@ -21,14 +21,15 @@ UNITS: dict[str, tuple[str, dict[str, int]]] = {
     "1/s": ("", {"s": -1}),
     "1/s2": ("", {"s": -2}),
 }
-"""Quantity, by the names of Modelica's standard library, and exponents of the SI base units; all factors are 1.
-Gains are no quantity."""
+"""Quantity by the names of Modelica's standard library, and exponents of the SI base units, by unit. All factors are 1.
+Gains have no quantity.
+"""
 DISPLAY = {"rad": ("deg", 180.0 / math.pi)}
-"""Units for people, and how many of them are one."""
+"""Display units, and their number in one SI unit."""
 
 
 def add_units(root: ET.Element, used: Collection[str], fmi: int) -> None:
-    """Add the definitions of the units in use, and a type for each quantity, to a modelDescription."""
+    """Add the definitions of the used units, and a type for each quantity, to a modelDescription."""
     definitions = ET.SubElement(root, "UnitDefinitions")
     for name, (_, exponents) in UNITS.items():
         if name in used:

@@ -18,7 +18,7 @@ DEFAULT_FRAME = "EndEffector"
 
 
 def read_text(path: Path, mesh_dir: Path | None) -> str:
-    """Return the text of a URDF, or of an expanded xacro file; raise BuildError where there is none."""
+    """Return the text of a URDF or of an expanded xacro file; raise BuildError if the file cannot be read."""
     if path.suffix == ".xacro":
         return expand(path, places_of(path.parent, mesh_dir), MAX_URDF)
     if path.is_dir() or not path.exists():
@@ -33,7 +33,7 @@ def read_text(path: Path, mesh_dir: Path | None) -> str:
 
 
 def last_links(urdf: Urdf) -> list[str]:
-    """Return the links without a child that a joint moves."""
+    """Return the links without child links that at least one joint moves."""
     parents = {joint.parent for joint in urdf.joints.values()}
     ends = [link for link in urdf.links if link not in parents]
     return [link for link in ends if any(joint.moves for joint in urdf.chain(link))]
@@ -70,14 +70,14 @@ def without_meshes(text: str) -> str:
 
 
 def lock_joints(text: str, locks: Mapping[str, float]) -> str:
-    """Return a URDF with joints, by name or shell pattern, fixed at positions, rad or m.
+    """Return a URDF in which joints, by name or shell pattern, are fixed at positions, rad or m.
 
-    Joints that mimic one of them are fixed too.
+    Joints that mimic a fixed joint are fixed too.
 
     Raises:
         RobotError: no joint has such a name, or a position is outside its joint's limits.
     """
-    from scipy.spatial.transform import Rotation  # which takes half a second to import
+    from scipy.spatial.transform import Rotation  # SciPy takes half a second to import
 
     urdf = read_urdf(text)
     moving = {name: joint for name, joint in urdf.joints.items() if joint.moves}
@@ -110,7 +110,7 @@ def lock_joints(text: str, locks: Mapping[str, float]) -> str:
                 element.remove(child)
         element.set("type", "fixed")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # where roll and yaw turn about one axis, any pair does
+            warnings.simplefilter("ignore")  # in gimbal lock, any pair of roll and yaw is correct
             rpy = rotated.as_euler("xyz")
         ET.SubElement(element, "origin", xyz=" ".join(map(repr, place.tolist())), rpy=" ".join(map(repr, rpy.tolist())))
     return ET.tostring(urdf.tree, encoding="unicode")

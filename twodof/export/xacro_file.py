@@ -1,8 +1,8 @@
 """Expand a xacro file to a URDF, by the xacro package in a confined process.
 
-A xacro file is a program: its expressions are Python's, it includes files and asks the environment.
-Here simpleeval computes its expressions, with numbers, texts and data alone; files are read in the
-folders alone from which a URDF's meshes may come; the environment is empty; memory and time end.
+A xacro file is a program: it has Python expressions, includes files and reads the environment. Here, simpleeval
+evaluates the expressions, which have access to numbers, texts and data only. Files are read only from folders that may
+contain a URDF's meshes. The environment is empty, and memory and time are limited.
 """
 
 import ast
@@ -28,14 +28,14 @@ from ..version import install
 
 LOG = logging.getLogger(__name__)
 ALLOWED = {"builtins.id", "compile", "glob.glob/2", "sys._getframe"}
-"""Audit events that touch nothing outside the process."""
+"""Audit events without effect outside the process."""
 
 
 def expand(path: Path, folders: Sequence[Path], most: int) -> str:
-    """Return the URDF of a xacro file with its arguments at their defaults.
+    """Return the URDF of a xacro file with the default values of its arguments.
 
-    It and what it includes, packages too, are in the folders; each file and the URDF have ``most``
-    bytes at most. A BuildError names what the file asks for in vain.
+    The file, its includes and packages must be in the folders. Each file and the URDF have at most ``most`` bytes. A
+    BuildError names a refused access or another fault.
     """
     missing = [name for name in ("xacro", "simpleeval") if find_spec(name) is None]
     if missing:
@@ -54,20 +54,20 @@ def expand(path: Path, folders: Sequence[Path], most: int) -> str:
 
 
 def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, seconds: int) -> None:
-    """Expand the file in the child; send the URDF and the remarks of xacro."""
+    """Expand the file in the child; send the URDF and the messages of xacro."""
     import xacro
     from xacro import substitution_args
 
-    import_module("yaml")  # as it is when it is used, when nothing can be imported any more
+    import_module("yaml")  # xacro imports it on use, which a confined process cannot
     os.environ.clear()
     xacro.safe_eval = _evaluate
     substitution_args._eval = _refuse_eval
     substitution_args._eval_find = lambda name: str(_package(name, folders))
     for name in ("isinstance", "repr", "type", "vars"):
         del xacro._global_symbols["python"][name]
-    xacro.process_doc(xacro.parse("<a b='${math.pi}'/>"))  # which imports the rest
+    xacro.process_doc(xacro.parse("<a b='${math.pi}'/>"))  # imports the remaining modules
     confine(MAX_XACRO_MEMORY, 2 * seconds, folders)
-    limit_time(seconds)  # a signal that names itself, before the one that does not
+    limit_time(seconds)  # SIGXCPU, before the kernel's SIGKILL
     sys.addaudithook(_guard(folders, most))
     remarks = io.StringIO()
     try:
@@ -84,7 +84,7 @@ def _expand(pipe: Connection, path: Path, folders: Sequence[Path], most: int, se
 
 
 def _reason(error: Exception) -> str:
-    """Return an error in one line, with the remedy where there is one."""
+    """Return an error in one line, with the remedy, if any."""
     from xacro.substitution_args import ArgException
 
     cause = error
@@ -102,14 +102,14 @@ def _reason(error: Exception) -> str:
 
 
 class _Every(set[str]):
-    """Set of all names."""
+    """Set that contains every name."""
 
     def __contains__(self, name: object) -> bool:
         return True
 
 
 def _evaluate(expression: str, symbols: dict[str, object], _: object = None) -> object:
-    """Return the value of an expression, in place of xacro's own function, which calls ``eval``."""
+    """Return the value of an expression; this function replaces xacro's, which calls ``eval``."""
     import xacro
     from simpleeval import BASIC_ALLOWED_ATTRS, EvalWithCompoundTypes
 
@@ -131,7 +131,7 @@ def _refuse_eval(*_: object) -> str:
 
 
 def _package(name: str, folders: Sequence[Path]) -> Path:
-    """Return the folder of a package, found by its folder's name or by its package.xml."""
+    """Return the folder of a package, by the name of the folder or by its package.xml."""
     for folder in folders:
         for candidate in (folder / name, folder):
             declared = candidate / "package.xml"

@@ -3,7 +3,7 @@
     p_child = p_parent + R_parent (xyz + R(rpy) a q),  R_child = R_parent R(rpy)            sliding
     p_child = p_parent + R_parent xyz,                 R_child = R_parent R(rpy) exp[a q]×  turning
 
-with a the joint's axis, and a column of the Jacobian of a point p
+a is the joint's axis. A column of the Jacobian of a point p is
 
     a                  sliding,        a × (p − p_child)        turning
 
@@ -22,13 +22,13 @@ from scipy.spatial.transform import Rotation
 from ..plant.urdf import Joint, Urdf
 
 Array = NDArray[np.float64]
-BLOCK = 10_000  # samples, whose arrays a cache holds
+BLOCK = 10_000  # samples whose arrays fit into the cache
 
 
 class Placement(NamedTuple):
-    """Transforms of a frame in another at N samples: N × 3, m, and N × 3 × 3; or one for all samples.
+    """Transforms of a frame in another one at N samples: N × 3, m, and N × 3 × 3; or one for all samples.
 
-    Matrices: SciPy takes ten times as long for the product of two Rotations.
+    Rotations are matrices, because SciPy takes ten times as long for the product of two Rotations.
     """
 
     translation: Array
@@ -55,11 +55,11 @@ class Kinematics:
 
     Args:
         urdf: the robot.
-        joints: names of the joints whose positions are the columns of q. Those that mimic one of
-            them, and have no column, follow it; all others rest at 0.
+        joints: names of the joints whose positions are the columns of q. Joints without a column follow the joint
+            that they mimic, or rest at 0.
 
     Attributes:
-        origins: rotation matrix of each joint's frame in its parent's at 0, by name.
+        origins: rotation matrix of each joint's frame in its parent's frame at position 0, by name.
     """
 
     def __init__(self, urdf: Urdf, joints: Sequence[str]) -> None:
@@ -88,18 +88,18 @@ class Kinematics:
     def pose(self, joint: Joint, q: ArrayLike) -> Array:
         """Return the pose of a joint's child in its parent; q is N × joints, rad or m.
 
-        N × 7, or 1 × 7 where it rests: m, and a unit quaternion x, y, z, w.
+        The pose is N × 7, or 1 × 7 for a joint at rest: position in m, and a unit quaternion x, y, z, w.
         """
         moved, still = self._moved(joint, q), Rotation.from_matrix(self.origins[joint.name])
         if joint.prismatic:
             position = joint.xyz + moved * still.apply(joint.axis)
             return np.hstack([position, np.broadcast_to(still.as_quat(), (len(moved), 4))])
-        half = still * Rotation.from_quat([*joint.axis, 0.0])  # a half turn
+        half = still * Rotation.from_quat([*joint.axis, 0.0])  # a rotation by π
         quat = np.cos(moved / 2) * still.as_quat() + np.sin(moved / 2) * half.as_quat()
         return np.hstack([np.broadcast_to(joint.xyz, (len(moved), 3)), quat])
 
     def _moved(self, joint: Joint, q: ArrayLike) -> Array:
-        """Return a joint's coordinate, N × 1, rad or m; 1 × 1 at rest, NaN for infinity."""
+        """Return a joint's position, N × 1, rad or m; 1 × 1 for a joint at rest, NaN instead of infinity."""
         column, ratio, offset = self.column(joint)
         if column is None:
             return np.full((1, 1), offset)
@@ -126,9 +126,9 @@ class Kinematics:
         return path
 
     def _seen_from_parent(self, joint: Joint, q: Array, point: Array) -> Array:
-        """Transform a point of the child to the parent; N × 3, or 1 × 3 where nothing moves.
+        """Transform a point of the child to the parent; N × 3, or 1 × 3 if nothing moves.
 
-        By Rodrigues' formula, p = a (a·p) + cos q (p − a (a·p)) + sin q a × p.
+        Rodrigues' formula is p = a (a·p) + cos q (p − a (a·p)) + sin q a × p.
         """
         moved, axis = self._moved(joint, q), np.array(joint.axis)
         origin = self.origins[joint.name].T

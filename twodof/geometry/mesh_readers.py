@@ -1,7 +1,7 @@
-"""Mesh files read by assimp (coal) and by trimesh, in a confined child process of ``meshes``.
+"""Read mesh files by assimp (coal) and by trimesh, in a confined child process of ``meshes``.
 
-Both have unsafe or unbounded code: assimp overruns its heap on damaged files. Nothing but their
-arrays leaves the process, as bytes and never as a pickle.
+Both libraries are unsafe or unbounded: assimp overruns its heap on damaged files. Only arrays leave the process, as
+bytes and never as a pickle.
 """
 
 import io
@@ -24,7 +24,7 @@ NO_COLOUR = (-1, -1, -1)
 
 
 def serve(pipe: Connection, kind: str, folder: Path, seconds: int) -> None:
-    """Read the mesh files that the parent names over the pipe, one after another, in so much processor time."""
+    """Read the mesh files that the parent names over the pipe, one after another, within limits of processor time."""
     try:
         read = {"shape": _coal, "colours": _trimesh}[kind]()
     except ImportError as missing:
@@ -41,7 +41,7 @@ def serve(pipe: Connection, kind: str, folder: Path, seconds: int) -> None:
                 raise ValueError(f"it has more than {MAX_TRIANGLES} triangles")
         except MemoryError:
             answer: object = f"it takes more than {MAX_MESH_MEMORY // 2**20} MiB"
-        except Exception as error:  # of a foreign reader, each in its own way
+        except Exception as error:  # third-party readers raise exceptions of any type
             answer = _reason(error, path)
         else:
             answer = [(len(v), len(t), *(colour or NO_COLOUR)) for v, t, colour in parts]
@@ -60,7 +60,7 @@ def _refusing(reason: str) -> Reader:
 
 
 def _reason(error: Exception, path: Path) -> str:
-    """Return an error as one line, without the file and hint that coal adds."""
+    """Return an error as one line, without the file name and the hint that coal adds."""
     text = " ".join(str(error).split()) or type(error).__name__
     text = text.rpartition(" message: ")[2].partition(" Hint: ")[0]
     text = text.removeprefix(f"Could not load resource {path} ")
@@ -71,7 +71,7 @@ def _coal() -> Reader:
     import coal
 
     def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
-        # boxes along the axes: others take longer, and complain on stderr of odd triangles
+        # axis-aligned boxes: others take longer, and print warnings on degenerate triangles
         mesh = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
         if mesh.num_tris > MAX_TRIANGLES:
             raise ValueError(f"it has {mesh.num_tris} triangles, at most {MAX_TRIANGLES}")
@@ -85,10 +85,10 @@ def _coal() -> Reader:
 def _trimesh() -> Reader:
     import trimesh
 
-    import_module("collada")  # as trimesh does when it is used, which a confined process cannot
+    import_module("collada")  # trimesh imports it on use, which a confined process cannot
 
     def read(content: bytes, path: Path, library: bytes | None) -> list[Part]:
-        files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # whatever its name
+        files: defaultdict[str, bytes | None] = defaultdict(lambda: library)  # for any name
         scene = trimesh.load_scene(io.BytesIO(content), file_type=path.suffix[1:], resolver=files, process=False)
         parts: list[Part] = []
         for mesh in scene.dump():

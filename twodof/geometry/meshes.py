@@ -1,4 +1,4 @@
-"""Meshes for drawing: triangles in surfaces of one colour each."""
+"""Meshes for drawing: triangles, in surfaces of one colour each."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from .mesh_readers import serve
 
 LOG = logging.getLogger(__name__)
 ReadMesh = Callable[[str], bytes | None]
-"""The bytes of a mesh by its name ``meshes/…``, None where it is missing."""
+"""Function that returns the bytes of a mesh by its name ``meshes/…``, or None if it is missing."""
 Colour = tuple[float, float, float]
-"""Red, green and blue, 0 to 1."""
+"""Red, green and blue, from 0 to 1."""
 COLOURED = (".dae", ".obj")
-"""Formats that have colours."""
+"""Formats with colours."""
 MESH_FORMATS = (".stl", ".dae", ".obj", ".ply", ".off")
-"""Those whose geometry is in the file itself; others, as glTF, name files to read it from."""
+"""Formats whose geometry is in the file itself; others, such as glTF, read it from further files."""
 SHAPE, COLOURS, LIBRARY = "shape", "colours", "colours.mtl"
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each takes address space
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each thread takes address space
 
 
 class Surface(NamedTuple):
-    """Vertices V × 3 in m and triangles T × 3, with their colour where the file has one."""
+    """Vertices V × 3 in m, triangles T × 3, and their colour, if the file has one."""
 
     vertices: Array
     triangles: NDArray[np.uint32]
@@ -42,7 +42,7 @@ class Surface(NamedTuple):
 
 
 class _KilledError(ValueError):
-    """A mesh terminated its reader."""
+    """A mesh that terminated its reader."""
 
 
 class _AnswerError(Exception):
@@ -52,11 +52,11 @@ class _AnswerError(Exception):
 class Meshes:
     """Mesh files of one robot, read in confined child processes that start on demand.
 
-    A context manager. The meshes share a process: they are of one robot, so one that spoils the
-    memory of its reader can only spoil the picture of its own robot.
+    Use it as a context manager. The meshes share a process; as they belong to one robot, a mesh that corrupts the
+    memory of its reader can only spoil the picture of this robot.
 
     Args:
-        read: gives the content of a mesh file.
+        read: returns the content of a mesh file.
     """
 
     def __init__(self, read: ReadMesh) -> None:
@@ -78,7 +78,7 @@ class Meshes:
         self._stack.close()
 
     def scaled(self, name: str, scale: Array) -> list[Surface]:
-        """Return the surfaces of a mesh, m; none, with a warning, where it is unreadable."""
+        """Return the surfaces of a mesh, m; if it is unreadable, warn and return none."""
         try:
             surfaces = [s._replace(vertices=s.vertices * scale) for s in self.surfaces(name)]
             if not all(np.isfinite(surface.vertices).all() for surface in surfaces):
@@ -91,13 +91,13 @@ class Meshes:
             return []
 
     def surfaces(self, name: str, coloured: bool = True) -> list[Surface]:
-        """Return the surfaces of a mesh file in its own unit; none where the file is missing.
+        """Return the surfaces of a mesh file in its own unit; none if the file is missing.
 
-        Textures are not shown. An OBJ's colours are those of the file beside it that a build gives
-        its name and ``.mtl``.
+        Textures are not shown. The colours of an OBJ file are in a file of the same name and ``.mtl``, which the build
+        makes.
 
         Raises:
-            ValueError: it cannot be read, or is of a format that has other files read beside it.
+            ValueError: the file cannot be read, or its format reads further files.
         """
         key = name, coloured
         if key not in self._results:
@@ -127,16 +127,16 @@ class Meshes:
                 return self._parsed(COLOURS, suffix, content, self._read(f"{name}.mtl"))
             except _KilledError:
                 raise
-            except ValueError:  # it reads less than assimp
+            except ValueError:  # trimesh supports fewer files than assimp
                 pass
         if suffix == ".obj":
-            content = content.replace(b"mtllib", b"# none")  # a library of colours, anywhere
+            content = content.replace(b"mtllib", b"# none")  # a material library at any path
         return self._parsed(SHAPE, suffix, content, None)
 
     def _parsed(self, kind: str, suffix: str, content: bytes, library: bytes | None) -> list[Surface]:
         """Return a reader's surfaces of a file.
 
-        A reader that has read other meshes may die of one of these: a fresh one tries again.
+        If a reader that has read other meshes dies, they may be the cause; a new reader tries again.
         """
         file = self._folder / f"mesh{suffix}"
         file.write_bytes(content)
@@ -174,9 +174,9 @@ def _received(reader: Child) -> list[Surface]:
     """Return the checked answer of a reader, which a malicious file may control.
 
     Raises:
-        ValueError: the file is refused.
-        _AnswerError: no sound reader answers so.
-        EOFError: it has ended.
+        ValueError: the reader refuses the file.
+        _AnswerError: the answer is invalid.
+        EOFError: the reader has ended.
     """
     try:
         answer = parsed(reader.receive(200 * MAX_SURFACES, MAX_MESH_WAIT))

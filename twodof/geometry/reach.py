@@ -2,7 +2,7 @@
 
     min |p(q) − p_des|² + |log(R_des R(q)ᵀ)|²   over low ≤ q ≤ high
 
-from many starts, each improved by SciPy's bounded least squares (trust region reflective; Branch, Coleman & Li,
+It is solved from many starts by SciPy's bounded least squares (trust region reflective; Branch, Coleman & Li,
 "A subspace, interior, and conjugate gradient method for large-scale bound-constrained minimization problems",
 SIAM J. Sci. Comput. 21(1), 1999). A metre counts as a radian.
 """
@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 from .kinematics import Array, Kinematics
 
 SCATTERED, IMPROVED = 2000, 6
-"""Starts that are compared, and the nearest of them that are improved."""
-LONGEST = 10.0  # m: travel of a sliding joint without limits from which starts are drawn
-EXACT = 1e-9  # m, rad: a start that ends so near to its target is not improved upon
+"""Number of compared starts, and of the best of them, from which the problem is solved."""
+LONGEST = 10.0  # m: range of starts for a prismatic joint without limits
+EXACT = 1e-9  # m, rad: a solution within this distance of the target ends the search
 
 
 class Nearest(NamedTuple):
-    """Nearest reachable pose: joint positions, position in the root frame (m), and its distances (m, rad)."""
+    """Nearest reachable pose: joint positions, position in the root frame (m), and errors (m, rad)."""
 
     q: Array
     point: Array
@@ -46,13 +46,13 @@ def nearest(
     """Return the reachable pose of a link that is nearest to a target.
 
     Args:
-        kinematics: of the robot.
+        kinematics: kinematics of the robot.
         link: the link whose origin is compared.
         axes: root axes, 0 to 2, along which the target is given.
         target: position along the axes, m.
-        quat: target orientation x, y, z, w; empty for any.
-        low, high: limits of the columns of q, rad or m, infinite where there is none.
-        q: first start.
+        quat: target orientation x, y, z, w; empty for any orientation.
+        low, high: limits of the columns of q, rad or m, infinite without a limit.
+        q: first start, rad or m.
     """
     wanted = Rotation.from_quat(quat) if quat.size else None
     chain, rows = kinematics.urdf.chain(link), [*axes, *((3, 4, 5) if wanted else ())]
@@ -81,7 +81,7 @@ def nearest(
         far = np.hypot(far, (Rotation.from_matrix(scattered.rotation) * wanted.inv()).magnitude())
     found = []
     width = high - low
-    margin = 1e-12 * (1 + np.where(np.isfinite(width), width, 0))  # the solver starts inside
+    margin = 1e-12 * (1 + np.where(np.isfinite(width), width, 0))  # the solver must start inside the limits
     for start in [q, *starts[np.argsort(far)[:IMPROVED]]]:
         inside = np.clip(start, low + margin, high - margin)
         found.append(least_squares(residual, inside, slope, (low, high), xtol=1e-13, ftol=1e-13, gtol=1e-13))

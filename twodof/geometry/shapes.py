@@ -18,11 +18,11 @@ Indices = NDArray[np.uint32]
 NO_MATERIAL = (0.62, 0.66, 0.70)
 STICKS = ((0.0, 0.447, 0.698), (0.835, 0.369, 0.0), (0.0, 0.620, 0.451), (0.8, 0.475, 0.655))
 BALL = (0.275, 0.306, 0.345)
-SIDES = 24  # of what is round
+SIDES = 24  # sides of a round shape
 
 
 class Shape(NamedTuple):
-    """Triangles on a link: V × 3 in m in the axes of a frame fixed to the link, and T × 3."""
+    """Triangles on a link: vertices V × 3 in m in a frame fixed to the link, and triangles T × 3."""
 
     link: str
     transform: Placement
@@ -34,14 +34,14 @@ class Shape(NamedTuple):
 def link_shapes(robot: Urdf, read: ReadMesh) -> tuple[list[Shape], list[str]]:
     """Return the visual shapes of all links, and the names of missing meshes.
 
-    Where there are none, sticks and balls show where the joints are.
+    A robot without visual shapes gets balls at its joints and sticks between them.
 
     Args:
-        robot: its meshes are named ``package://meshes/…``.
-        read: where they are from.
+        robot: the robot, whose meshes have names ``package://meshes/…``.
+        read: function that returns the content of a mesh.
 
     Raises:
-        RobotError: a shape is not described by numbers.
+        RobotError: an attribute of a shape is no number.
     """
     shapes, missing = [], []
     named = {material.get("name"): material for material in reversed(robot.tree.findall("material"))}
@@ -92,7 +92,7 @@ BOX = np.array([half for a, b, c, d in FACES for half in ((a, b, c), (a, c, d))]
 
 
 def sphere(radius: float) -> tuple[Array, Indices]:
-    """Return a sphere about the origin."""
+    """Return a sphere with its centre at the origin."""
     polar = np.linspace(0.0, math.pi, SIDES // 2 + 1)
     return _revolved(radius * np.sin(polar), -radius * np.cos(polar))
 
@@ -110,7 +110,7 @@ def _revolved(radii: Array, heights: Array) -> tuple[Array, Indices]:
     here = np.arange(SIDES)
     beside = (here + 1) % SIDES
     rows = np.arange(len(radii) - 1)[:, None] * SIDES
-    low, high = rows + SIDES, rows  # the line goes upwards: seen from outside, counterclockwise
+    low, high = rows + SIDES, rows  # the polyline goes upwards, so that triangles are counterclockwise from outside
     quads = [(high + here, high + beside, low + beside), (high + here, low + beside, low + here)]
     triangles = np.concatenate([np.stack(q, axis=-1).reshape(-1, 3) for q in quads])
     return vertices.reshape(-1, 3), triangles.astype(np.uint32)
@@ -135,7 +135,7 @@ def _sticks(robot: Urdf) -> list[Shape]:
 
 
 def _colour(visual: ET.Element, named: Mapping[str | None, ET.Element]) -> Colour:
-    """Return the colour of a material, its own or that of the robot's material of this name."""
+    """Return the colour of a material: its own, or that of the robot's material of the same name."""
     material = visual.find("material")
     if material is not None:
         for candidate in (material, named.get(material.get("name"))):
@@ -149,7 +149,7 @@ def floats(element: ET.Element | None, key: str, default: str) -> Array:
     """Return the numbers of an attribute.
 
     Raises:
-        ValueError: it has others.
+        ValueError: it has another number of values, or a value that is no number.
     """
     text = default if element is None else element.get(key, default)
     numbers = np.array([float(word) for word in text.split()])
