@@ -222,6 +222,41 @@ def test_a_motion_that_both_ranks_lead_back_to_their_border_slides_along_it(stre
     assert abs(v[0]) <= np.sqrt(2 * strength * 1e-6) + 2 * strength * 2.5e-4
 
 
+@pytest.mark.parametrize("h", [0.01, 1e-3])
+def test_a_rank_that_drops_soon_is_not_held_while_a_joint_moves_far(h):
+    """q̈ = −k sgn(q) sweeps 0.5 mrad every 20 ns for some six periods; then the joint flies on freely."""
+    v0, k = 1e5, 1e13
+    burst = 6.125 * 4.0 * v0 / k
+
+    def acceleration(q, v, rank):  # joint 2 is a clock of constant speed
+        return [0.0 if q[1] > burst else -k if rank == 2 else k, 0.0]
+
+    equations = jumping(acceleration, lambda q: 0.01 + q[0])
+    (q, _), (v, _) = advance(equations, [1e-30, 0.0], [v0, 1.0], h, FREE * 2, 1e-6, 1e-12, h)
+    left = 0.5 * v0 / k
+    assert v == pytest.approx(v0 - k * left, rel=1e-4)
+    assert q == pytest.approx(v0 * left - 0.5 * k * left**2 + v * (h - burst), rel=1e-6)
+
+
+def test_a_joint_that_bounces_on_a_clamp_within_nanoseconds_is_not_held_there():
+    """q̈ = −k (sin ωt − 0.5) for 6.35 periods of 0.1 µs, in each of which the joint leaves its limit and returns."""
+    k, period, h = 1e12, 1e-7, 1e-3
+    omega, begun, burst = 2.0 * np.pi / period, 0.02 * period, 6.35 * period
+
+    def acceleration(q, v):  # joint 2 oscillates, joint 3 is a clock of constant speed
+        return [-k * (q[1] - 0.5), -(omega**2) * q[1], 0.0] if q[2] < burst else [0.0] * 3
+
+    limits = [(-20.0, 0.0), *FREE * 2]
+    start = [0.0, np.sin(omega * begun), begun], [0.0, omega * np.cos(omega * begun), 1.0]
+    q, v = advance(smooth(acceleration), *start, h - begun, limits, 1e-6, 1e-12, h)
+    left, end = np.pi / 6 / omega, 0.35 * period  # of the last period
+    flown = end - left
+    speed = -k * ((np.cos(omega * left) - np.cos(omega * end)) / omega - 0.5 * flown)
+    reached = np.cos(omega * left) * flown / omega - (np.sin(omega * end) - 0.5) / omega**2 - 0.25 * flown**2
+    assert v[0] == pytest.approx(speed, rel=1e-3)
+    assert q[0] == pytest.approx(-k * reached + v[0] * (h - burst), rel=1e-6)
+
+
 def test_a_jump_that_no_rank_explains_is_refused(budget):
     """The same with one rank on both sides: what fails the error test is not taken."""
 

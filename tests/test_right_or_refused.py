@@ -19,6 +19,7 @@ from twodof.plant import integrator
 from twodof.plant.plant import Plant
 
 STEP = 0.01
+MANY_EVALUATIONS = 3
 EDGE = 1e-13  # beyond an event, so that the next piece begins on its other side
 
 
@@ -217,6 +218,43 @@ def test_a_motion_to_and_fro_across_the_singularity_is_no_sliding():
     )
     expected = Oracle(plant, max_step=1e-6).after(3e-4)[:2]
     np.testing.assert_allclose(both(engine("twodof"), plant, 1, 3e-4)[:, :2], [expected] * 2, atol=1e-5)
+
+
+@pytest.mark.parametrize("h", [1e-2, 1e-3, 1e-4])
+def test_a_motion_to_and_fro_across_the_singularity_gains_no_energy(h):
+    """The arm cannot reach its target and flips every 14 µs; its end moves straight on, slowed down by Kd alone."""
+    of = engine("twodof")
+    changes = {"q_start": [-1.5335428759485492, 0.063866274443934], "v_start": [1365.2510595711951, 4591.271768668014]}
+    changes |= {"x_des": [-0.4005888820673592, -0.049415464448237856], "Kp": [200.0] * 2, "Kd": [20.0] * 2}
+    speeds = []
+    for tolerances in ({}, {"rtol": 1e-9, "atol": 1e-12}):
+        plant = shipped(of, **changes, **tolerances)
+        values = of.values(plant)
+        assert all(of.call("advance", values, h) == 1 for _ in range(round(STEP / h)))
+        speeds.append(np.linalg.norm(Oracle(plant).jacobian(of.group(values, "q")) @ of.group(values, "v")))
+    assert speeds[0] == pytest.approx(speeds[1], rel=0.05)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 12])
+def test_gains_that_whip_the_arm_within_nanoseconds_are_right_or_refused_at_every_communication_step(steps):
+    """A start that is moved by 1e-12 rad moves the end by 4e-10: the motion is determined."""
+    x_des, of, found = [-0.44590624212903474, -0.13071369390558008], engine("twodof"), []
+    for rtol, parts in ((1e-10, 12), (1e-8, steps)):
+        plant = shipped(of, x_des=x_des, Kp=[1e8] * 2, Kd=[1e4] * 2, rtol=rtol, atol=1e-3 * rtol)
+        values = of.values(plant)
+        if not all(of.call("advance", values, 2.4e-4 / parts) == 1 for _ in range(parts)):
+            assert of.failure()[0] == MANY_EVALUATIONS and parts < 12
+            return
+        found.append(of.group(values, "q"))
+    np.testing.assert_allclose(found[1], found[0], atol=2e-4)
+
+
+@pytest.mark.parametrize("h", [1e-3, 2e-5])
+def test_gains_beyond_the_budget_are_refused_at_every_communication_step(h):
+    of = engine("twodof")
+    plant = shipped(of, x_des=[-0.3739811484848894, -0.08483538711664651], Kp=[1e14] * 2, Kd=[1e7] * 2)
+    assert of.call("advance", of.values(plant), h) == 0
+    assert of.failure()[0] == MANY_EVALUATIONS
 
 
 GAINS = [(50.0, 40.0), (50.0, 10.0), (200.0, 20.0), (1000.0, 60.0), (1.0, 1.0), (5000.0, 200.0)]

@@ -21,6 +21,7 @@ typedef struct {
     long evaluations;                      /* evaluations of the equations of motion so far */
     double Q[N_STATES][4];                 /* coefficients of the dense output */
     double margin, margin_new;             /* margins of the rank at y and y_new */
+    int crossed;                           /* whether the rank has changed in the communication step */
     Stops stops;
 } Step;
 

@@ -5,6 +5,7 @@
 #include "polynomial.c"
 #include "event_search.c"
 #include "rosenbrock.c"
+#include "anti_chatter.c"
 #include "integrator.c"
 #include "noise.c"
 #include "sampling.c"

@@ -17,19 +17,8 @@
 /* Values of the parameter integrator. */
 enum { AUTOMATIC, DORMAND_PRINCE, STIFF };
 static const double SAFETY = 0.9, MIN_FACTOR = 0.2, MAX_FACTOR = 10.0;
-/* Anti-chatter. CHATTER_TIME is a fraction of the largest step, FIRST_HOLD and HOLD_OF_ALL are fractions of
-   CHATTER_TIME. A joint that returns to its limit within CHATTER_TIME is held there for FIRST_HOLD. Each repetition
-   lengthens the hold by the factor HOLD_GROWTH. A hold of HOLD_OF_ALL or longer covers all joints at limits. Without
-   holds, an acceleration that grazes zero, or joints that push each other off their limits, would release and stop
-   joints without end. A joint that returns once is held for some picoseconds. The rank of J⁺ is held in the same way if
-   it drops soon after a rise: the motion leads back to the jump from both sides, and slides along it. A higher rank is
-   never held, because its J⁺ is unbounded. Each joint that friction holds again at the instant of its release, or that
-   stops within FIRST_HOLD of it, has a hold of its own: there, rounding decides. */
-static const double CHATTER_TIME = 0.5, FIRST_HOLD = 1.0 / 16777216.0, HOLD_GROWTH = 8.0,
-                    HOLD_OF_ALL = 1.0 / 512.0;
-/* Fraction of CHATTER_TIME that replaces it for the rank and for stops without reaction: near a singularity ordinary
-   gains move joints back and forth within microseconds, and without reaction no impact repeats without end. */
-static const double SHORT_CHATTER_TIME = 1.0 / 4096.0;
+/* Relative tolerance down to which steps share the tolerances. Below it, rounding would fail the error test. */
+static const double FINEST_TOLERANCE = 1.0 / 68719476736.0; /* 2⁻³⁶ */
 /* Step of the difference quotients that find the fastest joint: rad, m, rad/s or m/s. */
 static const double NUDGE = 1e-6;
 
@@ -83,6 +72,17 @@ static void find_fastest(Step *step, Failure *failure)
     }
 }
 
+/* Fraction of the tolerances that a step may use. Once the rank has changed in a communication step, the steps of
+   max_step share them by their lengths: a motion to and fro across a singularity takes so many of them within a
+   millisecond that their errors, each within the tolerances, would add up to energy. */
+static double share_of_tolerance(const Step *step)
+{
+    const double *value = step->plant->value;
+    if (!step->crossed)
+        return 1.0;
+    return fmin(1.0, fmax(step->size / value[MAX_STEP], FINEST_TOLERANCE / value[RTOL]));
+}
+
 /* Integrate from the time t and the state y until an event or the end; return the time, with y the state there, or NaN
    on failure. */
 static double until_event(Step *step, double t, double end, int rank_held, int *integrator, Event *event,
@@ -95,8 +95,10 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
     while (step->evaluations <= BUDGET) {
         const int last = t + next * (1.0 + 1e-9) >= end;
         step->size = last ? end - t : next;
-        const double norm = *integrator == STIFF ? rosenbrock(step) : dormand_prince(step);
-        double factor = norm > 0.0 ? SAFETY * pow(norm, *integrator == STIFF ? -1.0 / 3.0 : -0.2) : MAX_FACTOR;
+        const double error = *integrator == STIFF ? rosenbrock(step) : dormand_prince(step);
+        const double norm = error / share_of_tolerance(step);
+        const int order = (*integrator == STIFF ? 3 : 5) - step->crossed;
+        double factor = norm > 0.0 ? SAFETY * pow(norm, -1.0 / order) : MAX_FACTOR;
         if (norm < 1.0) {
             const double passed = first_event(step, rank_held, event);
             memcpy(step->y, step->y_new, sizeof step->y);
@@ -128,111 +130,44 @@ static double until_event(Step *step, double t, double end, int rank_held, int *
     return NAN;
 }
 
-/* A hold of joints at limits, of a joint in friction, or of the rank of J⁺. */
-typedef struct {
-    double until, length;
-} Hold;
-
-/* Begin a hold at t, longer than the last one if that ended less than `soon` ago. */
-static void hold_for_a_while(Hold *hold, double t, double soon, double longest)
-{
-    const int again = t - hold->until < soon;
-    hold->length = again ? fmin(HOLD_GROWTH * hold->length, longest) : FIRST_HOLD * longest;
-    hold->until = t + hold->length;
-}
-
-static int is_at_limit(const Step *step, int i)
-{
-    const double *value = step->plant->value;
-    return !(value[Q_MIN + i] < step->y[i] && step->y[i] < value[Q_MAX + i]);
-}
-
-/* Hold the joints that chatter at t; a long hold covers all joints at limits. */
-static void hold_joints(const Step *step, const int chattering[N_JOINTS], Hold *hold, double t,
-                        double joint_time, double chatter_time, int anti_chatter[N_JOINTS])
-{
-    int any = 0;
-    for (int i = 0; i < N_JOINTS; i++)
-        any |= chattering[i];
-    if (any)
-        hold_for_a_while(hold, t, joint_time, chatter_time);
-    else if (hold->until > t)
-        return;
-    const int all = any && hold->length >= HOLD_OF_ALL * chatter_time;
-    for (int i = 0; i < N_JOINTS; i++)
-        anti_chatter[i] = all ? is_at_limit(step, i) : chattering[i];
-}
-
 int advance_plant(Plant *plant, double h, long *evaluations, double stopped_at[N_JOINTS], Failure *failure)
 {
-    const double chatter_time = CHATTER_TIME * fmin(plant->value[MAX_STEP], h);
-    const double short_time = SHORT_CHATTER_TIME * chatter_time;
-    const double joint_time = plant->value[RIGID_STOPS] != 0.0 ? chatter_time : short_time;
-    double left[N_JOINTS], risen = -HUGE_VAL; /* when each joint left its limit, when the rank rose */
-    double slipped[N_JOINTS]; /* when each began to slip */
-    Hold joints = {-HUGE_VAL, 0.0}, rank = {-HUGE_VAL, 0.0}, stuck[N_JOINTS];
-    int anti_chatter[N_JOINTS] = {0}, chattering[N_JOINTS] = {0}, kept[N_JOINTS];
+    int kept[N_JOINTS], integrator = (int)plant->value[INTEGRATOR];
     Event event = {{0}, {0}, {0}};
-    int integrator = (int)plant->value[INTEGRATOR];
+    AntiChatter chatter;
     Step step;
     double t = 0.0;
     step.plant = plant;
     step.evaluations = *evaluations;
     step.stops.rank = N_ROWS;
+    step.crossed = 0;
     memcpy(step.y, &plant->value[Q], sizeof step.y);
-    for (int i = 0; i < N_JOINTS; i++) {
-        left[i] = slipped[i] = -HUGE_VAL;
-        stuck[i] = rank;
-        if (stopped_at)
-            stopped_at[i] = HUGE_VAL;
-    }
+    begin_anti_chatter(&chatter, plant);
+    for (int i = 0; stopped_at && i < N_JOINTS; i++)
+        stopped_at[i] = HUGE_VAL;
     while (t < h) {
-        const int before = step.stops.rank, rank_held = rank.until > t;
-        double end = rank_held ? fmin(h, rank.until) : h;
-        int again = 0;
-        hold_joints(&step, chattering, &joints, t, joint_time, chatter_time, anti_chatter);
-        if (joints.until > t)
-            end = fmin(end, joints.until);
-        for (int i = 0; i < N_JOINTS; i++) {
-            kept[i] = anti_chatter[i] || stuck[i].until > t;
-            end = stuck[i].until > t ? fmin(end, stuck[i].until) : end;
-        }
-        set_out(&step, anti_chatter, kept, rank_held);
-        for (int i = 0; i < N_JOINTS; i++) {
-            const int held_again = step.stops.watched[i] && event.released[i]; /* because of rounding */
-            if (!step.stops.held[i] && is_at_limit(&step, i))
-                left[i] = t;
-            if (!step.stops.held[i] && step.stops.slip[i] && step.y[N_JOINTS + i] == 0.0)
-                slipped[i] = t;
-            if (held_again && step.stops.held[i] == STUCK)
-                hold_for_a_while(&stuck[i], t, short_time, chatter_time);
-            chattering[i] = held_again && step.stops.held[i] != STUCK;
-            again |= held_again;
-        }
+        const int before = step.stops.rank, rank_held = chatter.rank.until > t;
+        const double end = hold_joints(&chatter, &step, t, h, kept);
+        set_out(&step, chatter.joints_held, kept, rank_held);
+        const int again = held_again(&chatter, &step, &event, t);
         memset(&event, 0, sizeof event);
         if (again)
             continue;
-        if (step.stops.rank > before)
-            risen = t;
-        if (step.stops.rank < before && t - risen < short_time) {
-            hold_for_a_while(&rank, t, short_time, chatter_time);
+        step.crossed |= t > 0.0 && step.stops.rank != before;
+        if (changes_back(&chatter, &step, before, t))
             continue;
-        }
         t = until_event(&step, t, end, rank_held, &integrator, &event, failure);
-        for (int i = 0; i < N_JOINTS; i++) {
-            chattering[i] = event.stopped[i] && t - left[i] < joint_time;
-            if (event.arrested[i] && t - slipped[i] < FIRST_HOLD * chatter_time)
-                hold_for_a_while(&stuck[i], t, short_time, chatter_time);
-            if (stopped_at && event.stopped[i])
+        find_chatter(&chatter, &step, &event, t);
+        for (int i = 0; stopped_at && i < N_JOINTS; i++)
+            if (event.stopped[i])
                 stopped_at[i] = fmin(stopped_at[i], t);
-        }
     }
     *evaluations = step.evaluations;
     if (isnan(t))
         return 0;
-    if (!(joints.until > h))
-        memset(anti_chatter, 0, sizeof anti_chatter);
-    impact(plant, step.y, anti_chatter);
+    if (!(chatter.joints.until > h))
+        memset(chatter.joints_held, 0, sizeof chatter.joints_held);
+    impact(plant, step.y, chatter.joints_held);
     memcpy(&plant->value[Q], step.y, sizeof step.y);
     return 1;
 }

@@ -1,18 +1,33 @@
 """Anti-chatter: temporary holds that prevent joints and the rank of J⁺ from switching without end."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, sqrt
 
+Tolerance = Callable[[float], float]
+"""Tolerance of the error test on a position, by its value."""
 CHATTER_TIME, SHORT_CHATTER_TIME, FIRST_HOLD, HOLD_GROWTH, HOLD_OF_ALL = 0.5, 2.0**-12, 2.0**-24, 8.0, 2.0**-9
-"""Times of the anti-chatter rule. CHATTER_TIME is a fraction of the largest step; SHORT_CHATTER_TIME, FIRST_HOLD and
-HOLD_OF_ALL are fractions of CHATTER_TIME. A joint that returns to its limit within CHATTER_TIME is held there for
-FIRST_HOLD. Each repetition lengthens the hold by the factor HOLD_GROWTH. A hold of HOLD_OF_ALL or longer covers all
-joints at limits. Without holds, an acceleration that grazes zero, or joints that push each other off their limits,
-would release and stop joints without end. The rank of J⁺ is held in the same way if it drops soon after a rise: the
-motion slides along the jump. A higher rank is never held, because its J⁺ is unbounded. SHORT_CHATTER_TIME applies to
-the rank and to stops without reaction, because near a singularity ordinary gains move joints back and forth within
-microseconds. It also applies to each joint that friction holds again at the instant of its release, or that stops
-within FIRST_HOLD of it: there, rounding decides.
+"""Times of the anti-chatter rule. CHATTER_TIME is a fraction of the largest step, SHORT_CHATTER_TIME and HOLD_OF_ALL
+are fractions of CHATTER_TIME, and FIRST_HOLD is a fraction of the longest hold. A joint that returns to its limit too
+soon is held there for FIRST_HOLD. Each repetition lengthens the hold by the factor HOLD_GROWTH. With rigid stops, "too soon" is
+within CHATTER_TIME, and a hold of HOLD_OF_ALL or longer covers all joints at limits. Without holds, an acceleration
+that grazes zero, or joints that push each other off their limits, would release and stop joints without end. The rank
+of J⁺ is held in the same way if it drops soon after a rise: the motion slides along the jump. A higher rank is never
+held, because its J⁺ is unbounded.
+
+The error of a hold bounds it for the rank (``Slide``) and for stops without reaction (``clamp_time``). In a hold of
+length τ, joint i errs by Δa_i τ²/2, where Δa is the difference of the accelerations with and without the hold. This
+must not exceed the tolerance of the error test. The last excursion, of length θ, shows Δa:
+
+    rank:     Δa = |a_low − Δv/θ|      Δv is the change of velocity under the higher rank
+    stop:     Δa = 2|v|/θ              return at v after a start from rest, if the acceleration falls linearly
+
+An excursion is chatter if θ is below the longest hold: its effect is then within the tolerances too. So the rule does
+not depend on the communication step, and fast motion is never held. Rounding ends an excursion from a stop that is
+shorter than FIRST_HOLD, which shows no Δa: such a hold grows only if the excursion follows the last hold at once.
+
+SHORT_CHATTER_TIME applies to each joint that friction holds again at the instant of its release, or that stops within
+FIRST_HOLD of it: there, rounding decides.
 """
 
 
@@ -27,3 +42,56 @@ class Hold:
         """Start a hold at t, longer than the last one if that ended less than ``soon`` ago."""
         self.length = min(HOLD_GROWTH * self.length, longest) if t - self.until < soon else FIRST_HOLD * longest
         self.until = t + self.length
+
+    @property
+    def at_once(self) -> float:
+        """Time after the hold within which an excursion by rounding prolongs it, s."""
+        return HOLD_GROWTH * self.length
+
+
+@dataclass
+class Slide(Hold):
+    """A hold of the rank of J⁺, with the time of its last rise, s, and the velocities then."""
+
+    risen: float = -inf
+    risen_v: Sequence[float] = ()
+
+    def rise(self, t: float, v: Sequence[float]) -> None:
+        """Record a rise of the rank at t with the velocities v."""
+        self.risen, self.risen_v = t, v
+
+    def drop(self, t: float, y: Sequence[float], rates: Sequence[float], tolerance: Tolerance, longest: float) -> bool:
+        """Start a hold if a drop of the rank at t is chatter; return whether it is.
+
+        Args:
+            t: time, s.
+            y, rates: the state (q, v) and its derivative under the lower rank.
+            tolerance: tolerance of the error test on a position.
+            longest: upper bound of the hold, s.
+        """
+        n, passed = len(self.risen_v), t - self.risen
+        if not passed < longest:
+            return False
+        for i, before in enumerate(self.risen_v):
+            error = 0.5 * passed * abs(rates[n + i] * passed - (y[n + i] - before))
+            longest = _bounded(longest, passed, error, tolerance(y[i]))
+        if passed < longest:
+            self.again(t, longest, longest)
+        return passed < longest
+
+
+def clamp_time(passed: float, v: float, tolerance: float, longest: float) -> float:
+    """Return the longest hold of a joint that returns to a stop without reaction, s.
+
+    Args:
+        passed: time since the joint left its limit, s.
+        v: its velocity at the return, rad/s or m/s.
+        tolerance: tolerance of the error test on its position.
+        longest: upper bound of the hold, s.
+    """
+    return _bounded(longest, passed, abs(v) * passed, tolerance) if passed < longest else longest
+
+
+def _bounded(longest: float, passed: float, error: float, tolerance: float) -> float:
+    """Return the longest hold within a tolerance, if a hold of the length ``passed`` has the given error."""
+    return min(longest, passed * sqrt(tolerance / error)) if error > 0.0 else longest

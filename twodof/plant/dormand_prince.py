@@ -38,6 +38,8 @@ P = np.array(
 )
 STAGES = 6
 """Evaluations of the right-hand side in one step."""
+FINEST_TOLERANCE = 2.0**-36
+"""Relative tolerance down to which steps share the tolerances. Below it, rounding would fail the error test."""
 
 
 @lru_cache(maxsize=8)  # most steps have the same size
@@ -80,6 +82,16 @@ def error_norm(K: list[State], y: State, y_new: State, step: float, rtol: float,
         ratio = error / (atol + rtol * size)
         total += ratio * ratio
     return sqrt(total / len(y))
+
+
+def shared_tolerance(part: float, rtol: float) -> float:
+    """Return the fraction of the tolerances that a step may use.
+
+    Args:
+        part: the step as a fraction of the time over which steps share the tolerances.
+        rtol: relative tolerance.
+    """
+    return min(1.0, max(part, FINEST_TOLERANCE / rtol))
 
 
 def interpolant(y: State, y_new: State, K: list[State], P: Array, step: float) -> Callable[[float], State]:

@@ -6,6 +6,8 @@ communication step restarts with the step min(max_step, h), so that the integrat
 A step is integrated in one regime: the set of joints at rest, the directions in which the others slip (``stops``), and
 the rank of J⁺. An event ends the regime. It is located within the step (``event_search``); the step ends there, and the
 next one begins in another regime. A step is accepted only if its error test passes.
+After a change of the rank, steps share the tolerances: motion back and forth across a singularity takes so many steps
+that their errors would add up to energy.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,8 +19,8 @@ from struct import Struct
 import numpy as np
 
 from . import event_search as events
-from .anti_chatter import CHATTER_TIME, FIRST_HOLD, HOLD_OF_ALL, SHORT_CHATTER_TIME, Hold
-from .dormand_prince import P, State, dormand_prince, error_norm, interpolant
+from .anti_chatter import CHATTER_TIME, FIRST_HOLD, HOLD_OF_ALL, SHORT_CHATTER_TIME, Hold, Slide, clamp_time
+from .dormand_prince import P, State, dormand_prince, error_norm, interpolant, shared_tolerance
 from .equations import Equations
 from .pseudo_inverse import rank_margin
 from .rosenbrock import CUBIC, damping_limits, rosenbrock
@@ -47,6 +49,7 @@ class _Motion:
     Attributes:
         rank: rank of J⁺ in this regime.
         rank_held: whether the rank must not rise in this regime.
+        crossed: whether the rank has changed in the communication step.
         evaluations: evaluations of the right-hand side so far.
         grips, margins: the result of ``Stops.restrain``, and the margin of the rank, at each stage of the present step.
     """
@@ -65,7 +68,7 @@ class _Motion:
         self._automatic = integrator == AUTOMATIC and bool(len(equations.damping))
         self._stiff = integrator == STIFF
         self.rank = MOST_ROWS
-        self.rank_held = False
+        self.rank_held = self.crossed = False
         self.grips: list[list[float]] = []
         self.margins: list[float] = []
 
@@ -104,11 +107,12 @@ class _Motion:
         self.margins.append(margin)
         return y[self.n :] + a
 
-    def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
-        """Integrate from t until an event or the end; return the time, the state and the event.
+    def tolerance(self, q: float) -> float:
+        """Return the tolerance of the error test on a position."""
+        return self.atol + self.rtol * abs(q)
 
-        rates is ẏ at y.
-        """
+    def until_event(self, y: State, rates: State, t: float, end: float) -> tuple[float, State, events.Event]:
+        """Integrate from t, with ẏ at y, until an event or the end; return the time, the state and the event."""
         if len(self.stops.held) == self.n and not any(map(isnan, self.grips[0])):
             return end, y, events.Event()  # inputs and all joints are held: nothing changes
         step = min(self.max_step, end - t)
@@ -124,9 +128,11 @@ class _Motion:
             else:
                 y_new, K = dormand_prince(self.rates, y, step, rates)
                 norm = error_norm(K, y, y_new, step, self.rtol, self.atol)
+            norm /= shared_tolerance(step / self.max_step, self.rtol) if self.crossed else 1.0
             factor = MIN_FACTOR
             if isfinite(norm):
-                factor = SAFETY * norm ** (-1 / 3 if self._stiff else -0.2) if norm > 0.0 else MAX_FACTOR
+                order = (3 if self._stiff else 5) - self.crossed
+                factor = SAFETY * norm ** (-1 / order) if norm > 0.0 else MAX_FACTOR
             if norm < 1.0:
                 found = self._first_event(y, y_new, step, K)
                 if found is not None:
@@ -222,8 +228,7 @@ class _Motion:
 
     def _event(self, y: State) -> tuple[State, events.Event]:
         """Return a state with positions clipped to limits and reversed velocities set to 0, and its event."""
-        y, n, stops = list(y), self.n, self.stops
-        event = events.Event()
+        y, n, stops, event = list(y), self.n, self.stops, events.Event()
         if stops.watched:
             grips = self.acceleration(y)[1]
             event.released = [i for k, i in enumerate(stops.watched) if min(grips[2 * k : 2 * k + 2]) < 0.0]
@@ -290,22 +295,22 @@ def advance(
 def _regimes(motion: _Motion, y: State, h: float) -> State:
     """Return the state after h, integrated from event to event."""
     n, stops, t = motion.n, motion.stops, 0.0
-    chatter_time = CHATTER_TIME * min(motion.max_step, h)
+    chatter_time = CHATTER_TIME * motion.max_step
     short_time = SHORT_CHATTER_TIME * chatter_time
-    joint_time = chatter_time if stops.rigid else short_time
-    joint_hold, rank_hold, stuck = Hold(), Hold(), [Hold() for _ in range(n)]
-    left, slipped, risen = [-inf] * n, [-inf] * n, -inf  # last release, start of slip, and rise of the rank
+    joint_hold, slide, stuck = Hold(), Slide(), [Hold() for _ in range(n)]
+    left, slipped = [-inf] * n, [-inf] * n  # last release and start of slip
+    soon, longest = chatter_time, chatter_time  # of the holds of joints at limits
     event, chattering, anti_chatter = events.Event(), [False] * n, [False] * n
     while t < h:
         if any(chattering):
-            joint_hold.again(t, joint_time, chatter_time)
+            joint_hold.again(t, soon, longest)
             anti_chatter = chattering
             if joint_hold.length >= HOLD_OF_ALL * chatter_time:
                 anti_chatter = stops.at_limits(y)
         elif joint_hold.until <= t:
             anti_chatter = [False] * n
-        rank, rank_held = motion.rank, rank_hold.until > t
-        end = min((hold.until for hold in (joint_hold, rank_hold, *stuck) if hold.until > t), default=h)
+        rank, rank_held = motion.rank, slide.until > t
+        end = min((hold.until for hold in (joint_hold, slide, *stuck) if hold.until > t), default=h)
         stops.impact(y, anti_chatter)
         kept = [chatters or hold.until > t for chatters, hold in zip(anti_chatter, stuck)]
         rates = motion.set_out(y, kept, rank_held)
@@ -319,16 +324,22 @@ def _regimes(motion: _Motion, y: State, h: float) -> State:
             if stops.rest[i] == STUCK:
                 stuck[i].again(t, short_time, chatter_time)
         chattering = [i in held_again and stops.rest[i] != STUCK for i in range(n)]
-        event = events.Event()
+        event, longest = events.Event(), chatter_time
+        soon = chatter_time if stops.rigid else joint_hold.at_once
         if held_again:
             continue
+        motion.crossed |= t > 0.0 and motion.rank != rank
         if motion.rank > rank:
-            risen = t
-        if motion.rank < rank and t - risen < short_time:
-            rank_hold.again(t, short_time, chatter_time)
+            slide.rise(t, y[n:])
+        elif motion.rank < rank and slide.drop(t, y, rates, motion.tolerance, chatter_time):
             continue
         t, y, event = motion.until_event(y, rates, t, min(end, h))
-        chattering = [i in event.stopped and t - left[i] < joint_time for i in range(n)]
+        for i in event.stopped:
+            passed, tolerance = t - left[i], inf if stops.rigid else motion.tolerance(y[i])
+            hold = clamp_time(passed, y[n + i], tolerance, chatter_time)
+            if passed < hold:
+                chattering[i], longest = True, min(longest, hold)
+                soon = soon if passed < FIRST_HOLD * chatter_time else max(soon, hold)
         for i in event.arrested:
             if t - slipped[i] < FIRST_HOLD * chatter_time:
                 stuck[i].again(t, short_time, chatter_time)
