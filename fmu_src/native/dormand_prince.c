@@ -32,10 +32,15 @@ static const double P[STAGES + 1][4] = {
 void evaluate(Step *step, const double y[N_STATES], double a[N_JOINTS], double effort[N_JOINTS],
               double *margin)
 {
+    const Stops *stops = &step->stops;
+    const double *v = y + N_JOINTS;
     step->evaluations++;
-    acceleration(step->plant, y, y + N_JOINTS, slip_of(&step->stops), step->stops.rank, a, margin);
-    if (step->stops.any_held)
-        restrain(step->plant, &step->stops, y, a, effort);
+    if (stops->any_held && step->plant->value[RIGID_STOPS] != 0.0) { /* no clamps: one recursion has all */
+        acceleration_at_rest(step->plant, y, v, slip_of(stops), stops->rank, stops->held, a, effort, margin);
+        return;
+    }
+    acceleration(step->plant, y, v, slip_of(stops), stops->rank, a, margin);
+    restrain(step->plant, stops, y, a, effort);
 }
 
 double error_norm(const Step *step, const double error[N_STATES])

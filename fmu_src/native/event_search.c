@@ -224,6 +224,9 @@ static double first_release(Step *step, double before)
         doubt |= step->stops.watched[i] && may_be_released(step, i);
     if (!doubt)
         return HUGE_VAL;
+    const double instant = TIME_RESOLUTION * step->size;
+    if (release_margin(step, instant, 0) < 0.0)
+        return instant; /* by rounding, which bisection would find by fifty looks */
     memcpy(effort[0], step->effort[0], sizeof *effort);
     memcpy(effort[LOOKS], step->effort[step->stages], sizeof *effort);
     for (int k = 1; k < LOOKS; k++)

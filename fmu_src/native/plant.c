@@ -107,16 +107,15 @@ static void add_excess(const double value[N_VARIABLES], const JointPosition join
         sum[i] += tau[i] - needed[i];
 }
 
-int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
-                 const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
+/* The commanded acceleration a, or 0, and the efforts that act beyond M a + h. Returns the rank. */
+static int find_excess(const double value[N_VARIABLES], const JointPosition joint[N_BODIES],
+                       const double q[N_JOINTS], const double v[N_JOINTS], const int slip[N_JOINTS], int rank,
+                       double a[N_JOINTS], double excess[N_JOINTS], double *margin)
 {
-    const double *value = plant->value, *force = &value[F_EXT];
-    JointPosition joint[N_BODIES];
-    double effort[N_JOINTS], excess[N_JOINTS], further[N_JOINTS];
+    const double *force = &value[F_EXT];
+    double effort[N_JOINTS], further[N_JOINTS];
     const int accelerates = COMMANDS_ACCELERATION && !is_held(value);
     double *given = accelerates ? a : effort;
-    int acts = 0;
-    place_joints(q, joint);
     if (is_held(value)) {
         memcpy(given, &value[TAU], sizeof effort);
         rank = 0;
@@ -139,17 +138,51 @@ int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_
     }
     if (!knows_all(value) || (value[LIMIT_EFFORT] != 0.0 && may_saturate(value, joint, v, a)))
         add_excess(value, joint, v, given, a, excess);
+    return rank;
+}
+
+int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                 const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin)
+{
+    JointPosition joint[N_BODIES];
+    double excess[N_JOINTS], further[N_JOINTS];
+    int acts = 0;
+    place_joints(q, joint);
+    rank = find_excess(plant->value, joint, q, v, slip, rank, a, excess, margin);
     for (int i = 0; i < N_JOINTS; i++)
         acts |= excess[i] != 0.0;
     if (acts) {
         EndBody end_body;
-        body(value, 0, &end_body);
-        acceleration_of_effort(joint, &end_body, &value[ARMATURE], excess, further);
+        body(plant->value, 0, &end_body);
+        acceleration_of_effort(joint, &end_body, &plant->value[ARMATURE], excess, further);
         for (int i = 0; i < N_JOINTS; i++)
             a[i] += further[i];
     }
     return rank;
 }
+
+#ifndef IS_COMPLEX
+void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                          const int slip[N_JOINTS], int rank, const int rests[N_JOINTS], double a[N_JOINTS],
+                          double reaction[N_JOINTS], double *margin)
+{
+    JointPosition joint[N_BODIES];
+    EndBody end_body;
+    double excess[N_JOINTS], free[N_JOINTS], given[N_JOINTS], further[N_JOINTS], effort[N_JOINTS];
+    place_joints(q, joint);
+    find_excess(plant->value, joint, q, v, slip, rank, a, excess, margin);
+    for (int i = 0; i < N_JOINTS; i++) {
+        free[i] = rests[i] ? 0.0 : 1.0;
+        given[i] = rests[i] ? -a[i] : excess[i];
+    }
+    body(plant->value, 0, &end_body);
+    hybrid_dynamics(joint, &end_body, &plant->value[ARMATURE], free, given, further, effort);
+    for (int i = 0; i < N_JOINTS; i++) {
+        a[i] = rests[i] ? 0.0 : a[i] + further[i];
+        reaction[i] = rests[i] ? effort[i] - excess[i] : 0.0;
+    }
+}
+#endif
 
 #ifdef IS_COMPLEX
 void inverse_mass(const Plant *plant, const double q[N_JOINTS], int count,

@@ -19,6 +19,13 @@ enum { N_STATES = 2 * N_JOINTS }; /* q and v are adjacent in the table, and so a
 INTERNAL int acceleration(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
                           const int slip[N_JOINTS], int rank, double a[N_JOINTS], double *margin);
 
+#ifndef IS_COMPLEX
+/* q̈ with reactions that keep some joints at rest, and the reactions, which act on all joints; else as acceleration. */
+INTERNAL void acceleration_at_rest(const Plant *plant, const double q[N_JOINTS], const double v[N_JOINTS],
+                                   const int slip[N_JOINTS], int rank, const int rests[N_JOINTS],
+                                   double a[N_JOINTS], double reaction[N_JOINTS], double *margin);
+#endif
+
 /* Compute the outputs x and xd, and with an orientation quat and omega, at the plant's state. */
 INTERNAL void compute_position(Plant *plant);
 

@@ -184,6 +184,9 @@ def first_release(
     def margin(passed: float) -> float:
         return min(grips(passed))
 
+    instant = TIME_RESOLUTION * step
+    if margin(instant) < 0.0:
+        return instant  # by rounding, which bisection would find by fifty looks
     inner = [grips(step * k / LOOKS) for k in range(1, LOOKS)]
     margins = [at_ends[0], *inner, at_ends[1]]
     looks = [x * step for i in doubtful for x in _doubtful_minima([m[i] for m in margins])]
