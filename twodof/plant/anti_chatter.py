@@ -57,7 +57,7 @@ class Slide(Hold):
     risen_v: Sequence[float] = ()
 
     def rise(self, t: float, v: Sequence[float]) -> None:
-        """Record a rise of the rank at t with the velocities v."""
+        """Note the time t of a rise of the rank, and the velocities v then."""
         self.risen, self.risen_v = t, v
 
     def drop(self, t: float, y: Sequence[float], rates: Sequence[float], tolerance: Tolerance, longest: float) -> bool:
