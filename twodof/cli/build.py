@@ -2,14 +2,14 @@
 
 import argparse
 import logging
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from .completion import joints, links
+from .completion import links
 from .info import controlled
 from .options import (
     CommandLineError,
+    add_lock,
     add_options,
     add_output,
     check_company,
@@ -17,6 +17,7 @@ from .options import (
     given_options,
     not_empty,
     output_file,
+    parse_locks,
     parse_settings,
 )
 from .printing import busy, print_next, print_table, quote, say
@@ -34,15 +35,7 @@ def add(build: argparse.ArgumentParser) -> None:
     flag("--no-meshes", help="omit the URDF's meshes from the FMU")
     frame = option("--frame", type=not_empty, help="controlled link (EndEffector, or the only last link)")
     completed(frame, links)
-    lock = option(
-        "--lock",
-        dest="locks",
-        action="append",
-        default=[],
-        metavar="JOINT[=VALUE]",
-        help="fix joints, names or shell patterns, at a position (0), rad or m",
-    )
-    completed(lock, joints)
+    add_lock(build)
     option("--axes", help="task axes of xyz (xy for the shipped arm, else xyz)")
     option(
         "--gravity",
@@ -129,7 +122,7 @@ def _build(options: argparse.Namespace) -> Path:
     chosen = FmuOptions(
         urdf=stock.urdf or options.urdf or options.robot,
         name=options.name or "",
-        lock=_locks(options.locks),
+        lock=parse_locks(options.locks),
         meshes=not options.no_meshes,
         gravity=options.gravity and tuple(options.gravity),
         q_start=tuple(options.q_start) if options.q_start else stock.q_start,
@@ -143,14 +136,3 @@ def _build(options: argparse.Namespace) -> Path:
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     return build_fmu(options.output, chosen, overwrite=options.overwrite)
-
-
-def _locks(texts: Sequence[str]) -> dict[str, float]:
-    locks: dict[str, float] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        try:
-            locks[name] = float(value) if equals else 0.0
-        except ValueError:
-            raise CommandLineError(f"--lock {text}: '{value}' is not a number") from None
-    return locks

@@ -29,6 +29,10 @@ EXAMPLES = {
     "layouts": ["twodof layouts my_robot.fmu -o layouts"],
     "info": ["twodof info my_robot.fmu", "twodof info my_bag", "twodof info my_sweep --json"],
     "linearise": ["twodof linearise TwoDof-native.fmu", "twodof linearise my_robot.fmu --at q=0.5,0.35 --at Kp=100"],
+    "fit": [
+        "twodof fit my_robot.urdf my_bag --free 'friction[*]' --free payload",
+        "twodof fit my_robot.urdf monday tuesday --free 'mass:*' --free 'com:*' --free 'inertia:*' -o fitted",
+    ],
     "plot": [
         "twodof plot my_bag",
         "twodof plot my_bag other_bag -o comparison.png --joints joint1,joint2",
@@ -54,6 +58,8 @@ MEANT = {
     "make": "build",
     "create": "build",
     "tune": "sweep",
+    "identify": "fit",
+    "calibrate": "fit",
     "html": "page",
     "convert": "export",
     "csv": "export",

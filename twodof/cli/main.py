@@ -17,7 +17,23 @@ from itertools import takewhile
 
 from ..errors import TwoDofError
 from ..version import __version__
-from . import build, check, export, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
+from . import (
+    build,
+    check,
+    export,
+    fit,
+    info,
+    layouts,
+    linearise,
+    live,
+    page,
+    plot,
+    publish,
+    recover,
+    run,
+    sweep,
+    view,
+)
 from .help import Parser, check_arguments, check_verb
 from .options import CommandLineError
 from .printing import CLEAR, in_options, say
@@ -31,6 +47,7 @@ VERBS = {
     check: "check an FMU of any maker against the standard",
     info: "show what is in an FMU, a bag or a sweep",
     linearise: "show the linear model of a native FMU about an operating point",
+    fit: "fit a robot's masses and friction to bags of its motion",
     plot: "draw bags, or the map of a sweep, into one figure",
     view: "replay a bag in the browser",
     live: "drive an FMU in the browser",

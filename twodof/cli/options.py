@@ -111,6 +111,19 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
     completed(frame, completion.links)
 
 
+def add_lock(parser: argparse.ArgumentParser) -> None:
+    """Add the option for locked joints."""
+    lock = parser.add_argument(
+        "--lock",
+        dest="locks",
+        action="append",
+        default=[],
+        metavar="JOINT[=VALUE]",
+        help="fix joints, names or shell patterns, at a position (0), rad or m",
+    )
+    completed(lock, completion.joints)
+
+
 def given_options(options: argparse.Namespace, *names: str) -> Keywords:
     """Return keyword arguments of the library from options of the same meaning."""
     return {name: getattr(options, name) for name in names}
@@ -158,6 +171,18 @@ def _parse_value(name: str, text: str) -> Setting:
             f"{name}={text}: '{text}' is not a number; write numbers as 0.2,0.1 without units, or true or false"
         ) from None
     return numbers[0] if len(numbers) == 1 else numbers
+
+
+def parse_locks(texts: Iterable[str]) -> dict[str, float]:
+    """Parse JOINT[=VALUE] texts: the position, rad or m, of each locked joint or pattern."""
+    locks: dict[str, float] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        try:
+            locks[name] = float(value) if equals else 0.0
+        except ValueError:
+            raise CommandLineError(f"--lock {text}: '{value}' is not a number") from None
+    return locks
 
 
 def dated(stem: str) -> Path:

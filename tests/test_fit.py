@@ -1,0 +1,155 @@
+"""Fits to recordings by MuJoCo, which has masses, friction and a payload that the URDF does not tell."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from motions import bag_of, move, mujoco_model, noisy
+
+import twodof
+from twodof.cli.main import main
+from twodof.errors import InputError
+
+ARM = Path(__file__).parents[1] / "urdf" / "2dof.urdf"
+GRAVITY = (0.0, -9.81, 0.0)
+TRUTH = {
+    "friction[1]": 0.08, "friction[2]": 0.05, "damping[1]": 0.02, "damping[2]": 0.01,
+    "armature[1]": 0.002, "armature[2]": 0.001, "payload": 0.15,
+}  # fmt: skip
+JOINTS = ("joint1", "joint2")
+FREE = ("friction[*]", "damping[*]", "armature[*]", "payload")
+HIDDEN: dict[str, Any] = {
+    "gravity": GRAVITY, "friction": [0.08, 0.05], "damping": [0.02, 0.01], "armature": [0.002, 0.001],
+}  # fmt: skip
+
+
+def arm_motion(**changed: Any) -> Any:
+    hidden = {"payload": 0.15, "end": "EndEffector", **HIDDEN, **changed}
+    return move(mujoco_model(ARM.read_text("utf-8"), **hidden), [-0.5, 0.6], 0.8, 30.0, fastest=2.0)
+
+
+@pytest.fixture(scope="module")
+def motion() -> Any:
+    return arm_motion()
+
+
+@pytest.fixture(scope="module")
+def bag(motion: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag whose joints are in another order, with a joint that the robot has not."""
+    q, effort = noisy(motion)
+    other = np.zeros((len(q), 1))
+    columns = [np.hstack([each[:, ::-1], other]) for each in (q, effort)]
+    return bag_of(tmp_path_factory.mktemp("fit") / "bag", [*JOINTS[::-1], "gripper"], *columns)
+
+
+def assert_true(result: twodof.Fit, truth: dict[str, float]) -> None:
+    """Each parameter is within three standard deviations, and within 3 % where these say so."""
+    assert truth.keys() == {p.name for p in result.parameters}
+    for p in result.parameters:
+        assert p.known and abs(p.after - truth[p.name]) <= 3.0 * p.deviation, (p, truth[p.name])
+        if 3.0 * p.deviation <= 0.03 * abs(truth[p.name]):
+            assert abs(p.after / truth[p.name] - 1.0) <= 0.03, (p, truth[p.name])
+
+
+def test_the_command_writes_a_folder_whose_robot_moves_as_recorded(bag, tmp_path, capsys):
+    free = [word for pattern in FREE for word in ("--free", pattern)]
+    gravity = ["--gravity", *map(str, GRAVITY)]
+    assert main(["fit", str(ARM), str(bag), *free, *gravity, "-o", str(tmp_path / "fitted")]) == 0
+    printed = capsys.readouterr().out
+    facts = json.loads((tmp_path / "fitted" / "fit.json").read_text("utf-8"))
+    assert [p["name"] for p in facts["parameters"]] == list(TRUTH) and facts["explains"]
+    assert all(re.search(rf"^{re.escape(name)} +0 ", printed, re.MULTILINE) for name in TRUTH), printed
+    assert "does not explain" not in printed and "--set armature=" in printed and "--set payload=" in printed
+    for joint in JOINTS:
+        assert facts["held_out"]["after"][joint] < 0.05 * facts["held_out"]["before"][joint]
+    robot = tmp_path / "fitted" / "robot.urdf"
+    fmu = twodof.build_fmu(
+        tmp_path / "Fitted.fmu",
+        twodof.FmuOptions(urdf=robot, mesh_dir=ARM.parents[1] / "meshes", settings=facts["settings"], control="effort"),
+    )
+    starts = {name: twodof.load_fmu(fmu).variables[name].start for name in TRUTH}
+    assert float(starts["friction[1]"]) == pytest.approx(0.08, rel=0.1)
+    assert float(starts["payload"]) == pytest.approx(0.15, rel=0.01)
+
+
+def test_hidden_values_are_found(bag):
+    assert_true(twodof.fit(ARM, bag, FREE, gravity=GRAVITY), TRUTH)
+
+
+def test_only_numbers_of_the_urdf_change(bag):
+    result = twodof.fit(ARM, bag, ("friction[*]", "mass:link2", "com:link2", "inertia:link2"), gravity=GRAVITY)
+    before, after = ARM.read_text("utf-8"), result.fitted_urdf.decode()
+    assert before != after and "The default robot" in after  # a comment
+    number = r"-?\d+\.?\d*(?:e[-+]?\d+)?"
+    added = re.sub(r"\n *<dynamics [^>]*/>", "", after)
+    assert re.sub(number, "#", before) == re.sub(number, "#", added)
+    assert after.count("<dynamics friction=") == 2
+
+
+def test_a_hidden_spring_is_said_with_its_joint(tmp_path):
+    q, effort = noisy(arm_motion(stiffness=[0.0, 0.1]))
+    result = twodof.fit(ARM, bag_of(tmp_path / "bag", JOINTS, q, effort), FREE, gravity=GRAVITY)
+    assert not result.explains
+    assert any("does not explain" in line and "'joint2'" in line for line in result.remarks)
+
+
+def refused(change: str, motion: Any) -> tuple[Any, Any, Any, list[str]]:
+    q, effort = noisy(motion)
+    stamps = 10**18 + 10_000_000 * np.arange(len(q))
+    names = [*JOINTS]
+    if change == "another robot":
+        names = ["left", "right"]
+    elif change == "short":
+        q, effort, stamps = q[:100], effort[:100], stamps[:100]
+    elif change == "still":
+        q[:, 1] = 0.3 + 1e-4 * np.random.default_rng(0).normal(size=len(q))
+    elif change == "nan":
+        q[700, 1] = np.nan
+    elif change == "millinewton":
+        effort = 1000.0 * effort
+    elif change == "repeated":
+        stamps[500:] -= stamps[500] - stamps[200]
+    elif change == "no efforts":
+        effort = None
+    elif change == "slow":
+        stamps = 10**18 + 200_000_000 * np.arange(len(q))
+    return q, effort, stamps, names
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("another robot", "has no joint 'joint1'"),
+        ("short", "is too short"),
+        ("still", "joint 'joint2' never moves"),
+        ("nan", "the position of joint 'joint2' at 7 s is no number"),
+        ("millinewton", "a factor of 1000"),
+        ("repeated", "several joint states at one time"),
+        ("no efforts", "has no efforts"),
+        ("slow", "a fit needs 20"),
+    ],
+)
+def test_a_recording_that_cannot_be_fitted_is_refused_in_a_line(change, words, motion, tmp_path, capsys):
+    q, effort, stamps, names = refused(change, motion)
+    bag = bag_of(tmp_path / "bag", names, q, effort, stamps)
+    with pytest.raises(InputError, match=re.escape(words)):
+        twodof.fit(ARM, bag, FREE, gravity=GRAVITY, output=tmp_path / "fitted")
+    assert not (tmp_path / "fitted").exists()
+    assert main(["fit", str(ARM), str(bag), "--free", "payload", "-o", str(tmp_path / "fitted")]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and words in error
+
+
+def test_patterns_and_folders_are_checked(bag, tmp_path):
+    with pytest.raises(InputError, match=re.escape("'frictoin[1]' matches no parameter; did you mean 'friction[1]'?")):
+        twodof.fit(ARM, bag, "frictoin[1]")
+    with pytest.raises(InputError, match="'Kp\\*' matches no parameter"):
+        twodof.fit(ARM, bag, "Kp*")
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(InputError, match="exists, and is not replaced"):
+        twodof.fit(ARM, bag, "payload", output=tmp_path / "mine")

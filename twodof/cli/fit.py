@@ -1,0 +1,77 @@
+"""Verb fit: fit a robot's parameters to bags of its motion."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .completion import links
+from .options import (
+    CommandLineError,
+    add_lock,
+    add_options,
+    add_output,
+    completed,
+    given_options,
+    not_empty,
+    parse_locks,
+)
+from .printing import busy, print_json, print_next, print_table, quote, say
+
+
+def add(fit: argparse.ArgumentParser) -> None:
+    """Add the options of the verb."""
+    fit.description = (
+        "Fit masses, friction and other parameters of a URDF to bags with positions and efforts. Writes robot.urdf"
+        " and fit.json into a folder. The last fifth of each bag is held out."
+    )
+    option = fit.add_argument
+    option("robot", type=Path, metavar="URDF", help="URDF or xacro file with the values to begin with")
+    option("bags", nargs="+", type=not_empty, metavar="BAG", help="bags of the robot")
+    option(
+        "--free",
+        action="append",
+        default=[],
+        metavar="PATTERN",
+        help="free parameters, by name or shell pattern: friction[*], damping[*], armature[*], mass:LINK, com:LINK,"
+        " inertia:LINK, payload, payload_com, gravity, offset:JOINT, gain:JOINT; repeatable",
+    )
+    add_output(fit, "FOLDER", "folder of the fitted robot (fitted)")
+    frame = option("--frame", type=not_empty, metavar="LINK", help="link of the payload (the only last link)")
+    completed(frame, links)
+    add_lock(fit)
+    option(
+        "--gravity", nargs=3, type=float, metavar=("X", "Y", "Z"), help="gravity, m/s2 in the root frame (0 0 -9.81)"
+    )
+    add_options(fit, "--json")
+
+
+def call(options: argparse.Namespace) -> int:
+    """Run the verb; return the exit status."""
+    if not options.free:
+        raise CommandLineError("name the free parameters with --free, for example --free 'friction[*]' --free payload")
+    output = Path(options.output or "fitted")
+    with busy(f"fitting {options.robot.name}", silent=True):
+        from ..identification.fitting import fit
+
+        result = fit(
+            options.robot,
+            options.bags,
+            options.free,
+            output=output,
+            lock=parse_locks(options.locks),
+            **given_options(options, "frame", "gravity"),
+        )
+    if options.json:
+        print_json(output=str(output), **result.facts)
+        return 0
+    print_table(*result.rows)
+    for remark in result.remarks:
+        say(f"note: {remark}")
+    given = {name: ",".join(map(repr, values)) for name, values in result.settings.items()}
+    settings = "".join(
+        f" --gravity {value.replace(',', ' ')}" if name == "gravity" else f" --set {name}={value}"
+        for name, value in given.items()
+    )
+    print_next(f"twodof build {quote(output / 'robot.urdf')}{settings}")
+    return 0

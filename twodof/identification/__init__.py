@@ -1,0 +1,1 @@
+"""Identification: physical parameters of a robot from bags of its motion."""

@@ -1,0 +1,180 @@
+"""Maximum likelihood of free parameters, their covariance, and tests of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import f as f_distribution
+
+from .parameters import SEEN, Parameters, Values
+from .regression import EDGES, Rows, jacobian, residual, rows_of
+from .stretches import Array, Stretch
+
+PRIOR = 3.0
+"""Standard deviation of the weak prior about the URDF's values, in scales: it holds what the data do not see."""
+TOLERANCE = 1e-10
+PASSES, FIRST_NOISE = 6, 0.02
+"""Times that the variances of noise are estimated anew, and the noise at first, a part of the efforts."""
+DELAY_SCALE = 0.02  # s
+FEWEST = 20  # rows of a bin of noise
+PRIOR_SHARE = 0.1
+"""Of the variance of a value: beyond it the value is that of the URDF, and not known by the data."""
+UNEXPLAINED, SIGNIFICANCE = 0.01, 1e-4
+"""Slow residuals are reported from this part of the efforts on, and below this probability."""
+
+
+class Misfit(NamedTuple):
+    """Slow residuals of one joint beside its fast ones.
+
+    Attributes:
+        joint: index.
+        rms: of the slow residuals, N·m or N.
+        ratio: of the variances of slow and fast residuals.
+        probability: of such a ratio if noise were white.
+        part: of the efforts that the slow residuals are.
+    """
+
+    joint: int
+    rms: float
+    ratio: float
+    probability: float
+    part: float
+
+    @property
+    def bad(self) -> bool:
+        """True where the model does not explain the data."""
+        return self.probability < SIGNIFICANCE and self.part > UNEXPLAINED
+
+
+class Estimate(NamedTuple):
+    """Result of an estimation of p coordinates and the delay.
+
+    Attributes:
+        x: coordinates, p.
+        values: physical values.
+        covariance: of the reported values, r × r, with the prior.
+        known: whether the data tell a reported value, r.
+        unseen: directions that the data do not see, in scales, directions × p.
+        delay: of recorded efforts, s, and its standard deviation.
+        noise: standard deviation of the efforts' noise, N·m or N, n.
+        misfits: of the joints.
+        evaluations: of the residuals.
+    """
+
+    x: Array
+    values: Values
+    covariance: Array
+    known: NDArray[np.bool_]
+    unseen: Array
+    delay: tuple[float, float]
+    noise: Array
+    misfits: tuple[Misfit, ...]
+    evaluations: int
+
+
+def estimate(parameters: Parameters, stretches: Sequence[Stretch]) -> Estimate:
+    """Return the most likely coordinates of the free parameters."""
+    x, low, scales = parameters.coordinates(_typical(stretches))
+    scales, low = np.append(scales, DELAY_SCALE), np.append(low, -np.inf)
+    start = np.append(x, 0.0)
+    z, evaluations = start.copy(), 0
+    rows: list[Rows] = []
+    sd: list[Array] = []
+    relinearise = any(free.group == "offset" for free in parameters.free)
+    for k in range(PASSES):
+        if k in (0, 3) or relinearise:
+            about = parameters.dynamics(parameters.values(z[:-1]))
+            rows = rows_of(parameters.robot, about, stretches, float(z[-1]), relinearise)
+        sd = sd or [np.full(len(each.tau), FIRST_NOISE * np.sqrt(np.mean(each.tau**2))) for each in rows]
+        solved = _solve(parameters, rows, sd, z, start, low, scales)
+        z, evaluations = solved.x, evaluations + solved.nfev
+        dynamics = parameters.dynamics(parameters.values(z[:-1]))
+        sd = [_deviations(each, residual(each, dynamics, float(z[-1]))) for each in rows]
+    return _result(parameters, rows, sd, z, scales, evaluations)
+
+
+def _typical(stretches: Sequence[Stretch]) -> dict[str, Array]:
+    """Return friction, damping and armature that would explain the efforts of each joint alone."""
+    rms = {name: np.sqrt(np.mean(np.concatenate([getattr(s, name) for s in stretches]) ** 2, 0)) for name in "va"}
+    effort = np.sqrt(np.mean(np.concatenate([s.tau for s in stretches]) ** 2, axis=0))
+    return {"friction": effort, "damping": effort / rms["v"], "armature": effort / rms["a"]}
+
+
+def _solve(
+    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, start: Array, low: Array, scales: Array
+) -> Any:
+    """Return the least squares of the whitened rows and the weak prior, as SciPy has it."""
+
+    def errors(z: Array) -> Array:
+        dynamics = parameters.dynamics(parameters.values(z[:-1]))
+        parts = [residual(each, dynamics, z[-1]) / s for each, s in zip(rows, sd)]
+        return np.concatenate([*parts, (z - start) / (PRIOR * scales)])
+
+    def rates(z: Array) -> Array:
+        return np.vstack([_information_root(parameters, rows, sd, z), np.diag(1.0 / (PRIOR * scales))])
+
+    inside = np.maximum(z, low + 1e-9 * scales)
+    return least_squares(
+        errors, inside, rates, bounds=(low, np.inf), x_scale=scales, xtol=1e-10, ftol=1e-10, gtol=1e-10
+    )
+
+
+def _information_root(parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array) -> Array:
+    """Return the Jacobian of the whitened residuals by the coordinates, the delay last."""
+    dynamics = parameters.dynamics(parameters.values(z[:-1]))
+    rates = parameters.rates(z[:-1])[1]
+    return np.vstack([jacobian(each, dynamics, rates) / s[:, None] for each, s in zip(rows, sd)])
+
+
+def _deviations(rows: Rows, errors: Array) -> Array:
+    """Return the standard deviation of each row's noise, by bins of frequency."""
+    variance = np.empty(len(EDGES) - 1)
+    for k in range(len(variance)):
+        near = np.abs(rows.bin - k)
+        own = near <= max(0, np.partition(near, min(FEWEST, len(near) - 1))[min(FEWEST, len(near) - 1)])
+        variance[k] = np.mean(errors[own] ** 2)
+    return np.sqrt(np.maximum(variance, 1e-30))[rows.bin]
+
+
+def _result(
+    parameters: Parameters, rows: Sequence[Rows], sd: Sequence[Array], z: Array, scales: Array, evaluations: int
+) -> Estimate:
+    J = _information_root(parameters, rows, sd, z) * scales
+    strengths, directions = np.linalg.eigh(J.T @ J)
+    variances = 1.0 / (np.maximum(strengths, 0.0) + PRIOR**-2)
+    unseen = strengths < SEEN**-2
+    reported = np.zeros((len(parameters.names) + 1, len(z)))
+    reported[:-1, :-1], reported[-1, -1] = parameters.rates(z[:-1])[0], 1.0
+    spread = (reported * scales) @ directions
+    covariance = spread * variances @ spread.T
+    total = np.diag(covariance)
+    by_prior = (spread[:, unseen] ** 2) @ variances[unseen]
+    values = parameters.values(z[:-1])
+    dynamics = parameters.dynamics(values)
+    misfits = [_misfit(each, residual(each, dynamics, float(z[-1])), len(z) / len(rows)) for each in rows]
+    noise = np.array([np.sqrt(np.mean(residual(each, dynamics, float(z[-1])) ** 2)) for each in rows])
+    return Estimate(
+        x=z[:-1],
+        values=values,
+        covariance=covariance[:-1, :-1],
+        known=(by_prior <= PRIOR_SHARE * total)[:-1],
+        unseen=directions[:-1, unseen].T,
+        delay=(float(z[-1]), float(np.sqrt(total[-1]))),
+        noise=noise,
+        misfits=tuple(misfits),
+        evaluations=evaluations,
+    )
+
+
+def _misfit(rows: Rows, errors: Array, used: float) -> Misfit:
+    """Compare slow residuals, where the motion is, with those of the middle of the band."""
+    slow, fast = rows.bin < 2, (rows.bin >= 2) & (rows.bin < 5)
+    own, other = max(1.0, slow.sum() - used), max(1.0, float(fast.sum()))
+    ratio = float(np.sum(errors[slow] ** 2) / own / max(np.sum(errors[fast] ** 2) / other, 1e-300))
+    rms = float(np.sqrt(np.sum(errors[slow] ** 2) / len(errors)))
+    effort = float(np.sqrt(np.sum(rows.tau**2) / len(errors)))
+    return Misfit(rows.joint, rms, ratio, float(f_distribution.sf(ratio, own, other)), rms / max(effort, 1e-300))

@@ -1,0 +1,175 @@
+"""Result of a fit: a table, facts for other programs, and the files of its folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..files import refusing, temporary_folder
+from ..notebook import card
+from ..version import __version__
+from .estimate import Misfit
+from .prediction import WINDOW
+
+
+class FittedParameter(NamedTuple):
+    """A free parameter before and after a fit.
+
+    Attributes:
+        name: as the pattern names it.
+        unit: FMI unit name, "" where there is none.
+        before, after: values.
+        deviation: standard deviation of the value after.
+        low, high: 95 % interval.
+        known: False where the data do not tell the value, which then is that of before.
+    """
+
+    name: str
+    unit: str
+    before: float
+    after: float
+    deviation: float
+    low: float
+    high: float
+    known: bool
+
+
+@dataclass(frozen=True, repr=False)
+class Fit:
+    """A fitted robot; ``print`` shows its table.
+
+    Attributes:
+        urdf: name of the URDF's file.
+        fitted_urdf: its text with fitted numbers.
+        joints: names of the robot's n joints.
+        parameters: the free ones.
+        unseen: for each direction that the data do not see, the parameters that make it up.
+        misfits: test of the model at each joint.
+        noise: standard deviation of the efforts' residuals at each joint, N·m or N.
+        delay: from a recorded effort to its action, s, and its standard deviation.
+        deviation_before, deviation: root mean square of simulated less measured positions of each joint in the
+            stretches held out, rad or m, with the parameters before and after; empty where none was long enough.
+        settings: fitted values that a URDF cannot hold, by variable of the FMU.
+        covariance: of the parameters, in their order.
+    """
+
+    urdf: str
+    fitted_urdf: bytes
+    joints: tuple[str, ...]
+    parameters: tuple[FittedParameter, ...]
+    unseen: tuple[str, ...]
+    misfits: tuple[Misfit, ...]
+    noise: tuple[float, ...]
+    delay: tuple[float, float]
+    deviation_before: tuple[float, ...]
+    deviation: tuple[float, ...]
+    settings: Mapping[str, tuple[float, ...]]
+    covariance: NDArray[np.float64]
+
+    @property
+    def explains(self) -> bool:
+        """True where the residuals at all joints are noise."""
+        return not any(misfit.bad for misfit in self.misfits)
+
+    @property
+    def rows(self) -> list[tuple[str, str, str, str, str]]:
+        """Cells of the table: name, before, after, 95 % interval, unit."""
+        rows = [("parameter", "before", "after", "95 % interval", "unit")]
+        for p in self.parameters:
+            interval = f"{p.low:.4g} … {p.high:.4g}" if p.known else "not seen"
+            rows.append((p.name, f"{p.before:.4g}", f"{p.after:.4g}", interval, p.unit))
+        return rows
+
+    @property
+    def remarks(self) -> list[str]:
+        """Warnings and results, a line each."""
+        lines = []
+        if self.unseen:
+            lines.append(f"the data do not tell: {'; '.join(self.unseen)}")
+        if bad := [misfit for misfit in self.misfits if misfit.bad]:
+            worst = max(bad, key=lambda misfit: misfit.part)
+            lines.append(
+                f"the model does not explain these data, least at joint '{self.joints[worst.joint]}': slow residuals"
+                f" of {worst.rms:.3g} N·m, {100 * worst.part:.2g} % of its effort, have {worst.ratio:.3g} times the"
+                " variance of fast ones; free more parameters, or look for what the URDF does not have"
+            )
+        if abs(self.delay[0]) > 5.0 * self.delay[1]:
+            side = "after" if self.delay[0] > 0.0 else "before"
+            lines.append(f"efforts act {1e3 * abs(self.delay[0]):.3g} ms {side} their stamps")
+        for joint, before, after in zip(self.joints, self.deviation_before, self.deviation):
+            lines.append(
+                f"held out: in windows of {WINDOW:g} s the simulated position of joint '{joint}' is off by"
+                f" {after:.3g} (rms), before by {before:.3g}"
+            )
+        return lines
+
+    def __str__(self) -> str:
+        widths = [max(map(len, column)) for column in zip(*self.rows)]
+        table = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in self.rows]
+        return "\n".join([*table, *self.remarks])
+
+    def __repr__(self) -> str:
+        return f"<Fit of {len(self.parameters)} parameters of {self.urdf}>"
+
+    def _repr_html_(self) -> str:
+        facts = {row[0]: " ".join((*row[1:3], f"({row[3]})", row[4])) for row in self.rows[1:]}
+        return card(f"Fit of {self.urdf}", facts | dict.fromkeys(self.remarks, ""))
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Facts for other programs, in SI units; null for numbers that are not finite."""
+        return {
+            "kind": "fit",
+            "urdf": self.urdf,
+            "version": __version__,
+            "parameters": [p._asdict() for p in self.parameters],
+            "unseen": self.unseen,
+            "explains": self.explains,
+            "misfits": [m._asdict() | {"joint": self.joints[m.joint], "bad": m.bad} for m in self.misfits],
+            "noise": dict(zip(self.joints, self.noise)),
+            "delay": {"value": self.delay[0], "deviation": self.delay[1]},
+            "held_out": {
+                "before": dict(zip(self.joints, map(_finite, self.deviation_before))),
+                "after": dict(zip(self.joints, map(_finite, self.deviation))),
+            },
+            "settings": dict(self.settings),
+            "remarks": self.remarks,
+        }
+
+    def save(self, folder: str | Path) -> Path:
+        """Write robot.urdf and fit.json into a new folder, whole or not at all; return its path.
+
+        Raises:
+            InputError: the folder exists or cannot be written.
+        """
+        path = check_folder(folder)
+        with refusing(InputError, f"write '{path}'"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with temporary_folder(path.parent) as draft:
+                inside = draft / "fitted"
+                inside.mkdir()
+                (inside / "robot.urdf").write_bytes(self.fitted_urdf)
+                (inside / "fit.json").write_text(json.dumps(self.facts, indent=2, allow_nan=False) + "\n", "utf-8")
+                inside.rename(path)
+        return path
+
+
+def check_folder(folder: str | Path) -> Path:
+    """Return the path of a folder that is to be written; raise InputError where something is there."""
+    path = Path(folder)
+    if os.path.lexists(path):
+        raise InputError(f"'{path}' exists, and is not replaced: remove it, or give another `output`")
+    return path
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,80 @@
+"""A URDF with fitted numbers, its comments, order and all other text kept."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import lxml.etree
+import numpy as np
+
+from ..plant.urdf import Urdf
+from .inertials import INERTIA, inertia_of, inertial_place
+from .parameters import Parameters, Values
+
+OF_DYNAMICS = ("friction", "damping")
+DIGITS = 9
+
+
+def fitted_urdf(text: str, urdf: Urdf, parameters: Parameters, values: Values) -> bytes:
+    """Return the text of a URDF with the fitted values that a URDF can hold.
+
+    These are friction and damping of joints, and masses, centres and inertias of links. A joint that others mimic
+    shares friction and damping with them, in the proportions of before.
+
+    Args:
+        text: of the URDF.
+        urdf: the same, read.
+        parameters: the free ones.
+        values: of all.
+    """
+    parser = lxml.etree.XMLParser(encoding="utf-8", resolve_entities=False, no_network=True, huge_tree=False)
+    tree = lxml.etree.parse(io.BytesIO(text.encode()), parser)
+    root = tree.getroot()
+    links = {link.get("name"): link for link in root.findall("link")}
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    for free in parameters.free:
+        if free.group in OF_DYNAMICS:
+            leader = parameters.robot.joints[free.place]
+            before, after = (float(getattr(v, free.group)[free.place]) for v in (parameters.start, values))
+            for joint in (joint for joint in urdf.joints.values() if joint.leader == leader):
+                own = getattr(joint, free.group)
+                share = own * after / before if before else after * (joint.name == leader)
+                if joint.moves and (share or own):
+                    _child(joints[joint.name], "dynamics").set(free.group, _number(share))
+        elif free.group in ("mass", "com", "inertia"):
+            _write_link(links[parameters.links[free.place]].find("inertial"), free.group, free.place, values)
+    declaration = re.match(r"\ufeff?<\?xml.*?\?>\s*", text, re.DOTALL)
+    written = lxml.etree.tostring(tree, encoding="unicode")
+    return f"{declaration[0] if declaration else ''}{written.rstrip()}\n".encode()
+
+
+def _write_link(inertial: Any, group: str, link: int, values: Values) -> None:
+    place = inertial_place(inertial)
+    if group == "mass":
+        inertial.find("mass").set("value", _number(values.mass[link]))
+    elif group == "com":
+        _child(inertial, "origin", first=True).set("xyz", " ".join(map(_number, values.com[link])))
+    else:
+        R = place.rotation
+        tensor = R.T @ inertia_of(values.second[link]) @ R
+        for key, index in INERTIA.items():
+            inertial.find("inertia").set(key, _number(tensor[index]))
+
+
+def _child(element: Any, tag: str, *, first: bool = False) -> Any:
+    """Return the child of an element with a tag, made where there is none, with the indentation of the others."""
+    found = element.find(tag)
+    if found is None:
+        found = lxml.etree.Element(tag)
+        if len(element):
+            found.tail = element.text if first else element[-1].tail
+            if not first:
+                element[-1].tail = element.text
+        element.insert(0 if first else len(element), found)
+    return found
+
+
+def _number(value: float) -> str:
+    return repr(float(np.format_float_positional(value, DIGITS, fractional=False)) if value else 0.0)

@@ -1,0 +1,177 @@
+"""Fit of a robot's physical parameters to bags of its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..bag.reader import read_bag
+from ..bag.recording import Recording
+from ..errors import InputError
+from ..export.urdf_source import end_effector, last_links, lock_joints, read_text
+from ..plant.robot import load_robot
+from ..plant.urdf import RobotError, Urdf, read_urdf
+from .estimate import Estimate, estimate
+from .fit_result import Fit, FittedParameter, check_folder
+from .fitted_urdf import fitted_urdf
+from .parameters import Dynamics, Parameters
+from .prediction import deviation, predict
+from .regression import regressors
+from .stretches import Array, Stretch, stretches
+
+WRONG_UNITS = 300.0
+"""Ratio of recorded efforts to those of the URDF's masses, from which another unit is suspected."""
+NORMAL_95 = 1.959964
+POSITIVE = ("friction", "damping", "armature", "payload", "mass")
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+def fit(
+    urdf: str | Path,
+    bags: str | Path | Sequence[str | Path],
+    free: str | Sequence[str],
+    *,
+    output: str | Path | None = None,
+    frame: str | None = None,
+    lock: Mapping[str, float] | None = None,
+    gravity: Sequence[float] | None = None,
+) -> Fit:
+    """Fit parameters of a robot to bags of its motion, with positions and efforts of its joints.
+
+    The last fifth of each bag is held out: it is predicted and never fitted.
+
+    Args:
+        urdf: the URDF or xacro file with the values to begin with.
+        bags: of any writer, with JointStates.
+        free: names or shell patterns of the free parameters: ``friction[1]``, ``damping[1]``, ``armature[1]``,
+            ``offset:JOINT``, ``gain:JOINT``, ``mass:LINK``, ``com:LINK``, ``inertia:LINK``, ``payload``,
+            ``payload_com``, ``gravity``.
+        output: folder for robot.urdf and fit.json, which must not exist; None: none.
+        frame: link of the payload; None: "EndEffector", or the only last link.
+        lock: positions, rad or m, at which joints are fixed, by name or shell pattern.
+        gravity: m/s² in the root frame; None: that of the bag's run, else (0, 0, −9.81).
+
+    Raises:
+        InputError: a bag does not fit the robot, is too short, or has values that are none; a pattern matches nothing.
+        BuildError: the URDF cannot be read.
+        BagError: a bag cannot be read.
+    """
+    if output is not None:
+        check_folder(output)
+    path = Path(urdf)
+    text = read_text(path, None)
+    try:
+        read = read_urdf(text)
+        locked = lock_joints(text, lock or {})
+        there = read_urdf(locked)
+        needs_frame = any("payload" in pattern for pattern in ([free] if isinstance(free, str) else free))
+        end = end_effector(there, frame) if frame or needs_frame else [*last_links(there), there.root][0]
+        robot = load_robot(locked, end, "xyz")
+    except RobotError as error:
+        raise InputError(f"{path.name}: {error}") from error
+    recordings = [read_bag(bag) for bag in ([bags] if isinstance(bags, str | Path) else bags)]
+    if not recordings:
+        raise InputError("a fit needs a bag")
+    patterns = [free] if isinstance(free, str) else free
+    parameters = Parameters(there, robot, patterns, gravity or _recorded_gravity(recordings))
+    if not parameters.free:
+        raise InputError("`free` names no parameter")
+    fitted, held = stretches(recordings, robot)
+    _check_units(parameters, fitted)
+    found = estimate(parameters, fitted)
+    result = _result(path, text, read, parameters, found, held)
+    if output is not None:
+        result.save(output)
+    return result
+
+
+def _recorded_gravity(recordings: Sequence[Recording]) -> tuple[float, ...]:
+    """Return the gravity of the run that made the first bag, m/s²."""
+    starts = recordings[0].provenance.get("start_values") or {}
+    return tuple(float(starts.get(f"gravity[{k + 1}]", GRAVITY[k])) for k in range(3))
+
+
+def _check_units(parameters: Parameters, fitted: Sequence[Stretch]) -> None:
+    """Refuse efforts far from those of the URDF's masses.
+
+    Raises:
+        InputError: saying how far.
+    """
+    values = parameters.dynamics(parameters.start)
+    stretch = max(fitted, key=lambda each: len(each.t))
+    few = stretch.part(slice(None, None, max(1, len(stretch.t) // 200)))
+    Y, G = regressors(parameters.robot, few, values.offset)
+    model = Y @ values.inertial + np.einsum("g,kgij,j->ki", values.gravity, G, values.inertial)
+    ours, theirs = np.sqrt(np.mean(model**2, axis=0)), np.sqrt(np.mean(few.tau**2, axis=0))
+    for joint, effort in zip(parameters.robot.joints, theirs):
+        if not effort:
+            raise InputError(f"the effort of joint '{joint}' is 0 throughout: it was not recorded")
+    ratio = float(np.median(theirs / np.maximum(ours, 1e-12)))
+    if not 1.0 / WRONG_UNITS < ratio < WRONG_UNITS:
+        raise InputError(
+            f"the recorded efforts are {ratio:.2g} times those of the URDF's masses: they are probably not in N·m,"
+            " but for example in N·mm, a factor of 1000; convert them, or correct the masses"
+        )
+
+
+def _result(path: Path, text: str, urdf: Urdf, parameters: Parameters, found: Estimate, held: Sequence[Stretch]) -> Fit:
+    robot = parameters.robot
+    before, after = parameters.dynamics(parameters.given), parameters.dynamics(found.values)
+    predictions = [predict(robot, after, found.delay[0], stretch) for stretch in held]
+    first = [predict(robot, before, 0.0, stretch) for stretch in held]
+    rms = [deviation(held, each).tolist() if held else [] for each in (first, predictions)]
+    return Fit(
+        urdf=path.name,
+        fitted_urdf=fitted_urdf(text, urdf, parameters, found.values),
+        joints=robot.joints,
+        parameters=tuple(_parameters(parameters, found)),
+        unseen=tuple(_unseen(parameters, found)),
+        misfits=found.misfits,
+        noise=tuple(found.noise.tolist()),
+        delay=found.delay,
+        deviation_before=tuple(rms[0]),
+        deviation=tuple(rms[1]),
+        settings=_settings(parameters, after, found),
+        covariance=found.covariance,
+    )
+
+
+def _parameters(parameters: Parameters, found: Estimate) -> list[FittedParameter]:
+    before, after = (parameters.reported(v).tolist() for v in (parameters.given, found.values))
+    listed = []
+    for k, (name, unit) in enumerate(zip(parameters.names, parameters.units)):
+        sd = float(np.sqrt(found.covariance[k, k]))
+        low, high = after[k] - NORMAL_95 * sd, after[k] + NORMAL_95 * sd
+        if name.partition(":")[0].partition("[")[0] in POSITIVE:
+            low = max(0.0, low)
+        known = bool(found.known[k])
+        listed.append(FittedParameter(name, unit, before[k], after[k], sd, low, high, known))
+    return listed
+
+
+def _unseen(parameters: Parameters, found: Estimate) -> list[str]:
+    """Return the names of the coordinates that make up each direction which the data do not see."""
+    names = parameters.coordinate_names
+    lines = []
+    for direction in found.unseen:
+        largest = float(np.abs(direction).max())
+        part = [name for name, each in zip(names, direction) if abs(each) > 0.3 * largest]
+        lines.append(" with ".join(dict.fromkeys(part)))
+    return sorted(set(lines))
+
+
+def _settings(parameters: Parameters, after: Dynamics, found: Estimate) -> dict[str, tuple[float, ...]]:
+    """Return the fitted values that a URDF cannot hold, as settings of a build."""
+    groups = {free.group for free in parameters.free}
+    settings: dict[str, Array] = {}
+    if "armature" in groups:
+        settings["armature"] = after.armature
+    if "payload" in groups:
+        settings["payload"] = found.values.payload
+    if "payload_com" in groups:
+        settings["payload_com"] = found.values.payload_com
+    if "gravity" in groups:
+        settings["gravity"] = after.gravity
+    return {name: tuple(float(f"{value:.9g}") for value in values) for name, values in settings.items()}

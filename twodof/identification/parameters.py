@@ -1,0 +1,322 @@
+"""Free parameters of a fit, and the physical values that their coordinates give.
+
+Each coordinate is free of constraints, or has 0 as its lower bound, and any value of it is a possible robot:
+
+    mass     m = exp(x)
+    inertia  I = tr(Σ) 1 − Σ,  Σ = L Lᵀ,  L triangular with diagonal exp(x): the second moments of mass about the
+             centre are positive definite, which with m > 0 is the condition on the pseudo-inertia
+    gain     exp(x)
+    gravity  two tilts of its direction; its magnitude is kept
+    friction, damping, armature, payload: the value itself, at least 0
+
+Source: Wensing, Kim, Slotine, "Linear matrix inequalities for physically consistent inertial parameter
+identification", IEEE RA-L 3, 2018.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from math import inf
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, choice
+from ..plant.robot import Robot
+from ..plant.urdf import Urdf
+from .inertials import INERTIA, dynamic_parameters, inertia_of, moving_links, second_moments
+
+Array = NDArray[np.float64]
+OF_JOINTS = ("friction", "damping", "armature", "offset", "gain")
+OF_LINKS = ("mass", "com", "inertia")
+OF_THE_ROBOT = ("payload", "payload_com", "gravity")
+ROWS, COLUMNS = np.tril_indices(3)
+LEAST_MOMENT = 1e-3  # of m·(5 cm)², m²: second moments of mass that a free inertia begins with at least
+LEAST_PAYLOAD = 0.01  # of the moving mass: a payload whose place is free begins with at least this
+SEEN = 0.5
+"""A direction is seen if its standard deviation is below this part of the parameters' scales."""
+
+
+@dataclass
+class Values:
+    """Physical values of all parameters of a robot with n joints and k links that move and have mass.
+
+    Attributes:
+        friction, damping, armature: of joints, n.
+        offset: what a position is more than its encoder shows, rad or m, n.
+        gain: what an effort is as a multiple of the recorded one, n.
+        mass: of links, kg, k.
+        com: their centres in the links' frames, m, k × 3.
+        second: their second moments of mass about the centre, in the links' axes, kg·m², k × 3 × 3.
+        payload: point mass in the task frame, kg, 1.
+        payload_com: where it is in the task frame, m, 3.
+        gravity: m/s², root frame, 3.
+    """
+
+    friction: Any
+    damping: Any
+    armature: Any
+    offset: Any
+    gain: Any
+    mass: Any
+    com: Any
+    second: Any
+    payload: Any
+    payload_com: Any
+    gravity: Any
+
+    def copy(self, kind: type) -> Values:
+        """Return a copy with numbers of a kind, float or complex."""
+        return Values(*(np.array(getattr(self, field.name), kind) for field in fields(self)))
+
+
+class Dynamics(NamedTuple):
+    """Values of inverse dynamics, or derivatives of this by the coordinates along a last axis.
+
+    Attributes:
+        inertial: ten dynamic parameters of each body about its joint's frame, in Pinocchio's order, 10·bodies;
+            bodies are what joints move, with all links that are rigidly joined.
+        friction, damping, armature, offset, gain, gravity: as in ``Values``.
+    """
+
+    inertial: Any
+    friction: Any
+    damping: Any
+    armature: Any
+    offset: Any
+    gain: Any
+    gravity: Any
+
+
+class Free(NamedTuple):
+    """Free parameters of one joint or link: the group, the index of that, and the names and units of its values."""
+
+    group: str
+    place: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+class Parameters:
+    """The free parameters of a robot: their names, and the map from coordinates to values.
+
+    Attributes:
+        robot: the robot.
+        links, bodies, places: names of the links that move and have mass, and of each the body that it is a part of
+            and where in that it is.
+        given, start: values of all parameters by the URDF, and those at which the coordinates begin.
+        free: the free ones.
+        names, units: of their values.
+        coordinate_names: of their coordinates, without the axes.
+
+    Args:
+        urdf, robot: the robot, read.
+        patterns: names or shell patterns.
+        gravity: at first, m/s².
+
+    Raises:
+        InputError: a pattern matches nothing.
+    """
+
+    def __init__(self, urdf: Urdf, robot: Robot, patterns: Sequence[str], gravity: Sequence[float]) -> None:
+        self.robot, model = robot, robot.model
+        n = len(robot.joints)
+        self.links, self.bodies, self.places, inertias = moving_links(urdf, model)
+        zero = np.zeros(n)
+        self.start = Values(
+            friction=np.array(robot.friction),
+            damping=np.array(robot.damping),
+            armature=zero,
+            offset=zero,
+            gain=np.ones(n),
+            mass=np.array([inertia.mass for inertia in inertias]),
+            com=np.array([inertia.lever for inertia in inertias]).reshape(-1, 3),
+            second=np.array([second_moments(inertia.inertia) for inertia in inertias]).reshape(-1, 3, 3),
+            payload=np.zeros(1),
+            payload_com=np.zeros(3),
+            gravity=np.array(gravity, float),
+        )
+        frame = model.frames[robot.frame_id]
+        self._end = frame.parentJoint - 1, frame.placement
+        known = self._known()
+        names = [name for name, _ in known]
+        chosen: set[str] = set()
+        for pattern in patterns:
+            # brackets are those of names
+            matches = fnmatch.filter(names, pattern.replace("[", "[[]"))
+            if not matches:
+                raise InputError(f"`free` '{pattern}' matches no parameter{choice(pattern, names)}")
+            chosen.update(matches)
+        self.free = [free for name, free in known if name in chosen]
+        self.given = self.start.copy(float)
+        self._settle()
+        self.names = tuple(name for free in self.free for name in free.names)
+        self.units = tuple(unit for free in self.free for unit in free.units)
+        sizes = {"gravity": 2, "com": 3, "payload_com": 3, "inertia": 6}
+        self.coordinate_names = tuple(_of_all(free) for free in self.free for _ in range(sizes.get(free.group, 1)))
+
+    def _known(self) -> list[tuple[str, Free]]:
+        """Return all parameters: the name that a pattern matches, and the parameters."""
+        known = []
+        for group in OF_JOINTS:
+            for i, (joint, slides) in enumerate(zip(self.robot.joints, self.robot.prismatic)):
+                name = f"{group}:{joint}" if group in ("offset", "gain") else f"{group}[{i + 1}]"
+                units = {
+                    "friction": ("N.m", "N"),
+                    "damping": ("N.m.s/rad", "N.s/m"),
+                    "armature": ("kg.m2", "kg"),
+                    "offset": ("rad", "m"),
+                    "gain": ("", ""),
+                }
+                known.append((name, Free(group, i, (name,), (units[group][slides],))))
+        for i, link in enumerate(self.links):
+            com = tuple(f"com:{link}.{axis}" for axis in "xyz")
+            inertia = tuple(f"inertia:{link}.{key}" for key in INERTIA)
+            known.append((f"mass:{link}", Free("mass", i, (f"mass:{link}",), ("kg",))))
+            known.append((f"com:{link}", Free("com", i, com, ("m",) * 3)))
+            known.append((f"inertia:{link}", Free("inertia", i, inertia, ("kg.m2",) * 6)))
+        known.append(("payload", Free("payload", 0, ("payload",), ("kg",))))
+        for group, unit in (("payload_com", "m"), ("gravity", "m/s2")):
+            known.append((group, Free(group, 0, tuple(f"{group}[{k}]" for k in (1, 2, 3)), (unit,) * 3)))
+        return known
+
+    def _settle(self) -> None:
+        """Move start values off the edge of what is possible, where their coordinates have no value."""
+        start, groups = self.start, [free.group for free in self.free]
+        moving = float(start.mass.sum())
+        if "payload_com" in groups:
+            if "payload" not in groups:
+                raise InputError("`free` 'payload_com' needs 'payload', which is 0")
+            start.payload[:] = max(float(start.payload[0]), LEAST_PAYLOAD * moving)
+        for free in self.free:
+            if free.group == "inertia":
+                values, vectors = np.linalg.eigh(start.second[free.place])
+                least = LEAST_MOMENT * 0.05**2 * max(start.mass[free.place], 1e-3 * moving)
+                start.second[free.place] = (vectors * np.maximum(values, least)) @ vectors.T
+
+    def coordinates(self, typical: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+        """Return the coordinates of the start values, their lower bounds, and their scales.
+
+        Args:
+            typical: sizes of friction, damping and armature at each joint, n each.
+        """
+        x: list[float] = []
+        low: list[float] = []
+        for free in self.free:
+            value = getattr(self.start, "second" if free.group == "inertia" else free.group)[free.place]
+            if free.group in ("mass", "gain"):
+                own = [np.log(value)]
+            elif free.group == "inertia":
+                factor = np.linalg.cholesky(value)
+                factor[range(3), range(3)] = np.log(np.diag(factor))
+                own = factor[ROWS, COLUMNS].tolist()
+            elif free.group == "gravity":
+                own = [0.0, 0.0]
+            elif free.group in ("com", "payload_com"):
+                own = list(getattr(self.start, free.group).reshape(-1, 3)[free.place])
+            else:
+                own = [value]
+            x += own
+            bounded = free.group in ("friction", "damping", "armature", "payload")
+            low += [0.0 if bounded else -inf] * len(own)
+        return np.array(x), np.array(low), self._scales(typical)
+
+    def _scales(self, typical: Mapping[str, Array]) -> Array:
+        """Return how much each coordinate may be off: a multiple of it that nobody would call known."""
+        moving = float(self.start.mass.sum())
+        scales: list[float] = []
+        for free in self.free:
+            if free.group in ("mass", "gain"):
+                scales.append(1.0)
+            elif free.group == "inertia":
+                factor = np.sqrt(np.trace(self.start.second[free.place]))
+                scales += [1.0 if row == column else factor for row, column in zip(ROWS, COLUMNS)]
+            elif free.group == "payload":
+                scales.append(moving)
+            elif free.group == "gravity":
+                scales += [0.5, 0.5]
+            elif free.group in ("com", "payload_com"):
+                scales += [0.1] * 3
+            elif free.group == "offset":
+                scales.append(0.2)
+            else:
+                scales.append(float(typical[free.group][free.place]))
+        return np.array(scales)
+
+    def values(self, x: NDArray[Any]) -> Values:
+        """Return the physical values at coordinates, which may be complex for derivatives."""
+        values, place = self.start.copy(x.dtype.type), 0
+        for free in self.free:
+            size = {"com": 3, "payload_com": 3, "inertia": 6, "gravity": 2}.get(free.group, 1)
+            part, i = x[place : place + size], free.place
+            place += size
+            if free.group in ("mass", "gain"):
+                getattr(values, free.group)[i] = np.exp(part[0])
+            elif free.group == "inertia":
+                factor = np.zeros((3, 3), x.dtype)
+                factor[ROWS, COLUMNS] = part
+                factor[range(3), range(3)] = np.exp(np.diag(factor))
+                values.second[i] = factor @ factor.T
+            elif free.group == "gravity":
+                g = self.start.gravity
+                axes = np.linalg.svd(g[None])[2][1:]
+                length = np.linalg.norm(g)
+                values.gravity[:] = (g + length * (part @ axes)) / np.sqrt(1.0 + part @ part)
+            elif free.group == "payload_com":
+                values.payload_com[:] = part
+            elif free.group == "com":
+                values.com[i] = part
+            else:
+                getattr(values, free.group)[i] = part[0]
+        return values
+
+    def reported(self, values: Values) -> NDArray[Any]:
+        """Return the values of the named parameters."""
+        numbers: list[Any] = []
+        for free in self.free:
+            if free.group == "inertia":
+                inertia = inertia_of(values.second[free.place])
+                numbers += [inertia[place] for place in INERTIA.values()]
+            elif free.group == "com":
+                numbers += list(values.com[free.place])
+            elif free.group in ("payload_com", "gravity"):
+                numbers += list(getattr(values, free.group))
+            else:
+                numbers.append(getattr(values, free.group)[free.place])
+        return np.array(numbers)
+
+    def dynamics(self, values: Values) -> Dynamics:
+        """Return what inverse dynamics needs of the values."""
+        others = (getattr(values, field) for field in Dynamics._fields[1:])
+        return Dynamics(self._inertial(values), *others)
+
+    def _inertial(self, values: Values) -> NDArray[Any]:
+        out = np.zeros(10 * (self.robot.model.njoints - 1), values.mass.dtype)
+        for link, (body, place) in enumerate(zip(self.bodies, self.places)):
+            out[10 * body : 10 * body + 10] += dynamic_parameters(
+                values.mass[link], values.com[link], values.second[link], place.rotation, place.translation
+            )
+        body, place = self._end
+        if body >= 0:
+            none = np.zeros((3, 3))
+            end = dynamic_parameters(values.payload[0], values.payload_com, none, place.rotation, place.translation)
+            out[10 * body : 10 * body + 10] += end
+        return out
+
+    def rates(self, x: Array) -> tuple[Array, Dynamics]:
+        """Return the exact derivatives of reported values and dynamics by the coordinates, by complex steps."""
+        step, columns = 1e-30, []
+        for k in range(len(x)):
+            moved = x.astype(complex)
+            moved[k] += 1j * step
+            values = self.values(moved)
+            columns.append([self.reported(values), *self.dynamics(values)])
+        reported, *rest = (np.stack(each, -1).imag / step for each in zip(*columns))
+        return reported, Dynamics(*rest)
+
+
+def _of_all(free: Free) -> str:
+    return free.group if free.group in OF_THE_ROBOT else free.names[0].partition(".")[0]

@@ -1,0 +1,212 @@
+"""Inverse dynamics along measured motion as a regression, whose rows are independent in noise.
+
+    τ_rec(t − delay) = (Y(q, v, q̈) π + F sgn v + D v + armature q̈)/gain + noise
+
+π are the ten inertial parameters of each body. For each joint and each stretch in which it moves, rows are
+coefficients in an orthonormal basis of smooth functions below the band's end, so that noise white in time stays white,
+and noise of positions, which the second derivative raises, is left out. Their variance depends on joint and frequency,
+and is estimated by the residuals.
+
+Sources: Janot, Vandanjon, Gautier, "A generic instrumental variable approach for industrial robot identification",
+IEEE TCST 22, 2014, for the regression; Whittle, "Estimation and information in stationary time series", 1953, for the
+likelihood by frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from ..plant.robot import Robot
+from .parameters import Dynamics
+from .stretches import Array, Stretch
+
+LEAST_SAMPLES, LONGEST = 12, 400
+"""Samples of a stretch in which a joint moves at least; a longer one is divided."""
+EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Edges of the bins of frequency in which noise has one variance, parts of the band."""
+
+
+class Rows(NamedTuple):
+    """Rows of one joint.
+
+    Attributes:
+        joint: its index.
+        Y: regressor of the inertial parameters without gravity, K × 10·bodies.
+        G: regressors per m/s² of gravity along x, y and z of the root, 3 × K × 10·bodies.
+        sign, v, a: of friction, damping and armature, K.
+        tau, tau_rate: recorded effort and its derivative, K.
+        offsets: derivative of the inverse dynamics with respect to positions, K × n.
+        bin: index of each row's bin of frequency, K.
+        block: index of the stretch of motion that a row is of, K.
+        about: offsets, n, and delay of the efforts, s, at which the rows are exact.
+    """
+
+    joint: int
+    Y: Array
+    G: Array
+    sign: Array
+    v: Array
+    a: Array
+    tau: Array
+    tau_rate: Array
+    offsets: Array
+    bin: NDArray[np.int64]
+    block: NDArray[np.int64]
+    about: tuple[Array, float]
+
+
+def regressors(robot: Robot, stretch: Stretch, offset: Array) -> tuple[Array, Array]:
+    """Return Y, N × n × 10·bodies, without gravity, and G, N × 3 × n × 10·bodies, of gravity along each axis.
+
+    Args:
+        robot: the robot.
+        stretch: samples of its motion.
+        offset: what positions are more than recorded, rad or m, n.
+    """
+    model = robot.model.copy()
+    data, n = model.createData(), len(robot.joints)
+    C = np.eye(n) if robot.coupling is None else robot.coupling
+    q, v, a = (stretch.q + offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T
+    model.gravity.linear = np.zeros(3)
+    count = 10 * (model.njoints - 1)
+    Y, G = np.empty((len(q), n, count)), np.empty((len(q), 3, n, count))
+    still = np.zeros(model.nv)
+    regressor = pin.computeJointTorqueRegressor
+    for k in range(len(q)):
+        Y[k] = C.T @ regressor(model, data, q[k], v[k], a[k])
+    for axis in range(3):
+        model.gravity.linear = np.eye(3)[axis]
+        for k in range(len(q)):
+            G[k, axis] = C.T @ regressor(model, data, q[k], still, still)
+    return Y, G
+
+
+def rows_of(
+    robot: Robot, values: Dynamics, stretches: Sequence[Stretch], delay: float, with_offsets: bool
+) -> list[Rows]:
+    """Return the rows of each joint, about values of the parameters and a delay of the efforts, s."""
+    found: list[list[Rows]] = [[] for _ in robot.joints]
+    block, about = 0, (values.offset, delay)
+    for stretch in stretches:
+        Y, G = regressors(robot, stretch, values.offset)
+        turning = _position_derivatives(robot, values, stretch, with_offsets)
+        late = _delayed(stretch, delay)
+        rate = np.gradient(late, stretch.step, axis=0)
+        for i, rows in enumerate(found):
+            for begin, end in _runs(stretch.moving[:, i]):
+                if end - begin < LEAST_SAMPLES:
+                    continue
+                at = slice(begin, end)
+                frequency = np.arange(end - begin) / (2.0 * (end - begin) * stretch.step)
+                keep = int(np.searchsorted(frequency, stretch.band[i]))
+                columns = np.column_stack(
+                    [
+                        Y[at, i], *(G[at, axis, i] for axis in range(3)), turning[at, i], np.sign(stretch.v[at, i]),
+                        stretch.v[at, i], stretch.a[at, i], late[at, i], rate[at, i],
+                    ]
+                )  # fmt: skip
+                size, n = Y.shape[2], len(robot.joints)
+                parts = np.split(smooth_basis(end - begin, keep) @ columns, [size, 4 * size, 4 * size + n], axis=1)
+                bins = np.searchsorted(EDGES, frequency[:keep] / stretch.band[i], side="right") - 1
+                gravity = parts[1].reshape(keep, 3, size).transpose(1, 0, 2)
+                sign, v, a, tau, tau_rate = parts[3].T
+                blocks = np.full(keep, block)
+                rows.append(Rows(i, parts[0], gravity, sign, v, a, tau, tau_rate, parts[2], bins, blocks, about))
+                block += 1
+    return [_joined(rows) for rows in found]
+
+
+def _joined(rows: list[Rows]) -> Rows:
+    """Return the rows of all stretches of a joint as one."""
+    names = ("Y", "G", "sign", "v", "a", "tau", "tau_rate", "offsets", "bin", "block")
+    parts: dict[str, Any] = {
+        name: np.concatenate([getattr(r, name) for r in rows], axis=int(name == "G")) for name in names
+    }
+    return rows[0]._replace(**parts)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the begin and the end of each run of True, of long ones in parts."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False])).tolist()
+    runs = []
+    for begin, end in zip(edges[::2], edges[1::2]):
+        cuts = np.linspace(begin, end, -(-(end - begin) // LONGEST) + 1).astype(int).tolist()
+        runs += [*pairwise(cuts)]
+    return runs
+
+
+@cache
+def smooth_basis(size: int, count: int) -> Array:
+    """Return orthonormal rows, count × size: cosines of rising frequency that fade to 0 at both ends.
+
+    White noise stays white in them, and as the functions begin and end smoothly, fast noise does not leak into slow
+    rows.
+    """
+    at = (np.arange(size) + 0.5) / size
+    waves = np.cos(np.pi * at[:, None] * np.arange(count)) * np.sin(np.pi * at[:, None]) ** 2
+    return np.asarray(np.linalg.qr(waves)[0].T)
+
+
+def _delayed(stretch: Stretch, delay: float) -> Array:
+    """Return the efforts that act at the samples, N × n."""
+    if not delay:
+        return stretch.tau
+    return np.asarray(make_interp_spline(stretch.t, stretch.tau, 3)(np.clip(stretch.t - delay, *stretch.t[[0, -1]])))
+
+
+def _position_derivatives(robot: Robot, values: Dynamics, stretch: Stretch, wanted: bool) -> Array:
+    """Return the derivative of the inverse dynamics with respect to positions, N × n × n; 0 where not wanted."""
+    model = robot.model.copy()
+    model.gravity.linear = values.gravity
+    for body, ten in enumerate(values.inertial.reshape(-1, 10)):
+        model.inertias[body + 1] = pin.Inertia.FromDynamicParameters(ten)
+    data, n = model.createData(), len(robot.joints)
+    out = np.zeros((len(stretch.t), n, n))
+    if not wanted:
+        return out
+    C = np.eye(n) if robot.coupling is None else robot.coupling
+    q, v, a = (stretch.q + values.offset) @ C.T + robot.offset, stretch.v @ C.T, stretch.a @ C.T
+    for k in range(len(q)):
+        pin.computeRNEADerivatives(model, data, q[k], v[k], a[k])
+        out[k] = C.T @ data.dtau_dq @ C
+    return out
+
+
+def residual(rows: Rows, values: Dynamics, delay: float) -> Array:
+    """Return the residuals of one joint's rows, N·m or N."""
+    return np.asarray(
+        rows.tau - (delay - rows.about[1]) * rows.tau_rate - modelled(rows, values) / values.gain[rows.joint]
+    )
+
+
+def modelled(rows: Rows, values: Dynamics) -> Array:
+    """Return the effort by the model, N·m or N."""
+    i = rows.joint
+    links = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ values.inertial
+    joint = values.friction[i] * rows.sign + values.damping[i] * rows.v + values.armature[i] * rows.a
+    return np.asarray(links + joint + rows.offsets @ (values.offset - rows.about[0]))
+
+
+def jacobian(rows: Rows, values: Dynamics, rates: Dynamics) -> Array:
+    """Return the derivative of ``residual`` by each coordinate, the delay last.
+
+    Args:
+        rows: of one joint.
+        values: of the parameters.
+        rates: derivatives of the values by the coordinates, which are the last axis.
+    """
+    i, gain = rows.joint, values.gain[rows.joint]
+    columns = (rows.Y + np.tensordot(values.gravity, rows.G, 1)) @ rates.inertial
+    columns += np.einsum("kij,j->ik", rows.G, values.inertial) @ rates.gravity + rows.offsets @ rates.offset
+    for group, column in (("friction", rows.sign), ("damping", rows.v), ("armature", rows.a)):
+        columns += np.outer(column, getattr(rates, group)[i])
+    columns -= np.outer(modelled(rows, values) / gain, rates.gain[i])
+    return np.column_stack([-columns / gain, -rows.tau_rate])

@@ -1,0 +1,164 @@
+"""Recorded joint states as smooth signals on an even grid: positions, their derivatives, and efforts.
+
+A recording is divided at gaps. Positions are interpolated to an even grid and filtered without phase by a Butterworth
+filter, forward and backward, which leaves the band of the fit as it is; a quintic spline gives their derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bag.recording import Recording
+from ..errors import InputError, choice
+from ..plant.robot import Robot
+
+Array = NDArray[np.float64]
+
+BAND, MOST_BAND, LEAST_BAND = 0.1, 20.0, 2.0
+"""Band of the fit: part of the sampling rate, and Hz at most and at least."""
+MOST_NOISE = 3e-4
+"""Noise of accelerations within the band, part of their power: noise in regressors makes inertias too small."""
+CUTOFF, ORDER = 2.5, 5
+"""Cut-off of the filter of positions as a multiple of the band, and its order in one direction."""
+GAP = 3.5  # times the usual time between samples
+SHORTEST = 2.0  # s of a stretch without a gap
+EDGE = 0.15  # s at both ends of a stretch, where the filter knows one side alone
+HELD_OUT = 0.2  # of each recording, at its end
+MOVES = 3.0  # standard deviations of the velocity's noise, above which a joint moves
+LEAST_SPEED = 0.03  # of the highest: below it the ripple of the filter may hide that a joint rests
+LEAST_RATE = 20.0  # Hz
+
+
+class Stretch(NamedTuple):
+    """Samples without a gap on an even grid, n joints in the robot's order.
+
+    Attributes:
+        bag: index of its recording.
+        t: s since the first sample of the bag, N.
+        measured: positions as recorded, N × n.
+        q, v, a: smooth positions and their derivatives, N × n.
+        tau: efforts as recorded, N × n.
+        moving: whether a joint surely moves, N × n.
+        band: highest frequency of the fit of each joint, Hz, n.
+    """
+
+    bag: int
+    t: Array
+    measured: Array
+    q: Array
+    v: Array
+    a: Array
+    tau: Array
+    moving: NDArray[np.bool_]
+    band: Array
+
+    @property
+    def step(self) -> float:
+        """Time between samples, s."""
+        return float(self.t[1] - self.t[0])
+
+    def part(self, rows: slice) -> Stretch:
+        """Return some of the samples."""
+        cut = {name: getattr(self, name)[rows] for name in ("t", "measured", "q", "v", "a", "tau", "moving")}
+        return self._replace(**cut)
+
+
+def stretches(recordings: Sequence[Recording], robot: Robot) -> tuple[list[Stretch], list[Stretch]]:
+    """Return the stretches to fit, and those held out, of recordings.
+
+    Raises:
+        InputError: a recording does not fit the robot, is too short or too slow, or has values that are none.
+    """
+    fitted: list[Stretch] = []
+    held: list[Stretch] = []
+    for bag, recording in enumerate(recordings):
+        q, tau = _columns(recording, robot)
+        t, h = recording.t, float(np.median(np.diff(recording.t))) if len(recording.t) > 1 else 0.0
+        name = recording.path
+        if not h > 0.0:
+            raise InputError(f"'{name}' has too few joint states, or several at one time")
+        if (np.diff(t) == 0.0).any():
+            raise InputError(f"'{name}' has several joint states at one time: are there two recordings in it?")
+        if 1.0 / h < LEAST_RATE:
+            raise InputError(f"'{name}' has {1.0 / h:.3g} joint states a second; a fit needs {LEAST_RATE:g}")
+        cuts = [0, *(np.flatnonzero(np.diff(t) > GAP * h) + 1), len(t)]
+        whole = [(a, b) for a, b in pairwise(cuts) if t[b - 1] - t[a] >= SHORTEST]
+        if not whole:
+            raise InputError(f"'{name}' is too short: a fit needs {SHORTEST:g} s without a gap")
+        end = t[-1] * (1.0 - HELD_OUT)
+        for a, b in whole:
+            stretch = _smooth(bag, t[a:b], q[a:b], tau[a:b], h)
+            split = int(np.searchsorted(stretch.t, end))
+            for part, into in ((stretch.part(slice(split)), fitted), (stretch.part(slice(split, None)), held)):
+                if len(part.t) * h >= 0.5 * SHORTEST:
+                    into.append(part)
+    if not fitted:
+        raise InputError("the recordings are too short to hold a fifth out")
+    for i, joint in enumerate(robot.joints):
+        if not any(stretch.moving[:, i].sum() * stretch.step >= 0.5 for stretch in fitted):
+            raise InputError(f"joint '{joint}' never moves in the recordings: lock it with `lock`, or record it moving")
+    return fitted, held
+
+
+def _columns(recording: Recording, robot: Robot) -> tuple[Array, Array]:
+    """Return positions and efforts in the robot's order of joints."""
+    name, own = recording.path, recording.joints
+    for joint in robot.joints:
+        if joint not in own:
+            raise InputError(
+                f"'{name}' has no joint '{joint}' of the robot{choice(joint, own)}; lock the joint with `lock`"
+                " if it does not move"
+            )
+    order = [own.index(joint) for joint in robot.joints]
+    if recording.tau.shape != recording.q.shape:
+        raise InputError(f"'{name}' has no efforts; record them, or name the `fmu` whose control moved the robot")
+    q, tau = recording.q[:, order], recording.tau[:, order]
+    for values, what in ((q, "position"), (tau, "effort")):
+        if bad := np.argwhere(~np.isfinite(values)).tolist():
+            k, i = bad[0]
+            raise InputError(f"'{name}': the {what} of joint '{robot.joints[i]}' at {recording.t[k]:g} s is no number")
+    return q, tau
+
+
+def _smooth(bag: int, t: Array, q: Array, tau: Array, h: float) -> Stretch:
+    """Return smooth signals of samples without a gap."""
+    from scipy.interpolate import make_interp_spline
+    from scipy.signal import butter, sosfiltfilt
+
+    grid = t[0] + h * np.arange(int((t[-1] - t[0]) / h + 1e-6) + 1)
+    even = np.abs(np.diff(t) / h - 1.0).max() < 1e-3
+    measured = q[: len(grid)] if even else make_interp_spline(t, q, 3)(grid)
+    tau = tau[: len(grid)] if even else np.array([np.interp(grid, t, column) for column in tau.T]).T
+    cutoff = CUTOFF * min(BAND / h, MOST_BAND)
+    # a line from end to end is taken out, so that a drift is not filtered
+    line = np.linspace(measured[0], measured[-1], len(grid))
+    sos = butter(ORDER, cutoff, fs=1.0 / h, output="sos")
+    smooth = line + sosfiltfilt(sos, measured - line, axis=0)
+    spline = make_interp_spline(grid, smooth, 5)
+    v, a = spline(grid, 1), spline(grid, 2)
+    # noise: white, of which the filter leaves out the part above its cut-off
+    nyquist = 0.5 / h
+    noise = np.std(measured - smooth, axis=0) / np.sqrt(1.0 - cutoff / nyquist)
+    v_noise = noise * 2.0 * np.pi * np.sqrt(cutoff**3 / 3.0 / nyquist)
+    moving = np.abs(v) > np.maximum(MOVES * v_noise, LEAST_SPEED * np.abs(v).max(axis=0))
+    # noise of accelerations below a frequency grows with its fifth power
+    a_noise = noise * (2.0 * np.pi) ** 2 * np.sqrt(cutoff**5 / 5.0 / nyquist)
+    power = np.maximum(np.var(a, axis=0) - a_noise**2, 1e-12)
+    band = cutoff * (MOST_NOISE * power / np.maximum(a_noise**2, 1e-300)) ** 0.2
+    band = np.clip(band, LEAST_BAND, cutoff / CUTOFF)
+    edge = int(np.ceil(EDGE / h))
+    reach = int(np.ceil(1.0 / cutoff / h))
+    whole = Stretch(bag, grid, measured, smooth, v, a, tau, _eroded(moving, reach), band)
+    return whole.part(slice(edge, len(grid) - edge))
+
+
+def _eroded(moving: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Return True where a joint moves in one direction, at least ``reach`` samples from where it may not."""
+    from scipy.ndimage import binary_erosion
+
+    return np.asarray(binary_erosion(moving, np.ones((2 * reach + 1, 1)), border_value=1))
