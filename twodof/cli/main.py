@@ -17,23 +17,7 @@ from itertools import takewhile
 
 from ..errors import TwoDofError
 from ..version import __version__
-from . import (
-    build,
-    check,
-    export,
-    fit,
-    info,
-    layouts,
-    linearise,
-    live,
-    page,
-    plot,
-    publish,
-    recover,
-    run,
-    sweep,
-    view,
-)
+from . import build, check, export, fit, info, layouts, linearise, live, page, plot, publish, recover, run, sweep, view
 from .help import Parser, check_arguments, check_verb
 from .options import CommandLineError
 from .printing import CLEAR, in_options, say
