@@ -1,11 +1,11 @@
 """The Python flavour's slave: adapts the plant to FMI 2.0 co-simulation through pythonfmu.
 
-It lives in the FMU as ``slave_<digest>.py`` beside the package ``twodof_<digest>``: names of its
-own, as the wrapper imports by name into ``sys.modules`` and several FMUs share one process.
+The FMU contains it as ``slave_<digest>.py``, next to the package ``twodof_<digest>``. The names are unique, because the
+wrapper imports modules by name into ``sys.modules``, which several FMUs may share.
 
-The wrapper turns an exception into fmi2Fatal, after which no call is allowed. So nothing here
-raises once the instance exists: what is refused is logged, leaves everything as it was and makes
-the next doStep a discard. The FMI state machine is the table ``ALLOWED``.
+The wrapper converts an exception to fmi2Fatal, after which no call is allowed. Therefore no method raises after
+instantiation: a refused call is logged, changes nothing, and makes the next doStep return fmi2Discard. The FMI state
+machine is the table ``ALLOWED``.
 """
 
 import importlib
@@ -49,7 +49,7 @@ def import_plant(resources: Path, site_packages: list[str]):
     with suppress(ModuleNotFoundError):
         return importlib.import_module(f"{PACKAGE}.plant.plant")
     for folder in site_packages:
-        site.addsitedir(folder)  # with its .pth files: pin keeps its modules behind one
+        site.addsitedir(folder)  # reads .pth files, which pin needs
     try:
         return importlib.import_module(f"{PACKAGE}.plant.plant")
     except ModuleNotFoundError as missing:
@@ -61,12 +61,12 @@ def import_plant(resources: Path, site_packages: list[str]):
             " or see documentation/externalDependencies.txt, or build the FMU with the option"
             " link_environment, or use the native FMU, which needs no Python"
         )
-        print(message, file=sys.stderr)  # importers that do not log show nothing else
+        print(message, file=sys.stderr)  # some importers show no log
         raise ImportError(message) from None
 
 
 class TwoDofSlave(fmi.Fmi2Slave):
-    """An instance of the FMU; it finds all files through ``self.resources``."""
+    """An instance of the FMU, with its files in ``self.resources``."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
@@ -113,7 +113,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             self._refused = ""
             return False
         if not self._allowed("fmi2DoStep"):
-            self._refused = ""  # this discard is its answer
+            self._refused = ""  # the discarded step reports it
             return False
         time = self._plant.time
         if not abs(current_time - time) <= TIME_TOLERANCE * max(1.0, abs(time)):
@@ -126,7 +126,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             self._plant.step(step_size, current_time)
         except self._plant_module.DiscardError as error:
             return self._discard(f"fmi2DoStep at {current_time!r} s: {error}")
-        except KeyboardInterrupt:  # SIGINT of the process; raised on, it would be fatal
+        except KeyboardInterrupt:  # SIGINT of the process; if re-raised, it would be fatal
             return self._discard(f"fmi2DoStep at {current_time!r} s: interrupted")
         self._outputs.clear()
         return True
@@ -139,7 +139,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
 
     def _get(self, vrs, kind, nothing):
         if self._phase not in ALLOWED["fmi2Get"]:
-            # some importers read start values too early: answered by a log line alone
+            # some importers read start values too early, which is only logged
             self._log(f"fmi2Get{kind} is not allowed in the state '{self._phase}'", Status.error)
             return [nothing] * len(vrs)
         if self._phase == INITIALIZATION and not self._outputs and self._initialise() is None:
@@ -166,7 +166,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         return self._outputs[group]
 
     def _set(self, vrs, values, kind):
-        """Set all values, or none where one of them is refused."""
+        """Set all values, or none if one of them is refused."""
         variables = [self._settable(vr, value, kind) for vr, value in zip(vrs, values)]
         if None in variables:
             return
@@ -210,7 +210,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
             self._refuse(f"{variable.name} = {value} is not finite")
             return None
         if variable.causality == "input" and variable.refusal(value):
-            self._refuse(variable.refusal(value))  # of parameters when the run begins
+            self._refuse(variable.refusal(value))  # parameters are checked when the run begins
             return None
         return variable
 
@@ -259,7 +259,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
         vars(plant).update(deepcopy(state["plant"]), time=state["time"])
         plant.prepare()
         sampling = type(plant.sampling)(**deepcopy(state["sampling"]))
-        if state["phase"] in (STEP, TERMINATED):  # before, it is checked when the run begins
+        if state["phase"] in (STEP, TERMINATED):  # in earlier phases, the begin of the run checks it
             plant.initialise()
             plant.q, plant.v = list(state["plant"]["q"]), list(state["plant"]["v"])
             limits = zip(plant.q, plant.q_min, plant.q_max)
@@ -270,7 +270,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
 
     @staticmethod
     def _fmu_state_from_bytes(state):
-        """Deserialise a state, None where it is damaged; setting it checks it."""
+        """Deserialise a state, or return None if it is damaged; it is checked when it is set."""
         try:
             return json.loads(state) if len(state) <= MAX_STATE else None
         except (ValueError, RecursionError):
@@ -279,7 +279,7 @@ class TwoDofSlave(fmi.Fmi2Slave):
     # --- refusals ---
 
     def _initialise(self):
-        """Return warnings of the plant's initialisation, None where its parameters are refused."""
+        """Return the warnings of the plant's initialisation; None if its parameters are refused."""
         try:
             warnings = self._plant.initialise()
         except self._plant_module.ParameterError as error:
@@ -317,5 +317,5 @@ def alike(value, own):
     if isinstance(own, list):
         return len(value) == len(own) and all(map(alike, value, own))
     if isinstance(own, str):
-        return not re.search("[\ud800-\udfff]", value)  # halves that no encoding has
+        return not re.search("[\ud800-\udfff]", value)  # lone surrogates, which cannot be encoded
     return abs(value) < float("inf")

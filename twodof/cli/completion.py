@@ -1,4 +1,4 @@
-"""Completion in the shell of the variables, frames and joints of the robot on the command line."""
+"""Shell completion of variables, frames and joints of the robot on the command line."""
 
 import argparse
 import xml.etree.ElementTree as ET
@@ -9,7 +9,7 @@ Completer = Callable[..., list[str]]
 
 
 def _file(options: argparse.Namespace) -> Path | None:
-    """Return the FMU, URDF or first bag of a command line that is being typed."""
+    """Return the FMU, URDF or first bag on an incomplete command line."""
     names = (getattr(options, name, None) for name in ("fmu", "urdf", "robot", "bag", "bags", "robots"))
     first = next((name for name in names if name), None)
     return Path(first[0] if isinstance(first, list) else first) if first else None

@@ -10,12 +10,12 @@ from .printing import busy, quote, say
 
 
 def is_robot(path: str | None) -> bool:
-    """Return whether a name is that of a URDF or xacro file, not of an FMU."""
+    """Return whether a name is that of a URDF or xacro file, and not of an FMU."""
     return bool(path) and Path(str(path)).suffix in (".urdf", ".xacro")
 
 
 def chosen_fmu(options: argparse.Namespace) -> Path:
-    """Return the named FMU, or that of the URDF or of the default arm."""
+    """Return the named FMU, or build and return that of the URDF or of the default arm."""
     of_urdf = is_robot(options.fmu)
     if options.frame is not None and not of_urdf:
         what = "an FMU" if options.fmu else "none"
@@ -36,7 +36,7 @@ def chosen_fmu(options: argparse.Namespace) -> Path:
 
 
 def fast_fmu(options: argparse.Namespace) -> Path:
-    """Return the named FMU, or the default arm's, native where it can be built."""
+    """Return the named FMU, or the default arm's FMU, which is native if a compiler is installed."""
     if options.fmu:
         return Path(options.fmu)
     try:
@@ -47,7 +47,7 @@ def fast_fmu(options: argparse.Namespace) -> Path:
 
 
 def _default_arm(verb: str, *, native: bool = False) -> Path:
-    """Return the default arm's FMU, built on demand; refuse to guess if the folder has other FMUs."""
+    """Return the default arm's FMU, built on demand; raise if the folder has only other FMUs."""
     from ..export.package import is_default_arm, is_fmu
 
     there = [path for path in sorted(Path().glob("*.fmu")) if is_fmu(path)]

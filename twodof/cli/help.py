@@ -1,4 +1,4 @@
-"""Help texts: the verbs, examples of each, and what a mistyped command line means."""
+"""Help texts: examples of each verb, and hints for mistyped command lines."""
 
 import argparse
 import re
@@ -82,12 +82,12 @@ MEANT = {
     "--csv": "--input",
     "--format": "--storage",
 }
-"""Words of other tools for verbs and options of this one."""
+"""Verbs and options of other tools, and the corresponding ones here."""
 COMPLETION = 'completion in bash and zsh: eval "$(register-python-argcomplete twodof)"'
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser that accepts no abbreviations, prints errors in a line, and ends its help with examples."""
+    """Parser without abbreviations, with errors in one line, and with examples at the end of its help."""
 
     def __init__(self, **named: Any) -> None:
         super().__init__(allow_abbrev=False, **named)
@@ -100,19 +100,19 @@ class Parser(argparse.ArgumentParser):
         return super().format_help() + (f"\nexamples:\n{shown}" if shown else "") + last
 
     def error(self, message: str) -> NoReturn:
-        """Exit with one line."""
+        """Exit with an error in one line."""
         message = re.sub(r"invalid (float|int) value: ('.*')$", r"\2 is not a number; leave units out", message)
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """Write out the help before the process ends, where a closed pipe can still be caught."""
+        """Flush the help before the process ends, so that the error of a closed pipe can be caught."""
         if sys.stdout is not None:
             sys.stdout.flush()
         super().exit(status, message)
 
 
 def check_verb(program: Parser, verbs: Iterable[str], arguments: Sequence[str]) -> None:
-    """Refuse a verb, or an option before it, that does not exist; name the one that is meant."""
+    """Refuse an unknown verb, or an unknown option before it; name the one that is probably meant."""
     word, named = next(iter(arguments), ""), [*verbs]
     if word[:1] == "-" and word not in program._option_string_actions:
         check_arguments(program, arguments)
@@ -121,7 +121,7 @@ def check_verb(program: Parser, verbs: Iterable[str], arguments: Sequence[str]) 
 
 
 def check_arguments(parser: Parser, unknown: Sequence[str]) -> None:
-    """Refuse arguments that a verb does not take; name the option that is meant."""
+    """Refuse unknown arguments of a verb; name the option that is probably meant."""
     if not unknown:
         return
     known, lists = [*parser._option_string_actions], f"; '{parser.prog} --help' lists them"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..simulation.verdict import Verdict
 
 
-MOST_JUDGED = 200_000  # samples of a bag without a verdict, which are read in a second
+MOST_JUDGED = 200_000  # samples of a bag without a stored verdict, which takes a second to judge
 
 
 def add(info: argparse.ArgumentParser) -> None:
@@ -178,7 +178,7 @@ def _print_fmu(fmu: Fmu) -> None:
 
 
 def controlled(fmu: Fmu) -> str:
-    """Return the frame and axes, or joints, that an FMU controls."""
+    """Return frame, axes and control law of an FMU as text."""
     if not fmu.frame:
         return "unknown"
     of = f"{fmu.frame}, axes {' '.join(fmu.axes)} of {fmu.root}"
@@ -217,7 +217,7 @@ def _print_bag(run: Recording) -> None:
 
 
 def _verdict_of(run: Recording) -> Verdict | None:
-    """Return the verdict that a bag has, or that of its samples where these are few; None else."""
+    """Return the stored verdict of a bag, or that of its samples if there are few; else None."""
     from ..bag.reader import read_bag
 
     stored = run.stored_verdict

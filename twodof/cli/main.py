@@ -44,7 +44,7 @@ LONGEST_LINE = 2000
 
 
 def parser() -> tuple[Parser, dict[str, Parser]]:
-    """Return the parser, which sets ``verb`` and its function ``call``, and the parsers of the verbs."""
+    """Return the parser, which sets ``verb`` and the verb's function ``call``, and the parsers of the verbs."""
     program = Parser(
         prog="twodof",
         description="From a URDF to an FMU, and from a co-simulation to a ROS 2 bag.",
@@ -69,18 +69,18 @@ def parser() -> tuple[Parser, dict[str, Parser]]:
 
 
 class _Words(logging.Formatter):
-    """Formatter that replaces arguments by options in messages of the library."""
+    """Log formatter that replaces arguments by options in messages of the library."""
 
     def format(self, record: logging.LogRecord) -> str:
         line = in_options(super().format(record))
-        return f"{CLEAR}{line}" if sys.stderr.isatty() else line  # over a line of progress
+        return f"{CLEAR}{line}" if sys.stderr.isatty() else line  # overwrites a progress line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost a tenth of a short run
-    os.environ.pop("MPLBACKEND", None)  # that of a notebook, which may not be installed here
+    os.environ.pop("MPLBACKEND", None)  # a notebook's backend may not be installed here
     try:
         options = _options(arguments)
         with _facts_beside(getattr(options, "output", None) or getattr(options, "export", None)):
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), 2)
     except TwoDofError as error:
         return _fail(in_options(str(error)))
-    except BrokenPipeError:  # the reader of our output has left: nothing more to say
+    except BrokenPipeError:  # the reader of the output has left
         _silence()
         return 1
     except MemoryError:
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ImportError, OSError) as error:
         if is_interrupt(error):
             return _fail("interrupted", INTERRUPTED)
-        if isinstance(error, ImportError):  # of a broken environment, or where memory does not do
+        if isinstance(error, ImportError):  # a broken environment, or too little memory
             return _fail(f"cannot load what it needs: {error}")
         _silence()
         culprit = "" if error.filename is None else f"'{error.filename}': "
@@ -116,27 +116,27 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
         import argcomplete
 
         argcomplete.autocomplete(program)
-    for argument in takewhile("--".__ne__, arguments):  # argparse would take it for an empty list
+    for argument in takewhile("--".__ne__, arguments):  # argparse would read it as an empty list
         if re.fullmatch(r"(-\w|--[\w-]+=)--", argument):
             program.error(f"argument {argument[:-2].rstrip('=')}: '--' is no value")
     check_verb(program, verbs, arguments)
     options, unknown = program.parse_known_args(arguments)
     check_arguments(verbs[options.verb], unknown)
     options.command_line = shlex.join(["twodof", *arguments])
-    if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr: no name of a file ends in a traceback
+    if isinstance(sys.stdout, io.TextIOWrapper):  # as for stderr, so that no file name raises
         sys.stdout.reconfigure(errors="backslashreplace")
     log = logging.StreamHandler()
     log.setFormatter(_Words("%(levelname)s: %(message)s"))
     logging.basicConfig(handlers=[log], level=logging.WARNING)
-    # those of matplotlib have names of an untrusted file
+    # messages of matplotlib contain names from untrusted files
     warnings.showwarning = lambda warning, *_, **__: logging.getLogger("twodof").warning("%s", warning)
-    # the FMU's errors come back with the exception that they cause
+    # exceptions contain the FMU's errors already
     logging.getLogger("twodof.fmu").addFilter(lambda record: record.levelno < logging.ERROR)
     return options
 
 
 def _facts_beside(output: str | None) -> AbstractContextManager[object]:
-    """Print facts to stderr where the standard output is the written file."""
+    """Print facts to stderr if the output file is the standard output."""
     from ..files import descriptor_of
 
     beside = output is not None and descriptor_of(output) == 1
@@ -145,7 +145,7 @@ def _facts_beside(output: str | None) -> AbstractContextManager[object]:
 
 def _fail(message: str, status: int = 1) -> int:
     line = " ".join(message.split())
-    if len(line) > LONGEST_LINE:  # names of untrusted files can have any length
+    if len(line) > LONGEST_LINE:  # names in untrusted files can have any length
         line = f"{line[: LONGEST_LINE // 2]} … {line[-LONGEST_LINE // 2 :]}"
     say(f"twodof: error: {line}", error=True)
     return status

@@ -58,7 +58,7 @@ OF_A_RUN: Table = {
     "--json": dict(action="store_true", help="print the results as JSON, in SI units"),
     "--fsync": dict(action="store_true", help="flush to the disk twice a second, against power loss"),
 }
-"""Options of verbs that may write a bag, except the FMU to run."""
+"""Options of verbs that may write a bag, without the FMU."""
 OF_A_PAGE: Table = {
     "--host": dict(help="address to listen on (127.0.0.1: this machine only)"),
     "--port": dict(type=int, help="port (8080); 0: any free port"),
@@ -77,11 +77,11 @@ OPTIONS: Table = {
 COMPLETERS = {"--set": completion.variables(), "--frame": completion.links}
 
 SAME = {"-o": ("output",), "--platform": ("platforms",), "a URDF": ("robot", "urdf"), "--range": ("ranges",)}
-"""Names of options in the namespace, where these differ."""
+"""Names of options in argparse's namespace that differ from the option."""
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add options of the table."""
+    """Add options from the table."""
     for name in names:
         completed(parser.add_argument(name, **OPTIONS[name]), COMPLETERS.get(name))
 
@@ -125,14 +125,14 @@ def add_lock(parser: argparse.ArgumentParser) -> None:
 
 
 def given_options(options: argparse.Namespace, *names: str) -> Keywords:
-    """Return keyword arguments of the library from options of the same meaning."""
+    """Return keyword arguments for the library from the options of the same meaning."""
     return {name: getattr(options, name) for name in names}
 
 
 def check_company(
     options: argparse.Namespace, needs: dict[str, str] | None = None, excludes: dict[str, str] | None = None
 ) -> None:
-    """Refuse an option that has no effect without, or together with, another one; name both."""
+    """Refuse an option that has no effect without another one, or together with it; name both."""
     for option, other in (needs or {}).items():
         if _given(options, option) and not _given(options, other):
             raise CommandLineError(f"{option} does nothing without {other}")

@@ -36,7 +36,7 @@ def call(options: argparse.Namespace) -> int:
     from ..plots.figure import file_kind
 
     if options.output is not None:
-        file_kind(options.output)  # before the bags are read
+        file_kind(options.output)  # refuses the file before the bags are read
     sweeps = [folder for folder in options.bags if any(Path(folder).glob("*.parquet"))]
     if not sweeps:
         if options.cost is not None:
@@ -77,7 +77,7 @@ def _plot_bags(options: argparse.Namespace) -> int:
 
 
 def _show_or_save(drawing: Drawing, output: str | None, *results: tuple[str, str]) -> None:
-    """Show a window where there is a terminal and a display; else save a file and print its name."""
+    """Show a window if there is a terminal and a display; otherwise save a file and print its name."""
     from ..plots.figure import save, show
 
     if output is None and sys.stdout.isatty() and show(drawing):

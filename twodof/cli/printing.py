@@ -21,20 +21,20 @@ OPTIONS = {
     "robots": "NAME=FMU",
     "set_gains": "--foxglove-control",
 }
-"""Options that are not called as the argument of the library which they give."""
+"""Options whose names differ from the library's argument."""
 NEEDS = {"plot": "matplotlib", "view": "websockets"}
-"""Modules that verbs need, of the extra 'view'."""
+"""Modules of the extra 'view' that verbs need."""
 POSE = "control 'pose'"
-"""An argument of the library that is two options here."""
+"""An argument of the library that corresponds to two options."""
 
 MOMENT, TICK = 0.4, 0.5
 """Seconds of silence before a task is named, and between two updates of its time."""
 CLEAR = "\r\x1b[K"
-"""Terminal's order to go to the line's start and clear it."""
+"""Terminal sequence that moves to the start of the line and clears it."""
 
 
 def in_options(text: str) -> str:
-    """Replace arguments, which the library puts in backticks, by options of the command line."""
+    """Replace arguments in backticks, as in messages of the library, by options of the command line."""
     text = text.replace(POSE, "control 'task --orientation'")
     return plain(ARGUMENT.sub(lambda m: OPTIONS.get(m[1], "--" + m[1].replace("_", "-")), text))
 
@@ -42,7 +42,7 @@ def in_options(text: str) -> str:
 def plain(text: str) -> str:
     """Return a text with control and bidirectional characters as escapes.
 
-    Names in untrusted files are no commands to the terminal, and turn no line around.
+    Names in untrusted files can then neither control the terminal nor reverse a line.
     """
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
@@ -53,7 +53,7 @@ def quote(path: Path) -> str:
 
 
 def say(text: str = "", *, error: bool = False) -> None:
-    """Print a line, on the standard error for an error; every verb prints by this function."""
+    """Print a line to stdout, or an error to stderr; every verb prints by this function."""
     print(plain(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
@@ -65,7 +65,7 @@ def print_table(*rows: Iterable[str], align: Callable[[str, int], str] = str.lju
 
 
 def print_next(*commands: str) -> None:
-    """Print the next command to type in this shell, if what it needs is installed."""
+    """Print the next command to type in this shell, if its packages are installed."""
     from ..version import install
 
     missing = {verb for verb, module in NEEDS.items() if find_spec(module) is None}
@@ -80,7 +80,7 @@ def print_next(*commands: str) -> None:
 
 
 def _program() -> str:
-    """Return this program's name where the shell finds it, else its path."""
+    """Return this program's name if the shell finds it, else its path."""
     own = Path(sys.executable).with_name("twodof")
     found = shutil.which("twodof")
     if found is not None and own.exists() and own.samefile(found):
@@ -93,7 +93,7 @@ def _program() -> str:
 
 @contextmanager
 def busy(what: str, *, silent: bool = False) -> Iterator[None]:
-    """Print the name of a slow task; on a terminal with its seconds, elsewhere only if it is not ``silent``."""
+    """Print the name of a slow task: on a terminal with its duration in s, elsewhere unless ``silent``."""
     done, begin, live = Event(), perf_counter(), sys.stderr is not None and sys.stderr.isatty()
 
     def show() -> None:

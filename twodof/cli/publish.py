@@ -78,7 +78,7 @@ def call(options: argparse.Namespace) -> int:
     robots = _robots(options)
     bag = bag_of(options, options.output) if options.output else None
     bags = {}
-    if bag is not None:  # a part of it for each robot, in its namespace
+    if bag is not None:  # each robot has a part of the bag, in its namespace
         space = options.namespace
         bags = {name: bag.of(f"{space}/{name}") if name else bag for name in robots}
     viewers = [_foxglove(options)] if options.foxglove else []
@@ -103,7 +103,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _robots(options: argparse.Namespace) -> dict[str, Experiment]:
-    """Return the FMUs by namespace; a single one needs none."""
+    """Return the FMUs by namespace; a single FMU needs no namespace."""
     from ..export.fmu_options import identifier
     from ..ros.messages import check_name
 

@@ -15,7 +15,7 @@ from .printing import print_json, print_next, print_table, quote, say
 from .signals import INTERRUPTED, asked_to_stop
 
 FAILED_IF = 3
-"""Exit status after a run that a condition of --fail-if judges."""
+"""Exit status of a run for which a condition of --fail-if holds."""
 
 if TYPE_CHECKING:
     from ..bag.writer import Bag
@@ -55,7 +55,7 @@ def call(options: argparse.Namespace) -> int:
     if options.stop_time == math.inf:
         raise CommandLineError("stop time inf s: 'twodof run' ends; 'twodof publish' goes on until Ctrl-C")
     for condition in options.fail_if:
-        expression(condition, RESULTS, condition=True)  # before a run that may take hours
+        expression(condition, RESULTS, condition=True)  # checked before a run that may take hours
     run = experiment_of(options, options.stop_time, options.step)
     bag = bag_of(options, options.output or dated("rosbag2"), measured=options.measured)
     pace = RealTime() if options.realtime else None
@@ -86,7 +86,7 @@ def experiment_of(options: argparse.Namespace, stop_time: float | None, step: fl
             from ..bag.provenance import robots_of
             from ..bag.recorded_commands import read_commands
 
-            if topic in robots_of(Path(folder)):  # of one of several robots, as it was driven
+            if topic in robots_of(Path(folder)):  # replay the inputs of one of several robots
                 folder, topic = table, None
             table = None
             changes = read_commands(fmu, folder, topic, step=step, settings=settings)

@@ -11,16 +11,16 @@ from ..errors import SimulationError
 INTERRUPTED = 130
 """Exit status after a request to end."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
-STOP_TIMEOUT = 5.0  # s in which the work in progress ends on request
-CLEAN_UP = 1.0  # s after an interrupt in which no other one disturbs what it ends
+STOP_TIMEOUT = 5.0  # s in which the present work must end after a request
+CLEAN_UP = 1.0  # s after an interrupt in which further ones are ignored
 _interrupts: list[float] = []
-"""Times of the interrupts, in seconds of the monotonic clock."""
+"""Times of the interrupts by the monotonic clock, s."""
 
 
 def interrupt(_number: int, _frame: object) -> None:
-    """Raise KeyboardInterrupt, and note it, because a C module in import turns it into an ImportError.
+    """Raise KeyboardInterrupt and note its time, because an import of a C module may turn it into an ImportError.
 
-    Another signal within CLEAN_UP of it is ignored: it would leave the code that removes temporary files.
+    Another signal within CLEAN_UP is ignored, because it would interrupt the removal of temporary files.
     """
     now = time.monotonic()
     if not _interrupts or now > _interrupts[-1] + CLEAN_UP:
@@ -31,8 +31,8 @@ def interrupt(_number: int, _frame: object) -> None:
 def is_interrupt(error: ImportError | OSError) -> bool:
     """Return whether an error is a consequence of Ctrl-C.
 
-    An OSError is where it came while a file was closed, which then is closed again and fails. So
-    does ``shutil.rmtree``, which removes the folder that an FMU was unzipped to.
+    An OSError is a consequence if Ctrl-C came while a file was closed: the second close fails. ``shutil.rmtree``, which
+    removes the folder of an unzipped FMU, fails likewise.
     """
     if isinstance(error, ImportError):
         return bool(_interrupts)
@@ -43,8 +43,8 @@ def is_interrupt(error: ImportError | OSError) -> bool:
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Return whether a signal asked the run to end; read between steps, so that no step is cut.
 
-    SIGINT, SIGTERM, and SIGHUP of a closed terminal. A second signal interrupts at once, and so does a
-    time-out where the first is not read; further ones are ignored while the bag is closed.
+    It handles SIGINT, SIGTERM, and SIGHUP of a closed terminal. A second signal interrupts at once, and so does a
+    time-out if the first request is not read. Further signals are ignored while the bag is closed.
     """
     asked = False
 
@@ -59,7 +59,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
         signal.setitimer(signal.ITIMER_REAL, STOP_TIMEOUT)
 
     def is_asked() -> bool:
-        if asked:  # it has its effect: what ends the run may take its time
+        if asked:  # the request was read; the end of the run may take longer
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         return asked
 
@@ -67,7 +67,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
     try:
         yield is_asked
     except SimulationError as error:
-        if asked:  # the Python flavour discards a step that is interrupted
+        if asked:  # the Python flavour discards an interrupted step
             raise KeyboardInterrupt from error
         raise
     finally:

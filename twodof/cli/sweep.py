@@ -88,7 +88,7 @@ def call(options: argparse.Namespace) -> int:
 
         def progress(done: int, runs: int) -> None:
             nonlocal total
-            if not total:  # what an earlier sweep has done says nothing about the rate
+            if not total:  # runs of an earlier sweep must not count for the rate
                 bar.total, bar.initial, bar.n = runs, done, done
             total = runs
             bar.update(done - bar.n)
@@ -131,7 +131,7 @@ def call(options: argparse.Namespace) -> int:
 
 
 def best_runs(table: DataFrame, cost: Expression | None) -> DataFrame:
-    """Return the first few of the ranked runs: variables, and known metrics."""
+    """Return variables and known metrics of the best runs."""
     from ..sweeps.ranking import ranked
 
     best = ranked(table, cost).head(5)
@@ -140,7 +140,7 @@ def best_runs(table: DataFrame, cost: Expression | None) -> DataFrame:
 
 
 def best_facts(table: DataFrame, cost: Expression | None = None) -> dict[str, object]:
-    """Return the best runs, their cost, and how many exceed the URDF's limits, for another program."""
+    """Return the best runs, their cost, and the number of runs beyond the URDF's limits, for JSON."""
     from ..sweeps.ranking import beyond_limits
 
     best = best_runs(table, cost).to_dict("records")
@@ -174,7 +174,7 @@ def print_best(table: DataFrame, cost: Expression | None = None) -> None:
 
 
 def _grids(texts: Iterable[str]) -> dict[str, tuple[float, ...]]:
-    """Return the grids of --grid: evenly spaced values, both ends included."""
+    """Return the grids of --grid: evenly spaced values, including both ends."""
     import numpy as np
 
     from ..bounds import MAX_RUNS

@@ -1,10 +1,10 @@
 """Closed-form motion of the end effector.
 
-While its inputs are held, each task axis obeys, away from singularities and limits,
+With held inputs, and away from singularities and limits, each task axis obeys
 
     ẍ = xdd_des + Kd (xd_des − ẋ) + Kp (x_des − x)
 
-With the impulse response ψ, the step response γ = ∫ψ and φ = 1 − Kp γ this is solved by
+With the impulse response ψ, the step response γ = ∫ψ and φ = 1 − Kp γ, the solution is
 
     x − x_des = φ (x₀ − x_des) + ψ ẋ₀ + γ a          a = xdd_des + Kd xd_des
     ẋ         = −Kp ψ (x₀ − x_des) + ψ' ẋ₀ + ψ a
@@ -22,7 +22,7 @@ SERIES_TERMS = 18
 
 
 class Held(NamedTuple):
-    """Constant inputs over a time, m task axes each: m, m/s, m/s², 1/s² and 1/s."""
+    """Constant inputs of m task axes: position (m), velocity (m/s), acceleration (m/s²), Kp (1/s²) and Kd (1/s)."""
 
     x_des: tuple[float, ...]
     xd_des: tuple[float, ...]
@@ -32,7 +32,7 @@ class Held(NamedTuple):
 
 
 class Responses(NamedTuple):
-    """Responses of ẍ + Kd ẋ + Kp x over time, named by the letters above."""
+    """Responses of ẍ + Kd ẋ + Kp x over time, with the names of the equations above."""
 
     phi: Array
     psi: Array
@@ -41,10 +41,10 @@ class Responses(NamedTuple):
 
 
 def responses(t: Array, Kp: float, Kd: float) -> Responses:
-    """Return responses at times t ≥ 0 (s), accurate at, near and away from critical damping.
+    """Return the responses at times t ≥ 0 (s), which are accurate at, near and away from critical damping.
 
     ψ and γ are divided differences of exp(p t) over the roots p of p² + Kd p + Kp, and over 0 and
-    the roots. They are computed in forms that do not cancel where roots meet or vanish.
+    the roots. The formulas avoid cancellation where roots are equal or 0.
     """
     half = 0.5 * Kd
     discriminant = half * half - Kp
@@ -72,7 +72,7 @@ def responses(t: Array, Kp: float, Kd: float) -> Responses:
 
 
 def _series(t: Array, Kp: float, Kd: float) -> Array:
-    """Return γ for times short against the roots: Σ hₖ tᵏ⁺² / (k + 2)!."""
+    """Return γ for times that are short relative to the roots: Σ hₖ tᵏ⁺² / (k + 2)!."""
     h, before = 1.0, 0.0
     term = 0.5 * t * t
     total = np.zeros_like(t)
@@ -94,8 +94,8 @@ def task_error(
 
     Args:
         x0, xd0: position and velocity at the start, m and m/s, m values each.
-        schedule: communication points, ascending from 0, and the inputs that hold from each on.
-            At that point the error is still that from the target before.
+        schedule: ascending communication points, from 0 on, and the inputs that apply from each on. At that
+            point itself, the error still refers to the previous target.
         step: communication step, s.
         steps: number of communication steps before each, ascending from 0.
     """
@@ -103,10 +103,10 @@ def task_error(
     error = np.empty((len(steps), len(x)))
     error[steps == 0] = x - np.array(schedule[0][1].x_des)
     ends = [k for k, _ in schedule[1:]] + [int(steps[-1])]
-    with np.errstate(over="ignore", invalid="ignore"):  # with negative gains it explodes
+    with np.errstate(over="ignore", invalid="ignore"):  # with negative gains, the solution overflows
         for (k, held), end in zip(schedule, ends):
             here = slice(*np.searchsorted(steps, (k, end), side="right"))
-            t = (np.append(steps[here], end) - k) * step  # at the last, what follows begins
+            t = (np.append(steps[here], end) - k) * step  # the last time is the start of the next part
             gains = {*zip(held.Kp, held.Kd)}
             solved = {each: responses(t, *each) for each in gains}
             for i, (x_des, xd_des, xdd_des, Kp, Kd) in enumerate(zip(*held)):

@@ -1,4 +1,4 @@
-"""Style, header and files of all figures, of bags and of sweeps."""
+"""Style, header and files of all figures of bags and sweeps."""
 
 import html
 import io
@@ -54,7 +54,7 @@ TICK_STYLE: Style = {
     "grid_color": HAIR,
     "grid_linewidth": 0.6,
 }
-"""Styles set on each panel, because matplotlib makes ticks as it draws, when the style is the user's."""
+"""Styles that are set on each panel, because matplotlib makes ticks while it draws, in the user's style."""
 
 
 class Plot(Figure):
@@ -68,11 +68,11 @@ class Drawing(NamedTuple):
     """Content of a figure or page.
 
     Attributes:
-        name: of the file where the user gives none.
-        draw: draws it into an empty figure, and sets the figure's size.
-        columns: of the table that stands below it on a page.
-        body: makes the HTML that stands on a page in place of the figure; None: the figure does.
-        above: makes the HTML that stands on a page above that.
+        name: default name of the file.
+        draw: function that draws into an empty figure, and sets the figure's size.
+        columns: columns of the table below the figure on a page.
+        body: function that returns the HTML that replaces the figure on a page; None: show the figure.
+        above: function that returns the HTML above the figure on a page.
     """
 
     title: str
@@ -93,10 +93,10 @@ def save(drawing: Drawing, output: str | Path | None = None) -> Path:
 
     Args:
         output: .png, .svg, .pdf, or .html, a page with the figure and a table; None: the drawing's name and .png in
-            the working directory, with a number where another file has that name.
+            the working directory, with a number if another file has that name.
 
     Raises:
-        PlotError: another kind of file, or it cannot be written.
+        PlotError: the kind of file is unknown, or the file cannot be written.
     """
     path = Path(output) if output is not None else free_name(drawing.name, ".png", _is_ours)
     kind = file_kind(path)
@@ -110,7 +110,7 @@ def file_kind(path: str | Path) -> str:
     """Return the kind of file by its name: "png", "svg", "pdf" or "html".
 
     Raises:
-        PlotError: any other.
+        PlotError: the kind is unknown.
     """
     kind = Path(path).suffix.lower().removeprefix(".")
     kind = kind or ("" if descriptor_of(path) is None else "png")
@@ -120,14 +120,14 @@ def file_kind(path: str | Path) -> str:
 
 
 def show(drawing: Drawing) -> bool:
-    """Show a figure in a window until it is closed; return False where there is no display."""
+    """Show a figure in a window until it is closed; return False without a display."""
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
-        return False  # saves the third of a second that pyplot takes
+        return False  # avoids the import of pyplot, which takes a third of a second
     from matplotlib import pyplot as plt
 
     try:
         figure = plt.figure()
-    except Exception:  # each toolkit has its own; a file is as good
+    except Exception:  # each toolkit raises its own exceptions; the caller then saves a file
         return False
     if figure.canvas.required_interactive_framework is None:
         plt.close(figure)
@@ -140,7 +140,7 @@ def show(drawing: Drawing) -> bool:
 def draw_head(
     figure: Figure, title: str, texts: Iterable[str], size: tuple[float, float], handles: Sequence[Line2D] = ()
 ) -> SubFigure:
-    """Draw a title, texts and a legend; return the part for the panels, of a size in inches."""
+    """Draw a title, texts and a legend; return the subfigure for the panels, of a size in inches."""
     letters = int((size[0] - 0.3) / LETTER)
     lines = [line for text in texts for line in textwrap.wrap(text, letters)]
     for handle in handles:
@@ -169,7 +169,7 @@ def draw_head(
 
 
 def _end(text: str, letters: int) -> str:
-    """Return as much of a text's end as fits."""
+    """Return the longest end of a text that fits."""
     return text if len(text) <= letters else f"…{text[1 - letters :]}"
 
 

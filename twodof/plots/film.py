@@ -1,4 +1,4 @@
-"""Film of a run: the arm moves through its workspace, in the views of the run's figure; needs no display."""
+"""Film of a run, made without a display: the arm moves in its workspace, in the views of the run's figure."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg  # where it is missi
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-SIZE, DOTS = (8.0, 4.5), 160  # inches, and pixels in one of them: 1280 × 720
+SIZE, DOTS = (8.0, 4.5), 160  # inches, and pixels per inch: 1280 × 720
 PALETTE = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"
 FILMS: dict[str, Style] = {
     ".mp4": dict(
@@ -38,9 +38,9 @@ FILMS: dict[str, Style] = {
     ".webp": dict(fps=30, codec="libwebp_anim", output_params=["-loop", "0", "-quality", "75"]),
     ".gif": dict(fps=25, codec="gif", pix_fmt_out="pal8", output_params=["-filter_complex", PALETTE]),
 }
-"""Options of FFmpeg by the file's suffix; a frame of a GIF takes whole hundredths of a second."""
+"""Options of FFmpeg by suffix; a frame of a GIF lasts a whole number of hundredths of a second."""
 PICTURES = (*FILMS, ".png")
-"""Suffixes of the formats; a PNG is the picture at the end."""
+"""Suffixes of the formats; a PNG is the picture at the end of the run."""
 
 
 def film(
@@ -50,7 +50,7 @@ def film(
 
     Args:
         bag: the bag, or its folder.
-        output: the file, written whole or not at all; its suffix, of ``PICTURES``, is the format.
+        output: the file, written completely or not at all; its suffix (``PICTURES``) selects the format.
         urdf, frame: the robot and its end effector, as in ``track.read_tracks``.
 
     Raises:
@@ -80,7 +80,7 @@ def _encoded(frames: Iterator[bytes], path: Path, kind: str) -> bytes:
     size = tuple(round(side * DOTS) for side in SIZE)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, f"film{kind}")
-        # its default rounds the size up to whole blocks of 16 pixels
+        # FFmpeg's writer would round the size up to multiples of 16 pixels
         writer = imageio_ffmpeg.write_frames(
             file, size, pix_fmt_in="rgba", quality=None, macro_block_size=2, ffmpeg_log_level="error", **FILMS[kind]
         )
@@ -94,7 +94,7 @@ def _encoded(frames: Iterator[bytes], path: Path, kind: str) -> bytes:
 def _frames(track: Track, times: Array) -> Iterator[bytes]:
     """Yield pictures of the run at times since its first sample, s: red, green, blue and alpha of each pixel.
 
-    What stands still is drawn once; the arm's points are interpolated between samples by the joints' positions.
+    Static parts are drawn once; the arm's points are computed from interpolated joint positions.
     """
     figure = drawn(Drawing(title([track]), track.name, partial(_draw, track), ()))
     figure.set_dpi(DOTS)
@@ -115,7 +115,7 @@ def _frames(track: Track, times: Array) -> Iterator[bytes]:
 
 
 def _draw(track: Track, figure: Figure) -> None:
-    """Draw the static parts, and the arm of each view as its last line, which moves."""
+    """Draw the static parts, and the arm of each view as its last line, which is moved later."""
     room = draw_head(figure, title([track]), [common_settings([track]), *outcome(track)[:1]], SIZE)
     figure.set_size_inches(SIZE)
     every = views([track], {(0, ""): looks([track.name])[0]})

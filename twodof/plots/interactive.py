@@ -1,7 +1,7 @@
 """Interactive figure of runs on a page: zoom, a cursor through all panels, switchable joints and bags.
 
-Of each quantity one panel has the curves of all joints. What stands on the page is plotly's figures
-as it has them, data and layout, and its library, packed; ``interactive.js`` unpacks and joins them.
+One panel for each quantity has the curves of all joints. The page contains plotly's figures (data and layout) and its
+library, compressed; ``interactive.js`` unpacks and links them.
 """
 
 import base64
@@ -23,11 +23,13 @@ from .words import labels
 from .workspace import View, views, workspace_title
 
 POINTS = 120_000
-"""Total of all curves. An hour of seven joints at 100 Hz is known by its extremes every three seconds,
-and the page has some four megabytes."""
+"""Number of points of all curves together. An hour of seven joints at 100 Hz is drawn by its extremes every three
+seconds, and the page has about 4 MB.
+"""
 ROW, GAP, EDGE, TOP = 150, 34, 44, 50
-"""Pixels: a panel's height, between panels, below the last, and above the first, for its heading
-and plotly's buttons above that."""
+"""Pixels: height of a panel, distance between panels, and margins below the last panel and above the first, with space
+for heading and plotly's buttons.
+"""
 Chart = dict[str, Any]
 """A figure of plotly, or a part of one, as JSON."""
 LAYOUT: Chart = {
@@ -65,7 +67,7 @@ def body(tracks: Sequence[Track]) -> str:
 
 
 def _verdicts(tracks: Sequence[Track]) -> str:
-    """Return the lines of a run's verdict, or the first line of each of several."""
+    """Return the lines of a run's verdict, or the first line of each verdict for several runs."""
     lines: Sequence[str] = tracks[0].verdict.lines
     if len(tracks) > 1:
         lines = [f"{label}: {track.verdict.lines[0]}" for label, track in zip(labels(tracks), tracks)]
@@ -73,7 +75,7 @@ def _verdicts(tracks: Sequence[Track]) -> str:
 
 
 def scripts(name: str, library: str, content: object) -> str:
-    """Return the HTML of plotly's library and a page's content, both packed, and of the script that draws it."""
+    """Return the HTML with plotly's library and the content, both compressed, and the script that draws them."""
     return (
         f'<script type="text/plain" id="library">{packed(library.encode())}</script>\n'
         f'<script type="text/plain" id="content">{packed(json.dumps(content).encode())}</script>\n'
@@ -82,7 +84,7 @@ def scripts(name: str, library: str, content: object) -> str:
 
 
 def _numbers(values: Array) -> dict[str, str]:
-    """Return numbers in plotly's binary form, which is exact."""
+    """Return numbers in plotly's exact binary form."""
     content = np.ascontiguousarray(values, dtype="<f8").tobytes()
     return {"dtype": "f8", "bdata": base64.b64encode(content).decode()}
 
@@ -93,7 +95,7 @@ def _line(stroke: Stroke) -> dict[str, object]:
 
 
 def _trace(stroke: Stroke) -> dict[str, object]:
-    """Return a line or markers of a track's joint; the legend groups it by kind."""
+    """Return plotly's trace for a line or markers of a track's joint, grouped by kind."""
     mark: dict[str, object] = {"color": stroke.colour}
     if stroke.mark == "+":
         mark = {"symbol": "cross-thin-open", "size": 13, "color": INK, "line": {"width": 1.6}}
@@ -111,13 +113,13 @@ def _trace(stroke: Stroke) -> dict[str, object]:
         "marker": mark,
         "x": _numbers(stroke.x),
         "y": _numbers(stroke.y),
-        "line": {**_line(stroke), "simplify": False},  # which bends curves visibly
+        "line": {**_line(stroke), "simplify": False},  # plotly's simplification changes curves visibly
         "meta": [stroke.track, stroke.joint, stroke.kind],
     }
 
 
 def _thinned(tracks: Sequence[Track], figure: Chart) -> str:
-    """Return the samples to draw where they are too many: a line for each track."""
+    """Return notes, as HTML, on tracks of which only some samples are drawn."""
     text = ""
     for i, track in enumerate(tracks):
         own = (trace["x"]["bdata"] for trace in figure["data"] if trace["meta"][0] == i)
@@ -132,7 +134,7 @@ def _thinned(tracks: Sequence[Track], figure: Chart) -> str:
 
 
 def _looks(tracks: Sequence[Track]) -> Looks:
-    """Return styles: colours distinguish the larger of tracks and joints, dashes the other."""
+    """Return styles: colours distinguish tracks or joints, whichever are more, and dashes the others."""
     bags, joints = looks(labels(tracks)), looks(joint_names(tracks))
     by_bag = len(bags) > len(joints)
     own = {}
@@ -218,7 +220,7 @@ def _value_axis(panels: Sequence[Panel], top: float, bottom: float) -> dict[str,
     if panels[0].kind == "error":
         decades = {"type": "log", "dtick": 3 if high > 1e6 * low else 1}
         return {**axis, **decades, "range": np.log10([low, high]).tolist()}
-    pad = 0.04 * (high - low)  # off the edges, whatever another joint's range is
+    pad = 0.04 * (high - low)  # keeps curves away from the edges
     return {**axis, "range": [low - pad, high + pad], "nticks": 6}
 
 

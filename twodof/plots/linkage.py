@@ -12,12 +12,12 @@ from ..export.urdf_source import DEFAULT_FRAME
 from ..geometry.kinematics import Array, Kinematics, rotated
 from ..plant.urdf import Joint, RobotError, Urdf, check_axes, read_urdf
 
-LOOKS = 2000  # for singularities, along the way
+LOOKS = 2000  # samples that are checked for singularities
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Reach circle of a planar arm, m; its normal is the root's x, y or z: 0, 1, 2."""
+    """Reach circle of a planar arm, m; the normal is the index of the root's x, y or z axis."""
 
     centre: Array
     radius: float
@@ -29,10 +29,10 @@ class Motion:
     """Motion of the robot's links; points in the root frame, m.
 
     Attributes:
-        frame, root: the end effector's link, and the link that points are expressed in.
-        path: the end effector's, N × 3.
-        start, end: the arm at the first and the last sample: root, joints and end effector, × 3.
-        reach: None where the arm does not move in a plane of two of the root's axes.
+        frame, root: the end effector's link, and the link in which points are expressed.
+        path: path of the end effector, N × 3.
+        start, end: points of the arm at the first and the last sample: root, joints and end effector, × 3.
+        reach: reach circle; None unless the arm moves in a plane of two of the root's axes.
     """
 
     robot: str
@@ -48,9 +48,9 @@ class Linkage(NamedTuple):
     """Geometry, limits and damping of a robot for pictures; its masses may be invalid.
 
     Attributes:
-        moving: joints that move on their own; those that mimic one too where a bag has them.
+        moving: independent joints, and joints that mimic them if the bag has these.
         frame: the end effector's link.
-        axes: the task's, of "xyz".
+        axes: task axes, letters of "xyz".
     """
 
     urdf: Urdf
@@ -61,7 +61,7 @@ class Linkage(NamedTuple):
 
     @property
     def chain(self) -> list[Joint]:
-        """Joints that move the frame, from the root on."""
+        """Joints that move the frame, in order from the root."""
         return [joint for joint in self.urdf.chain(self.frame) if joint.moves]
 
     def motion(self, q: Array) -> Motion:
@@ -78,10 +78,10 @@ class Linkage(NamedTuple):
         return np.stack([transforms[i].translation for i in shown], axis=1)
 
     def _reach(self) -> Reach | None:
-        """Return the reach circle, where all joints rotate about one of the root's axes.
+        """Return the reach circle if all joints rotate about one of the root's axes, else None.
 
-        Distances between neighbouring joints do not change, so no point is farther than their sum;
-        in a plane the stretched arm is that long. For arms in space the sum would be too large.
+        Distances between neighbouring joints are constant, so no point is farther than their sum. The stretched planar
+        arm has this length; for spatial arms the sum would be too large.
         """
         at_zero = np.zeros((1, len(self.moving)))
         chain = self.urdf.chain(self.frame)
@@ -102,7 +102,7 @@ class Linkage(NamedTuple):
     def is_singular(self, q: Array, rcond: float, turns: bool) -> bool:
         """Return whether σ_min ≤ rcond·σ_max of the task Jacobian at any sample.
 
-        That has the rows of the task axes, and where an orientation is followed three of turning.
+        The Jacobian has the rows of the task axes, and under orientation control three angular rows.
         """
         axes = ["xyz".index(axis) for axis in self.axes] + [3, 4, 5] * turns
         J = self.kinematics.jacobian(self.frame, q[:: ceil(len(q) / LOOKS)])[:, axes]
@@ -116,7 +116,7 @@ def load_linkage(text: str, frame: str, axes: str, names: Sequence[str]) -> Link
     ``names`` are the joints whose positions are known.
 
     Raises:
-        RobotError: it is not sound, or no joint moves the frame.
+        RobotError: the URDF is invalid, or no joint moves the frame.
     """
     check_axes(axes)
     urdf = read_urdf(text)

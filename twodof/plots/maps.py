@@ -1,6 +1,6 @@
 """Interactive map of a sweep on a page: two maps side by side, a Pareto front, and the run that is clicked.
 
-``maps.js`` draws them with plotly, whose library stands packed on the page, from the columns of the table.
+``maps.js`` draws them from the table's columns with plotly, whose compressed library is on the page.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from .strokes import downsampled
 if TYPE_CHECKING:
     import pandas
 
-MOST_RUNS = 20_000  # that a page holds: of a larger sweep an even part
+MOST_RUNS = 20_000  # runs on a page; of a larger sweep, an evenly spaced selection
 MOST_CURVES, POINTS = 2000, 200
-"""Runs whose curves a page holds, and points of each."""
+"""Number of runs whose curves a page contains, and of points in each curve."""
 
 
 def map_page(table: pandas.DataFrame, varied: Sequence[str], bags: Path | None, best: Sequence[int]) -> str:
-    """Return the HTML of the interactive map; "" where plotly is missing.
+    """Return the HTML of the interactive map; "" without plotly.
 
     Args:
-        table: of the sweep.
-        varied: its variables.
+        table: table of the sweep.
+        varied: varied variables.
         bags: folder with a bag of each run, whose curves are shown when the run is clicked; None: none.
-        best: run that is selected at first, if any.
+        best: initially selected run, if any.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -65,7 +65,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def _curves(rows: pandas.DataFrame, bags: Path | None) -> dict[str, dict[str, object]]:
-    """Return curves of each run that has a bag, by its number: the distance from the target, or the joints."""
+    """Return the curves of runs with a bag, by run number: distance from the target, or joint positions."""
     curves: dict[str, dict[str, object]] = {}
     if bags is None or not bags.is_dir():
         return curves

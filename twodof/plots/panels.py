@@ -18,30 +18,30 @@ from .track import JointTrack, Track
 KINDS = {"q": "Position", "v": "Velocity", "tau": "Effort", "error": "Distance from the target"}
 UNITS = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "tau": ("N·m", "N")}
 """Units of rotating and of sliding joints."""
-SMALLEST_EFFORT = 1e-6  # N·m, N: what changes less is shown at rest
-SMALLEST_PART = 1e-4  # of a value: ticks, of six digits, differ
+SMALLEST_EFFORT = 1e-6  # N·m, N: smaller changes are shown as rest
+SMALLEST_PART = 1e-4  # fraction of a value, so that ticks with six digits differ
 CURVE, THIN, THICK = 1.4, 0.9, 4.0
-"""Widths: of curves, of limits and targets, of closed forms behind curves."""
+"""Line widths of curves, of limits and targets, and of closed forms behind curves."""
 SEEN_IN = {"limit": "q", "friction": "q", "saturation": "tau"}
 MARKS = {"limit": "at its limit", "friction": "sticks", "saturation": "saturated"}
-"""Panels in which the beginnings of some causes are marked, and the marks' names."""
+"""Panels in which causes are marked at their first occurrence, and the names of the marks."""
 SETTLED = "within 2 % from here on"
 TARGET, HELD = "thin dashes: target", "grey band: held by friction"
 Looks = Mapping[tuple[int, str], Look]
-"""Styles of each track's joints, and of the track itself, whose joint is ""."""
+"""Styles of each track's joints; the joint "" has the style of the track itself."""
 
 
 class Panel(NamedTuple):
     """One quantity over time.
 
     Attributes:
-        kind: of KINDS.
-        joint: its name; "" of the error.
-        unit: "rad or m" where no robot tells which.
-        strokes: curves of each track that has it, which have a kind; behind them targets, limits,
-            and what the error is in closed form, where that is in the range.
-        note: limits in words; of an error that is below the range, that it is.
-        range: that shows the curves, and the limits that are near.
+        kind: quantity, one of KINDS.
+        joint: name of the joint; "" for the error.
+        unit: unit; "rad or m" if the robot is unknown.
+        strokes: curves of each track with this quantity, which have a kind; behind them targets, limits, and
+            the closed form of the error, if it is in the range.
+        note: limits in words, or the note that an error is below the range.
+        range: range of the axis, which contains the curves and nearby limits.
     """
 
     kind: str
@@ -67,7 +67,7 @@ def with_joints(tracks: Sequence[Track], names: Sequence[str]) -> list[Track]:
     """Return the tracks with the named joints only, in that order.
 
     Raises:
-        PlotError: no track has a joint of such a name.
+        PlotError: no track has a joint of a given name.
     """
     known = joint_names(tracks)
     for name in names:
@@ -84,7 +84,7 @@ def duration(tracks: Sequence[Track]) -> float:
 
 
 def panels_of(tracks: Sequence[Track], looks: Looks) -> list[Panel]:
-    """Return panels of each joint in turn, of the KINDS that any has; then the error if it is known."""
+    """Return the panels of each joint for the known KINDS, then the panel of the error, if it is known."""
     joints = [joint for track in tracks for joint in track.joints]
     kinds = [kind for kind in UNITS if any(getattr(joint, kind).size for joint in joints)]
     names = joint_names(tracks)
@@ -132,7 +132,7 @@ def _joint_panel(kind: str, name: str, tracks: Sequence[Track], looks: Looks) ->
 
 
 def _events(track: int, kind: str, joint: JointTrack, of: Track) -> list[Stroke]:
-    """Return a mark where a cause of the verdict begins to be seen in a joint's panel."""
+    """Return marks in a joint's panel at the times at which causes of the verdict were first seen."""
     found = []
     for cause in of.verdict.causes:
         if cause.joint == joint.name and cause.time is not None and SEEN_IN.get(cause.kind) == kind:

@@ -1,7 +1,7 @@
-"""Figure of one run or several: joints, the arm in its workspace, and the error.
+"""Figure of one or several runs: joints, the arm in its workspace, and the error.
 
-Sizes are in inches of paper. Printed 17 cm wide, as the text of an A4 page is, the smallest letters
-are 5 pt high; more than ROWS joints take a wider page.
+Sizes are in inches of paper. At a width of 17 cm, the text width of an A4 page, the smallest letters are 5 pt high.
+More than ROWS joints need a wider page.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
-ROWS = 16  # of joints; more stand in columns beside each other
+ROWS = 16  # rows of joints; more joints need further columns
 NAMES, PANEL = 0.8, {1: 2.2, 2: 2.2, 3: 1.62}
-"""Widths: joints' names; panels with ticks, by how many each joint has."""
+"""Widths: of joint names, and of panels with ticks, by the number of panels for each joint."""
 JOINTS, LOWEST, HIGHEST, ERROR = 3.6, 0.62, 1.6, 1.4
-"""Heights: of all joints, the least and most of one's, and of the error."""
-BESIDE = 3.3  # width of the workspace with its axes and key
+"""Heights: of all joints, minimum and maximum for one joint, and of the error."""
+BESIDE = 3.3  # width of the workspace with axes and legend
 VIEWS = {0: (0.0, 0.0), 1: (3.8, 5.8), 2: (4.8, 7.8)}
-"""Least and most height of the workspace with its key, by the number of views."""
-ABOVE = 13.0  # points from a panel to its title, with room for the limits between
-POINTS = 4000  # of a curve; panels are fewer pixels wide
+"""Minimum and maximum height of the workspace with its legend, by the number of views."""
+ABOVE = 13.0  # points between a panel and its title, with space for limits
+POINTS = 4000  # points of a curve; panels have fewer pixels
 
 
 def plot(*bags: Recording | str | Path, urdf: str | Path | None = None, frame: str | None = None) -> Figure:
     """Return a figure of one bag, or of several for comparison.
 
     Args:
-        bags: bags, or their folders; all robots of one that has several.
+        bags: bags, or their folders; all robots of a bag are drawn.
         urdf, frame: the robot and its end effector, as in ``track.read_tracks``.
 
     Raises:
-        BagError, PlotError: naming what is wrong.
+        BagError, PlotError: a bag or an argument is invalid; the message names it.
     """
     return drawn(drawing(read_tracks(each_of(bags), urdf=urdf, frame=frame)))
 
 
 def each_of(bags: Sequence[Recording | str | Path]) -> list[Recording | Path]:
-    """Return the bags, with each robot of a bag that has several."""
+    """Return the bags; a bag of several robots is replaced by its robots."""
     parts = ([bag] if isinstance(bag, Recording) else each_robot(Path(bag)) for bag in bags)
     return [part for several in parts for part in several]
 
@@ -70,7 +70,7 @@ def drawing(tracks: Sequence[Track]) -> Drawing:
 
 
 def _draw(tracks: Sequence[Track], figure: Figure) -> None:
-    """Draw the joints with the error below them, and beside them the workspace."""
+    """Draw the joints, the error below them, and the workspace next to them."""
     bags = looks(labels(tracks))
     names = ["", *joint_names(tracks)]
     own = {(i, name): look for i, look in enumerate(bags) for name in names}
@@ -119,7 +119,7 @@ def _draw(tracks: Sequence[Track], figure: Figure) -> None:
 
 
 def _marked(panels: Iterable[Panel]) -> list[str]:
-    """Return the names of the marks in some panels."""
+    """Return the names of the marks in panels."""
     return [*dict.fromkeys(stroke.label for panel in panels for stroke in panel.strokes if stroke.mark == "v")]
 
 
@@ -130,7 +130,7 @@ def _units(panels: Sequence[Panel]) -> list[list[str]]:
 
 
 def _wrapped(name: str, height: float) -> str:
-    """Return a joint's name broken after underscores into the lines that its row can hold."""
+    """Return a joint's name broken after underscores into lines that fit into its row."""
     lines = re.findall(r".{1,11}$|.{1,10}_|.{1,11}", name)
     room = int(height / 0.13)
     if len(lines) > room:
@@ -167,7 +167,7 @@ def draw_view(axes: Axes, view: View) -> None:
     _set_ticks(axes.xaxis, 5)
     _set_ticks(axes.yaxis, 5)
     _draw_strokes(axes, view.strokes)
-    axes.set_xlim(view.across, auto=True)  # so that the aspect may widen them
+    axes.set_xlim(view.across, auto=True)  # so that the aspect ratio may widen them
     axes.set_ylim(view.up, auto=True)
 
 
@@ -191,7 +191,7 @@ def _draw_error(axes: Axes, panel: Panel) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
     _draw_strokes(axes, [stroke.thinned(POINTS) for stroke in panel.strokes])
     axes.set_title(f"{KINDS[panel.kind]} in {panel.unit}")
-    if any(not stroke.kind and not stroke.mark for stroke in panel.strokes):  # one tells of all closed forms
+    if any(not stroke.kind and not stroke.mark for stroke in panel.strokes):  # one entry for all closed forms
         axes.legend(handles=axes.get_lines()[:1], loc="lower right", bbox_to_anchor=(1.0, 1.02))
     else:
         _tell(axes, panel.note)
@@ -206,7 +206,7 @@ def _line(colour: str, dashes: Sequence[float]) -> Style:
 
 
 def _draw_strokes(axes: Axes, strokes: Iterable[Stroke]) -> None:
-    """Draw lines, the deepest first."""
+    """Draw lines, those with the lowest depth first."""
     for stroke in strokes:
         look = {**_line(stroke.colour, stroke.dashes), "label": stroke.label}
         look |= {"linewidth": stroke.width, "zorder": stroke.depth}
@@ -241,7 +241,7 @@ def _marks(stroke: Stroke) -> Style:
 
 
 def _key(strokes: Iterable[Stroke]) -> list[Line2D]:
-    """Return one legend handle for each label; labels of several tracks are grey."""
+    """Return one legend handle for each label; labels that several tracks share are grey."""
     handles: dict[str, Stroke] = {}
     for stroke in strokes:
         first = handles.setdefault(stroke.label, stroke)

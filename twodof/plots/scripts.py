@@ -12,10 +12,10 @@ EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) (\w+))",
 
 
 def script(*parts: str) -> str:
-    """Return a module of the package and all that it imports as one script, in which each has a scope of its own.
+    """Return a module and all modules that it imports as one script, in which each module has its own scope.
 
-    A page is one file, from which a module cannot be imported. Each import and export names all that it is of, in
-    one line.
+    A page is a single file and cannot import modules. In the sources, each import or export must be on one line that
+    lists all its names.
     """
     scopes: dict[Path, str] = {}
     _add(data_file(*parts), scopes)
@@ -23,7 +23,7 @@ def script(*parts: str) -> str:
 
 
 def _add(file: Path, scopes: dict[Path, str]) -> None:
-    """Add a module after those that it imports."""
+    """Add a module after the modules that it imports."""
     text = file.read_text("utf-8")
     for _, path in IMPORT.findall(text):
         if (imported := data_file("fmu_src", "page", Path(path).name)) not in scopes:

@@ -22,7 +22,7 @@ UNITS = {
     "payload_com": "m",
     "f_ext": "N",
 }
-"""Units of variables, where they do not depend on the joint."""
+"""Units of variables that do not depend on the joint."""
 
 
 def settings_of(bag: Recording) -> dict[str, str]:
@@ -49,13 +49,13 @@ def _group(name: str) -> str:
 
 
 def _text(values: Sequence[float | bool]) -> str:
-    """Return one value where all are equal, as gains often are, else all of them."""
+    """Return one value if all are equal, as gains often are, else all values."""
     texts = [str(v).lower() if isinstance(v, bool) else number(v) for v in values]
     return texts[0] if len(set(texts)) == 1 else f"({', '.join(texts)})"
 
 
 def number(value: float) -> str:
-    """Format a number with six digits and a typographic minus; the largest double means none."""
+    """Format a number with six digits and a typographic minus; the largest double becomes "none"."""
     if abs(value) >= UNBOUNDED:
         return "none"
     return f"{value + 0.0:.6g}".replace("-", "\N{MINUS SIGN}")  # + 0.0: no negative zero

@@ -17,11 +17,12 @@ Style = dict[str, Any]
 INK, GREY, PALE, HAIR = "#1f2933", "#5b6570", "#b4bcc4", "#e6e9ec"
 ALARM = "#D55E00"
 DASHES = ((), (5, 1.5), (7, 1.5, 1, 1.5), (1.5, 1))
-"""On and off, in widths of the line. With the colours, whose number this does not divide, 28
-curves look different."""
+"""Dash patterns: lengths of dashes and gaps, in line widths. Combined with the colours, whose number is coprime to
+theirs, they distinguish 28 curves.
+"""
 
-SMALLEST_RANGE = 1e-3  # rad, m, rad/s, m/s: what moves less is shown at rest
-SMALLEST_ERROR = 1e-12  # m: what is below is rounding
+SMALLEST_RANGE = 1e-3  # rad, m, rad/s, m/s: smaller motion is shown as rest
+SMALLEST_ERROR = 1e-12  # m: smaller errors are rounding errors
 
 
 class Look(NamedTuple):
@@ -36,14 +37,15 @@ class Stroke(NamedTuple):
     """A line in a picture, or markers.
 
     Attributes:
-        track: whose, or None.
-        x, y: across and up; empty for lines across the whole picture at the other's values.
-        width: of the line in points; 0: none.
-        mark: "o" at all points but the last, "+", "v", "x" or "." at all, or "".
-        depth: what is higher is drawn over what is lower.
-        joint: whose of the track; "": the track's own.
-        kind: the quantity whose values it has, of those that a page tells; "": of none.
-        framed: whether the picture must show it.
+        track: index of the track, or None.
+        x, y: horizontal and vertical coordinates; one is empty for lines across the whole picture at the other's
+            values.
+        width: line width in points; 0: no line.
+        mark: marker at all points: "o" (not at the last point), "+", "v", "x", "." or "".
+        depth: drawing order; higher strokes cover lower ones.
+        joint: joint of the track; "": the stroke belongs to the whole track.
+        kind: quantity of the values, for which a page shows numbers; "": none.
+        framed: whether the limits of the picture must include it.
     """
 
     label: str
@@ -61,7 +63,7 @@ class Stroke(NamedTuple):
 
     @property
     def is_limit(self) -> bool:
-        """True for a limit, and not for a curve with that label."""
+        """True for a limit, and not for a curve with the same label."""
         return self.label == "limit" and not self.kind
 
     @property
@@ -83,14 +85,14 @@ def looks(names: Iterable[str]) -> list[Look]:
 
 
 def downsampled(values: Array, most: int) -> Indices:
-    """Return indices of a limited number of samples that draw the same line (M4).
+    """Return the indices of a limited number of samples that draw the same line (M4).
 
-    From near by too, so that a jump is one: of parts as short as may be the first, last, smallest
-    and largest, and both sides of the greatest rise and fall.
+    Of each part, the first, last, smallest and largest sample are kept, and both sides of the steepest rise and fall,
+    so that a jump remains a jump when the user zooms in. Parts are as short as the limit allows.
     """
     kept: Indices = np.arange(len(values))
     size = 1
-    with np.errstate(all="ignore"):  # between infinities
+    with np.errstate(all="ignore"):  # differences of infinities
         rise = np.diff(values)
     lines = [values, np.append(rise, np.nan), np.append(np.nan, rise)]
     while len(kept) > most:

@@ -1,7 +1,7 @@
 """The gain map: metrics of a sweep over the varied variables.
 
-One variable: a curve for each metric. Two: a heat map for each, or dots where values are random.
-More: a row of such maps for each pair, which show the best over all others.
+For one variable, each metric is a curve. For two, it is a heat map, or dots if values are random. For more variables,
+each pair has a row of such maps, which show the best value over the other variables.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .maps import map_page
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR, Style
 
 # isort: split
-from matplotlib.axes import Axes  # where it is missing, twodof.figure says so
+from matplotlib.axes import Axes  # if matplotlib is missing, figure raises
 from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from ..sweeps.ranking import Expression
 
 PAIRED = ("settling_time", "overshoot", "peak_effort")
-"""Metrics of which maps of pairs are drawn: speed, its price in precision and in effort."""
+"""Metrics that are drawn for pairs of variables: speed, and its cost in precision and effort."""
 MOST_PAIRS = 10
-WIDTH, HEIGHT = 3.2, 2.5  # of a panel with its axes and bar, inches
+WIDTH, HEIGHT = 3.2, 2.5  # inches, of a panel with axes and colour bar
 WRITTEN = {"N.m": "N·m", "1/s": "s⁻¹", "1/s2": "s⁻²", "m/s2": "m/s²", "rad/s2": "rad/s²"}
-"""FMI's units, as other figures have them."""
-WIDE = 10.0  # ratio of largest to smallest from which on colours are logarithmic
+"""FMI units in the spelling of figures."""
+WIDE = 10.0  # ratio of largest to smallest value from which on colours are logarithmic
 BEST: Style = dict(marker="*", s=90, color=COLOURS[1], edgecolors="white", linewidths=0.7)
 BEYOND: Style = dict(marker="X", s=10, color=INK, edgecolors="white", linewidths=0.4)
 CRITICAL: Style = dict(linestyle=(0, (4, 2)), linewidth=1.2)
@@ -70,13 +70,13 @@ def drawing(table: pandas.DataFrame, name: str, cost: Expression | None = None, 
     """Return the drawing of a sweep, given the result of ``read_sweep``.
 
     Args:
-        table: the sweep's.
-        name: its folder's.
-        cost: by which the best runs of the page are ranked; None: by RANKED.
+        table: table of the sweep.
+        name: name of the sweep's folder.
+        cost: cost by which the page ranks runs; None: rank by RANKED.
         bags: folder with a bag of each run, whose curves a page shows.
 
     Raises:
-        PlotError: it has no finished run.
+        PlotError: the sweep has no finished run.
     """
     provenance = table.attrs["provenance"]
     design = provenance["design"]
@@ -124,7 +124,7 @@ def _draw(
             _draw_curve(axes, table, panel)
         else:
             rows = table
-            if len(varied) > 2:  # of all candidates at one place, the best
+            if len(varied) > 2:  # the best of all candidates at one point
                 counts = table.index.isin(candidates(table).index)
                 rows = table.assign(**{panel.metric: table[panel.metric].where(counts)})
                 rows = rows.groupby([panel.x, panel.y], as_index=False)[panel.metric].min()
@@ -143,7 +143,7 @@ def _draw(
 
 
 def _panels(table: pandas.DataFrame, varied: Sequence[str]) -> tuple[list[_Panel], int]:
-    """Return the panels, and how many are side by side."""
+    """Return the panels, and the number of panels in a row."""
     metrics = [metric for metric in METRICS if metric not in USE]
     telling = [metric for metric in metrics if table[metric].nunique() > 1]
     telling = telling or [metric for metric in metrics if table[metric].notna().any()]
@@ -177,7 +177,7 @@ def _draw_cells(axes: Axes, rows: pandas.DataFrame, panel: _Panel) -> ScalarMapp
         cmap="viridis",
         rasterized=values.size > 2500,
         edgecolors="face",
-        linewidth=0.3,  # else readers of SVG and PDF show seams
+        linewidth=0.3,  # avoids seams in viewers of SVG and PDF
     )
 
 
@@ -206,12 +206,12 @@ def _draw_critical(axes: Axes, panel: _Panel, colour: str) -> None:
 
 
 def _mark_best(axes: Axes, table: pandas.DataFrame, panel: _Panel) -> None:
-    """Mark the candidate with the least value; none where several are equal."""
+    """Mark the candidate with the smallest value; mark none if several are equal."""
     runs = candidates(table).dropna(subset=[panel.metric])
     least = runs[ranks(runs[panel.metric].to_numpy(dtype=float)) == 0]
     metric = METRICS[panel.metric]
     axes.set_title(f"{metric.title}{_in(metric.unit)}", pad=14.0)
-    value = least[panel.metric].min()  # of none it is not a number
+    value = least[panel.metric].min()  # NaN without candidates
     shown = f"{value:.3g}" if value > ROUNDING else "0"
     text = f"least in {len(least)} runs: {shown}" if len(least) else "not defined"
     if len(least) == 1:
@@ -232,8 +232,8 @@ def _label_decades(axis: Axis) -> None:
 
 
 def _edges(values: Array) -> Array:
-    """Return edges of the cells around ascending values."""
-    if len(values) == 1:  # a sweep that has just begun
+    """Return the edges of cells around ascending values."""
+    if len(values) == 1:  # an unfinished sweep
         return np.array([values[0] - 0.5, values[0] + 0.5])
     middles = (values[1:] + values[:-1]) / 2
     return np.array([2 * values[0] - middles[0], *middles, 2 * values[-1] - middles[-1]])

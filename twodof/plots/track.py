@@ -18,9 +18,9 @@ from .closed_form import Array, Held, task_error
 from .linkage import Linkage, Motion, load_linkage
 from .settings import settings_of
 
-AT_LIMIT = 1e-9  # of a limit's size
-NOTABLE = 1e-6  # m off the closed form: what is less is the integrator's
-MOST = 200_000  # samples of a bag that are drawn
+AT_LIMIT = 1e-9  # tolerance relative to a limit
+NOTABLE = 1e-6  # m: smaller deviations from the closed form are integration errors
+MOST = 200_000  # drawn samples of a bag
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class JointTrack:
     """One joint's coordinate over time.
 
     Attributes:
-        unit: "rad" or "m"; "" where no robot tells which.
-        low, high: limits of the run, or else of the URDF; None where none is known.
-        effort, speed: limits of the URDF, N·m or N, and per s; None likewise.
-        q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample,
-            N values each; all but q are empty where they are not known.
+        unit: "rad" or "m"; "" if the robot is unknown.
+        low, high: position limits of the run, or else of the URDF; None if unknown.
+        effort, speed: limits of the URDF, N·m or N, rad/s or m/s; None if unknown.
+        q, v, tau, target: positions, velocities, efforts, and targets in effect up to each sample, N
+            values each; unknown ones are empty.
         rubs: whether it has friction.
     """
 
@@ -50,7 +50,7 @@ class JointTrack:
 
     @property
     def stuck(self) -> Array:
-        """Positions in stretches of samples in which friction holds the joint, NaN in others, N values."""
+        """Positions at samples at which friction holds the joint, NaN at other samples, N values."""
         rests = np.pad((self.v == 0.0) & self.rubs, 1) if self.v.size else np.zeros(len(self.q) + 2, bool)
         return np.where(rests[1:-1] & (rests[:-2] | rests[2:]), self.q, np.nan)
 
@@ -69,12 +69,12 @@ class Task:
     """Target and error of the controller; m task axes.
 
     Attributes:
-        target: position in effect up to each sample, N × m; not a number where none was known yet.
-        error: distance from the target, m, N values; likewise.
-        closed_form: the same for the closed form; None where the gains are not known, or the robot
-            has fewer joints than the task has coordinates.
-        off: distance between the two positions, m, N values; None likewise.
-        disturbances: effects that the closed form leaves out.
+        target: target position in effect up to each sample, N × m; NaN before the first target.
+        error: distance from the target, m, N values; NaN before the first target.
+        closed_form: error of the closed form; None if the gains are unknown, or if the robot has fewer joints
+            than the task has coordinates.
+        off: distance of the position from the closed form, m, N values; None without a closed form.
+        disturbances: effects that the closed form neglects.
     """
 
     axes: str
@@ -87,14 +87,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Track:
-    """Everything drawn of one bag.
+    """All data of a bag for drawing.
 
     Attributes:
-        settings: how it was made, as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
+        settings: settings of the run as text by name, e.g. {"Kp": "50 s⁻²"}; empty if unknown.
         t: time since the first sample, s, N values.
-        joints: in the bag's order.
-        motion, task: None where the robot is not known, or for the task the target.
-        linkage: the robot; None where none is known.
+        joints: joints in the bag's order.
+        motion, task: motion of the links, and task; None if the robot is unknown, the task also without a target.
+        linkage: the robot; None if unknown.
     """
 
     recording: Recording
@@ -107,7 +107,7 @@ class Track:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Verdict of the run; of a third-party bag of its samples, with the robot that was given."""
+        """Verdict of the run; for a third-party bag, of its samples with the given robot."""
         bag, task = self.recording, self.task
         if bag.provenance or self.linkage is None or self.motion is None:
             return bag.verdict
@@ -116,7 +116,7 @@ class Track:
         return bag.verdict_with(self.linkage.urdf, self.linkage.frame, self.linkage.axes, x, target)
 
     def skeletons(self, times: Array) -> Array:
-        """Return the points of the arm at N times between samples, s: root, joints and end effector, N × points × 3."""
+        """Return points of the arm (root, joints, end effector) at N times, s, between samples: N × points × 3."""
         assert self.linkage is not None
         q = np.column_stack([np.interp(times, self.t, joint.q) for joint in self.joints])
         names = [joint.name for joint in self.joints]
@@ -124,7 +124,7 @@ class Track:
 
     @property
     def name(self) -> str:
-        """Name of the bag, with that of one of its robots."""
+        """Name of the bag, with the robot's name in a bag of several."""
         folder, robot = robot_in(self.recording.path)
         return shown("-".join([folder.resolve().name, *filter(None, robot.split("/"))]))
 
@@ -138,17 +138,17 @@ def read_tracks(
 ) -> list[Track]:
     """Read bags, or the bags in folders, and compute the drawn quantities.
 
-    A single folder with more than ``most`` samples is downsampled without a visible change of lines
-    over time; several bags are compared sample by sample.
+    A single folder with more than ``most`` samples is downsampled without a visible change of its curves. Several bags
+    are read completely, to compare them sample by sample.
 
     Args:
-        urdf: the robot of all of them; None: the one that each bag carries, if any.
-        frame: the end effector's link; None: as in the run that made the bag, and for third-party
-            bags the URDF's "EndEffector", or the deepest link.
+        urdf: the robot of all bags; None: the robot in each bag, if any.
+        frame: the end effector's link; None: as in the run that made the bag; for third-party bags the
+            URDF's "EndEffector", or the deepest link.
 
     Raises:
         BagError: a bag cannot be read.
-        PlotError: the URDF is at fault, does not fit the bag, or there are no positions.
+        PlotError: the URDF is invalid, does not fit the bag, or there are no positions.
     """
     try:
         text = None if urdf is None else read_text(Path(urdf), None)
@@ -161,7 +161,7 @@ def read_tracks(
 
 
 def _lines(track: Track) -> list[Array]:
-    """Return other quantities drawn over time besides positions and velocities, N values each."""
+    """Return the curves over time other than positions and velocities, N values each."""
     lines = [joint.tau for joint in track.joints if joint.tau.size]
     if track.motion is not None:
         lines += [*track.motion.path.T]
@@ -208,7 +208,7 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
     n, starts = len(names), bag.provenance.get("start_values", {})
     first = bag.schedule[0][1]
     efforts, targets = bag.tau, bag.held("q_des", n)
-    if not efforts.size and f"tau_cmd[{n}]" in first:  # of a bare plant: what it is to apply
+    if not efforts.size and f"tau_cmd[{n}]" in first:  # commanded efforts of a bare plant
         efforts = bag.held("tau_cmd", n)
     joints = []
     for i, name in enumerate(names):
@@ -224,7 +224,7 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
         q, v, tau, target = (
             values[:, i] if values.shape == bag.q.shape else np.empty(0) for values in (bag.q, bag.v, efforts, targets)
         )
-        if effort is not None and first.get("limit_effort"):  # of commands; a bag's are within it
+        if effort is not None and first.get("limit_effort"):  # commands may exceed it; a bag's efforts do not
             tau = np.clip(tau, -effort, effort)
         rubs = bool(first.get(f"friction[{i + 1}]"))
         joints.append(JointTrack(name, unit, low, high, effort, speed, q, v, tau, target, rubs))
@@ -232,7 +232,7 @@ def _joints(bag: Recording, names: Sequence[str], linkage: Linkage | None) -> tu
 
 
 def _of_linkage(bag: Recording, linkage: Linkage, names: Sequence[str], values: Array) -> Array:
-    """Return a bag's columns of q or v for the linkage's joints; 0 for irrelevant joints.
+    """Return the columns of q or v for the linkage's joints; joints that do not move the frame have 0.
 
     Raises:
         PlotError: a joint that moves the frame is not in the bag.
@@ -269,7 +269,7 @@ def _task(bag: Recording, linkage: Linkage, joints: Sequence[JointTrack], q: Arr
         turns = "quat_des[1]" in first
         inputs_known = bag.provenance and KNOWN_UNTIL not in bag.provenance
         dof = {joint.leader for joint in linkage.chain}
-        followed = len(axes) + 3 * turns <= len(dof)  # in all task rows at once
+        followed = len(axes) + 3 * turns <= len(dof)  # all task rows can be followed exactly
         if not (inputs_known and followed and all(f"{g}[1]" in first for g in Held._fields)):
             return Task(linkage.axes, target, error, None, None, ())
         held = [(k, Held(*(vector(v, g) for g in Held._fields))) for k, v in bag.schedule]

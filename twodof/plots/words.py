@@ -29,11 +29,11 @@ TOLD = {
     "step": "",
     "FMU": "",
 }
-"""Settings that a figure tells, and the values that go without saying."""
+"""Settings that a figure shows, and the default values that it omits."""
 
 
 def labels(tracks: Sequence[Track]) -> list[str]:
-    """Return a distinguishing label of each track: up to three settings, or else the bag's name."""
+    """Return a distinguishing label for each track: up to three settings, or else the bag's name."""
     every = list(dict.fromkeys(key for track in tracks for key in track.settings))
     differing = [key for key in every if len({track.settings.get(key) for track in tracks}) > 1]
     words = [
@@ -54,7 +54,7 @@ def common_settings(tracks: Sequence[Track]) -> str:
         values = {track.settings.get(key, silent) for track in tracks}
         if len(values) == 1 and values != {silent}:
             words.append(_setting(key, values.pop()))
-    if len(tracks) == 1 and tracks[0].motion:  # else it is the title
+    if len(tracks) == 1 and tracks[0].motion:  # otherwise the title has it
         words.append(f"bag {tracks[0].name}")
     return ", ".join(words)
 
@@ -66,7 +66,7 @@ def _setting(key: str, text: str) -> str:
 
 
 def outcome(track: Track) -> list[str]:
-    """Return the lines of a run's verdict, and its deviation from the closed form."""
+    """Return the lines of a run's verdict, and a line on its deviation from the closed form."""
     task = track.task
     if task is None or task.off is None:
         return [*track.verdict.lines]
@@ -74,16 +74,16 @@ def outcome(track: Track) -> list[str]:
 
 
 def difference(first: Track, other: Track) -> str:
-    """Return the largest joint difference of two runs while both last; "" without common joints.
+    """Return the largest joint difference of two runs in their common time, as text; "" without common joints.
 
-    Positions of the other are interpolated linearly to the times of the first.
+    Positions of the second run are interpolated linearly at the times of the first.
     """
     both = first.t <= other.t[-1]
     t, places = first.t[both], {joint.name: joint.q for joint in other.joints}
     found = []
     for joint in first.joints:
         if joint.name in places and len(t):
-            with np.errstate(invalid="ignore"):  # of two infinities
+            with np.errstate(invalid="ignore"):  # difference of two infinities
                 off = np.abs(joint.q[both] - np.interp(t, other.t, places[joint.name]))
             if (lost := ~np.isfinite(off)).any():
                 lost_at = f"{joint.name} is not finite at {number(t[lost.argmax()])} s"

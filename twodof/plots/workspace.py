@@ -14,8 +14,8 @@ from .track import Task, Track
 from matplotlib.path import Path as Polyline  # where it is missing, twodof.figure says so
 
 MANY_TARGETS = 12
-MANY_CORNERS = 20_000  # of a path; SVG and PDF have some 20 bytes for each
-POINTS = 72.0  # an inch
+MANY_CORNERS = 20_000  # points of a path; each takes about 20 bytes in SVG and PDF
+POINTS = 72.0  # points per inch
 SIDE = 2.8  # inches, width of the workspace
 
 
@@ -23,8 +23,8 @@ class View(NamedTuple):
     """A projection along one of the root's axes.
 
     Attributes:
-        axes: letters of the axes across and up.
-        across, up: limits that show what must be seen, with room at the edges, m.
+        axes: letters of the horizontal and the vertical axis.
+        across, up: limits of the axes, with space at the edges, m.
     """
 
     axes: str
@@ -34,13 +34,13 @@ class View(NamedTuple):
 
 
 def workspace_title(tracks: Sequence[Track]) -> str:
-    """Return the title: whose path, and in which view."""
+    """Return the title, with the frame of the path and the view."""
     frames = dict.fromkeys(f"{t.motion.frame} in {t.motion.root}" for t in tracks if t.motion)
     return f"Path of {', '.join(frames)}"
 
 
 def views(tracks: Sequence[Track], looks: Looks) -> list[View]:
-    """Return one view for planar motion, else from above and from the side; none without a robot."""
+    """Return one view for planar motion, else a top view and a side view; none without a robot."""
     return [_view(plane, tracks, looks) for plane in _planes(tracks)]
 
 
@@ -73,9 +73,9 @@ def _stroke(label: str, track: int | None, points: Array, *look: Any, **more: An
 
 
 def _arms(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Iterator[Stroke]:
-    """Return the arms at the start, drawn once where equal, and at the end.
+    """Return the arms at the start, with equal ones drawn once, and at the end.
 
-    Those at the end are ever thinner: arms that end in the same place are all seen.
+    Arms at the end have decreasing widths, so that all arms with the same end are visible.
     """
     starts: list[Array] = []
     alone = len(tracks) == 1
@@ -106,12 +106,12 @@ def _paths(plane: tuple[int, int], tracks: Sequence[Track], looks: Looks) -> Ite
 
 
 def _target(plane: tuple[int, int], i: int, task: Task) -> Stroke:
-    """Return targets in order of time: markers, or a line where there are many."""
+    """Return targets in order of time: markers, or a line if there are many."""
     known = task.target[np.isfinite(task.target).all(axis=1)]
     changed = np.r_[True, (known[1:] != known[:-1]).any(axis=1)]
     along = dict(zip(task.axes, known[changed].T))
     x, y = (along.get("xyz"[axis], np.empty(0)) for axis in plane)
-    if len(x) != len(y):  # a line where the other axis is not controlled
+    if len(x) != len(y):  # a line across the picture, because the other axis is not controlled
         return Stroke("target", i, x[-MANY_TARGETS:], y[-MANY_TARGETS:], INK, THIN, depth=5.0)
     if len(x) > MANY_TARGETS:
         return _stroke("target", i, _drawable(np.column_stack([x, y])), INK, THIN, depth=5.0)
@@ -119,7 +119,7 @@ def _target(plane: tuple[int, int], i: int, task: Task) -> Stroke:
 
 
 def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
-    """Return each different reach circle that lies in the plane."""
+    """Return the distinct reach circles in the plane of the view."""
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     circles: dict[tuple[float, ...], Stroke] = {}
@@ -142,9 +142,10 @@ def _circles(plane: tuple[int, int], tracks: Sequence[Track]) -> list[Stroke]:
 
 
 def _drawable(points: Array) -> Array:
-    """Return the points, × 2, of a path: all, because matplotlib merges collinear ones.
+    """Return the points of a path, × 2.
 
-    Where that leaves too many corners, as of noise, those with which both coordinates over time look the same.
+    All points are drawn, because matplotlib merges collinear ones. If too many remain, for example with noise, both
+    coordinates are downsampled over time without a visible change.
     """
     size = max(float(np.ptp(points, axis=0).max()), SMALLEST_RANGE)
     corners = np.asarray(Polyline(points * (POINTS * SIDE / size)).cleaned(simplify=True).vertices)
