@@ -3,7 +3,7 @@
 import { cross, dot, multiply, plus, transform, turn, unit } from "./matrices.js";
 
 const FIELD_OF_VIEW = 0.6; // rad, vertical
-const ROOM = 1.45, ROOM_ASKEW = 1.1; // of the picture to what is in it, which is less across than its diagonal
+const ROOM = 1.45, ROOM_ASKEW = 1.1; // size of the picture over that of the scene, whose diagonal appears shorter in 3D
 
 export class Camera {
   touched = false;
@@ -13,8 +13,8 @@ export class Camera {
   back = [0, 0, 1];
 
   /**
-   * @param {{front: number[], vertical: number[]}} view towards the viewer, and upwards
-   * @param {boolean} flat seen from the front, and never tumbled
+   * @param {{front: number[], vertical: number[]}} view directions to the viewer and upwards
+   * @param {boolean} flat whether it shows the front only and never rotates
    * @param {number[][]} points that must be seen, m
    */
   constructor(view, flat, points) {
@@ -25,7 +25,7 @@ export class Camera {
     this.reset();
   }
 
-  /** Back to where all is seen from. */
+  /** Return to the view that shows everything. */
   reset() {
     this.touched = false;
     this.back = unit(this.view.front);
@@ -45,12 +45,12 @@ export class Camera {
     return cross(this.back, this.right);
   }
 
-  /** @returns {number[]} where the viewer is */
+  /** @returns {number[]} position of the viewer */
   get eye() {
     return plus(this.centre, this.stretched, this.back);
   }
 
-  /** The distance; larger where the picture is narrow. */
+  /** The distance of the viewer, which is larger for a narrow picture. */
   get stretched() {
     return this.distance / Math.min(1, this.aspect);
   }
@@ -116,7 +116,7 @@ export class Camera {
     this.distance = Math.min(Math.max(this.distance * factor, this.size / 20), this.size * 20);
   }
 
-  /** @type {(p: number[]) => void} Step back, where what moves has left the picture and the user has not chosen it. */
+  /** @type {(p: number[]) => void} Step back if the motion leaves the picture, unless the user has chosen the view. */
   follow(p) {
     const [x, y] = this.project(p);
     if (!this.touched && !(Math.min(x, y) > 0.03 && Math.max(x, y) < 0.97) && this.distance < 9 * this.size)

@@ -1,4 +1,4 @@
-/** Sliders of what the FMU has to set. */
+/** Sliders for the FMU's inputs and parameters. */
 
 import { byId, element } from "./elements.js";
 import { shortNames } from "./robot.js";
@@ -50,7 +50,8 @@ export class Controls {
     return PER_JOINT.includes(group) ? [element("div", group), ...rows] : rows;
   }
 
-  /** @type {(name: string, first: string) => HTMLElement} Row of a variable or group, with the value of its first. */
+  /** @type {(name: string, first: string) => HTMLElement} Row of a variable or group, with the value of its first
+   * element. */
   row(name, first) {
     const { session } = this, variable = session.variable(first);
     const value = session.values.get(first);
@@ -104,7 +105,7 @@ export class Controls {
     return [-most, most];
   }
 
-  /** Show what the session has, but where the user is typing. */
+  /** Show the session's values, except in a field in which the user types. */
   show() {
     for (const [name, inputs] of this.fields) {
       const value = this.session.values.get(name);
@@ -119,7 +120,7 @@ export class Controls {
   }
 }
 
-/** @type {(unit: string) => string} An FMI unit as people write it: 1/s2 is s⁻². */
+/** @type {(unit: string) => string} An FMI unit in common spelling: 1/s2 is s⁻². */
 function unitText(unit) {
   return unit.replace("1/s2", "s⁻²").replace("1/s", "s⁻¹").replace("2", "²").replace(/\./g, "·");
 }

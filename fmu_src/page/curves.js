@@ -1,10 +1,10 @@
-/** Curves over time, panels with one time axis: zoom, a cursor over all, and lines that are switched. */
+/** Curves over time, in panels with a common time axis: zoom, a common cursor, and lines that can be hidden. */
 
 /** @typedef {import("./samples.js").Samples} Samples */
 
 const MARGIN = { left: 58, right: 8, top: 20, bottom: 18 };
 export const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c", "#9467bd"];
-export const SMALLEST = 1e-12; // what is below is rounding
+export const SMALLEST = 1e-12; // smaller values are rounding errors
 
 export class Curves {
   /** @param {Samples} session @param {PanelFacts[]} panels @param {HTMLElement} parent */
@@ -12,7 +12,7 @@ export class Curves {
     this.session = session;
     /** @type {Set<number>} */
     this.hidden = new Set();
-    /** @type {[number, number] | null} times that were chosen; null: those of interest */
+    /** @type {[number, number] | null} times chosen by the user; null: default */
     this.chosen = null;
     /** @type {number | null} */
     this.cursor = null;
@@ -25,7 +25,7 @@ export class Curves {
     });
   }
 
-  /** @returns {[number, number]} The times that are shown, s. */
+  /** @returns {[number, number]} The interval of time that is shown, s. */
   get shown() {
     return this.chosen ?? this.session.span;
   }
@@ -72,7 +72,7 @@ export class Curves {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio))
       Object.assign(canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
-    // which a browser then draws by itself: where graphics are emulated, that costs a tenth
+    // asks the browser for software drawing, which takes a tenth of the time if graphics are emulated
     const settings = { willReadFrequently: true };
     const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", settings));
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -109,7 +109,7 @@ export class Curves {
     context.restore();
   }
 
-  /** Points of the lines that are shown: of each pixel's samples the least and the largest. */
+  /** Points of the visible lines: for each pixel, the smallest and the largest of its samples. */
   /** @type {(panel: Curves["panels"][number], pixels: number) => Outline[]} */
   rows(panel, pixels) {
     const { session } = this, [from, to] = this.shown;
@@ -156,7 +156,7 @@ function stroke(context, points) {
   context.stroke();
 }
 
-/** @type {(low: number, high: number, count: number) => number[]} Round values between two, some so many of them. */
+/** @type {(low: number, high: number, count: number) => number[]} About `count` round values between two limits. */
 function ticks(low, high, count) {
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = power * ([1, 2, 5, 10].find((factor) => factor * power >= rough) ?? 10);

@@ -18,7 +18,7 @@ export class Engine {
     return new Engine((await WebAssembly.instantiate(module, {})).instance);
   }
 
-  /** Call a function; what is worse than a warning is thrown, in the FMU's own words. */
+  /** Call a function; a status worse than a warning throws an error with the FMU's message. */
   /** @type {(name: string, ...values: number[]) => void} */
   call(name, ...values) {
     this.calls.engine_forget();
@@ -37,7 +37,7 @@ export class Engine {
     new Uint32Array(this.memory.buffer, this.places, places.length).set(places);
   }
 
-  /** @type {(places: number[], values: number[]) => void} Set variables of any type: all, or none where one is refused. */
+  /** @type {(places: number[], values: number[]) => void} Set variables of any type: all, or none if one is refused. */
   set(places, values) {
     this.prepare(places);
     new Float64Array(this.memory.buffer, this.values, values.length).set(values);

@@ -6,9 +6,9 @@ import { base, circle, compose, cross, dot, plus, rotation, transform, unit } fr
 /** @typedef {import("./samples.js").Samples} Samples */
 
 const KEYS = /** @type {Record<string, [number, number]>} */ ({ ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] });
-const STEP = 0.04; // of the picture, by a key
+const STEP = 0.04; // part of the picture for each press of a key
 const GRIP = 26, GRIP_OF_RING = 12; // pixels
-const RING = 0.16; // of the size of the scene
+const RING = 0.16; // radius relative to the scene
 const RING_POINTS = 48;
 export const AXIS_COLOURS = [[0.84, 0.22, 0.2], [0.2, 0.62, 0.3], [0.2, 0.42, 0.85]];
 
@@ -17,7 +17,7 @@ export class Handle {
    * @param {HTMLCanvasElement} canvas
    * @param {Camera} camera
    * @param {Samples} session
-   * @param {() => number[]} place where the target is, in the root frame
+   * @param {() => number[]} place position of the target in the root frame
    * @param {(name: string, values: number[]) => void} onChange called with the new target
    */
   constructor(canvas, camera, session, place, onChange) {
@@ -28,11 +28,11 @@ export class Handle {
     this.onChange = onChange;
     this.axes = session.steered && session.groups.has("x_des") ? session.axes : [];
     this.turns = session.steered && session.groups.has("quat_des");
-    /** @type {Map<number, number[]>} where pointers are, in parts of the picture */
+    /** @type {Map<number, number[]>} positions of pointers, in parts of the picture */
     this.pointers = new Map();
     /** @type {((x: number, y: number) => void) | null} */
     this.drag = null;
-    this.hint = this.axes.length ? "drag the ball: it is the target" : ""; // until the user does
+    this.hint = this.axes.length ? "drag the ball: it is the target" : ""; // until the first drag
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const end of /** @type {const} */ (["pointerup", "pointercancel"]))
@@ -96,7 +96,7 @@ export class Handle {
     else this.camera.orbit(dx, dy);
   }
 
-  /** Carry the target in the plane of the picture, or in that of the task axes. */
+  /** Move the target in the plane of the picture, or in the plane of two task axes. */
   /** @type {(at: number[]) => (x: number, y: number) => void} */
   carry(at) {
     const begin = this.place(), { camera, axes } = this;
@@ -119,7 +119,7 @@ export class Handle {
     return circle(this.place(), RING * this.camera.size, one, two, RING_POINTS);
   }
 
-  /** The axis of the ring that is next to a point of the picture, else -1. */
+  /** The axis of the ring nearest to a point of the picture, within `grip` pixels; else -1. */
   /** @type {(at: number[], grip: number) => number} */
   nearest(at, grip) {
     const distances = [0, 1, 2].map((axis) => Math.min(...this.ring(axis).map((p) => this.distance(at, p))));
@@ -127,7 +127,7 @@ export class Handle {
     return least < GRIP_OF_RING * grip ? distances.indexOf(least) : -1;
   }
 
-  /** @type {(at: number[], axis: number) => (x: number, y: number) => void} Turn the target about one of its axes. */
+  /** @type {(at: number[], axis: number) => (x: number, y: number) => void} Rotate the target about one of its axes. */
   turn(at, axis) {
     const place = this.place(), start = this.session.held("quat_des"), orientation = rotation(start);
     const normal = transform(orientation, base(axis)), one = transform(orientation, base((axis + 1) % 3));

@@ -11,7 +11,7 @@ import { Robot } from "./robot.js";
 import { Session } from "./session.js";
 import { unpacked } from "./unpack.js";
 
-const PAUSE = 0.1; // s between pictures of curves and numbers, where no cursor asks for more
+const PAUSE = 0.1; // s between updates of curves and numbers, unless the cursor moves
 
 class App {
   /** @param {Session | Replay | Remote} session @param {ArrayBuffer} meshes */
@@ -27,7 +27,7 @@ class App {
     const tell = this.tell.bind(this);
     this.picture = new Picture(this.robot, meshes, tell);
     this.panel = new Panel(this.robot, this.picture.reach, tell);
-    this.drawn = -Infinity; // when the panel was, ms
+    this.drawn = -Infinity; // time of the panel's last update, ms
     this.listen();
     this.before = performance.now();
     this.frame(this.before);
@@ -38,7 +38,7 @@ class App {
     this.order(() => this.session.set(name, value));
   }
 
-  /** @type {(action: () => void) => void} Do what the user asks for. */
+  /** @type {(action: () => void) => void} Execute a request of the user. */
   order(action) {
     this.session.message = "";
     this.attempt(action);
@@ -55,7 +55,7 @@ class App {
     }
   }
 
-  /** Say on buttons what they do now. */
+  /** Update the labels of the buttons. */
   label() {
     const { playing, recorded } = this.session;
     const texts = { play: playing ? "Pause" : "Play", record: recorded ? `Stop recording (${recorded} samples)` : "Record" };
@@ -76,7 +76,7 @@ class App {
     on("home", () => this.picture.camera.reset());
     on("download", () => session instanceof Session && save(new Blob([mcap(session, this.robot)]), `${session.facts.name}.mcap`));
     on("picture", () => {
-      this.show(0); // a scene is kept until the browser has shown it
+      this.show(0); // WebGL keeps a scene only until the browser has shown it
       byId("scene").toBlob((/** @type {Blob} */ content) => save(content, `${session.facts.name || "robot"}.png`));
     });
     if (session instanceof Remote) on("record", () => this.order(() => session.record()));

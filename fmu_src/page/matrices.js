@@ -1,4 +1,4 @@
-/** Vectors of three, and matrices of 4 × 4 by columns, as WebGL has them. */
+/** Vectors of three numbers, and 4 × 4 matrices in column order, as in WebGL. */
 
 /** @type {(a: Numbers, b: Numbers) => Float64Array} */
 export function multiply(a, b) {
@@ -14,7 +14,7 @@ export function transform(m, p, w = 1) {
   return [0, 1, 2].map((i) => m[i] * p[0] + m[4 + i] * p[1] + m[8 + i] * p[2] + m[12 + i] * w);
 }
 
-/** @type {(a: Numbers, angle: number) => Float64Array} A turn about an axis of length 1, rad: Rodrigues' formula. */
+/** @type {(a: Numbers, angle: number) => Float64Array} A rotation about a unit axis, rad, by Rodrigues' formula. */
 export function turn(a, angle) {
   const c = Math.cos(angle), s = Math.sin(angle), d = 1 - c;
   const [x, y, z] = [a[0], a[1], a[2]];
@@ -38,7 +38,7 @@ export function rotation(quat) {
   return sine === 0 ? placed([0, 0, 0]) : turn([x / sine, y / sine, z / sine], 2 * Math.atan2(sine, w));
 }
 
-/** Angle of the rotation from one frame to another, rad; the cosine of a small one would not tell it. */
+/** Angle of the rotation from one frame to another, rad, which is also exact for small angles. */
 /** @type {(a: Numbers, b: Numbers) => number} */
 export function angleBetween(a, b) {
   const apart = Math.hypot(...[0, 1, 2, 4, 5, 6, 8, 9, 10].map((i) => a[i] - b[i]));
@@ -85,7 +85,7 @@ export function originOf(m) {
   return [m[12], m[13], m[14]];
 }
 
-/** Points of a circle, from one direction to the other and around. */
+/** Points of a circle, which begins in direction `one` and continues to `two`. */
 /** @type {(centre: Numbers, radius: number, one: Numbers, two: Numbers, parts?: number) => number[][]} */
 export function circle(centre, radius, one, two, parts = 96) {
   return Array.from({ length: parts + 1 }, (_, i) => {

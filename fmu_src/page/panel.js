@@ -27,7 +27,7 @@ export class Panel {
     byId("controls").append(...session.facts.remarks.map((remark) => element("p", remark)));
   }
 
-  /** What curves there are. */
+  /** Definitions of the curves. */
   panels() {
     const { robot } = this, { session } = robot, { facts } = session, units = unitsOf(facts.joints);
     /** @type {Record<string, (line: number) => (number | null)[]>} */

@@ -9,15 +9,15 @@ import { Scene } from "./scene.js";
 /** @typedef {import("./robot.js").Robot} Robot */
 
 const TRAIL = 1.5; // s
-const TILES = 10; // of the floor, to each side
-const MOMENTS = 30, PATH_POINTS = 600; // of a replay, that are in the picture at first, and of its path
-const SLOW = 0.04, SLOW_FRAMES = 10; // s of a frame, and so many in a row, from which on edges are not smoothed
+const TILES = 10; // tiles of the floor on each side
+const MOMENTS = 30, PATH_POINTS = 600; // samples of a replay that the first view contains, and points of its path
+const SLOW = 0.04, SLOW_FRAMES = 10; // s: longer frames are slow; successive slow frames that end anti-aliasing
 
 export class Picture {
   /**
    * @param {Robot} robot
    * @param {ArrayBuffer} meshes
-   * @param {(name: string, value: number[]) => void} tell what the target is to be
+   * @param {(name: string, value: number[]) => void} tell called with the new target
    */
   constructor(robot, meshes, tell) {
     this.robot = robot;
@@ -28,7 +28,7 @@ export class Picture {
     this.reach = robot.reach() ?? { centre: [0, 0, 0], radius: 1 };
     this.camera = this.makeCamera();
     this.handle = new Handle(canvas, this.camera, session, () => robot.target(), tell);
-    this.slow = 0; // frames, until now
+    this.slow = 0; // successive slow frames
   }
 
   makeCamera() {
@@ -56,7 +56,7 @@ export class Picture {
     return new Camera(view, flat, points.filter((point) => point.every(Number.isFinite)));
   }
 
-  /** @type {(k: number, passed: number) => void} Show sample k, so many s after the picture before. */
+  /** @type {(k: number, passed: number) => void} Show sample k, `passed` s after the previous picture. */
   show(k, passed) {
     const { robot, scene, camera } = this, links = robot.links(k), target = robot.target(k);
     this.slow = passed > SLOW ? this.slow + 1 : 0;
@@ -74,7 +74,7 @@ export class Picture {
     scene.draw(camera, fractions(styled("--scene")), Number(styled("--bright")));
   }
 
-  /** Draw axes at the root and, below a robot in space, a floor; return what casts a shadow onto that. */
+  /** Draw axes at the root and, for a spatial robot, a floor; return the projection of its shadow. */
   /** @type {(scene: Scene, colour: number[]) => Float64Array | null} */
   addFloor(scene, colour) {
     const { camera } = this, up = camera.view.vertical, size = camera.size;
@@ -122,7 +122,8 @@ function fractions(colour) {
   return [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16) / 255);
 }
 
-/** @type {(count: number, some: number) => number[]} Numbers of samples, so many, from the first to the last. */
+/** @type {(count: number, some: number) => number[]} `some` evenly spaced sample numbers, from the first to the last.
+ * */
 function spread(count, some) {
   const most = Math.min(count, some);
   return Array.from({ length: most }, (_, i) => Math.round((i * (count - 1)) / Math.max(most - 1, 1)));

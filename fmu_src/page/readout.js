@@ -7,7 +7,7 @@ import { shortNames, unitsOf } from "./robot.js";
 /** @typedef {import("./curves.js").Curves} Curves */
 /** @typedef {import("./robot.js").Robot} Robot */
 
-/** @type {(value: number) => string} A number to be read, no zero with a sign. */
+/** @type {(value: number) => string} A number as text, without a negative zero. */
 function digits(value) {
   if (!Number.isFinite(value)) return "\u2013";
   const rounded = value.toFixed(Math.abs(value) < 10 ? 4 : 2);
@@ -15,7 +15,7 @@ function digits(value) {
 }
 
 export class Readout {
-  /** @type {Map<string, HTMLElement>} cells of the values beside the joints, by name */
+  /** @type {Map<string, HTMLElement>} cells of values other than joints, by name */
   more = new Map();
 
   /** @param {Robot} robot @param {Curves} curves */

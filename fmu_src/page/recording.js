@@ -1,5 +1,5 @@
 /**
- * A session as a ROS 2 bag: an MCAP file of serialised messages, with where they come from.
+ * A session as a ROS 2 bag: an MCAP file of serialised messages, with their provenance.
  *
  * Sources: the MCAP specification, version 0; OMG, "DDS-XTypes" 1.3, section 7.4.1, plain CDR.
  */
@@ -14,14 +14,14 @@ const OP = {
   statistics: 11, metadata: 12, metadataIndex: 13, dataEnd: 15,
 };
 
-/** Bytes that grow, little endian. */
+/** A growing buffer of little-endian bytes. */
 class Bytes {
   constructor() {
     this.view = new DataView(new ArrayBuffer(1024));
     this.length = 0;
   }
 
-  /** @type {(size: number) => number} The offset of free room for a number of bytes. */
+  /** @type {(size: number) => number} Reserve a number of bytes; return their offset. */
   room(size) {
     if (this.length + size > this.view.byteLength) {
       const longer = new Uint8Array(2 * (this.length + size));
@@ -36,7 +36,7 @@ class Bytes {
     return new Uint8Array(this.view.buffer, 0, this.length);
   }
 
-  /** @type {(size: number, ...values: (number | bigint)[]) => Bytes} Whole numbers of so many bits. */
+  /** @type {(size: number, ...values: (number | bigint)[]) => Bytes} Append integers of a size in bits. */
   put(size, ...values) {
     for (const value of values) {
       const at = this.room(size / 8);
@@ -64,13 +64,13 @@ class Bytes {
     return this;
   }
 
-  /** @type {(text: string, end?: string) => Bytes} A text behind its length. */
+  /** @type {(text: string, end?: string) => Bytes} Append a text after its length. */
   text(text, end = "") {
     const content = new TextEncoder().encode(text + end);
     return this.put(32, content.length).raw(content);
   }
 
-  /** Gap before numbers of a size, in CDR, which counts from behind its first 4 bytes. */
+  /** Append padding before numbers of a size, which CDR aligns relative to the end of its first 4 bytes. */
   /** @type {(size: number) => Bytes} */
   align(size) {
     return this.raw(new Uint8Array((size - ((this.length - 4) % size)) % size));
@@ -89,7 +89,7 @@ function textMap(entries) {
   return new Bytes().put(32, content.length).raw(content.content);
 }
 
-/** @type {(stamp: bigint, frame: string) => Bytes} A message's beginning; its stamp in ns. */
+/** @type {(stamp: bigint, frame: string) => Bytes} The header of a message with a stamp in ns. */
 function headed(stamp, frame) {
   const second = 1000000000n;
   return new Bytes().raw([0, 1, 0, 0]).put(32, stamp / second, stamp % second).text(frame, "\0");
@@ -160,7 +160,7 @@ export function mcap(session, robot) {
   return file.record(OP.footer, new Bytes().put(64, summary, 0).put(32, 0)).raw(MAGIC).content;
 }
 
-/** Messages that are stored together, with where each is. */
+/** A chunk of messages, with their offsets. */
 class Chunk {
   records = new Bytes();
   /** @type {bigint[]} */
@@ -168,7 +168,7 @@ class Chunk {
 
   /** @param {string[]} topics */
   constructor(topics) {
-    /** @type {[bigint, number][][]} times and places of each topic's messages */
+    /** @type {[bigint, number][][]} times and offsets of each topic's messages */
     this.places = topics.map(() => []);
   }
 
@@ -179,7 +179,7 @@ class Chunk {
     this.records.record(OP.message, new Bytes().put(16, channel).put(32, 0).put(64, stamp, stamp).raw(data));
   }
 
-  /** @type {(file: Bytes) => Bytes} Append it and its indexes; the record of where they are. */
+  /** @type {(file: Bytes) => Bytes} Append the chunk and its indexes to a file; return the record of their offsets. */
   write(file) {
     const { records, places } = this, at = file.length, [start, end] = [this.times[0], this.times[this.times.length - 1]];
     const content = new Bytes().put(64, start, end, records.length).put(32, 0).text("").put(64, records.length);

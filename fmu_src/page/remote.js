@@ -1,17 +1,17 @@
-/** An FMU that is stepped by the server of this page: orders go up, samples come down. */
+/** An FMU that the server of this page steps: the page sends requests and receives samples. */
 
 import { MOST_NUMBERS, Samples } from "./samples.js";
 
 const NOTED = 8000; // ms that a note is shown
-const PACE_WINDOW = 1000; // ms over which the real-time factor is taken
-const RETRY = 1000; // ms between two looks for a server that was lost
+const PACE_WINDOW = 1000; // ms over which the real-time factor is computed
+const RETRY = 1000; // ms between two attempts to reconnect
 
 /** A connection to this page's server. */
 function connection() {
   return new WebSocket(`${location.origin.replace("http", "ws")}/socket${location.search}`);
 }
 
-/** Look for the server until it speaks, and show what it has now: its robot may be another. */
+/** Try to reconnect to the server; then reload the page, because the robot may be another one. */
 function seek() {
   const socket = connection();
   socket.onmessage = () => location.reload();
@@ -20,11 +20,11 @@ function seek() {
 
 export class Remote extends Samples {
   without = ["scrub", "loops", "pace", "download"];
-  sent = 0; // requests
+  sent = 0; // number of sent requests
   run = -1;
   noted = -1;
   forgetting = 0; // timer of the note
-  /** @type {[number, number][]} by the clock, ms, and of the robot, s */
+  /** @type {[number, number][]} wall time, ms, and simulated time, s */
   past = [];
 
   /** @param {Facts} facts @param {WebSocket} socket */
@@ -100,7 +100,7 @@ export class Remote extends Samples {
     this.tell("play", on);
   }
 
-  /** The server advances it. */
+  /** Do nothing: the server advances the simulation. */
   advance() {}
 
   step() {

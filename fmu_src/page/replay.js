@@ -1,8 +1,8 @@
-/** A bag that is replayed: all samples are there from the beginning. */
+/** Replay of a bag, all of whose samples are on the page. */
 
 import { Samples } from "./samples.js";
 
-const LONGEST = 1; // s of a frame that count: the page may not have been shown meanwhile
+const LONGEST = 1; // s: longest frame, because the page may have been hidden
 
 export class Replay extends Samples {
   without = ["defaults", "download", "record"];
@@ -22,7 +22,7 @@ export class Replay extends Samples {
     return this.nearest(this.moment);
   }
 
-  /** @returns {[number, number]} All of it. */
+  /** @returns {[number, number]} The whole replay, s. */
   get span() {
     return [0, this.duration || this.facts.step];
   }
@@ -33,7 +33,7 @@ export class Replay extends Samples {
     if (on && this.moment >= this.duration) this.moment = 0;
   }
 
-  /** @type {(passed: number, speed: number) => void} Go on by s of the clock. */
+  /** @type {(passed: number, speed: number) => void} Advance by s of wall time. */
   advance(passed, speed) {
     this.moment += Math.min(passed, LONGEST) * speed;
     if (this.moment < this.duration) return;
@@ -47,7 +47,7 @@ export class Replay extends Samples {
     this.moment = Math.min(Math.max(t, 0), this.duration);
   }
 
-  /** One sample further. */
+  /** Advance by one sample. */
   step() {
     this.seek(this.time(Math.min(this.now + 1, this.count - 1)));
   }

@@ -16,7 +16,7 @@ export class Robot {
     return this.linksAt(this.session.at("q", k));
   }
 
-  /** @type {(q: Numbers) => Float64Array[]} The same at positions in rad or m. */
+  /** @type {(q: Numbers) => Float64Array[]} Transforms of all links at positions q, rad or m. */
   linksAt(q) {
     /** @type {Float64Array[]} */
     const places = [placed([0, 0, 0])];
@@ -84,7 +84,7 @@ export class Robot {
     );
   }
 
-  /** @type {(k: number) => JointFacts[]} Joints that their friction holds: only these have a velocity of exactly 0. */
+  /** @type {(k: number) => JointFacts[]} Joints that friction holds; only these have a velocity of exactly 0. */
   sticking(k) {
     const v = this.session.at("v", k), { values } = this.session;
     return this.facts.joints.filter((_, i) => v[i] === 0 && Number(values.get(`friction[${i + 1}]`)) > 0);
@@ -98,10 +98,11 @@ export function unitsOf(joints) {
   return slide ? ["m", "m/s", "N"] : ["rad", "rad/s", "N·m"];
 }
 
-/** @type {(joints: JointFacts[]) => string[]} Names without the whole words that all of them begin and end with. */
+/** @type {(joints: JointFacts[]) => string[]} Names without their common first and last words. */
 export function shortNames(joints) {
   const words = joints.map(({ name }) => name.split(/([^_/]*[_/])/).filter(Boolean)), [first] = words;
-  /** @type {(at: (own: string[]) => string) => boolean} True if all begin, or end, with one word, and have others. */
+  /** @type {(at: (own: string[]) => string) => boolean} True if all names begin, or end, with the same word and have
+   * other words. */
   const alike = (at) => words.length > 1 && words.every((own) => own.length > 1 && at(own) === at(first));
   while (alike((own) => own[0])) words.forEach((own) => own.shift());
   while (alike((own) => own[own.length - 1])) words.forEach((own) => own.splice(-2, 2, own[own.length - 2].slice(0, -1)));

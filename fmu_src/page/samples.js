@@ -1,16 +1,16 @@
 /** Samples of a robot's motion: inputs and outputs, from any source. */
 
-const WINDOW = 10; // s that are shown of a run that goes on
+const WINDOW = 10; // s of a continuing run that are shown
 export const MOST_NUMBERS = 2 ** 24; // 128 MiB: an hour of an arm of seven joints at 100 Hz
 
 export class Samples {
   count = 0;
   playing = true;
-  steered = true; // by its inputs
-  message = ""; // message to the user, until the next request
-  notice = ""; // the same, for some time
-  recorded = 0; // samples in a bag that is being written
-  /** @type {string[]} what of the page it has no use for */
+  steered = true; // whether the user can change inputs
+  message = ""; // message to the user until the next request
+  notice = ""; // message that disappears after some time
+  recorded = 0; // number of samples in the present recording
+  /** @type {string[]} elements of the page that it does not use */
   without = [];
 
   /**
@@ -19,7 +19,7 @@ export class Samples {
    */
   constructor(facts, timed) {
     this.facts = facts;
-    this.axes = [...facts.axes].map((axis) => "xyz".indexOf(axis)); // in which there is a target, and the others
+    this.axes = [...facts.axes].map((axis) => "xyz".indexOf(axis)); // indices of the task axes; the others are `free`
     this.free = [0, 1, 2].filter((axis) => !this.axes.includes(axis));
     /** @type {Map<string, Variable>} */
     this.variables = new Map(facts.variables.map((variable) => [variable.name, variable]));
@@ -29,7 +29,7 @@ export class Samples {
       const group = name.split("[")[0];
       this.groups.set(group, [...(this.groups.get(group) ?? []), name]);
     }
-    /** @type {Map<string, [number, number]>} where a group begins in a sample, and its length */
+    /** @type {Map<string, [number, number]>} offset of a group in a sample, and its length */
     this.columns = new Map();
     this.width = Number(timed);
     for (const group of facts.recorded) {
@@ -49,13 +49,13 @@ export class Samples {
     return variable;
   }
 
-  /** @returns {Map<string, Value>} Inputs and parameters as they are at first. */
+  /** @returns {Map<string, Value>} Start values of inputs and parameters. */
   defaults() {
     const settable = this.facts.variables.filter((v) => ["input", "parameter"].includes(v.causality));
     return new Map(settable.map((v) => [v.name, /** @type {Value} */ (v.start)]));
   }
 
-  /** The values to set, element by element; a number for a vector sets all of its elements. */
+  /** The elements to set and their values; a number for a vector sets all of its elements. */
   /** @type {(name: string, value: Value | number[]) => [string, Value][]} */
   checked(name, value) {
     const names = this.groups.get(name) ?? [name];
@@ -76,7 +76,7 @@ export class Samples {
     return pairs;
   }
 
-  /** @type {(sample: Numbers) => void} Take one sample more. */
+  /** @type {(sample: Numbers) => void} Append a sample. */
   append(sample) {
     if ((this.count + 1) * this.width > this.data.length) {
       const longer = new Float64Array(2 * this.data.length);
@@ -97,7 +97,7 @@ export class Samples {
     return this.data[k * this.width];
   }
 
-  /** @type {(t: number) => number} Number of the sample that is nearest to a time, s. */
+  /** @type {(t: number) => number} Number of the sample nearest to a time, s. */
   nearest(t) {
     let first = 0, last = this.count - 1;
     while (first < last) {
@@ -108,50 +108,50 @@ export class Samples {
     return first;
   }
 
-  /** Number of the sample that is shown. */
+  /** Number of the shown sample. */
   get now() {
     return this.count - 1;
   }
 
-  /** @returns {[number, number]} Times that are of interest, s. */
+  /** @returns {[number, number]} Default interval of time for curves, s. */
   get span() {
     const end = this.time(this.now);
     return [Math.max(0, end - WINDOW), Math.max(end, WINDOW)];
   }
 
-  /** @returns {[string, string][]} More to tell beside the samples, names and texts. */
+  /** @returns {[string, string][]} Further facts for the readout: names and texts. */
   remarks() {
     return [];
   }
 
-  /** @type {(group: string, k: number, i: number) => number} A number of sample k; not one where there is none. */
+  /** @type {(group: string, k: number, i: number) => number} A number of sample k; NaN if the group is missing. */
   value(group, k, i) {
     const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
     return i < size ? this.data[k * this.width + begin + i] : NaN;
   }
 
-  /** @type {(group: string, k?: number) => Float64Array} A vector of sample k, empty where there is none. */
+  /** @type {(group: string, k?: number) => Float64Array} A vector of sample k; empty if the group is missing. */
   at(group, k = this.now) {
     const [begin, size] = /** @type {[number, number]} */ (this.columns.get(group));
     return this.data.subarray(k * this.width + begin, k * this.width + begin + size);
   }
 
-  /** @type {(group: string) => number[]} A vector of inputs or parameters as they are set now. */
+  /** @type {(group: string) => number[]} The present values of a vector of inputs or parameters. */
   held(group) {
     return (this.groups.get(group) ?? []).map((name) => Number(this.values.get(name)));
   }
 
-  /** @type {(group: string, k: number) => number[]} A target in sample k: of the latest, what is set by now. */
+  /** @type {(group: string, k: number) => number[]} A target in sample k; for the latest sample, the present input. */
   target(group, k) {
     return this.steered && k === this.count - 1 ? this.held(group) : [...this.at(group, k)];
   }
 
-  /** Followed input and current target; null where there is none. */
+  /** Names of the controlled output and of its target; null without one. */
   get follows() {
     return [["x", "x_des"], ["q", "q_des"]].find(([, target]) => this.groups.has(target)) ?? null;
   }
 
-  /** Distance of the end effector from its target, m, or of the joints from theirs; NaN without. */
+  /** Distance of the end effector from its target, m, or of the joints from theirs; NaN without a target. */
   error(k = this.now) {
     if (!this.follows) return NaN;
     const [now, wanted] = this.follows, place = this.at(now, k);

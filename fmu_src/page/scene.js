@@ -41,17 +41,17 @@ const LINES = [
   in vec4 tint; out vec4 shown;
   void main() { shown = tint; }`,
 ];
-const CREASE = 0.8; // cosine of the angle between faces from which on their edge is sharp
-const LINE_SIZE = 11; // numbers of one
+const CREASE = 0.8; // cosine of the angle between two faces below which their edge is sharp
+const LINE_SIZE = 11; // numbers for each line
 
 export class Scene {
-  /** @type {number[]} to be drawn next */
+  /** @type {number[]} lines of the next picture */
   lines = [];
-  /** @type {number[]} likewise, below all else */
+  /** @type {number[]} lines of the next picture, below everything else */
   ground = [];
   /** @type {{mesh: number, model: Float64Array, colour: number[]}[]} */
   solids = [];
-  fineness = 2; // pixels that are computed for one that is shown, along each side
+  fineness = 2; // computed pixels for each shown pixel, along each side
 
   /**
    * @param {HTMLCanvasElement} canvas
@@ -118,21 +118,21 @@ export class Scene {
   }
 
   /**
-   * A mesh in red, green, blue, and how much it covers: with less than 1 it is seen before all that cover, and
-   * with 2 it is flat, without light and behind them.
+   * Add a mesh with red, green, blue and opacity. With an opacity below 1 it is drawn in front of opaque meshes, and
+   * with 2 it is drawn unlit behind them.
    */
   /** @type {(mesh: number, model: Float64Array, colour: number[]) => void} */
   addSolid(mesh, model, colour) {
     this.solids.push({ mesh, model, colour });
   }
 
-  /** Lines from point to point in such a colour, of a width in pixels. */
+  /** Add lines from point to point with a colour, and a width in pixels. */
   /** @type {(points: number[][], colour: number[], width: number, into?: number[]) => void} */
   addLine(points, colour, width, into = this.lines) {
     for (let i = 1; i < points.length; i++) into.push(...points[i - 1], ...points[i], ...colour, width);
   }
 
-  /** Show what was added, its colours so far from their own towards white. */
+  /** Draw what was added; `bright` blends the colours towards white. */
   /** @type {(camera: Camera, background: number[], bright: number) => void} */
   draw(camera, background, bright) {
     const { gl, canvas } = this;
@@ -151,7 +151,7 @@ export class Scene {
     this.drawSolids(this.solids.filter(({ colour }) => colour[3] === 1), view, light, bright);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.BLEND);
-    gl.enable(gl.CULL_FACE); // a far side would be seen in part
+    gl.enable(gl.CULL_FACE); // otherwise back faces would be visible in part
     this.drawSolids(this.solids.filter(({ colour }) => colour[3] < 1), view, light, bright);
     gl.disable(gl.CULL_FACE);
     gl.disable(gl.BLEND);
@@ -205,7 +205,7 @@ function smoothed(places, triangles) {
   const { length } = triangles, count = places.length / 3;
   const faces = facesOf(places, triangles), [begins, around] = facesAround(count, triangles);
   const corners = new Uint16Array(4 * length), normals = new Int8Array(4 * length), indices = new Uint32Array(length);
-  const newest = new Int32Array(count).fill(-1), older = new Int32Array(length); // of those of a vertex
+  const newest = new Int32Array(count).fill(-1), older = new Int32Array(length); // drawn vertices of each vertex
   let made = 0;
   for (let corner = 0; corner < length; corner++) {
     const vertex = triangles[corner], own = corner - (corner % 3);
@@ -229,7 +229,7 @@ function smoothed(places, triangles) {
   return { corners: corners.subarray(0, 4 * made), normals: normals.subarray(0, 4 * made), indices };
 }
 
-/** Normals of triangles, of their areas' length: that of a triangle begins at its first corner. */
+/** Normals of triangles, with the length of twice the area; a normal has the index of the triangle's first corner. */
 /** @type {(places: Uint16Array, triangles: Uint32Array) => Float64Array} */
 function facesOf(places, triangles) {
   const faces = new Float64Array(triangles.length);
@@ -249,7 +249,7 @@ function cosine(faces, f, g) {
   return (x * u + y * v + z * w) / Math.sqrt((x * x + y * y + z * z) * (u * u + v * v + w * w));
 }
 
-/** First corners of the triangles about each of so many vertices, and where those of a vertex begin. */
+/** First corners of the triangles at each of `count` vertices, and the index at which those of a vertex begin. */
 /** @type {(count: number, triangles: Uint32Array) => Uint32Array[]} */
 function facesAround(count, triangles) {
   const begins = new Uint32Array(count + 1), around = new Uint32Array(triangles.length);

@@ -1,17 +1,17 @@
-/** A run of the FMU's engine in this very page. */
+/** A run of the FMU's engine in this page. */
 
 import { MOST_NUMBERS, Samples } from "./samples.js";
 
 /** @typedef {import("./engine.js").Engine} Engine */
 
-const LATE = 0.25; // s behind the clock above which the session falls behind real time
-const BUSY = 0.012, SHARE = 0.5; // s of a frame, or its share, in which the plant is stepped
+const LATE = 0.25; // s: largest delay behind the clock; beyond it, simulated time falls behind
+const BUSY = 0.012, SHARE = 0.5; // s, or share of a frame, for stepping the plant
 
 export class Session extends Samples {
   without = ["scrub", "loops", "record"];
   k = 0;
   begun = 0;
-  due = 0; // time of the robot that the clock asks for, s
+  due = 0; // simulated time that the clock requires, s
   /** @type {Record<string, Value>} */
   startValues = {};
   /** @type {[number, Record<string, Value>][]} */
@@ -26,7 +26,8 @@ export class Session extends Samples {
     this.startAgain();
   }
 
-  /** @type {(all?: boolean) => void} Restart; inputs and parameters keep their values, or take the FMU's. */
+  /** @type {(all?: boolean) => void} Restart; inputs and parameters keep their values or, with `all`, take the FMU's.
+   * */
   startAgain(all = false) {
     if (all) this.values = this.defaults();
     this.engine.call("engine_reset");
@@ -69,7 +70,8 @@ export class Session extends Samples {
     this.engine.set(places, pairs.map(([, value]) => Number(value)));
   }
 
-  /** @type {(name: string, value: Value | number[]) => void} Set inputs from the next step on; parameters restart it. */
+  /** @type {(name: string, value: Value | number[]) => void} Set inputs, which apply from the next step on; a parameter
+   * restarts the simulation. */
   set(name, value) {
     const pairs = this.checked(name, value);
     const before = /** @type {Map<string, Value>} */ (this.values);
@@ -99,7 +101,7 @@ export class Session extends Samples {
     this.due = this.time(this.k);
   }
 
-  /** Step as far as the clock is, which has gone on by so many s, and there is time for. */
+  /** Step until the clock's time, which has advanced by `passed` s, as far as the frame has time. */
   /** @type {(passed: number, speed: number) => void} */
   advance(passed, speed) {
     this.due += passed * speed;

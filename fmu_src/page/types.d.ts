@@ -50,17 +50,17 @@ interface Facts {
   frameLink: number;
   shapes: { link: number; place: number[]; colour: number[] }[];
   meshes: { low: number[]; size: number; vertices: number; triangles: number }[];
-  /** Of a page with an engine: what its bags say of their origin, and of their topics. */
+  /** Only for a page with an engine: provenance and topics of its bags. */
   provenance: Record<string, unknown>;
   definitions: Record<string, string>;
   qos: string;
 }
 
-/** What the server of a page has to tell. */
+/** An update from the server of a page. */
 interface News {
   /** Number of the run. */
   run: number;
-  /** Time of the latest sample, s; there may be more samples than there was room for. */
+  /** Time of the latest sample, s; some samples may be missing. */
   t: number;
   /** Number of this page's requests received before it was sent. */
   received: number;
@@ -84,7 +84,7 @@ interface News {
 interface PanelFacts {
   title: string;
   value: (k: number, line: number) => number;
-  /** Which of the joints it has a line of. */
+  /** Joints with a line in the panel. */
   lines: number[];
   /** Whether its axis is logarithmic. */
   log: boolean;
@@ -92,7 +92,7 @@ interface PanelFacts {
   limits: (line: number) => (number | null)[];
 }
 
-/** A line that is drawn. */
+/** A visible line. */
 interface Outline {
   line: number;
   points: number[][];

@@ -1,4 +1,4 @@
-/** Data that stands packed on a page. */
+/** Compressed data on a page. */
 
 /** @type {(id: string) => Promise<ArrayBuffer>} The content of an element, by its id. */
 export async function unpacked(id) {
@@ -7,7 +7,7 @@ export async function unpacked(id) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
 }
 
-/** @returns {Promise<any>} The content of a page of plotly's, whose library is there from then on. */
+/** @returns {Promise<any>} The content of a plotly page; it also loads plotly's library. */
 export async function plotlyContent() {
   const [library, content] = await Promise.all(["library", "content"].map(unpacked));
   const script = document.createElement("script"), decoder = new TextDecoder();

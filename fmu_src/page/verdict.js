@@ -1,21 +1,21 @@
-/** The verdict of a run so far: whether its target is reached, and the causes where it is not, the root first. */
+/** The present verdict of a run: whether the target is reached and, if not, the causes, the root cause first. */
 
 import { base, originOf } from "./matrices.js";
 
 /** @typedef {import("./robot.js").Robot} Robot */
 
-const BAND = 0.02, FLOOR = 1e-4; // share of the way, and m or rad: an error within one of them has reached the target
-const SETTLE = 1; // s after a change of the target before which only causes that no wait can mend are named
-const LOOKED_AT = 400, OFTEN = 0.05; // samples, and the share of them from which on a state is a cause
-const SCATTERED = 400, IMPROVED = 6, TRIES = 40; // starts of the search for the nearest reachable point, and steps of those improved
+const BAND = 0.02, FLOOR = 1e-4; // share of the initial error, and m or rad: a smaller error has reached the target
+const SETTLE = 1; // s after a change of the target, during which only permanent causes are named
+const LOOKED_AT = 400, OFTEN = 0.05; // number of examined samples, and the share from which on a state is a cause
+const SCATTERED = 400, IMPROVED = 6, TRIES = 40; // nearest reachable point: starts, improved starts, steps of each
 const SINGULAR = 0.02; // ratio of the smallest to the largest singular value
 const CREEPING = 1e-5; // rad/s or m/s
-const FEWEST = 0.2; // damping ratio below which the damping is too little
+const FEWEST = 0.2; // damping ratio below which the damping is insufficient
 
 export class Verdict {
   began = 0; // sample at which the target was changed
   target = "";
-  way = [0, 0]; // errors at that time, m or rad, and rad
+  way = [0, 0]; // errors of position or joints (m or rad) and orientation (rad) at that time
   asked = ""; // target and limits of the latest search, and what it found
   best = { point: [0], distance: 0 };
 
@@ -125,7 +125,10 @@ export class Verdict {
     return best;
   }
 
-  /** The nearest to a target of positions that fill the limits evenly: multiples of 1 / g, 1 / g², … with g ** (n + 1) = g + 1. */
+  /**
+   * The joint positions nearest to a target among evenly distributed ones within the limits: multiples of 1 / g,
+   * 1 / g², … with g ** (n + 1) = g + 1.
+   */
   /** @type {(limits: number[][], wanted: number[]) => number[][]} */
   scattered(limits, wanted) {
     const ends = limits.map((pair) => pair.map((limit, side) => (Math.abs(limit) < 1e3 ? limit : [-Math.PI, Math.PI][side])));
@@ -145,7 +148,7 @@ export class Verdict {
     return zero.length ? [`${zero.join(", ")} = 0: nothing pulls this to its target`] : [];
   }
 
-  /** Share of the samples since the target was changed at which something is so, and of the last quarter of them. */
+  /** Shares of the samples since the last change of the target, and of their last quarter, with a condition. */
   /** @type {(so: (k: number) => boolean) => number[]} */
   shares(so) {
     const last = this.session.count - 1, stride = Math.max(1, Math.ceil((last - this.began) / LOOKED_AT)), found = [];
@@ -179,7 +182,7 @@ export class Verdict {
     });
   }
 
-  /** Efforts that the robot's motors do not have. */
+  /** Lines of the verdict on efforts beyond the URDF's limits. */
   beyond() {
     const { session, joints } = this;
     return session.values.get("limit_effort") === true ? [] : joints.flatMap(({ name, effort }, i) =>
@@ -214,7 +217,7 @@ export class Verdict {
   }
 }
 
-/** A number in four digits. */
+/** A number with four digits. */
 /** @type {(value: number) => string} */
 function short(value) {
   return String(Number((Math.abs(value) < 1e-9 ? 0 : value).toPrecision(4))).replace("-", "\u2212");
@@ -225,13 +228,13 @@ function off(a, b) {
   return a.map((value, i) => value - b[i]);
 }
 
-/** The product of the transpose of rows with them, and a number on its diagonal. */
+/** The product AᵀA of rows A, plus a number on the diagonal. */
 /** @type {(rows: number[][], more: number) => number[][]} */
 function squared(rows, more) {
   return rows[0].map((_, a) => rows[0].map((_, b) => rows.reduce((sum, row) => sum + row[a] * row[b], a === b ? more : 0)));
 }
 
-/** Solution of A y = b of a positive definite matrix, by elimination. */
+/** Solution of A y = b for a positive definite matrix, by elimination. */
 /** @type {(A: number[][], b: number[]) => number[]} */
 function solved(A, b) {
   const rows = A.map((row, i) => [...row, b[i]]), n = b.length;

@@ -1,5 +1,5 @@
-// Unpacks the library and the figures, draws them, and joins them to a legend: its boxes switch
-// joints and bags in all figures, its columns have the values under the cursor.
+// Decompresses the library and the figures, draws them, and links them to a legend. Its boxes show or hide joints
+// and bags in all figures; its columns have the values under the cursor.
 
 import { plotlyContent } from "../../fmu_src/page/unpack.js";
 
@@ -7,7 +7,7 @@ import { plotlyContent } from "../../fmu_src/page/unpack.js";
 /** @typedef {{data: {meta: [number, string, string]}, fullData: {x: ArrayLike<number>}, pointNumber: number, x: number, y: number}} Hovered */
 /** @typedef {{data: {meta: [number | null, string, string]}[], layout: object}} Chart */
 
-const ROUNDING = 1e-12; // smaller values are not shown
+const ROUNDING = 1e-12; // smaller values are shown as 0
 const UNITS_OF = { q: "position", v: "velocity", tau: "effort", error: "distance" };
 
 /** @param {Row} row @param {() => void} changed @returns {HTMLTableRowElement} a box, a look, a name */
@@ -64,7 +64,7 @@ class Legend {
     for (const cell of this.cells.values()) cell.textContent = "";
     const latest = Math.max(...points.map(({ x }) => x));
     for (const { data, fullData, pointNumber, x, y } of points) {
-      if (x < latest && pointNumber === fullData.x.length - 1) continue; // it has ended before
+      if (x < latest && pointNumber === fullData.x.length - 1) continue; // the curve ended earlier
       const cell = this.cells.get(data.meta.join(" "));
       if (cell) cell.textContent = (Math.abs(y) < ROUNDING ? 0 : Number(y)).toPrecision(5).replaceAll("-", "\u2212");
     }

@@ -1,4 +1,4 @@
-// Draws a sweep: two maps side by side, a Pareto front of two metrics, and what is known of the run that is clicked.
+// Draws a sweep: two maps side by side, a Pareto front of two metrics, and the data of the clicked run.
 
 import { plotlyContent } from "../../fmu_src/page/unpack.js";
 
@@ -6,7 +6,7 @@ import { plotlyContent } from "../../fmu_src/page/unpack.js";
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
-/** @returns {any} what all charts have, in the page's colours */
+/** @returns {any} common layout of all charts, in the page's colours */
 function layout() {
   const [ink, hair] = dark.matches ? ["#d5dade", "#3a4046"] : ["#1f2933", "#e6e9ec"];
   const axis = { gridcolor: hair, linecolor: hair, zeroline: false, automargin: true, exponentformat: "power" };
@@ -54,7 +54,7 @@ class SweepPage {
     return { kind, shown, div: box.appendChild(document.createElement("div")) };
   }
 
-  /** @param {string[]} names @returns {boolean[]} which runs no other is better than in both of two metrics */
+  /** @param {string[]} names @returns {boolean[]} runs on the Pareto front of two metrics */
   front([first, second]) {
     const { columns, outcome, beyond } = this.sweep, a = columns[first], b = columns[second];
     const fit = this.runs.map((_, k) => k).filter((k) => a[k] !== null && b[k] !== null && outcome[k] === "finished" && !beyond[k]);
@@ -102,7 +102,7 @@ class SweepPage {
     this.tell();
   }
 
-  /** Show the run that is chosen: its numbers, how to repeat it, and its curves where there is a bag. */
+  /** Show the selected run: its numbers, the command that repeats it, and its curves, if it has a bag. */
   tell() {
     const { columns, outcome, beyond, varied, metrics, curves, fmu, settings } = this.sweep, k = this.chosen, run = this.runs[k];
     const number = (/** @type {string} */ name) => Number(columns[name][k]).toPrecision(4);
