@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 import pytest
-from native_models import Engine, damped_arm, engine, model, shipped
+from native_models import Engine, damped_arm, engine, from_urdf, model, shipped
 from scipy.integrate import solve_ivp
 
 from twodof.plant import integrator
@@ -374,6 +374,38 @@ def test_a_limit_that_is_touched_between_two_ends_of_a_step_stops_the_joint(max_
         plant = shipped(of, **start, q_min=low, q_max=high, rigid_stops=False, max_step=max_step)
         expected = Oracle(plant, max_step=max_step / 50).after(max_step)
         np.testing.assert_allclose(both(of, plant, 1, max_step), [expected] * 2, atol=1e-4, rtol=1e-4)
+
+
+ROTOR = """
+<robot name="rotor">
+  <link name="world"/>
+  <joint name="slide" type="prismatic"><parent link="world"/><child link="carriage"/>
+    <axis xyz="1 0 0"/><limit lower="0" upper="1" effort="0" velocity="0"/></joint>
+  <link name="carriage"><inertial><mass value="0.009"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="turn" type="continuous"><parent link="carriage"/><child link="disc"/><axis xyz="0 0 1"/></joint>
+  <link name="disc"><inertial><origin xyz="0.1 0 0"/><mass value="0.001"/>
+    <inertia ixx="10" iyy="10" izz="10" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>"""
+"""A carriage of 10 g that a rotating imbalance of 1e-4 kg·m moves; a disc so heavy that its speed stays constant."""
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_a_release_that_ends_between_two_looks_at_the_effort_is_found_by_both_flavours(rigid):
+    """The imbalance pulls the carriage off its stop for 80 mrad, once within a step: q̈ = k (cos θ − cos θ*)."""
+    width, speed, k = 0.04, 100.0, 100.0
+    h = (0.875 + 2.0 * width) / speed
+    of = Engine(from_urdf(ROTOR, "disc", "xy", "effort"))
+    plant = of.model.plant()
+    plant.q_start, plant.v_start, plant.tau_cmd = [0.0, -0.875], [0.0, speed], [-0.01 * k * np.cos(width), 0.0]
+    plant.atol, plant.max_step, plant.rigid_stops = 1e-3, h, rigid
+    plant.initialise()
+    turned, end = 3.0 * width, 2.0 * width  # since the release, and θ at the end
+    v = np.sin(end) + np.sin(width) - np.cos(width) * turned
+    q = np.cos(width) - np.cos(end) + np.sin(width) * turned - np.cos(width) * turned**2 / 2.0
+    found = both(of, plant, 1, h)
+    np.testing.assert_allclose(found[:, 0], k / speed**2 * q, rtol=1e-4)
+    np.testing.assert_allclose(found[:, 2], k / speed * v, atol=1e-4 * k / speed * width**3)
 
 
 @pytest.mark.parametrize("name", ["tiago", "tiago_dual"])
