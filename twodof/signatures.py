@@ -1,8 +1,9 @@
 """Shared keywords of functions, and default callbacks."""
 
 from collections.abc import Callable, Iterable
+from functools import wraps
 from inspect import Parameter, signature
-from typing import TypeVar
+from typing import TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -16,26 +17,37 @@ def ignore(*_: object) -> None:
     """Do nothing with the arguments."""
 
 
-def with_keywords_of(*delegates: Callable[..., object]) -> Callable[[Function], Function]:
-    """Return a decorator that adds the delegates' keywords to the signature of a function with ``**options``.
+def with_keywords_of(*delegates: Callable[..., object], name: str = "") -> Callable[[Function], Function]:
+    """Return a decorator that shows and checks the delegates' keywords of a function with ``**options``.
 
-    Type checkers know these keywords from PEP 692; ``help``, editors and ``check_keywords`` read the signature.
+    Type checkers know the keywords by PEP 692, ``help`` and editors by this. A call with another keyword raises a
+    TypeError that names the function.
+
+    Args:
+        delegates: functions whose keywords the function accepts.
+        name: name of the function if it is an alias.
     """
 
     def shown(function: Function) -> Function:
+        @wraps(function)
+        def checked(*arguments: object, **keywords: object) -> object:
+            _check_keywords(keywords, checked)
+            return function(*arguments, **keywords)
+
         own = signature(function)
-        named = {name: p for name, p in own.parameters.items() if p.kind is not Parameter.VAR_KEYWORD}
+        named = {key: p for key, p in own.parameters.items() if p.kind is not Parameter.VAR_KEYWORD}
         for delegate in delegates:
-            for name, parameter in signature(delegate).parameters.items():
+            for key, parameter in signature(delegate).parameters.items():
                 if parameter.kind is Parameter.KEYWORD_ONLY:
-                    named.setdefault(name, parameter)
-        function.__signature__ = own.replace(parameters=[*named.values()])  # type: ignore[attr-defined]
-        return function
+                    named.setdefault(key, parameter)
+        checked.__signature__ = own.replace(parameters=[*named.values()])  # type: ignore[attr-defined]
+        checked.__name__ = checked.__qualname__ = name or function.__name__
+        return cast(Function, checked)
 
     return shown
 
 
-def check_keywords(given: Iterable[str], called: Callable[..., object]) -> None:
+def _check_keywords(given: Iterable[str], called: Callable[..., object]) -> None:
     """Refuse keywords that a function with ``**options`` does not accept.
 
     Raises:

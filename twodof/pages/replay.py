@@ -24,7 +24,7 @@ from ..plots.film import PICTURES as PICTURES
 from ..plots.film import film
 from ..plots.scripts import packed
 from ..plots.track import Track, read_tracks
-from ..signatures import check_keywords, ignore, never, with_keywords_of
+from ..signatures import ignore, never, with_keywords_of
 from .arm import RECORDED, Arm, arm_page
 from .serving import HOST, PORT, Server
 
@@ -180,7 +180,6 @@ def view(
         host, port: address to listen on.
         robot: options of ``replay``.
     """
-    check_keywords(robot, view)
     page, remarks = replay(bag, **robot)
     with Server(page, host, port) as server:
         opened(server.url, remarks)

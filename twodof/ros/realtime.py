@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from ..errors import InputError
 from ..fmu import Fmu
-from ..signatures import check_keywords, ignore, never, with_keywords_of
+from ..signatures import ignore, never, with_keywords_of
 from ..simulation.experiments import Experiment, ExperimentOptions, experiment
 from ..simulation.master import Member, Steer, as_experiment, simulate, simulate_together
 from ..simulation.pace import RealTime
@@ -51,7 +51,7 @@ def publish(
         PublishError: in lockstep no command arrived in time.
         SimulationError: the FMU refused or failed a call.
     """
-    run = as_experiment(publish, run, options, {"stop_time": inf})
+    run = as_experiment(run, options, {"stop_time": inf})
     publisher = publisher or Publisher()
     if pace is None and not publisher.lockstep:
         pace = RealTime()
@@ -95,7 +95,6 @@ def publish_together(
     Raises:
         FmuError, InputError, PublishError, SimulationError: as ``publish``.
     """
-    check_keywords(options, publish_together)
     if pace is None and not options.get("lockstep"):
         pace = RealTime()
     if not robots:

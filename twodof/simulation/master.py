@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..errors import InputError, SimulationError, diverged, step_failure
 from ..fmu import Fmu, Instance, instantiate
 from ..plant.urdf import Urdf
-from ..signatures import check_keywords, ignore, never, with_keywords_of
+from ..signatures import ignore, never, with_keywords_of
 from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOptions, experiment, pop_until
 from .input_values import Setting, Value, resolve
 from .judge import BLOCK, OUTPUTS, Judge
@@ -75,7 +75,7 @@ def samples(
         FmuError, InputError: before the first sample.
         SimulationError: the FMU refused or failed a call, or gave a value that is not finite.
     """
-    run = as_experiment(samples, run, options)
+    run = as_experiment(run, options)
     yield from _stepped(run, None, pace, stop, ready, resume, instance)
 
 
@@ -129,18 +129,13 @@ def _stepped(
 
 
 def as_experiment(
-    called: Callable[..., object],
-    run: Experiment | Fmu | str | Path,
-    options: ExperimentOptions,
-    usual: ExperimentOptions | None = None,
+    run: Experiment | Fmu | str | Path, options: ExperimentOptions, usual: ExperimentOptions | None = None
 ) -> Experiment:
     """Return the experiment itself, or make one from an FMU and the options of ``experiment``.
 
     Raises:
         FmuError, InputError: as ``experiment``; or options are given together with an experiment.
-        TypeError: the function ``called`` has no keyword of an option's name.
     """
-    check_keywords(options, called)
     if not isinstance(run, Experiment):
         merged: ExperimentOptions = options if usual is None else {**usual, **options}
         return experiment(run, **merged)
@@ -231,12 +226,12 @@ def simulate(
         steer: called after each sample; returns new inputs, which apply from that sample's time on. Inputs
             that a sink commands take precedence.
     """
-    run = as_experiment(simulate, run, options)
+    run = as_experiment(run, options)
     member = Member(run, sinks, steer, resume, instance)
     return simulate_together([member], pace=pace, stop=stop)[0]
 
 
-run = simulate  # the name of the command
+run = with_keywords_of(name="run")(simulate)  # the name of the command
 
 
 def judge_of(run: Experiment, robot: Urdf | None) -> Judge:
