@@ -242,19 +242,28 @@ def test_reader_that_leaves_early_gets_no_traceback(line: str, folder: Path) -> 
     assert err == ""
 
 
-@pytest.mark.parametrize("output", ["/dev/full", None])
-def test_output_that_cannot_be_written_gives_no_traceback(output: str | None, folder: Path) -> None:
-    redirect = f">{output}" if output else ">&-"
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", ["info arm.fmu", "--help", "--version", "help run", "run --help"])
+def test_a_full_disk_under_the_output_is_an_error(arguments: str, unbuffered: str, folder: Path) -> None:
+    assert redirected(arguments, ">/dev/full", folder, unbuffered) == (1, "twodof: error: No space left on device\n")
+
+
+def test_a_closed_output_is_no_error(folder: Path) -> None:
+    assert redirected("info arm.fmu", ">&-", folder) == (0, "")
+
+
+def redirected(arguments: str, redirect: str, folder: Path, unbuffered: str = "") -> tuple[int, str]:
+    """Exit status and errors of a command whose output goes elsewhere."""
     done = subprocess.run(
-        ["sh", "-c", f'"$0" "$@" {redirect}', *COMMAND, "info", "arm.fmu"],
+        ["sh", "-c", f'"$0" "$@" {redirect}', *COMMAND, *arguments.split()],
         cwd=folder,
-        env=ENVIRONMENT,
+        env={**ENVIRONMENT, "PYTHONUNBUFFERED": unbuffered},
         stderr=subprocess.PIPE,
         text=True,
         timeout=120,
+        check=False,
     )
-    assert "Traceback" not in done.stderr
-    assert len(done.stderr.splitlines()) <= 1
+    return done.returncode, done.stderr
 
 
 @pytest.mark.parametrize("verb", ["", *(verb.__name__.rpartition(".")[2] for verb in VERBS)])

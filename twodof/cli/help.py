@@ -104,6 +104,13 @@ class Parser(argparse.ArgumentParser):
         message = re.sub(r"invalid (float|int) value: ('.*')$", r"\2 is not a number; leave units out", message)
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Write help, or raise: argparse ignores that it cannot be written, where output is not buffered."""
+        if file is sys.stdout is not None:
+            sys.stdout.write(message)
+        else:
+            super()._print_message(message, file)
+
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Flush the help before the process ends, so that the error of a closed pipe can be caught."""
         if sys.stdout is not None:
