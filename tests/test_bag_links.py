@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -75,6 +76,16 @@ def test_linked_messages_are_refused(linked: Path, capsys: pytest.CaptureFixture
         twodof.read_bag(linked)
     assert target.read_bytes() == before
     assert sorted(path.name for path in linked.parent.iterdir()) == ["bag", "private"]
+
+
+def test_a_pipe_in_the_place_of_messages_is_refused(linked: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = (path for path in linked.iterdir() if path.suffix in (".mcap", ".db3"))
+    file.unlink()
+    os.mkfifo(file)
+    for command in ("info", "recover"):
+        assert main([command, str(linked)]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == f"twodof: error: '{file}' is no regular file; remove it from the bag"
 
 
 def test_a_bag_that_the_user_names_by_a_link_is_read(linked: Path) -> None:

@@ -18,15 +18,16 @@ def storage_files(folder: Path) -> list[Path]:
     A single MCAP file, as pages and other tools write it, is a bag too.
 
     Raises:
-        BagError: a file is a link: an untrusted bag could name any file of this machine.
+        BagError: a file is a link, as an untrusted bag could name any file of this machine, or a pipe or device.
     """
     if folder.suffix == ".mcap" and folder.is_file():
         return [folder]
     named = [p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")]
     if link := next((p for p in named if p.is_symlink()), None):
         raise BagError(f"'{link}' is a link, and links in a bag are not followed; copy the file")
-    files = [p for p in named if p.is_file()]
-    return sorted(files, key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
+    if odd := next((p for p in named if not (p.is_file() or p.is_dir())), None):
+        raise BagError(f"'{odd}' is no regular file; remove it from the bag")
+    return sorted(filter(Path.is_file, named), key=lambda p: [int(n) for n in re.findall(r"\d{1,9}", p.stem)][-1:])
 
 
 def stated_count(folder: Path) -> int | None:
