@@ -438,6 +438,10 @@ def test_the_environment_of_ros_2(variables: dict[str, str], place: Network) -> 
         ),
         ({"CYCLONEDDS_URI": "<CycloneDDS></Domain>"}, "parser error.*correct CYCLONEDDS_URI"),
         ({"CYCLONEDDS_URI": "<Größe/>"}, "cannot be opened.*correct CYCLONEDDS_URI"),
+        (
+            {"CYCLONEDDS_URI": "<Domain><General><Transport>udp6</Transport></General></Domain>"},
+            "localhost: unknown address; correct CYCLONEDDS_URI",
+        ),
         ({"ROS_STATIC_PEERS": "127.0.0.1;a b"}, "ROS_STATIC_PEERS: 'a b' is not found"),
     ],
 )

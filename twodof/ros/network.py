@@ -10,6 +10,7 @@ import re
 import socket
 import stat
 import struct
+import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -30,6 +31,14 @@ LAST_DOMAIN = 232  # ports of larger domains would exceed 65535
 LOOPBACK = {"lo": "127.0.0.1"}
 MOST_PARTICIPANTS = 32  # participants of one host that are searched, as in rmw_cyclonedds
 NO_NETWORK = "<CycloneDDS><Domain><General><Transport>none</Transport></General></Domain></CycloneDDS>"
+OPEN = """
+import sys
+from contextlib import suppress
+sys.path[:] = sys.argv[3:]
+with suppress(Exception):
+    from cyclonedds.domain import Domain
+    Domain(int(sys.argv[1]), sys.argv[2])
+"""
 ANNOUNCED = 1  # s between two announcements to participants of this host
 SO_ATTACH_FILTER = 26  # on Linux, for all supported architectures
 INTERFACE, SOURCE = 0xFFFFF008, 0xFFF0000C  # packet filter: offsets of interface and IPv4 source
@@ -242,8 +251,10 @@ def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, 
         try:
             with errors.open("wb") as file:
                 os.dup2(file.fileno(), 2)
+            configuration = network.configuration(str(trace), own)
+            aborts = bool(network.custom) and _aborts(network.domain, configuration)
             with network.guarded():
-                opened = domain.Domain(network.domain, network.configuration(str(trace), own))
+                opened = None if aborts else domain.Domain(network.domain, configuration)
         except (core.DDSException, UnicodeEncodeError):
             opened = None
         finally:
@@ -254,5 +265,11 @@ def _try_to_open(network: Network, own: Mapping[str, str] | None) -> tuple[Any, 
     present = dict(re.findall(r"(\S+) udp/([\d.]+)", "".join(re.findall(": interfaces: .*", account))))
     chosen = re.findall(r"(\S+) \(index", "".join(re.findall("selected interfaces: .*", account)))
     # each line of an error begins with time, domain and program
-    messages = "; ".join(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
-    return opened, {name: present.get(name, "localhost") for name in chosen}, messages
+    messages = dict.fromkeys(re.sub(r"^[\d.]+ \[\d*\] +\S+: ", "", line) for line in lines)
+    return opened, {name: present.get(name, "localhost") for name in chosen}, "; ".join(messages)
+
+
+def _aborts(number: int, configuration: str) -> bool:
+    """Return whether Cyclone DDS aborts the process that opens this domain, as for addresses of another family."""
+    command = [sys.executable, "-I", "-c", OPEN, str(number), configuration, *sys.path]
+    return subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode < 0
