@@ -262,8 +262,8 @@ def zig_cache() -> Path | None:
         cache.parent.mkdir(parents=True, exist_ok=True)
         cache.mkdir(mode=0o700, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
-        if not _is_ours(cache):
-            fault = f"its cache '{cache}' is another user's, or others write to it"
+        if not _is_ours(cache) or not all(_is_ours(part, 0o002) for part in cache.iterdir()):
+            fault = f"its cache '{cache}', or a part of it, is another user's, or others write to it"
     except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
         if named:
             reason = error.strerror if isinstance(error, OSError) else error
@@ -277,7 +277,10 @@ def zig_cache() -> Path | None:
     return cache
 
 
-def _is_ours(path: Path) -> bool:
-    """Return whether only this user and root can write a file or folder."""
+def _is_ours(path: Path, writers: int = 0o022) -> bool:
+    """Return whether only this user and root can write a file or folder.
+
+    Zig makes its folders in a cache by the umask, which may let the user's own group write.
+    """
     state = path.stat()
-    return state.st_uid == os.geteuid() and not state.st_mode & 0o022
+    return state.st_uid == os.geteuid() and not state.st_mode & writers
