@@ -21,8 +21,8 @@ import numpy as np
 from ..bag.provenance import provenance_of
 from ..bag.storage import profile
 from ..bounds import MAX_HEAD, MAX_SOURCE
-from ..errors import PageError
-from ..export.compiler import compile_web_module, standard_headers
+from ..errors import BuildError, PageError
+from ..export.compiler import compile_web_module, compiles_for_the_web, standard_headers
 from ..files import data_file, head_of, read_member, refusing, write_file
 from ..fmu import Fmu, opened, read_resource
 from ..geometry.kinematics import Kinematics, Placement
@@ -98,7 +98,16 @@ def page_of(run: Experiment) -> bytes:
         raise PageError(f"'{fmu.path}' has no plant in C, as native FMUs of this package have; build one with `native`")
     arm = arm_of(run)
     files = {**standard_headers(), **sources, "page.c": _asset("page.c").encode()}
-    module = compile_web_module(files, ["page.c"])  # a page needs no derivatives
+    try:
+        module = compile_web_module(files, ["page.c"])  # a page needs no derivatives
+    except BuildError as error:
+        from ..export.flavours import engine_sources  # Pinocchio takes long to import
+
+        own = engine_sources(fmu.control, fmu.version).items()
+        if sources.items() >= own or not compiles_for_the_web():
+            raise
+        reason = "another version of twodof built it, and its C sources do not fit the page of this one"
+        raise PageError(f"'{fmu.path}': {reason}; build it again") from error
     provenance = provenance_of(run, "")
     provenance["versions"] = {"twodof": provenance["versions"]["twodof"]}  # a page uses only this package
     engine, allowed = {"engine": packed(module)}, " 'wasm-unsafe-eval'"
