@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import browser
@@ -50,6 +52,12 @@ def test_a_notebook_runs_and_its_stored_outputs_are_current(name: str, tmp_path:
     assert sum("<svg" in text for text in html) == PICTURES[name]
     assert ["image/png", "text/plain"] in [kinds for cell in before for kinds, _ in cell]
     assert path.stat().st_size < MAX_SIZE
+
+
+def test_an_arm_is_shown_without_what_takes_long_to_import(native_path: Path) -> None:
+    code = "import sys, twodof; twodof.show(sys.argv[1]); print({*sys.modules} & {'matplotlib', 'pinocchio', 'pandas'})"
+    done = subprocess.run([sys.executable, "-c", code, native_path], check=True, stdout=subprocess.PIPE, text=True)
+    assert done.stdout == "set()\n"
 
 
 def test_a_cell_that_fails_is_an_error(tmp_path: Path) -> None:

@@ -29,12 +29,12 @@ def add(view: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     check_company(options, excludes={"--host": "--export", "--port": "--export"})
-    from ..pages.replay import PICTURES, export, view
+    from ..pages.replay import FILMS, export, view
 
     robot = given_options(options, "urdf", "mesh_dir", "frame", "fmu")
     if options.export:
         _print_remarks(export(options.bag, options.export, **robot))
-        film = Path(options.export).suffix.lower() in PICTURES
+        film = Path(options.export).suffix.lower() in FILMS
         say(f"film  {options.export}" if film else f"page  {options.export}; it needs no network")
         return 0
     with asked_to_stop() as asked:

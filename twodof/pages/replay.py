@@ -20,8 +20,6 @@ from ..geometry.kinematics import Array
 from ..geometry.meshes import ReadMesh
 from ..geometry.shapes import Shape, link_shapes
 from ..plant.urdf import RobotError, read_urdf
-from ..plots.film import PICTURES as PICTURES
-from ..plots.film import film
 from ..plots.scripts import packed
 from ..plots.track import Track, read_tracks
 from ..signatures import ignore, never, with_keywords_of
@@ -31,6 +29,8 @@ from .serving import HOST, PORT, Server
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+FILMS = (".mp4", ".webp", ".gif", ".png")
+"""Suffixes of films, and of the picture at the end."""
 MOST_SAMPLES = 100_000  # of a bag with more samples, at most a quarter of this number is shown
 NO_ROBOT = '<robot name="none"><link name="base"/></robot>'
 IDLE = 0.05  # s between two checks of ``stop``
@@ -194,14 +194,16 @@ def export(bag: Recording | str | Path, path: str | Path, **robot: Unpack[RobotO
         PageError: the suffix is unknown, an option has no effect, or the file cannot be written.
     """
     suffix = Path(path).suffix.lower()
-    if suffix in PICTURES:
+    if suffix in FILMS:
         useless = [name for name in ("mesh_dir", "fmu") if robot.get(name) is not None]
         if useless:
             raise PageError(f"a film shows the arm as lines: `{useless[0]}`, of its meshes, does nothing")
+        from ..plots.film import film  # Matplotlib takes half a second to import
+
         film(bag, path, urdf=robot.get("urdf"), frame=robot.get("frame"))
         return []
     if suffix not in ("", ".html", ".htm"):
-        raise PageError(f"'{path}': the name of an export ends in .html, {', '.join(PICTURES)}")
+        raise PageError(f"'{path}': the name of an export ends in .html, {', '.join(FILMS)}")
     page, remarks = replay(bag, **robot)
     with refusing(PageError, f"write '{path}'"):
         write_file(Path(path), page)

@@ -39,8 +39,6 @@ FILMS: dict[str, Style] = {
     ".gif": dict(fps=25, codec="gif", pix_fmt_out="pal8", output_params=["-filter_complex", PALETTE]),
 }
 """Options of FFmpeg by suffix; a frame of a GIF lasts a whole number of hundredths of a second."""
-PICTURES = (*FILMS, ".png")
-"""Suffixes of the formats; a PNG is the picture at the end of the run."""
 
 
 def film(
@@ -50,7 +48,7 @@ def film(
 
     Args:
         bag: the bag, or its folder.
-        output: the file, written completely or not at all; its suffix (``PICTURES``) selects the format.
+        output: the file, written completely or not at all; its suffix, of ``FILMS`` or .png, selects the format.
         urdf, frame: the robot and its end effector, as in ``track.read_tracks``.
 
     Raises:
