@@ -55,7 +55,7 @@ LIBRARIES = {
     "rosbags": {"ros", "bag"},
     "scipy": {"export", "geometry", "identification"},  # its rotations; filters and least squares
     "simpleeval": {"export"},
-    "tqdm": {"cli"},
+    "tqdm": {"simulation"},
     "trimesh": {"geometry"},
     "websockets": {"pages"},
     "xacro": {"export"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +59,23 @@ def test_an_arm_is_shown_without_what_takes_long_to_import(native_path: Path) ->
     code = "import sys, twodof; twodof.show(sys.argv[1]); print({*sys.modules} & {'matplotlib', 'pinocchio', 'pandas'})"
     done = subprocess.run([sys.executable, "-c", code, native_path], check=True, stdout=subprocess.PIPE, text=True)
     assert done.stdout == "set()\n"
+
+
+@pytest.mark.parametrize(("silence", "shown"), [(0, True), (1e6, False)])
+def test_a_notebook_shows_bars_of_what_takes_long(
+    native_path: Path, tmp_path: Path, silence: float, shown: bool
+) -> None:
+    """Text where ipywidgets are missing, else widgets; a script shows none."""
+    shutil.copy(native_path, tmp_path / "arm.fmu")
+    begin = f"import twodof\nfrom twodof.simulation import progress\nprogress.SILENCE = {silence}"
+    run, sweep = "twodof.run('arm.fmu', stop_time=60);", "twodof.sweep('arm.fmu', grid={'Kp': [20, 60]}, stop_time=1);"
+    notebook = executed(notebook_of((begin, run, sweep)), tmp_path)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    told = ["".join(o.get("text") or o["data"]["text/plain"] for o in cell.outputs) for cell in cells]
+    assert ["simulating" in told[1], "/60.0 s, " in told[1], "sweeping" in told[2], "/2 " in told[2]] == [shown] * 4
+    assert shown or told == ["", "", ""]
+    script = subprocess.run([sys.executable, "-c", "\n".join((begin, run, sweep))], cwd=tmp_path, capture_output=True)
+    assert (script.returncode, script.stderr) == (0, b"")
 
 
 def test_a_cell_that_fails_is_an_error(tmp_path: Path) -> None:

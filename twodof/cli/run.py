@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from ..simulation.experiments import Experiment
     from ..simulation.pace import RealTime
     from ..simulation.run_summary import Summary
-    from ..simulation.sample import Sample, Sink
-
-BAR = "{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left"
 
 
 def add(run: argparse.ArgumentParser) -> None:
@@ -50,6 +47,7 @@ def call(options: argparse.Namespace) -> int:
     from ..simulation.expressions import expression
     from ..simulation.master import simulate
     from ..simulation.pace import RealTime
+    from ..simulation.progress import Progress
     from ..simulation.verdict import RESULTS
 
     if options.stop_time == math.inf:
@@ -59,8 +57,9 @@ def call(options: argparse.Namespace) -> int:
     run = experiment_of(options, options.stop_time, options.step)
     bag = bag_of(options, options.output or dated("rosbag2"), measured=options.measured)
     pace = RealTime() if options.realtime else None
+    bars = [Progress()] if sys.stderr.isatty() else []
     with asked_to_stop() as asked:
-        summary = simulate(run, bag, *_progress(), pace=pace, stop=asked)
+        summary = simulate(run, bag, *bars, pace=pace, stop=asked)
     decided = summary.verdict.failed_by(*options.fail_if)
     if options.json:
         print_json(**facts_of(run, bag, summary, pace), failed_by=decided or None)
@@ -162,26 +161,3 @@ def print_summary(
 def verdict_rows(lines: Sequence[str]) -> list[tuple[str, str]]:
     """Return rows of a table with the lines of a verdict."""
     return [("" if i else "verdict", line) for i, line in enumerate(lines)]
-
-
-def _progress() -> list[Sink]:
-    """Return a sink that shows a progress bar on a terminal, and nothing in a pipe."""
-    if not sys.stderr.isatty():
-        return []
-    from tqdm import tqdm
-
-    from ..simulation.sample import Sink
-
-    class Progress(Sink):
-        def begin(self, run: Experiment) -> Progress:
-            self._step = run.step
-            self._bar = tqdm(total=run.steps * run.step, unit="s", leave=False, desc="simulating", bar_format=BAR)
-            return self
-
-        def write(self, sample: Sample) -> None:
-            self._bar.update(self._step if sample.k else 0.0)
-
-        def __exit__(self, *exception: object) -> None:
-            self._bar.close()
-
-    return [Progress()]

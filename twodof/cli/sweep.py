@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterable
 from functools import partial
@@ -71,8 +72,7 @@ def add(sweep: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
-    from tqdm import tqdm
-
+    from ..simulation.progress import counting
     from ..sweeps.coordinator import sweep
     from ..sweeps.ranking import cost_of
 
@@ -84,14 +84,12 @@ def call(options: argparse.Namespace) -> int:
     output = Path(options.output or dated("sweep"))
     begin = time.perf_counter()
     total = 0
-    with asked_to_stop() as asked, tqdm(unit="run", disable=None, leave=False, desc="sweeping", smoothing=0.05) as bar:
+    with asked_to_stop() as asked, counting("sweeping", "run", shown=sys.stderr.isatty()) as show:
 
         def progress(done: int, runs: int) -> None:
             nonlocal total
-            if not total:  # runs of an earlier sweep must not count for the rate
-                bar.total, bar.initial, bar.n = runs, done, done
             total = runs
-            bar.update(done - bar.n)
+            show(done, runs)
 
         table = sweep(
             fmu,

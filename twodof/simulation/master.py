@@ -27,6 +27,7 @@ from .experiments import NANOSECONDS, TIME_TOLERANCE, Experiment, ExperimentOpti
 from .input_values import Setting, Value, resolve
 from .judge import BLOCK, OUTPUTS, Judge
 from .pace import RealTime
+from .progress import Progress, in_notebook
 from .run_summary import Summary
 from .sample import Sample, Sink
 from .setup import robot_of, setup_of
@@ -218,7 +219,7 @@ def simulate(
     resume: Resume = ignore,
     **options: Unpack[ExperimentOptions],
 ) -> Summary:
-    """Run an FMU and pass every sample to every sink; sinks open once the FMU is initialised.
+    """Run an FMU and pass every sample to every sink; sinks open once the FMU is initialised. A notebook shows a bar.
 
     Other arguments and errors as in ``samples``.
 
@@ -227,7 +228,8 @@ def simulate(
             that a sink commands take precedence.
     """
     run = as_experiment(run, options)
-    member = Member(run, sinks, steer, resume, instance)
+    bars = (Progress(),) if in_notebook() else ()
+    member = Member(run, (*sinks, *bars), steer, resume, instance)
     return simulate_together([member], pace=pace, stop=stop)[0]
 
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from ..files import temporary_folder
 from ..fmu import Fmu, opened
-from ..signatures import ignore, never
+from ..signatures import never
 from ..simulation.experiments import Experiment, experiment
 from ..simulation.input_values import Setting
+from ..simulation.progress import counting, in_notebook
 from ..version import versions
 from .batches import Batches
 from .design import Design, make_design
@@ -46,7 +47,7 @@ def sweep(
     bags: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] = ignore,
+    progress: Callable[[int, int], None] | None = None,
     stop: Callable[[], bool] = never,
     command_line: str = "",
 ) -> pandas.DataFrame:
@@ -67,7 +68,7 @@ def sweep(
         workers: number of local processes; None: one for each core.
         scheduler: address of a Dask scheduler whose workers are used instead. Anybody who can reach it can
             run code as you, unless Dask is configured to use TLS.
-        progress: called with the number of finished runs and of all runs.
+        progress: called with the number of finished runs and of all runs; None: a notebook shows a bar.
         stop: called at least twice a second; True ends the sweep with the finished runs.
         command_line: command line for the provenance.
 
@@ -79,7 +80,8 @@ def sweep(
     """
     run = experiment(fmu, stop_time=stop_time, step=step, settings=settings)
     design = make_design(run.fmu, grid or {}, ranges or {}, random, seed, run.given)
-    with temporary_folder() as spare:
+    with temporary_folder() as spare, counting("sweeping", "run", shown=progress is None and in_notebook()) as show:
+        progress = progress or show
         path = spare / "sweep" if output is None else Path(output)
         job = _job(run, stop_time, design.names, path.resolve() / "bags" if bags else None)
         provenance = _provenance(run.fmu, design, job, command_line)

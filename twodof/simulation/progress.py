@@ -1,0 +1,63 @@
+"""Progress bars, on a terminal and in notebooks."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any
+
+from .sample import Sample, Sink
+
+if TYPE_CHECKING:
+    from .experiments import Experiment
+
+SILENCE = 1.0  # s until a notebook shows a bar
+BAR = "{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s, {remaining} left"
+
+
+def in_notebook() -> bool:
+    """Return whether the kernel of a notebook runs this process."""
+    return "ipykernel.zmqshell" in sys.modules
+
+
+def _bar(what: str, unit: str, **options: Any) -> Any:
+    """Return a bar of tqdm that vanishes at its end; a widget where the notebook has them, else text."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ipywidgets may be missing
+        from tqdm.auto import tqdm
+    return tqdm(desc=what, unit=unit, leave=False, delay=SILENCE * in_notebook(), **options)
+
+
+@contextmanager
+def counting(what: str, unit: str, *, shown: bool) -> Iterator[Callable[[int, int], None]]:
+    """Return a function that shows the numbers of what is done and of all, if it is to."""
+    with ExitStack() as stack:
+        bar: Any = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal bar
+            if bar is None:  # runs of an earlier sweep must not count for the rate
+                options = {"total": total, "initial": done, "smoothing": 0.05, "disable": not shown}
+                bar = stack.enter_context(_bar(what, unit, **options))
+            bar.update(done - bar.n)
+
+        yield show
+
+
+class Progress(Sink):
+    """Bar of the simulated time."""
+
+    def begin(self, run: Experiment) -> Progress:
+        """Receive the experiment; return self."""
+        self._step = run.step
+        self._bar = _bar("simulating", "s", total=run.steps * run.step, bar_format=BAR)
+        return self
+
+    def write(self, sample: Sample) -> None:
+        """Show the time of a sample."""
+        self._bar.update(self._step if sample.k else 0.0)
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.close()
