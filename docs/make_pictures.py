@@ -1,11 +1,10 @@
-"""Make the pictures of docs/ that matplotlib draws, and fmu_src/model.png, the icon of FMUs.
+"""Make the pictures of docs/ that matplotlib draws.
 
     python docs/make_pictures.py
 
 arm.png shows the default run, from the samples of the FMU, with the arm drawn from its meshes as seen from above.
 plot.png shows three gains; first.png, steered.png and gantry.png the runs of the tutorial, by its own commands; map.png
-and load.png the sweeps in docs/gains.md. The icon is for FMI tools and suits the FMU of any robot. Needs the extras
-'view', 'sweep' and 'native'.
+and load.png the sweeps in docs/gains.md. Needs the extras 'view', 'sweep' and 'native'.
 """
 
 from __future__ import annotations
@@ -15,13 +14,12 @@ import re
 import subprocess
 import sys
 import tempfile
-from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch
+from matplotlib.patches import Arc
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -60,7 +58,6 @@ def main() -> None:
         draw_map(native, loads, {"Kd": 80.0, "limit_effort": True}, ROOT / "docs" / "load.png")
         draw_sampled(Path(folder), ROOT / "docs" / "sampled.png")
     draw_arm(samples, ROOT / "docs" / "arm.png")
-    draw_icon(ROOT / "fmu_src" / "model.png")
 
 
 # --- the arm ---
@@ -289,48 +286,6 @@ def sampled_radius(T: float, delay: float, Kp: float, Kd: float) -> float:
     step[2, 0], step[3] = 1.0, command
     step[4:, 3:-1] = np.eye(whole)
     return float(np.abs(np.linalg.eigvals(step)).max())
-
-
-# --- the icon ---
-
-
-def draw_icon(path: Path) -> None:
-    """Draw a robot arm in a block, with inputs on the left and outputs on the right."""
-    figure = plt.figure(figsize=(3.0, 2.0), dpi=100)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0, 300), ylim=(0, 200))
-    axes.axis("off")
-    axes.add_patch(
-        FancyBboxPatch(
-            (74, 8), 152, 184, boxstyle="round,pad=0,rounding_size=10", facecolor="#f4f6f8", edgecolor=INK, lw=1.6
-        )
-    )
-    arm = np.array([[116, 42], [116, 88], [158, 138], [198, 110]], dtype=float)
-    axes.plot([94, 138], [30, 30], color=INK, lw=5, solid_capstyle="round")
-    looks = ((INK, 15), ("#54657c", 12), (ORANGE, 9))
-    for link, (colour, width) in zip(pairwise(arm), looks, strict=True):
-        axes.plot(*np.transpose(link), color=colour, lw=width, solid_capstyle="round")
-    for joint, radius in zip(arm[1:3], (6.0, 5.0), strict=True):
-        axes.add_patch(Circle(joint, radius, facecolor="white", edgecolor=INK, lw=1.2, zorder=5))
-    axes.add_patch(Circle(arm[3], 3.4, facecolor="white", edgecolor=INK, lw=1.2, zorder=5))
-    labels = {"fontsize": 12, "va": "center"}
-    for text, y in (("$x_{des}$", 150), ("$K_p$", 100), ("$K_d$", 50)):
-        axes.text(8, y, text, ha="left", **labels)
-        arrow(axes, 48, 74, y)
-    for text, y in (("$q$", 130), ("$v$", 70)):
-        arrow(axes, 226, 258, y)
-        axes.text(270, y, text, ha="left", **labels)
-    figure.savefig(path, transparent=True, pil_kwargs={"optimize": True}, metadata={"Software": None})
-    plt.close(figure)
-
-
-def arrow(axes: plt.Axes, start: float, end: float, y: float) -> None:
-    """Draw a signal from left to right."""
-    axes.add_patch(
-        FancyArrowPatch(
-            (start, y), (end, y), arrowstyle="-|>", mutation_scale=13, color=BLUE, lw=1.8, shrinkA=0, shrinkB=0
-        )
-    )
 
 
 if __name__ == "__main__":

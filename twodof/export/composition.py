@@ -17,6 +17,7 @@ from .compiler import PLATFORMS, TARGETS, host_platform
 from .documentation import documentation
 from .flavours import Files, Flavour, native_flavour, python_flavour
 from .fmu_options import FmuOptions
+from .icon import icon
 from .mesh_files import collect_meshes
 from .model_description import model_description
 from .native import engine_variables
@@ -67,7 +68,7 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     guid = digest.hexdigest()
     description = model_description(options, robot, variables, flavour, guid)
     files["modelDescription.xml"] = description
-    files[ICONS[flavour.fmi]] = data_file("fmu_src", "model.png").read_bytes()
+    files[ICONS[flavour.fmi]] = icon(read_urdf(urdf), robot, starts["q_start"])
 
     def finish() -> Files:
         """Return the files that the GUID does not cover: binaries and documentation."""

@@ -14,12 +14,12 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import fmpy
-import numpy as np
 from fmpy.model_description import ModelDescription, ModelVariable, ValidationError
 
 from ..bounds import MAX_DESCRIPTION, MAX_RESOURCE
 from ..errors import ZIP_ERRORS, FmuError, kind_of, no_such
 from ..export.compiler import host_platform
+from ..export.icon import side_view
 from ..export.start_values import groups_of, vector
 from ..files import UnsafeArchiveError, check_archive, read_member, shown
 from ..notebook import card, picture
@@ -159,9 +159,8 @@ def _pose(fmu: Fmu) -> str:
     q = [[float(fmu.start_values.get(name, 0.0)) for name in fmu.vector("q_start")]]
     kinematics, parents = Kinematics(urdf, fmu.joints[: len(q[0])]), {joint.parent for joint in urdf.joints.values()}
     chains = [urdf.chain(link) for link in urdf.links if link not in parents]
-    bodies = [np.concatenate([frame.translation for frame in kinematics.along(chain, q)]) for chain in chains]
-    a, b = sorted(np.argsort(np.ptp(np.concatenate(bodies), axis=0))[1:])
-    return picture(((body[:, a], body[:, b]) for body in bodies), f"{'xyz'[a]} in m", f"{'xyz'[b]} in m", equal=True)
+    lines, axes = side_view([[at.translation[0] for at in kinematics.along(chain, q)] for chain in chains])
+    return picture((line.T for line in lines), *(f"{axis} in m" for axis in axes), equal=True)
 
 
 def load_fmu(path: str | Path) -> Fmu:

@@ -59,6 +59,14 @@ class Robot:
         """Return the mask of the joints between the root and the task frame."""
         return tuple(bool(column.any()) for column in self._path().T)
 
+    def origins(self, q: Sequence[float]) -> dict[str, NDArray[np.float64]]:
+        """Return the origins of all links in the root frame at joint positions q, m, by name."""
+        data = self.model.createData()
+        positions = np.array(q) if self.coupling is None else self.coupling @ q + self.offset
+        pin.framesForwardKinematics(self.model, data, positions)
+        frames = enumerate(self.model.frames)
+        return {f.name: data.oMf[i].translation.copy() for i, f in frames if f.type == pin.FrameType.BODY}
+
     def swing(self) -> tuple[float, ...]:
         """Bound on how fast each joint changes σ/σ_max of the task Jacobian, 1/rad or 1/m.
 
