@@ -188,7 +188,7 @@ def test_refused_table_is_named_with_its_culprit(fmu: Fmu, tmp_path: Path, text:
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"PK\x03\x04\xc0\x00\x80"])
 def test_table_that_is_not_text_is_refused(fmu: Fmu, tmp_path: Path, content: bytes) -> None:
     (tmp_path / "inputs.csv").write_bytes(content)
-    with pytest.raises(InputError, match=r"inputs\.csv' is not a CSV file"):
+    with pytest.raises(InputError, match=r"inputs\.csv' is not UTF-8 text; save it as CSV UTF-8"):
         read_changes(fmu, tmp_path / "inputs.csv")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,8 @@ MISTAKES: dict[str, str] = {
     f"{RUN} --Set Kp=3": "'--Set'; did you mean '--set'",
     f"{RUN} --xyzzy": "no option '--xyzzy'; 'twodof run --help' lists",
     f"{RUN} --set Kp=80 Kd=20": "'Kd=20' belongs to no option: .*--set Kd=20",
+    f"{RUN} --set Kp 80": "'80' belongs to no option: .*--set Kp=80$",
+    f"{RUN} --set x_des 0.2,0.1": "as in --set Kp=0.2,0.1$",
     f"{RUN} other.fmu": "'other.fmu' is one argument too many; 'twodof run --help'",
     f"{RUN} --step 10ms": "'10ms' is not a number; leave units out",
     f"{RUN} --storage db3": "'db3' .*'sqlite3'",
@@ -71,6 +74,8 @@ MISTAKES: dict[str, str] = {
     f"{RUN} --input tabs.csv": "no column 'time'; it has tabs between",
     f"{RUN} --input capital.csv": "no column 'time'; rename the column 'Time'",
     f"{RUN} --input headless.csv": "no column 'time'; its first line is '0,50'",
+    f"{RUN} --input lonely.csv": "'lonely.csv' has no column beside 'time'; add one for each input",
+    f"{RUN} --input wide.csv": "'wide.csv' is not UTF-8 text; save it as CSV UTF-8",
     f"{RUN} --input lower.csv": "no variable 'kp'; did you mean 'Kp'",
     # settings
     f"{RUN} --set x_des_1=0.2": r"'x_des_1'; did you mean 'x_des\[1\]'",
@@ -96,7 +101,11 @@ MISTAKES: dict[str, str] = {
     "plot bag --joints Joint1 -o x.png": "no joint 'Joint1'; did you mean 'joint1'",
     "plot bag --frame endeffector -o x.png": "did you mean 'EndEffector'",
     "plot bag -o x.jpg": "'x.jpg': the name of a plot ends in .png",
+    "build robot.urdf --gravity 0,-9.81,0": "--gravity: expected 3 numbers with spaces between them",
+    "page arm.fmu -o arm.fmu": "'arm.fmu': the name of a page ends in .html",
+    "layouts arm.fmu -o notes.txt": "cannot make the folder 'notes.txt': File exists",
     # sweeps
+    "sweep arm.fmu --range Kp=20:80 -o s": "0 random draws of Kp; give at least 1 with --random",
     "sweep arm.fmu -o s": "nothing to vary; give a grid",
     "sweep arm.fmu --grid Kp=50:100 -o s": "expected NAME=LOW:HIGH:COUNT, as in --grid Kp=20:200:10",
     "sweep arm.fmu --grid Kp=50,60 -o s": "expected NAME=LOW:HIGH:COUNT, as in",
@@ -123,8 +132,10 @@ def things(native_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "capital.csv": "Time,Kp\n0,50\n",
         "headless.csv": "0,50\n1,60\n",
         "lower.csv": "time,kp\n0,50\n",
+        "lonely.csv": "time\n0\n1\n",
     }.items():
         (folder / name).write_text(text)
+    (folder / "wide.csv").write_text("time,Kp\n0,50\n", encoding="utf-16")
     return folder
 
 
@@ -143,3 +154,45 @@ def test_a_mistake_gets_its_remedy(
     assert len(error) == 1 and re.search(MISTAKES[line], error[0])
     shutil.rmtree("out", ignore_errors=True)  # the bag of a run that failed on the way
     assert sorted(things.iterdir()) == before
+
+
+CALLS: dict[str, tuple[Callable[[], object], str]] = {
+    "a path as a sink": (lambda: twodof.run("arm.fmu", "bag2"), r"such as twodof.Bag\('my_bag'\), not 'bag2'"),  # type: ignore[arg-type]
+    "a class as a sink": (lambda: twodof.run("arm.fmu", twodof.Bag), "a sink is an object"),  # type: ignore[arg-type]
+    "a text as a time": (
+        lambda: twodof.run("arm.fmu", stop_time="5"),  # type: ignore[arg-type]
+        "`stop_time` is '5', not a number of seconds",
+    ),
+    "a list of settings": (
+        lambda: twodof.run("arm.fmu", settings=[("Kp", 80)]),  # type: ignore[arg-type]
+        r"values by name, as \{'Kp': 80\}, not \[\('Kp', 80\)\]",
+    ),
+    "one value as a grid": (
+        lambda: twodof.sweep("arm.fmu", grid={"Kp": 50}),  # type: ignore[dict-item]
+        r"grid of Kp is 50; give its values, as \[20, 50, 80\]",
+    ),
+    "three values as a range": (
+        lambda: twodof.sweep("arm.fmu", ranges={"Kp": (1, 2, 3)}, random=2),
+        r"range of Kp is \(1, 2, 3\); give low and high",
+    ),
+    "one number as gravity": (
+        lambda: twodof.FmuOptions(gravity=-9.81),  # type: ignore[arg-type]
+        "`gravity` is the number -9.81; give all its elements",
+    ),
+    "one number as a start": (
+        lambda: twodof.FmuOptions(q_start=0.5),  # type: ignore[arg-type]
+        "`q_start` is the number 0.5; give all",
+    ),
+    "a list of locks": (
+        lambda: twodof.FmuOptions(lock=["joint1"]),  # type: ignore[arg-type]
+        r"`lock` is \['joint1'\]; give positions by joint, as \{'joint1': 0.0\}",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", CALLS)
+def test_a_mistake_in_python_gets_its_remedy(mistake: str, things: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(things)
+    call, words = CALLS[mistake]
+    with pytest.raises((twodof.TwoDofError, TypeError), match=words):
+        call()

@@ -189,7 +189,7 @@ def test_a_name_without_an_index_sets_all_elements(native_path: Path) -> None:
             "Kp[2] gets values from the design of Kp and from Kp[2]",
         ),
         (["--grid", "Kp=1:2:3", "--set", "Kp[1]=4"], "Kp[1] gets values from the settings and from Kp"),
-        (["--range", "Kp=1:2"], "0 random draws of Kp; at least 1 is needed"),
+        (["--range", "Kp=1:2"], "0 random draws of Kp; give at least 1 with --random"),
         (["--range", "Kp=2:1", "--random", "3"], "LOW 2 must be below HIGH 1"),
         (["--random", "3"], "there is nothing to vary"),
         (["--grid", "Kp=1:2:3", "--random", "3"], "3 random draws of nothing; give a range"),

@@ -102,6 +102,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Exit with an error in one line."""
         message = re.sub(r"invalid (float|int) value: ('.*')$", r"\2 is not a number; leave units out", message)
+        message = re.sub(r"expected (\d) arguments$", r"expected \1 numbers with spaces between them", message)
         self.exit(2, f"{self.prog}: error: {plain(message)}\n")
 
     def _print_message(self, message: str, file: Any = None) -> None:
@@ -133,6 +134,8 @@ def check_arguments(parser: Parser, unknown: Sequence[str]) -> None:
         return
     known, lists = [*parser._option_string_actions], f"; '{parser.prog} --help' lists them"
     word = unknown[0].partition("=")[0]
+    if re.fullmatch(r"-?[\d.][-+.,\deE]*", unknown[0]) and "--set" in known:
+        parser.error(f"'{unknown[0]}' belongs to no option: a setting is one word, as in --set Kp={unknown[0]}")
     if word[:1] == "-":
         parser.error(f"there is no option '{word}'{_meant(word, known) or lists}")
     if "=" in unknown[0] and "--set" in known:

@@ -64,6 +64,11 @@ class FmuOptions:
             object.__setattr__(self, "name", name)
         if self.control not in CONTROLS:
             raise BuildError(f"`control` '{self.control}' is unknown{choice(self.control, CONTROLS)}")
+        for name in ("gravity", "q_start"):
+            if isinstance(value := getattr(self, name), int | float):
+                raise BuildError(f"`{name}` is the number {value:g}; give all its elements, in a tuple")
+        if not isinstance(self.lock, Mapping):
+            raise BuildError(f"`lock` is {self.lock!r:.50}; give positions by joint, as {{'joint1': 0.0}}")
 
     @property
     def is_default_arm(self) -> bool:

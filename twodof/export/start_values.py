@@ -61,6 +61,8 @@ def resolve(fmu: Variables, settings: Mapping[str, Setting]) -> dict[str, Value]
     Raises:
         InputError: a name is unknown or an output, or a value has a wrong number or type, or is not finite.
     """
+    if not isinstance(settings, Mapping):
+        raise InputError(f"settings are values by name, as {{'Kp': 80}}, not {settings!r:.50}")
     values: dict[str, Value] = {}
     for name, setting in settings.items():
         elements = [name] if name in fmu.variables else vector(fmu.variables, name)

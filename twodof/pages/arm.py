@@ -37,6 +37,8 @@ RECORDED = ("q", "v", "x", "quat", "tau", "x_des", "quat_des", "q_des")
 """Groups of variables in a sample, in their order."""
 GRAIN = 65535  # resolution of vertices, as parts of a mesh's size
 POLICY = "default-src 'none'; script-src 'sha256-{script}'{more}; style-src 'unsafe-inline'; img-src data:"
+PAGES = ("", ".html", ".htm")
+"""Suffixes of pages."""
 CONTAINER = b'<div class="arm" id="arm"'
 """Mark that identifies a page with an arm."""
 
@@ -81,10 +83,12 @@ def page(
 
     Raises:
         FmuError, InputError: the file is no FMU, or a setting is invalid.
-        PageError: the FMU is not a native one of this package, or the page cannot be written.
+        PageError: the FMU is not a native one of this package, or the page has another suffix or cannot be written.
         BuildError: there is no compiler.
     """
     path = Path(output)
+    if path.suffix.lower() not in PAGES:
+        raise PageError(f"'{path}': the name of a page ends in .html")
     content = page_of(experiment(fmu, stop_time=inf, step=step, settings=settings))
     with refusing(PageError, f"write '{path}'"):
         write_file(path, content)

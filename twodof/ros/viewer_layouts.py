@@ -13,7 +13,7 @@ from string import Template
 from typing import Any
 
 from ..errors import InputError
-from ..files import data_file, write_file
+from ..files import data_file, refusing, write_file
 from ..fmu import Fmu, load_fmu
 from ..plant.variables import GAINS
 from ..simulation.experiments import experiment
@@ -66,7 +66,8 @@ def layouts(
         if not overwrite and path.exists() and path.read_bytes() != content:
             reason = "exists and differs; choose another folder or give `overwrite=True`"
             raise InputError(f"'{path}' {reason}")
-    stem.parent.mkdir(parents=True, exist_ok=True)
+    with refusing(InputError, f"make the folder '{folder}'"):
+        stem.parent.mkdir(parents=True, exist_ok=True)
     for path, content in contents.items():
         write_file(path, content)
     return [*contents]

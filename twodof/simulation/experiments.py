@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import pairwise
 from math import inf, isfinite
+from numbers import Real
 from pathlib import Path
 from typing import TypedDict
 
@@ -111,6 +112,7 @@ def experiment(
         InputError, FmuError: an argument or the FMU is invalid; the message names it.
     """
     fmu = fmu if isinstance(fmu, Fmu) else load_fmu(fmu)
+    _check_times(start_time=start_time, stop_time=stop_time, step=step)
     step = default(fmu, "stepSize", 0.01) if step is None else step
     if stop_time is None:
         stop_time = start_time + default(fmu, "stopTime", 5.0) - default(fmu, "startTime", 0.0)
@@ -140,12 +142,22 @@ def experiment(
         stamp_start=stamp_start,
     )
     run.first_stamp()  # raises for a time that ROS 2 cannot express
-    end, source = run.time(run.steps), "`changes`" if input_file is None else f"'{input_file}'"
-    if late := sum(t > end + TIME_TOLERANCE * step for t, _ in run.changes):
+    _report_late(run, "`changes`" if input_file is None else f"'{input_file}'")
+    return run
+
+
+def _report_late(run: Experiment, source: str) -> None:
+    end = run.time(run.steps)
+    if late := sum(t > end + TIME_TOLERANCE * run.step for t, _ in run.changes):
         LOG.warning(
             f"{source}: {late} of its times are after the run's end at {end:g} s, and their inputs are never set"
         )
-    return run
+
+
+def _check_times(**times: object) -> None:
+    for name, seconds in times.items():
+        if not isinstance(seconds, Real | None):
+            raise InputError(f"`{name}` is {seconds!r:.50}, not a number of seconds")
 
 
 def pop_until(t: float, due: deque[tuple[float, dict[str, Value]]]) -> dict[str, Value]:

@@ -49,6 +49,8 @@ def read_changes(fmu: Fmu, path: str | Path) -> Changes:
     if "time" not in header:
         raise InputError(f"'{path}' has no column 'time'; {_header_remedy(names)}")
     elements = {name: _inputs(fmu, path, name) for name in header if name != "time"}
+    if not elements:
+        raise InputError(f"'{path}' has no column beside 'time'; add one for each input")
     columns = [element for name in header for element in elements.get(name, ["time"])]
     twice = next((element for element, n in Counter(columns).items() if n > 1), None)
     if twice is not None:
@@ -116,5 +118,7 @@ def _rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
         raise InputError(no_such("CSV", Path(path))) from error
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise InputError(f"'{path}' is not UTF-8 text; save it as CSV UTF-8") from error
+    except csv.Error as error:
         raise InputError(f"'{path}' is not a CSV file: {error}") from error

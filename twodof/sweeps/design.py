@@ -60,17 +60,24 @@ def make_design(
     Raises:
         InputError: a variable or number is invalid; the message names it.
     """
-    grids = {name: tuple(map(float, values)) for name, values in grid.items()}
-    limits = {}
+    grids, limits = {}, {}
+    for name, values in grid.items():
+        try:
+            grids[name] = tuple(map(float, values))
+        except TypeError as error:
+            raise InputError(f"the grid of {name} is {values!r:.50}; give its values, as [20, 50, 80]") from error
     for name, pair in ranges.items():
-        low, high = map(float, pair)
+        try:
+            low, high = map(float, pair)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"the range of {name} is {pair!r:.50}; give low and high, as (20, 80)") from error
         if not (isfinite(low) and isfinite(high) and low < high):
             raise InputError(f"the range of {name}, {low:g} to {high:g}, does not ascend")
         limits[name] = (low, high)
     if not grids and not limits:
         raise InputError("there is nothing to vary; give a grid, or ranges and a number of draws")
     if limits and random < 1:
-        raise InputError(f"{random} random draws of {', '.join(limits)}; at least 1 is needed")
+        raise InputError(f"{random} random draws of {', '.join(limits)}; give at least 1 with `random`")
     if random and not limits:
         raise InputError(f"{random} random draws of nothing; give a range")
     if seed < 0:
