@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import (
+    EVEN_FRAMES,
     EVERY_OTHER_FRAME,
     HOSTILE,
     LINKS,
@@ -361,6 +362,15 @@ def arms(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]
     return {"task": arm, "joint": twodof.page(joint, folder / "joint.html")}
 
 
+def test_a_joint_that_moves_no_target_is_no_cause(browser, panda, tmp_path) -> None:
+    """A Panda whose fingers are closed: only the joint of the arm that is at its limit is named."""
+    with shown(browser, twodof.page(panda, tmp_path / "panda.html")) as page:
+        page.evaluate("""() => { arm.play(false); arm.startAgain(true); arm.set("x_des", [0.5, 0.1, 0.4]);
+            arm.set("q_start[7]", arm.values.get("q_max[7]")); }""")
+        text = until(page, lambda text: "joint 'panda_joint7' is at its upper limit" in text, said)
+        assert "finger" not in text
+
+
 def test_a_run_that_reaches_its_target_has_no_cause(browser, arms) -> None:
     """At the target, on the way to it and after a drag to another, in all steps."""
     with shown(browser, arms["task"]) as page:
@@ -467,14 +477,6 @@ def test_the_picture_is_that_of_the_scene(page, tmp_path) -> None:
 def test_units_stand_beside_the_sliders(page) -> None:
     units = page.locator("#arm-controls label:visible small").all_text_contents()
     assert units[:4] == ["m", "m", "s⁻²", "s⁻¹"]
-
-
-EVEN_FRAMES = """{
-    const next = requestAnimationFrame.bind(window);
-    let time = performance.now();
-    window.requestAnimationFrame = (show) => next(() => show((time += 20)));
-}"""
-"""Frames of 20 ms each, however slow the machine is: a page of slow frames leaves the shadow out."""
 
 
 def test_a_robot_in_space_stands_on_a_floor_with_its_shadow(browser, panda, tmp_path) -> None:

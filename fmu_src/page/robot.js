@@ -52,13 +52,19 @@ export class Robot {
     return angleBetween(this.frame(k), rotation(session.target("quat_des", k)));
   }
 
+  /** Numbers of the links from the root, without it, to that of the task frame. */
+  chain() {
+    const chain = [];
+    for (let i = this.facts.frameLink; i > 0; i = this.facts.links[i].parent) chain.unshift(i);
+    return chain;
+  }
+
   /**
    * A ball outside of which no target can be reached: about the first joint that moves the frame, as
    * far as all that follow are long; and the links to the frame.
    */
   reach() {
-    const chain = [];
-    for (let i = this.facts.frameLink; i > 0; i = this.facts.links[i].parent) chain.unshift(i);
+    const chain = this.chain();
     const first = chain.findIndex((i) => this.facts.links[i].column >= 0);
     if (first < 0) return null;
     let radius = 0;

@@ -158,10 +158,12 @@ export class Verdict {
   }
 
   atLimits() {
-    const { session } = this, q = session.at("q"), wanted = session.held("q_des");
+    const { session, robot } = this, q = session.at("q"), wanted = session.held("q_des");
+    const moving = robot.chain().map((link) => robot.facts.links[link].column), inSpace = session.groups.has("x_des");
     return this.robot.stopped(session.now).flatMap((joint) => {
       const i = this.joints.indexOf(joint), [low, high] = this.limits(i), side = 2 * q[i] < low + high ? "lower" : "upper";
-      return wanted[i] === (side === "lower" ? low : high) ? [] : [`joint '${joint.name}' is at its ${side} limit`];
+      const idle = inSpace ? !moving.includes(i) : wanted[i] === (side === "lower" ? low : high);
+      return idle ? [] : [`joint '${joint.name}' is at its ${side} limit`];
     });
   }
 
