@@ -18,6 +18,7 @@ UR5, PANDA = "ur_description/urdf/ur5_robot.urdf", "panda_description/urdf/panda
 AT_UR5, AT_PANDA = (0.1, -1.2, 1.4, 0.2, -1.0, 0.3), (0.0, -0.6, 0.0, -2.2, 0.0, 1.7, 0.8)
 FINGERS = {"panda_finger_joint1": 0.0}
 LARGE_STEPS = {"max_step": 0.01}
+COARSE = {"control_period": 0.001, "q_resolution": (0.05, 0.05), "v_from_q": True}
 
 
 class Failure(NamedTuple):
@@ -71,6 +72,34 @@ FAILURES = {
         {"q_des": (0.9, -1.2, 1.4, 0.2, -1.0, 0.3), "Kp": 4000.0},
         ("effort",),
         "beyond the URDF's limit",
+    ),
+    "a slow controller": Failure(
+        "ur5",
+        "joint",
+        {"control_period": 0.04, "Kp": 300.0, "Kd": 50.0, "q_des": (0.4, -0.9, 1.7, 0.5, -1.3, 0.6)},
+        ("sampling",),
+        "too high for control_period = 0.04 s",
+    ),
+    "a late controller": Failure(
+        "arm",
+        "joint",
+        {"control_period": 0.004, "control_delay": 0.03, "Kp": 400.0, "q_des": (0.8, 0.65)},
+        ("sampling",),
+        "too high for control_period = 0.004 s, control_delay = 0.03 s",
+    ),
+    "a coarse encoder": Failure(
+        "arm",
+        "joint",
+        {**COARSE, "Kp": 400.0, "Kd": 60.0, "q_des": (0.2, 0.05)},
+        ("sampling",),
+        "q_resolution[1] = 0.05 rad, so velocities in steps of 50 rad/s",
+    ),
+    "a load too heavy for the motors": Failure(
+        "panda",
+        "task",
+        {"limit_effort": True, "payload": 30.0, "payload_known": True, "x_des": (0.328, 0.0563, 0.5176)},
+        ("saturation",),
+        "of the time, with the payload of 30 kg",
     ),
     "too short": Failure("arm", "task", {}, ("time",), "the position still approaches", 1.0),
     "degrees and a saturated motor": Failure(

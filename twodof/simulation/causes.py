@@ -22,7 +22,7 @@ KINDS = {
     "friction": "a joint that sticks",
     "saturation": "a motor at its effort limit",
     "load": "a load that the controller does not know",
-    "sampling": "an oscillation as fast as the communication step",
+    "sampling": "an oscillation as fast as the steps of controller or communication",
     "damping": "too little damping",
     "singularity": "a singular pose",
     "time": "gains that are too slow for the duration",
@@ -40,7 +40,7 @@ LEAST_TURN = 2.0 * pi  # rad: a larger joint target may be in degrees
 MILLIMETRES = 10.0  # m: a target farther away is probably not in metres
 CREEPING = 1e-3  # fraction of its largest speed below which a joint with friction counts as stuck
 EFFORT_UNITS = {"rad": "N·m", "m": "N"}  # by the joint's unit
-FAST = 0.25  # sign changes of a velocity per sample that indicate too large a step
+FAST = 0.25  # sign changes of a velocity in the time of a step that indicate too large a step
 
 
 class Cause(NamedTuple):
@@ -78,8 +78,13 @@ def causes(judge: Judge, missed: Sequence[str], motion: str) -> tuple[Cause, ...
         found += [*_at_limits(judge, missed), *_saturated(judge), *_sampled(judge)]
     if missed and motion in ("oscillating", "diverging"):
         found += _damping(judge)
-    order = [*KINDS]
-    return tuple(sorted(found, key=lambda cause: (order.index(cause.kind), -cause.share))[:MOST])
+    order, motors = [*KINDS], max((cause.share for cause in found if cause.kind == "saturation"), default=0.0)
+
+    def rank(cause: Cause) -> tuple[int, bool, float]:
+        passing = cause.kind == "limit" and cause.share < motors  # a joint in the way saturates motors no longer
+        return order.index("saturation" if passing else cause.kind), passing, -cause.share
+
+    return tuple(sorted(found, key=rank)[:MOST])
 
 
 def _degrees(judge: Judge) -> Iterator[Cause]:
@@ -190,7 +195,9 @@ def _saturated(judge: Judge) -> Iterator[Cause]:
         beyond = judge.effort[i] > bounds[i] * (1.0 + EXACT)
         if judge.share[i] > OFTEN and not beyond and _late(judge, inside[:, i]) > OFTEN:
             most = f"{bounds[i]:.4g} {EFFORT_UNITS.get(setup.units[i], '')} for {100 * judge.share[i]:.3g} %"
-            text = f"the motor of joint '{joint}' was saturated at {most} of the time"
+            payload = judge.held.get("payload")
+            load = f", with the payload of {payload:g} kg" if payload else ""
+            text = f"the motor of joint '{joint}' was saturated at {most} of the time{load}"
             yield Cause("saturation", text, float(judge.share[i]), joint, float(t[inside[:, i].argmax()]))
 
 
@@ -228,11 +235,27 @@ def _sampled(judge: Judge) -> Iterator[Cause]:
     turns = (np.sign(v[1:]) * np.sign(v[:-1]) < 0.0).mean(axis=0)
     turns[np.abs(v).mean(axis=0) <= 1e-3 * np.maximum(judge.speed, 1e-3)] = 0.0
     i = int(turns.argmax())
-    if turns[i] >= FAST:
+    sampling = [setup.starts.get(name, 0.0) for name in ("control_period", "control_delay")]
+    if turns[i] * max(setup.step, sum(sampling)) >= FAST * setup.step:
         gains = "" if "x" in judge.aims or "q" in judge.aims else " of the controller outside"
-        often = f"every {1.0 / turns[i]:.2g} communication steps of {setup.step:g} s"
-        text = f"joint '{setup.joints[i]}' turns round {often}: the gains{gains} are too high for the step"
+        what = ", ".join(_sampling(judge, i)) or f"communication steps of {setup.step:g} s"
+        often = f"turns round every {setup.step / turns[i]:.2g} s"
+        text = f"joint '{setup.joints[i]}' {often}: the gains{gains} are too high for {what}"
         yield Cause("sampling", text, float(turns[i]), setup.joints[i])
+
+
+def _sampling(judge: Judge, i: int) -> Iterator[str]:
+    """Yield the settings of a sampled controller and of the sensors of joint i."""
+    starts, unit = judge.setup.starts, judge.setup.units[i]
+    period, coarse = starts.get("control_period", 0.0), starts.get(f"q_resolution[{i + 1}]", 0.0)
+    for name, of in (("control_period", "s"), ("control_delay", "s"), (f"q_resolution[{i + 1}]", unit)):
+        if starts.get(name):
+            yield f"{name} = {starts[name]:g} {of}"
+    if coarse and period and starts.get("v_from_q"):
+        yield f"so velocities in steps of {coarse / period:.4g} {unit}/s"
+    for name, of in ((f"q_noise[{i + 1}]", unit), (f"v_noise[{i + 1}]", f"{unit}/s")):
+        if starts.get(name):
+            yield f"{name} = {starts[name]:g} {of}"
 
 
 def _damping(judge: Judge) -> Iterator[Cause]:
