@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import io
 import sys
-import sysconfig
 import tempfile
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,6 +27,7 @@ from playwright.sync_api import Browser, Page  # noqa: E402
 import twodof  # noqa: E402
 
 SIZE = {"width": 1280, "height": 800}
+shown_by = partial(browser.opened, begin=browser.EVEN_FRAMES)  # a slow machine would leave shadows out
 FRAMES, FRAME = 72, 0.08  # number; s of one
 TARGETS = [[0.5, 0.2, 0.45], [0.35, -0.3, 0.3], [0.55, 0.0, 0.6]]
 INPUTS = "time,x_des[1],x_des[2]\n0,0.2,0.05\n2,0.1,0.2\n4,0.22,-0.08\n"
@@ -65,14 +66,14 @@ def panda_page(folder: Path) -> str:
 def moving(chromium: Browser, folder: Path) -> None:
     """Make docs/panda.webp: a Panda in its page follows three targets, in real time."""
     frames = []
-    with browser.opened(chromium, panda_page(folder)) as shown:
+    with shown_by(chromium, panda_page(folder)) as shown:
         shown.locator("#arm-play").click()
         shown.evaluate("() => { arm.startAgain(); arm.set('quat_des', [1, 0, 0, 0]); }")
         for target in TARGETS:
             shown.evaluate("target => arm.set('x_des', target)", target)
             for _ in range(FRAMES // len(TARGETS)):
                 shown.evaluate("steps => arm.step(steps)", round(FRAME / 0.01))
-                shown.wait_for_timeout(100)  # until the page has drawn it
+                draw(shown)
                 frames.append(Image.open(io.BytesIO(shown.screenshot())).convert("RGB").resize((720, 450)))
     frames[0].save(
         ROOT / "docs/panda.webp",
@@ -87,7 +88,7 @@ def moving(chromium: Browser, folder: Path) -> None:
 
 def page(chromium: Browser, folder: Path) -> None:
     """Make docs/page.png: a Panda in a page of its own."""
-    with browser.opened(chromium, panda_page(folder), scale=2) as shown:
+    with shown_by(chromium, panda_page(folder), scale=2) as shown:
         shown.locator("#arm-play").click()
         shown.evaluate(
             "() => { arm.startAgain(); arm.set('x_des', [0.5, 0.1, 0.4]);"
@@ -98,17 +99,14 @@ def page(chromium: Browser, folder: Path) -> None:
 
 def view(chromium: Browser, folder: Path) -> None:
     """Make the picture of a replay, 0.6 s after the target has changed."""
-    with (
-        browser.served("view", "my_bag", cwd=folder) as command,
-        browser.opened(chromium, command.url, scale=2) as page,
-    ):
+    with browser.served("view", "my_bag", cwd=folder) as command, shown_by(chromium, command.url, scale=2) as page:
         page.evaluate("arm.seek(4.6)")
         shoot(page, "view.png")
 
 
 def live(chromium: Browser, folder: Path, fmu: Path) -> None:
     """Make the picture of the live arm, paused on its way to a target that was moved."""
-    with browser.served("live", fmu, cwd=folder) as command, browser.opened(chromium, command.url, scale=2) as page:
+    with browser.served("live", fmu, cwd=folder) as command, shown_by(chromium, command.url, scale=2) as page:
         page.wait_for_function("() => arm.error() < 0.01")
         page.evaluate("arm.set('x_des', [0.14, 0.19])")
         page.wait_for_function("() => arm.error() > 0.08")
@@ -119,25 +117,30 @@ def live(chromium: Browser, folder: Path, fmu: Path) -> None:
 
 def panda(chromium: Browser, folder: Path) -> None:
     """Make the picture of the scene alone, of the run in docs/tutorial.md after a second."""
-    share = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share"
-    urdf = share / "example-robot-data/robots/panda_description/urdf/panda.urdf"
+    urdf = robots_folder() / "panda_description/urdf/panda.urdf"
     bent = (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8, 0.03)
     options = twodof.FmuOptions(
-        urdf=urdf, mesh_dir=share, frame="panda_hand_tcp", control="pose", native=True, q_start=bent
+        urdf=urdf, mesh_dir=robots_folder().parent, frame="panda_hand_tcp", control="pose", native=True, q_start=bent
     )
-    fmu = twodof.build_fmu(folder / "Panda.fmu", options)
+    fmu = twodof.build_fmu(folder / "bent.fmu", options)
     goal = {"x_des": (0.45, 0.2, 0.4), "quat_des": (0.9, 0.1, 0.3, 0.2)}
     twodof.simulate(fmu, twodof.Bag(folder / "panda"), stop_time=1, settings=goal)
-    with browser.served("view", "panda", cwd=folder) as command, browser.opened(chromium, command.url) as page:
+    with browser.served("view", "panda", cwd=folder) as command, shown_by(chromium, command.url) as page:
         page.evaluate("arm.seek(1)")
-        page.wait_for_timeout(3000)
+        draw(page)
         picture = Image.fromarray(browser.still(page).astype("uint8"))
         picture.save(ROOT / "docs" / "panda.png", optimize=True)
 
 
+def draw(page: Page) -> None:
+    """Wait until a page has drawn its scene and its panel, which takes turns with it."""
+    for _ in range(3):
+        page.evaluate(browser.DRAWN)
+
+
 def shoot(page: Page, name: str) -> None:
     """Save a screenshot with smoothed edges."""
-    page.wait_for_timeout(3000)
+    draw(page)
     picture = Image.open(io.BytesIO(page.screenshot()))
     picture.resize((SIZE["width"], SIZE["height"])).save(ROOT / "docs" / name, optimize=True)
 

@@ -68,9 +68,9 @@ EVERY_OTHER_FRAME = """{
 EVEN_FRAMES = """{
     const next = requestAnimationFrame.bind(window);
     let time = performance.now();
-    window.requestAnimationFrame = (show) => next(() => show((time += 20)));
+    window.requestAnimationFrame = (show) => next(() => show((time += 35)));
 }"""
-"""Frames of 20 ms each, however slow the machine is: a page of slow frames leaves the shadow out."""
+"""Frames of 35 ms each, however slow the machine is: a page of slow frames leaves the shadow out."""
 AT_REST = """async () => {
     const asked = () => arm.news === undefined || arm.news.received === arm.sent && !arm.news.playing;
     if (arm.playing || !asked()) return false;
