@@ -42,7 +42,10 @@ LIBRARIES = {
     "coal": {"geometry"},  # meshes
     "cyclonedds": {"ros"},
     "distributed": {"sweeps"},
+    "ecospy": {"fmu"},
     "fmpy": {"fmu"},
+    "fmuloader": {"fmu"},
+    "libcosimpy": {"fmu"},
     "foxglove": {"pages"},
     "lz4": {"bag"},
     "imageio_ffmpeg": {"plots"},

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from twodof.plots.closed_form import Held, responses, task_error
+from twodof.export.closed_form import Held, responses, task_error
 
 GAINS = {
     "overdamped, the default": (50.0, 40.0),

@@ -72,6 +72,7 @@ def add(build: argparse.ArgumentParser) -> None:
         choices=(2, 3),
         help="FMI version of a native FMU (2; 3 on machines without a name in FMI 2.0)",
     )
+    flag("--reference", help="add experiments with reference trajectories, for 'twodof check'")
     flag("--scalars", help="make each element of a vector a variable in FMI 3, for tools without arrays")
 
 
@@ -132,7 +133,7 @@ def _build(options: argparse.Namespace) -> Path:
         settings=parse_settings(options.settings),
         arrays=not options.scalars,
         platforms=tuple(dict.fromkeys(platforms)),
-        **given_options(options, "axes", "link_environment", "native", "fmi"),
+        **given_options(options, "axes", "link_environment", "native", "fmi", "reference"),
     )
     logging.getLogger("twodof.export").setLevel(logging.INFO)  # each platform's takes time
     return build_fmu(options.output, chosen, overwrite=options.overwrite)

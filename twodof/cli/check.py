@@ -10,6 +10,14 @@ def add(check: argparse.ArgumentParser) -> None:
     """Add the options of the verb."""
     check.description = "Check an FMU of any maker; exit status 1 if a row fails."
     check.add_argument("fmu", metavar="FMU", help="co-simulation FMU of FMI 2.0 or 3.0")
+    check.add_argument(
+        "--with",
+        dest="tools",
+        action="append",
+        default=[],
+        choices=("fmpy", "libcosim", "ecos", "fmuloader"),
+        help="run the FMU's references in this FMI tool too; repeatable",
+    )
     add_options(check, "--json")
 
 
@@ -18,7 +26,7 @@ def call(options: argparse.Namespace) -> int:
     from ..fmu.checking import check
 
     with busy("checking", silent=True):
-        done = check(options.fmu)
+        done = check(options.fmu, tools=options.tools)
     if options.json:
         print_json(kind="check", **done.facts())
     else:

@@ -17,6 +17,7 @@ OPTIONS = {
     "path": "-o",
     "output": "-o",
     "platforms": "--platform",
+    "tools": "--with",
     "changes": "--input",
     "robots": "NAME=FMU",
     "set_gains": "--foxglove-control",

@@ -21,6 +21,7 @@ from .icon import icon
 from .mesh_files import collect_meshes
 from .model_description import model_description
 from .native import engine_variables
+from .references import references
 from .start_values import resolve
 from .urdf_source import end_effector, lock_joints, read_text, without_meshes
 
@@ -71,9 +72,10 @@ def compose(options: FmuOptions) -> tuple[Flavour, Files, Callable[[], Files]]:
     files[ICONS[flavour.fmi]] = icon(read_urdf(urdf), robot, starts["q_start"])
 
     def finish() -> Files:
-        """Return the files that the GUID does not cover: binaries and documentation."""
+        """Return the files that the GUID does not cover: binaries, documentation and references."""
         described = documentation(options, robot, table, flavour, guid, urdf)
-        return {**flavour.signed(guid), **described}
+        extra = references(robot, table, options.control) if options.reference else {}
+        return {**flavour.signed(guid), **described, **extra}
 
     return flavour, files, finish
 

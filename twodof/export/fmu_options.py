@@ -39,6 +39,7 @@ class FmuOptions:
             FMI 2, for tools that do not support arrays.
         platforms: FMI platforms of a native FMU, e.g. "linux64", "win64", or in FMI 3.0
             "x86_64-linux", "aarch64-linux"; empty: this machine's platform.
+        reference: add experiments with reference trajectories (FMI-LS-REF) to the FMU.
     """
 
     urdf: str | Path | None = None
@@ -57,6 +58,7 @@ class FmuOptions:
     fmi: int | None = None
     arrays: bool = True
     platforms: tuple[str, ...] = ()
+    reference: bool = False
 
     def __post_init__(self) -> None:
         if not self.name:

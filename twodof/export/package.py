@@ -54,7 +54,7 @@ def build_fmu(output: str | Path | None = None, options: FmuOptions | None = Non
 
     try:
         flavour, files, finish = compose(options)
-        built = files["modelDescription.xml"], flavour.platforms
+        built = files["modelDescription.xml"], flavour.platforms, options.reference
         same = _fits(path, lambda zipped: _holds(zipped, *built))
         there = path.is_file() and descriptor_of(path) is None  # /dev/stdout is written into
         if there and not (same or overwrite or is_default_arm(path)):
@@ -102,12 +102,13 @@ def _fits(path: Path, fits: Callable[[zipfile.ZipFile], bool]) -> bool:
         return False
 
 
-def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str]) -> bool:
+def _holds(archive: zipfile.ZipFile, description: bytes, platforms: Sequence[str], reference: bool) -> bool:
     """Return whether a file is already this FMU; its GUID is a digest of all relevant inputs."""
+    refers = any(name[:6] == "extra/" for name in archive.namelist())
     built_for = {name.split("/")[1] for name in archive.namelist() if name[:9] == "binaries/"}
     with archive.open("modelDescription.xml") as file:
         same = file.read(len(description) + 1) == description
-    return same and built_for == set(platforms)
+    return same and refers == reference and built_for == set(platforms)
 
 
 def _write_zip(path: Path, files: Mapping[str, bytes], comment: bytes) -> None:

@@ -13,10 +13,14 @@ from typing import NamedTuple
 
 from ..bounds import MAX_CALL_WAIT, MAX_ROW
 from ..children import Child
-from ..errors import FmuError
+from ..errors import FmuError, InputError
 from ..notebook import card
-from .description import load_any_fmu, problems_of
-from .trials import TRIALS, Trial, UnpassedError
+from .description import Fmu, load_any_fmu, problems_of
+from .importers import require
+from .reference_runs import references_of
+from .trials import TRIALS, Trial, UnpassedError, reference_run
+
+REFERENCE, WITH = "reference ", " with "
 
 
 class Row(NamedTuple):
@@ -62,19 +66,22 @@ class Check:
         return {**asdict(self), "path": str(self.path), "passed": self.passed, "rows": [r._asdict() for r in self.rows]}
 
 
-def check(fmu: str | Path) -> Check:
-    """Check an FMU of any maker: description, states, steps, derivatives, order of calls.
+def check(fmu: str | Path, *, tools: Sequence[str] = ()) -> Check:
+    """Check an FMU of any maker: description, states, steps, derivatives, order of calls, and references it carries.
 
     The FMU runs in a child process, whose crash is a failed row. It is a program all the same: check only an FMU that
     you would run.
 
     Args:
         fmu: an FMI 2.0 or 3.0 co-simulation FMU with a binary for this machine.
+        tools: FMI tools that run the references too: "fmpy", "libcosim", "ecos" or "fmuloader".
 
     Raises:
         FmuError: the file is missing, no FMU, unsafe to unzip, or has no co-simulation.
+        InputError: a tool is not installed, or the FMU carries no references for it.
     """
     path = Path(fmu)
+    require(tools)
     problems = problems_of(path)
     try:
         known = load_any_fmu(path)
@@ -87,7 +94,18 @@ def check(fmu: str | Path) -> Check:
     if known.platform not in known.platforms:
         reason = f"it has no binary for this machine ({known.platform}), only for: {', '.join(known.platforms)}"
         return Check(path, (first, *(Row(name, "does not apply", reason) for name in TRIALS)))
-    return Check(path, (first, *_tried(path, [*TRIALS])))
+    return Check(path, (first, *_tried(path, [*TRIALS, *_runs(known, tools)])))
+
+
+def _runs(fmu: Fmu, tools: Sequence[str]) -> list[str]:
+    """Return the names of the rows of references, one for each experiment and tool."""
+    try:
+        names = [reference.name for reference in references_of(fmu)]
+    except FmuError:  # which the row then has
+        names = [""]
+    if tools and not names:
+        raise InputError(f"'{fmu.path}' carries no references to run; build one with `reference=True`")
+    return [f"{REFERENCE}{name}{tool and WITH + tool}" for name in names for tool in ("", *tools)]
 
 
 def _tried(path: Path, names: Sequence[str]) -> Iterator[Row]:
@@ -116,10 +134,18 @@ def _serve(pipe: Connection, path: Path, names: Sequence[str]) -> None:
         pipe.send_bytes(json.dumps(words).encode()[:MAX_ROW])
 
     trial = Trial(load_any_fmu(path), lambda what: send("note", what))
+
+    def result(name: str) -> str:
+        if name in TRIALS:
+            return TRIALS[name](trial)
+        experiment, _, tool = name.removeprefix(REFERENCE).partition(WITH)
+        by_name = {reference.name: reference for reference in references_of(trial.fmu)}
+        return reference_run(trial, by_name[experiment], tool)
+
     for name in names:
         outcome = "passed"
         try:
-            text = TRIALS[name](trial)
+            text = result(name)
         except UnpassedError as unpassed:
             outcome, text = unpassed.outcome, str(unpassed)
         except Exception as error:  # whatever the FMU makes FMPy raise is the result of this trial

@@ -17,7 +17,9 @@ from fmpy.model_description import ModelVariable
 
 from ..errors import SimulationError
 from .description import Fmu
+from .importers import TOOLS, Run, in_this_master
 from .instance import Instance, instantiate
+from .reference_runs import Reference
 
 STEPS = 20
 SIZES = (1.0, 0.5, 0.25, 0.25, 2.0, 3.0, 0.5, 1.5, 1.0)
@@ -294,6 +296,24 @@ def _forbidden(trial: Trial) -> Calls:
         "a step after the end": ("ended", lambda i: i.slave.doStep(t, h)),
     }
     return {what: call for what, call in calls.items() if again or "parameter" not in what}
+
+
+def reference_run(trial: Trial, reference: Reference, tool: str = "") -> str:
+    """Compare the results of a run, in another tool or in this master, with those that the FMU carries."""
+    names, fmi = reference.results[0], str(trial.fmu.version)
+    run: Run = in_this_master
+    missing = [n for n in [*names, *reference.stimuli[0], *reference.parameters] if n not in trial.fmu.variables]
+    if missing:
+        raise SimulationError(f"there is no variable '{missing[0]}'")
+    if tool:
+        _, run, versions = TOOLS[tool]
+        if fmi not in versions or any(variable.dimensions for variable in trial.about.modelVariables):
+            raise UnpassedError("does not apply", f"{tool} is not tried with arrays, and of FMI with {versions}")
+    trial.note("the run of a reference")
+    rows = run(trial.fmu, reference, names)
+    if reference.tolerance != reference.tolerance:
+        raise UnpassedError("does not apply", "the experiment states no tolerance")
+    return reference.judge(rows)
 
 
 TRIALS: dict[str, Callable[[Trial], str]] = {

@@ -12,9 +12,9 @@ import numpy as np
 
 from ..bag.recording import Recording
 from ..errors import PlotError
+from ..export.closed_form import Array
 from ..files import refusing, write_file
 from ..version import needing
-from .closed_form import Array
 from .figure import Drawing, draw_head, drawn
 from .panels import title
 from .runs import draw_view

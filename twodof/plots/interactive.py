@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import PlotError
+from ..export.closed_form import Array
 from ..version import needing
-from .closed_form import Array
 from .panels import CURVE, HELD, KINDS, TARGET, Looks, Panel, duration, joint_names, panels_of
 from .scripts import packed, script
 from .strokes import GREY, HAIR, INK, Stroke, looks

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import PlotError, choice
-from .closed_form import Array
+from ..export.closed_form import Array
 from .settings import number
 from .strokes import ALARM, PALE, SMALLEST_ERROR, SMALLEST_RANGE, Look, Stroke
 from .track import JointTrack, Track

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..bag.downsampling import Indices, extremes
+from ..export.closed_form import Array
 from ..notebook import COLOURS as COLOURS
-from .closed_form import Array
 
 Style = dict[str, Any]
 """Keywords of a matplotlib artist."""

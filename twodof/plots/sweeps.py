@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import PlotError
+from ..export.closed_form import Array
 from ..sweeps.ranking import METRICS, ROUNDING, USE, beyond_limits, candidates, ranked, ranks, remark
-from .closed_form import Array
 from .figure import Drawing, draw_head, html_of
 from .maps import map_page
 from .strokes import COLOURS, GREY, HAIR, INK, PALE, SMALLEST_ERROR, Style

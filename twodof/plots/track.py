@@ -11,10 +11,10 @@ from ..bag.provenance import KNOWN_UNTIL, robot_in
 from ..bag.reader import read_bag, read_downsampled
 from ..bag.recording import Recording, Verdict
 from ..errors import BuildError, PlotError
+from ..export.closed_form import Array, Held, task_error
 from ..export.urdf_source import read_text
 from ..files import shown
 from ..plant.urdf import UNBOUNDED, RobotError
-from .closed_form import Array, Held, task_error
 from .linkage import Linkage, Motion, load_linkage
 from .settings import settings_of
 

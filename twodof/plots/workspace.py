@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .closed_form import Array
+from ..export.closed_form import Array
 from .panels import CURVE, THIN, Looks
 from .strokes import ALARM, GREY, INK, PALE, SMALLEST_RANGE, Stroke, downsampled
 from .track import Task, Track

@@ -1,0 +1,194 @@
+"""References that an FMU carries: their form, and what they catch."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import fmpy
+import lxml.etree
+import pytest
+from tools import needs
+
+import twodof
+from twodof.cli.main import main
+from twodof.errors import InputError
+from twodof.export.compiler import UNITS
+from twodof.fmu import checking
+from twodof.fmu.description import load_any_fmu
+
+FOLDER = "extra/org.fmi-standard.fmi-ls-ref/"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default arm's native FMU with references."""
+    options = twodof.FmuOptions(native=True, reference=True)
+    return twodof.build_fmu(tmp_path_factory.mktemp("references") / "arm.fmu", options)
+
+
+def members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def packed(files: dict[str, bytes], path: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
+
+
+def rows(path: Path, *tools: str) -> dict[str, checking.Row]:
+    """The rows of references alone."""
+    return {row.name: row for row in checking._tried(path, checking._runs(load_any_fmu(path), tools))}
+
+
+def test_the_files_have_the_form_of_the_standards(built: Path) -> None:
+    files = members(built)
+    manifest = lxml.etree.fromstring(files[f"{FOLDER}fmi-ls-manifest.xml"])
+    named = {name.partition("}")[2]: value for name, value in manifest.attrib.items()}
+    assert named["fmi-ls-name"] == "org.fmi-standard.fmi-ls-ref"
+    related = {element.get("source"): element for element in manifest}
+    assert {FOLDER + source for source in related} | {f"{FOLDER}fmi-ls-manifest.xml"} == {
+        name for name in files if name.startswith("extra/")
+    }
+    for source, element in related.items():
+        assert element.get("checksum") == hashlib.sha3_256(files[FOLDER + source]).hexdigest()
+    assert [s for s, e in related.items() if e.get("role") == "experiment/smoke-test"] == ["references.exp"]
+    schema = next(Path(fmpy.__file__).parent.rglob("SystemStructureParameterValues.xsd"))
+    for name in ("move", "push"):
+        lxml.etree.XMLSchema(file=str(schema)).assertValid(lxml.etree.fromstring(files[f"{FOLDER}{name}.ssv"]))
+
+
+def test_builds_are_identical_and_references_come_and_go(tmp_path: Path, native_path: Path, built: Path) -> None:
+    options = twodof.FmuOptions(native=True, reference=True)
+    again = twodof.build_fmu(tmp_path / "arm.fmu", options)
+    assert again.read_bytes() == built.read_bytes()
+    plain = {name: content for name, content in members(built).items() if not name.startswith("extra/")}
+    assert plain == members(native_path)
+    python = twodof.build_fmu(tmp_path / "python.fmu")
+    before = python.read_bytes()
+    twodof.build_fmu(python, twodof.FmuOptions(reference=True))
+    assert f"{FOLDER}references.exp" in members(python)
+    assert twodof.build_fmu(python).read_bytes() == before
+
+
+@pytest.mark.parametrize("control", ["task", "pose", "joint", "effort"])
+@pytest.mark.parametrize("kind", ["python", "3"])
+def test_fmus_meet_their_references(control: str, kind: str, tmp_path: Path) -> None:
+    options = twodof.FmuOptions(control=control, reference=True, native=kind == "3", fmi=3 if kind == "3" else None)
+    found = rows(twodof.build_fmu(tmp_path / "arm.fmu", options))
+    assert [(name, row.outcome) for name, row in found.items()] == [
+        ("reference move", "passed"),
+        ("reference push", "passed"),
+    ]
+
+
+def test_a_panda_meets_its_references_in_the_closed_form(panda: str, tmp_path: Path) -> None:
+    (tmp_path / "panda.urdf").write_text(panda)
+    start = (0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8)
+    options = twodof.FmuOptions(
+        tmp_path / "panda.urdf", frame="panda_hand_tcp", q_start=start, meshes=False, native=True, reference=True
+    )
+    path = twodof.build_fmu(tmp_path / "panda.fmu", options)
+    assert b"xd[3] in closed form" in members(path)[f"{FOLDER}references.exp"]
+    assert {row.outcome for row in rows(path).values()} == {"passed"}
+
+
+Changed = Callable[[str, str, str], Path]
+
+
+@pytest.fixture
+def changed(built: Path, tmp_path: Path) -> Changed:
+    """An FMU in whose source the first match of a pattern, behind marks, has 1e-6 more."""
+
+    def change(file: str, mark: str, pattern: str) -> Path:
+        files = members(built)
+        sources = {Path(name).name: text for name, text in files.items() if name.startswith("sources/")}
+        text, place = sources[file].decode(), 0
+        for part in mark.split("|"):
+            place = text.index(part, place)
+        match = re.compile(pattern).search(text, place)
+        assert match
+        sources[file] = f"{text[: match.start()]}({match[0]} + 1e-6){text[match.end() :]}".encode()
+        for name, text in sources.items():
+            (tmp_path / name).write_bytes(text)
+        command = [needs("gcc"), "-std=c99", "-shared", "-fPIC", *UNITS, "-o", "arm.so", "-lm"]
+        subprocess.run(command, check=True, cwd=tmp_path)
+        (library,) = (name for name in files if name.endswith(".so"))
+        return packed({**files, library: (tmp_path / "arm.so").read_bytes()}, tmp_path / "changed.fmu")
+
+    return change
+
+
+NUMBER = r"\d+\.\d+(e-?\d+)?"
+
+
+@pytest.mark.parametrize(
+    ("file", "mark"),
+    [
+        ("mechanism.c", "end_body->mass = "),
+        ("mechanism.c", "void inverse_dynamics(|#else"),
+        ("mechanism.c", "void acceleration_of_effort(|#else"),
+        ("dormand_prince.c", "{"),
+    ],
+)
+def test_a_constant_that_is_off_by_a_millionth_fails(changed: Changed, file: str, mark: str) -> None:
+    found = rows(changed(file, mark, NUMBER if file == "mechanism.c" else r"19372\.0 / 6561"))
+    texts = [row.text for row in found.values() if row.outcome == "failed"]
+    assert texts and all("the tolerance is 1e-10" in text for text in texts), found
+
+
+def test_a_compiler_of_another_maker_leaves_it_within_the_tolerance(changed: Changed) -> None:
+    """The control of the test above: the same way with a change that does nothing."""
+    found = rows(changed("mechanism.c", "void effort_bounds(|{", NUMBER))
+    assert {row.outcome for row in found.values()} == {"passed"}, found
+
+
+@pytest.mark.parametrize("tool", ["fmpy", "libcosim"])
+def test_another_tool_meets_them(tool: str, built: Path) -> None:
+    if tool == "libcosim":
+        needs("libcosimpy")
+        needs("libatomic")
+    found = rows(built, tool)
+    assert [row.outcome for row in found.values()] == ["passed"] * 4 and f"reference push with {tool}" in found
+
+
+def test_a_tool_that_is_missing_or_has_nothing_to_run_is_refused(
+    built: Path, native_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("twodof.fmu.importers.find_spec", lambda name: None if name == "ecospy" else name)
+    assert main(["check", str(built), "--with", "ecos"]) == 1
+    assert "ecos is not installed: pip install ecospy" in capsys.readouterr().err
+    assert main(["check", str(native_path), "--with", "fmpy"]) == 1
+    assert "carries no references to run; build one with --reference" in capsys.readouterr().err
+    with pytest.raises(InputError, match="did you mean 'fmpy'"):
+        twodof.check(built, tools=["fmpi"])
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "text"),
+    [
+        ("push-ref.csv", b"0.01,", b"0.01,x", "could not convert"),
+        ("push-ref.csv", b"\n0.02,", b"\n0.02,1,", "cannot be read"),
+        ("push.ssv", b"ssv:Real", b"ssv:Complex", "cannot be read"),
+        ("references.exp", b'"push.ssv"', b'"none.ssv"', "none.ssv"),
+        ("references.exp", b'"push.ssv"', b'"../../../../etc/passwd"', "etc/passwd"),
+        ("references.exp", b"<Experiments", b"<!DOCTYPE x><Experiments", "declares entities"),
+        ("references.exp", b'stepSize="0.01"', b'stepSize="0"', "no run of whole steps"),
+        ("push-in.csv", b"tau_ext[1]", b"tau_axt[1]", "there is no variable 'tau_axt[1]'"),
+    ],
+)
+def test_damaged_references_fail_their_row(
+    built: Path, tmp_path: Path, name: str, old: bytes, new: bytes, text: str
+) -> None:
+    files = members(built)
+    assert old in files[FOLDER + name]
+    files[FOLDER + name] = files[FOLDER + name].replace(old, new)
+    found = rows(packed(files, tmp_path / "damaged.fmu"))
+    assert any(row.outcome == "failed" and text in row.text for row in found.values()), found

@@ -1,0 +1,238 @@
+"""Reference trajectories that an FMU carries, so that an importer can be checked with it.
+
+Two experiments of 0.5 s, from the start position: "move" follows targets, or efforts of a controller; "push" has
+external efforts too. Inputs are constant over HOLD steps, and references are of samples at which no input changes:
+then it does not matter whether an importer sets inputs before or after it reads outputs, or interpolates them.
+
+Each sample is solved twice, by Dormand and Prince's order 8 and by Radau IIA of order 5 (Hairer, Norsett & Wanner,
+"Solving ODEs" I and II), with Pinocchio's equations of motion. Where a closed form exists it is the reference, and both
+solvers must agree with it. Form: FMI-LS-REF 1.0.0-beta.1 and MA-HS-Experiments, with SSP 1.0's parameter sets.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from ..errors import BuildError
+from ..plant.plant import Plant
+from ..plant.robot import Robot
+from ..plant.variables import Variable
+from .closed_form import Array, responses
+from .fmi3_files import xml_text
+
+FOLDER = "extra/org.fmi-standard.fmi-ls-ref"
+MANIFEST = "http://fmi-standard.org/fmi-ls-manifest"
+SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
+STEPS, STEP, HOLD = 50, 0.01, 5  # communication steps, s, steps
+ROWS = [k for k in range(1, STEPS + 1) if k % HOLD]  # samples of the references
+SWING, ACCELERATION = 0.05, 0.5  # rad or m of each joint, rad/s² or m/s²
+TIGHT = {"rtol": 1e-11, "atol": 1e-13}
+SOLVERS = {"DOP853": 1e-13, "Radau": 1e-11}  # SciPy's, with their tolerances
+LEAST_TOLERANCE, MOST_TOLERANCE = 1e-10, 1e-7
+"""Of a variable's largest magnitude, or of 1. The first is what the FMU's integrator leaves; beyond the second the
+solvers do not agree, and there is no reference."""
+IDEAL: dict[str, float | bool] = {
+    **dict.fromkeys(("friction", "control_period", "control_delay", "q_resolution", "q_noise", "v_noise"), 0.0),
+    **{"v_from_q": False, "limit_effort": False, **TIGHT},
+}
+"""Parameters with which the motion is smooth, by group."""
+GROUPS = ("q", "v", "x", "xd", "quat", "omega", "tau")
+Columns = dict[str, Array]
+
+
+def references(robot: Robot, table: Sequence[Variable], control: str) -> dict[str, bytes]:
+    """Return the files of the folder ``extra``, by their path in the FMU.
+
+    Raises:
+        BuildError: the motion from the start position is not smooth, or the solvers do not agree.
+    """
+    names = {variable.name: variable for variable in table}
+    files: dict[str, bytes] = {}
+    experiments = ET.Element("Experiments", name="references", description="Co-simulation with its reference results")
+    for name in ("move", "push"):
+        values = {n: IDEAL[v.group] for n, v in names.items() if v.group in IDEAL}
+        if name == "move":
+            values |= {n: 0.0 for n, v in names.items() if v.group == "damping"}
+        values |= {
+            n: v.start + 1e3 * (-1) ** (v.group == "q_min") for n, v in names.items() if v.group in ("q_min", "q_max")
+        }
+        plant = Plant(robot, table, control)
+        for key, value in values.items():
+            _set(plant, names[key], value)
+        plant.initialise()
+        stimuli = _stimuli(plant, names, name == "push")
+        found = [_solve(plant, names, stimuli, method, tolerance) for method, tolerance in SOLVERS.items()]
+        tolerance, exact = _tolerance(plant, stimuli, found)
+        times: Array = STEP * np.arange(STEPS + 1, dtype=np.float64)
+        files[f"{name}-in.csv"] = _csv(times, stimuli)
+        files[f"{name}-ref.csv"] = _csv(times[ROWS], {key: column[ROWS] for key, column in found[0].items()})
+        files[f"{name}.ssv"] = _parameter_set(name, values, names)
+        text = f"{', '.join(exact)} in closed form, the rest by" if exact else "by"
+        described = f"references: {text} two solvers; deviations are of a variable's largest magnitude, or of 1"
+        experiment = ET.SubElement(experiments, "Experiment", name=name, description=described)
+        experiment.set("tolerance", f"{tolerance:.3g}")
+        span = {"startTime": "0", "stopTime": f"{STEPS * STEP:g}", "stepSize": f"{STEP:g}"}
+        ET.SubElement(experiment, "TransientSimulation", span)
+        for tag, source in (
+            ("Parameters", f"{name}.ssv"),
+            ("Stimuli", f"{name}-in.csv"),
+            ("References", f"{name}-ref.csv"),
+        ):
+            ET.SubElement(experiment, tag, source=source)
+    files["references.exp"] = xml_text(experiments)
+    files["fmi-ls-manifest.xml"] = _manifest(files)
+    return {f"{FOLDER}/{name}": content for name, content in files.items()}
+
+
+def _set(plant: Plant, variable: Variable, value: float | bool) -> None:
+    if variable.index is None:
+        setattr(plant, variable.group, value)
+    else:
+        getattr(plant, variable.group)[variable.index] = value
+
+
+def _stimuli(plant: Plant, names: Mapping[str, Variable], push: bool) -> Columns:
+    """Return the inputs at each communication point, STEPS + 1 values each, as they are written."""
+    n, q, blocks = len(plant.q), np.array(plant.q), STEPS // HOLD
+    swing, x = SWING * (-1.0) ** np.arange(n), np.array(plant.x)
+    plant.q = [*(q + swing)]
+    reach = np.array(plant.x) - x
+    plant.q = [*q]
+    block = np.arange(STEPS + 1)[:, None] // HOLD
+    ramp, moves = np.minimum((block + 1.0) / blocks, 0.8), block < blocks // 2
+    phase, mass = 2.0 * np.pi * block / blocks + np.arange(n), plant.known.mass_matrix(q)
+    inputs = {
+        "x_des": x + ramp * reach,
+        "xd_des": moves * reach,
+        "q_des": q + ramp * swing,
+        "v_des": moves * swing,
+        "tau_cmd": plant.known.inverse_dynamics(q, 0.0 * q, 0.0 * q) + ACCELERATION * np.cos(phase) @ mass,
+    }
+    if push:
+        J = np.array(plant.known.observe(q, 0.0 * q)[1][:3])
+        mobility = float(np.linalg.norm(J @ np.linalg.solve(mass, J.T), 2)) or 1.0
+        inputs["tau_ext"] = ACCELERATION * np.sin(phase) @ mass
+        inputs["f_ext"] = ACCELERATION / mobility * np.cos(phase[:, :1] + np.arange(3))
+    columns = {}
+    for name, variable in names.items():
+        if variable.causality == "input":
+            group = inputs.get(variable.group)
+            values = np.full(STEPS + 1, variable.start, float) if group is None else group[:, variable.index]
+            columns[name] = np.array([float(f"{value:.9g}") for value in values])
+    return columns
+
+
+def _solve(plant: Plant, names: Mapping[str, Variable], stimuli: Columns, method: str, tolerance: float) -> Columns:
+    """Return the outputs at each communication point by one solver, inputs held over each step."""
+    n, rank = len(plant.q), -1
+    plant.q, plant.v = list(plant.q_start), list(plant.v_start)
+    outputs = [v for v in names.values() if v.causality == "output" and v.group in GROUPS]
+    rows = np.empty((STEPS + 1, len(outputs)))
+    for k in range(STEPS + 1):
+        vectors = {group: getattr(plant, group) for group in {variable.group for variable in outputs}}
+        rows[k] = [vectors[variable.group][variable.index] for variable in outputs]
+        for name, column in stimuli.items():
+            _set(plant, names[name], float(column[k]))
+        equations = plant.equations_of_motion()
+        kept = sum(ratio > equations.rcond for ratio in equations.ratios(np.array(plant.q)))
+        if rank not in (-1, kept):
+            raise BuildError("no references: the robot passes a singular pose near its start; choose another `q_start`")
+        rank = kept
+
+        def rates(t: float, y: Array, equations: Any = equations) -> Array:
+            return np.concatenate([y[n:], equations.acceleration(y[:n], y[n:], None, [0] * n)[0]])
+
+        start = np.array([*plant.q, *plant.v])
+        end = solve_ivp(rates, (0.0, STEP), start, method=method, rtol=tolerance, atol=1e-14).y[:, -1]
+        plant.q, plant.v = end[:n].tolist(), end[n:].tolist()
+    return {variable.name: column for variable, column in zip(outputs, rows.T)}
+
+
+def _tolerance(plant: Plant, stimuli: Columns, found: Sequence[Columns]) -> tuple[float, list[str]]:
+    """Put the closed form into the references; return the tolerance and the names that have one.
+
+    Raises:
+        BuildError: solvers, or the closed form, do not agree.
+    """
+    first, second = found
+    exact = _closed_form(plant, stimuli, first)
+    first |= exact
+    scales = {name: max(1.0, float(np.abs(column).max())) for name, column in first.items()}
+    apart = {name: float(np.abs(column - first[name])[ROWS].max()) / scales[name] for name, column in second.items()}
+    worst = max(apart, key=lambda name: apart[name])
+    if not apart[worst] <= MOST_TOLERANCE:
+        raise BuildError(f"no references: solvers and closed form differ by {apart[worst]:.2g} in {worst}")
+    return max(LEAST_TOLERANCE, 10.0 * apart[worst]), [*exact]
+
+
+def _closed_form(plant: Plant, stimuli: Columns, solved: Columns) -> Columns:
+    """Return the columns that obey ë + Kd ė + Kp e = 0 between two samples, from the state at the start."""
+    group, rate = ("q", "v") if plant.control == "joint" else ("x", "xd")
+    names = [name for name in solved if name.startswith(f"{group}[") and name.replace(group, f"{group}_des") in stimuli]
+    equations = plant.equations_of_motion()
+    rows = len(plant.robot.axes) + 3 * (plant.control == "pose")
+    full = rows <= len(plant.q) and min(equations.ratios(np.array(plant.q)), default=1.0) > equations.rcond
+    pushed = any(column.any() for name, column in stimuli.items() if name.startswith(("tau_ext", "f_ext")))
+    if any(plant.damping) or pushed or not (full or group == "q") or (plant.payload and not plant.payload_known):
+        return {}
+    columns: Columns = {}
+    for name in names:
+        i = name.removeprefix(group)
+        target, speed, push = (
+            stimuli.get(f"{g}_des{i}", np.zeros(STEPS + 1)) for g in (group, rate, "a" if group == "q" else "xdd")
+        )
+        e, v = [solved[name][0]], [solved[f"{rate}{i}"][0]]
+        for k in range(STEPS):
+            Kp, Kd = stimuli[f"Kp{i}"][k], stimuli[f"Kd{i}"][k]
+            phi, psi, gamma, psi_rate = (float(part[0]) for part in responses(np.array([STEP]), Kp, Kd))
+            a, off = push[k] + Kd * speed[k], e[-1] - target[k]
+            e.append(target[k] + phi * off + psi * v[-1] + gamma * a)
+            v.append(-Kp * psi * off + psi_rate * v[-1] + psi * a)
+        columns |= {name: np.array(e), f"{rate}{i}": np.array(v)}
+    return columns
+
+
+# --- files ---
+
+
+def _csv(times: Array, columns: Columns) -> bytes:
+    """Return a CSV; twelve digits are the same on all machines."""
+    rows = [[f"{value:.12g}" for value in row] for row in np.column_stack([times, *columns.values()])]
+    return "".join(f"{','.join(row)}\n" for row in [["time", *columns], *rows]).encode()
+
+
+def _parameter_set(name: str, values: Mapping[str, float | bool], names: Mapping[str, Variable]) -> bytes:
+    root = ET.Element("ssv:ParameterSet", {"xmlns:ssv": SSV, "version": "1.0", "name": name})
+    parameters = ET.SubElement(root, "ssv:Parameters")
+    for key, value in values.items():
+        parameter = ET.SubElement(parameters, "ssv:Parameter", name=key)
+        text = str(value).lower() if isinstance(value, bool) else f"{value:.9g}"
+        ET.SubElement(parameter, f"ssv:{names[key].type}", value=text)
+    return xml_text(root)
+
+
+def _manifest(files: Mapping[str, bytes]) -> bytes:
+    """Return the text of fmi-ls-manifest.xml, with the digests of the files."""
+    about = "Layered Standard providing information on related files included in an FMU."
+    facts = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-beta.1", "description": about}
+    root = ET.Element(
+        "fmiReferences", {"xmlns:fmi-ls": MANIFEST, **{f"fmi-ls:fmi-ls-{k}": v for k, v in facts.items()}}
+    )
+    kinds = {
+        "exp": ("application/x-ma-hs-experiments", "experiment/smoke-test"),
+        "ssv": ("application/x-ssp-parameter-set", "parameter"),
+        "csv": ("text/csv", "other"),
+    }
+    for name, content in sorted(files.items()):
+        kind, role = kinds[name.rpartition(".")[2]]
+        role = "result" if name.endswith("-ref.csv") else role
+        ET.SubElement(
+            root, "Related", type=kind, source=name, role=role, checksum=hashlib.sha3_256(content).hexdigest()
+        )
+    return xml_text(root)

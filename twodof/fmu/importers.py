@@ -1,0 +1,145 @@
+"""Runs of a reference's stimuli in this master and in other FMI tools, by the name of the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.util import find_spec
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, choice
+from .description import Fmu
+from .instance import instantiate
+from .reference_runs import Reference, Values
+
+Rows = NDArray[np.float64]
+NANOSECONDS = 1_000_000_000
+
+
+def in_this_master(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
+    """Run by this package's own calls."""
+    with instantiate(fmu) as instance:
+        instance.initialise(reference.start, inf, _starts(fmu, reference))
+        return reference.rows(instance.set, instance.step, instance.reader(names))
+
+
+def _starts(fmu: Fmu, reference: Reference) -> Values:
+    """Return the start values of a reference, each of its variable's type."""
+    kinds: dict[str, Callable[[Any], Any]] = {"Real": float, "Integer": int, "Boolean": bool}
+    values = {**reference.parameters, **reference.inputs(0)}
+    return {name: kinds[fmu.variables[name].type](value) for name, value in values.items()}
+
+
+def in_fmpy(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
+    """Run by FMPy's simulate_fmu."""
+    from fmpy import simulate_fmu
+
+    columns, numbers = reference.stimuli
+    result = simulate_fmu(
+        str(fmu.path),
+        start_time=reference.start,
+        stop_time=reference.stop,
+        step_size=reference.step,
+        output_interval=reference.step,
+        start_values=_starts(fmu, reference),
+        input=np.array([tuple(row) for row in numbers], dtype=[(name, float) for name in ["time", *columns]]),
+        output=[*names],
+        fmi_type="CoSimulation",
+    )
+    return np.array([[float(row[name]) for name in names] for row in result])
+
+
+def in_libcosim(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
+    """Run by an execution of libcosim with one slave."""
+    from libcosimpy.CosimExecution import CosimExecution
+    from libcosimpy.CosimManipulator import CosimManipulator
+    from libcosimpy.CosimObserver import CosimObserver
+    from libcosimpy.CosimSlave import CosimLocalSlave
+
+    execution = CosimExecution.from_step_size(round(reference.step * NANOSECONDS))
+    slave = execution.add_local_slave(CosimLocalSlave(str(fmu.path), "fmu"))
+    setters = {
+        "Real": execution.real_initial_value,
+        "Integer": execution.integer_initial_value,
+        "Boolean": execution.boolean_initial_value,
+    }
+    for name, value in _starts(fmu, reference).items():
+        setters[fmu.variables[name].type](slave, fmu.variables[name].reference, value)
+    observer, inputs = CosimObserver.create_last_value(), CosimManipulator.create_override()
+    execution.add_observer(observer)
+    execution.add_manipulator(inputs)
+    outputs = [fmu.variables[name].reference for name in names]
+
+    def change(values: Values) -> None:
+        if values:
+            inputs.slave_real_values(slave, [fmu.variables[name].reference for name in values], [*values.values()])
+
+    return reference.rows(change, lambda t, h: execution.step(1), partial(observer.last_real_values, slave, outputs))
+
+
+def in_ecos(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
+    """Run by a simulation of ecos with one model."""
+    from ecospy import EcosSimulation, EcosSimulationStructure
+
+    with EcosSimulationStructure() as structure:
+        structure.add_model("fmu", str(fmu.path))
+        structure.add_parameter_set("start", {f"fmu::{name}": v for name, v in _starts(fmu, reference).items()})
+        with EcosSimulation(step_size=reference.step, structure=structure) as simulation:
+            simulation.init(start_time=reference.start, parameter_set="start")
+
+            def change(values: Values) -> None:
+                for name, value in values.items():
+                    simulation.set_real(f"fmu::{name}", value)
+
+            def read() -> list[float]:
+                return [simulation.get_real(f"fmu::{name}") for name in names]
+
+            return reference.rows(change, lambda t, h: simulation.step(1), read)
+
+
+def in_fmuloader(fmu: Fmu, reference: Reference, names: Sequence[str]) -> Rows:
+    """Run by the calls of fmuloader."""
+    from fmuloader.fmi2 import Fmi2Slave, Fmi2Type
+
+    slave = Fmi2Slave(str(fmu.path), model_identifier=fmu.description.coSimulation.modelIdentifier)
+    slave.instantiate("fmu", Fmi2Type.CO_SIMULATION, guid=fmu.guid)
+    setters = {"Real": slave.set_real, "Integer": slave.set_integer, "Boolean": slave.set_boolean}
+
+    def change(values: Values) -> None:
+        for name, value in values.items():
+            setters[fmu.variables[name].type]([fmu.variables[name].reference], [value])
+
+    change(_starts(fmu, reference))
+    slave.setup_experiment(start_time=reference.start)
+    slave.enter_initialization_mode()
+    slave.exit_initialization_mode()
+    rows = reference.rows(change, slave.do_step, lambda: slave.get_real([fmu.variables[n].reference for n in names]))
+    slave.free_instance()
+    return rows
+
+
+Run = Callable[[Fmu, Reference, Sequence[str]], Rows]
+TOOLS: dict[str, tuple[str, Run, str]] = {
+    "fmpy": ("fmpy", in_fmpy, "23"),
+    "libcosim": ("libcosimpy", in_libcosim, "2"),
+    "ecos": ("ecospy", in_ecos, "23"),
+    "fmuloader": ("fmuloader", in_fmuloader, "2"),
+}
+"""Python packages of the tools, their runs, and the versions of FMI that they are tried with."""
+
+
+def require(tools: Sequence[str]) -> None:
+    """Refuse a tool that is unknown or not installed.
+
+    Raises:
+        InputError: naming it, with the remedy.
+    """
+    for tool in tools:
+        if tool not in TOOLS:
+            raise InputError(f"`tools`: '{tool}' is unknown{choice(tool, TOOLS)}")
+        if find_spec(TOOLS[tool][0]) is None:
+            raise InputError(f"{tool} is not installed: pip install {TOOLS[tool][0]}")

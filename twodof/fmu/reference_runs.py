@@ -1,0 +1,172 @@
+"""Experiments with reference results that an FMU carries, and their runs in this and other FMI tools.
+
+Form: FMI-LS-REF and MA-HS-Experiments, its times in the element TransientSimulation or, as drafts have them, in
+Experiment; SSP 1.0's parameter sets; CSV. A deviation is of a variable's largest magnitude in the results, or of 1.
+"""
+
+from __future__ import annotations
+
+import csv
+import posixpath
+import zipfile
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+from urllib.parse import unquote
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bounds import MAX_REFERENCE
+from ..errors import FmuError, SimulationError
+from ..files import read_member
+from .description import Fmu, opened
+from .validation import is_plain_xml
+
+MANIFEST = "extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"
+TIME_TOLERANCE = 1e-6  # of a communication step
+MOST_STEPS = 1_000_000
+Values = dict[str, float | bool | int]
+Table = tuple[list[str], NDArray[np.float64]]
+
+
+class Reference(NamedTuple):
+    """An experiment with its reference results.
+
+    Attributes:
+        name: of the experiment.
+        start, stop, step: s.
+        tolerance: of the results; NaN where it states none.
+        parameters: start values by name.
+        stimuli, results: names of the columns beside the time, and the numbers, the time in the first column.
+    """
+
+    name: str
+    start: float
+    stop: float
+    step: float
+    tolerance: float
+    parameters: Values
+    stimuli: Table
+    results: Table
+
+    @property
+    def steps(self) -> int:
+        """Number of communication steps."""
+        return round((self.stop - self.start) / self.step)
+
+    def time(self, k: int) -> float:
+        """Return the time after k steps, s."""
+        return self.start + k * self.step
+
+    def inputs(self, k: int) -> Values:
+        """Return the inputs that hold from k steps on."""
+        names, numbers = self.stimuli
+        return {n: float(np.interp(self.time(k), numbers[:, 0], numbers[:, i + 1])) for i, n in enumerate(names)}
+
+    def rows(
+        self,
+        change: Callable[[Values], object],
+        step: Callable[[float, float], object],
+        read: Callable[[], Iterable[float]],
+    ) -> NDArray[np.float64]:
+        """Step a tool that is initialised; return what it reads after each step, and NaN for the start."""
+        held, rows = self.inputs(0), []
+        for k in range(self.steps):
+            inputs = self.inputs(k)
+            change({name: value for name, value in inputs.items() if value != held[name]})
+            held = inputs
+            step(self.time(k), self.step)
+            rows.append([*read()])
+        return np.array([[np.nan] * len(rows[0]), *rows])
+
+    def judge(self, rows: NDArray[np.float64]) -> str:
+        """Compare the columns of the results, one row for each communication point; return a line.
+
+        Raises:
+            SimulationError: they differ by more than the tolerance.
+        """
+        names, numbers = self.results
+        index = np.rint((numbers[:, 0] - self.start) / self.step).astype(int)
+        if np.abs(numbers[:, 0] - self.start - index * self.step).max(initial=0.0) > TIME_TOLERANCE * self.step:
+            raise SimulationError("its results are not at communication points")
+        kept = (index > 0) & (index < len(rows))
+        expected, found = numbers[kept, 1:], rows[index[kept]]
+        off = np.abs(found - expected) / np.maximum(1.0, np.abs(expected).max(axis=0, initial=0.0))
+        k, i = np.unravel_index(np.nanargmax(np.where(np.isnan(off), np.inf, off)), off.shape)
+        if not off[k, i] <= self.tolerance:
+            text = f"{names[i]} is {found[k, i]:.12g} instead of {expected[k, i]:.12g} at {numbers[kept, 0][k]:g} s"
+            raise SimulationError(f"{text}, {off[k, i]:.3g} away; the tolerance is {self.tolerance:g}")
+        return f"{off.size} values within {self.tolerance:g}, at most {off[k, i]:.2g} away"
+
+
+def references_of(fmu: Fmu) -> list[Reference]:
+    """Return the experiments that have results, of an FMU with a manifest of FMI-LS-REF; none without one.
+
+    Raises:
+        FmuError: a file is damaged or missing, or has not the form.
+    """
+    if MANIFEST not in fmu.members:
+        return []
+    with opened(fmu) as archive:
+        try:
+            files = _Files(archive, posixpath.dirname(MANIFEST))
+            related = files.xml(posixpath.basename(MANIFEST)).iter("Related")
+            sources = [r.get("source", "") for r in related if r.get("role", "").startswith("experiment")]
+            found = [files.reference(e) for source in sources for e in files.xml(source).iter("Experiment")]
+        except (KeyError, ValueError, ET.ParseError) as error:
+            raise FmuError(f"the references in '{fmu.path}' cannot be read: {error}") from error
+    return [reference for reference in found if reference is not None]
+
+
+class _Files(NamedTuple):
+    """Files of the folder of FMI-LS-REF."""
+
+    archive: zipfile.ZipFile
+    folder: str
+
+    def read(self, source: str) -> bytes:
+        """Return a file by its relative URI."""
+        return read_member(self.archive, posixpath.normpath(f"{self.folder}/{unquote(source)}"), MAX_REFERENCE)
+
+    def xml(self, source: str) -> ET.Element:
+        """Return the root of an XML file."""
+        content = self.read(source)
+        if not is_plain_xml(content):
+            raise ValueError(f"{source} declares entities or is not UTF-8")
+        return ET.fromstring(content)
+
+    def reference(self, experiment: ET.Element) -> Reference | None:
+        """Return an experiment; None where it has no results as CSV, or is no simulation over time."""
+        times = {**experiment.attrib, **getattr(experiment.find("TransientSimulation"), "attrib", {})}
+        results, stimuli, parameters = (experiment.find(tag) for tag in ("References", "Stimuli", "Parameters"))
+        if results is None or results.get("type", "text/csv") != "text/csv" or "stepSize" not in times:
+            return None
+        start, stop, step = (float(times.get(f"{key}", 0.0)) for key in ("startTime", "stopTime", "stepSize"))
+        count = (stop - start) / step if step > 0.0 else 0.0
+        if not 0.5 < count < MOST_STEPS:
+            raise ValueError(f"experiment '{experiment.get('name')}' is no run of whole steps, at most {MOST_STEPS}")
+        return Reference(
+            *(experiment.get("name", ""), start, stop, step, float(times.get("tolerance", "nan"))),
+            parameters={} if parameters is None else self.parameters(parameters.get("source", "")),
+            stimuli=([], np.zeros((1, 1))) if stimuli is None else self.table(stimuli.get("source", "")),
+            results=self.table(results.get("source", "")),
+        )
+
+    def parameters(self, source: str) -> Values:
+        """Return the numbers and Booleans of a parameter set."""
+        read: dict[str, Callable[[str], float | bool]] = {"Real": float, "Float64": float, "Boolean": "true".__eq__}
+        read |= {"Integer": int, "Int32": int}
+        values: Values = {}
+        for parameter in self.xml(source).iterfind(".//{*}Parameter"):
+            for kind in parameter:
+                values[parameter.get("name", "")] = read[kind.tag.rpartition("}")[2]](kind.get("value", ""))
+        return values
+
+    def table(self, source: str) -> Table:
+        """Return the columns of a CSV file."""
+        head, *rows = csv.reader(self.read(source).decode("utf-8").splitlines())
+        numbers = np.array([[float(cell) for cell in row] for row in rows])
+        if numbers.ndim != 2 or numbers.shape[1] != len(head) or not np.isfinite(numbers).all():
+            raise ValueError(f"{source} is no table of finite numbers")
+        return head[1:], numbers
